@@ -1,0 +1,83 @@
+"""What every driver is: a name, options, counters, a state, and one coroutine.
+
+A driver runs until it is cancelled. It opens its device, reopens it with backoff when it goes away,
+and hands over measurements and events by calling `emit`; it never raises for what a device does.
+A fault that no retry can mend (a DBC file that does not exist) raises `PermanentDriverError` from
+the constructor.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol
+
+from pydantic import BaseModel, ConfigDict
+
+from drivers.measurements import DeviceEvent, Measurement
+
+Emit = Callable[[Measurement | DeviceEvent], None]
+Now = Callable[[], int]
+
+State = Literal["starting", "absent", "silent", "running", "failed"]
+
+
+class DriverError(Exception):
+    """A fault of a device or of its line that may pass: the driver retries."""
+
+
+class PermanentDriverError(DriverError):
+    """A fault that no retry can mend; the configuration or the installation must change."""
+
+
+class DriverOptions(BaseModel):
+    """Base of every driver's options: unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(slots=True)
+class DriverStatus:
+    """What `health` says of a device: its state and why it is so, in one sentence.
+
+    `starting` not yet tried; `absent` the port or bus cannot be opened; `silent` open but nothing
+    intelligible for the driver's time-out; `running`; `failed` permanently.
+    """
+
+    state: State = "starting"
+    detail: str = ""
+
+
+class Driver(Protocol):
+    """A device's driver. `counters` holds every received, refused and damaged item by name."""
+
+    Options: ClassVar[type[DriverOptions]]
+    name: str
+    counters: Counter[str]
+    status: DriverStatus
+
+    async def run(self) -> None:
+        """Serve the device until cancelled."""
+
+
+@dataclass(slots=True)
+class Backoff:
+    """Waits between attempts to reopen a device: doubling from `first_s` up to `longest_s`."""
+
+    first_s: float = 0.25
+    longest_s: float = 5.0
+    _next_s: float = 0.0
+
+    def next(self) -> float:
+        """The wait before the next attempt, in s."""
+        self._next_s = min(self.longest_s, self._next_s * 2 or self.first_s)
+        return self._next_s
+
+    def reset(self) -> None:
+        """Start again from the first wait: the device was there."""
+        self._next_s = 0.0
+
+
+monotonic_ns: Now = time.monotonic_ns

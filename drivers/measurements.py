@@ -1,0 +1,202 @@
+"""The vocabulary that drivers speak: what a device said, in SI units, with the stamp it gave.
+
+A driver never settles *when* a measurement was true. It reports the device's own stamp (one of the
+`Stamp` classes) and `t_seen_ns`, the host's monotonic clock (`time.monotonic_ns`) when the last
+byte or frame came in. Whoever consumes the measurement turns the stamp into a validity instant.
+
+Frames: *sensor* axes are the device's own; *body* is forward-right-down; *NED* is
+north-east-down at the point that the measurement speaks of. Angles are radians unless a name says
+otherwise. Latitude, longitude and height are geodetic on WGS 84 (CGCS2000 agrees to centimetres).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Vector3 = tuple[float, float, float]
+
+
+# --------------------------------------------------------------------------- stamps
+
+
+@dataclass(frozen=True, slots=True)
+class ArrivalStamp:
+    """The device gave no time: true `latency_s` before the measurement was seen."""
+
+    latency_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class MonotonicStamp:
+    """Already on the host's monotonic clock (files, simulation)."""
+
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class KernelStamp:
+    """Receive stamp of the kernel, CLOCK_REALTIME, in ns; `latency_s` from validity to stamp."""
+
+    realtime_ns: int
+    latency_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceStamp:
+    """A device's own free-running clock, unwrapped by the driver; `device` names that clock."""
+
+    device: str
+    ticks_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class UtcStamp:
+    """A full UTC instant as POSIX nanoseconds (a leap second repeats the last second's count)."""
+
+    utc_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOfDayStamp:
+    """A time of day without a date, in one of several possible zones.
+
+    `time_of_day_s` may reach 86401 (leap second). `zones_h` lists the possible offsets of the
+    printed time from UTC. `requested_ns` is the monotonic instant at which the device was asked,
+    None when it was not. `uncertainty_s` bounds what the printed fraction leaves open.
+    """
+
+    time_of_day_s: float
+    zones_h: tuple[int, ...] = (0,)
+    requested_ns: int | None = None
+    uncertainty_s: float = 0.0
+
+
+Stamp = ArrivalStamp | MonotonicStamp | KernelStamp | DeviceStamp | UtcStamp | TimeOfDayStamp
+
+
+# --------------------------------------------------------------------------- measurements
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """Mean angular rate (rad/s) and specific force (m/s^2) since the sample before, sensor axes."""
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    gyro_rad_s: Vector3
+    accel_m_s2: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class PositionFix:
+    """A GNSS receiver's fix of its antenna, with velocity where the receiver gives one.
+
+    `sd_ned_m` and `sd_v_ned_m_s` are one sigma; None where the device did not say (the aiding then
+    uses what the configuration holds). A velocity whose down part is None is horizontal only.
+    `quality` follows NMEA GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
+    """
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    lat_rad: float
+    lon_rad: float
+    height_m: float | None
+    quality: int = 1
+    satellites: int | None = None
+    hdop: float | None = None
+    vdop: float | None = None
+    sd_ned_m: Vector3 | None = None
+    v_ned_m_s: tuple[float, float, float | None] | None = None
+    sd_v_ned_m_s: tuple[float, float, float | None] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DelayedFix:
+    """A BeiDou RDSS fix: the terminal's position at the instant its request left the antenna.
+
+    `precision_class_m` is the class the centre states (20 or 100 m). `height_m` is what went into
+    the solution, not an independent measurement. `multi_value` says two solutions were possible.
+    """
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    lat_rad: float
+    lon_rad: float
+    height_m: float
+    precision_class_m: float
+    multi_value: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """Roll, pitch, yaw (rad, NED to body, 3-2-1) with one sigma; a NaN component is not given."""
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    rpy_rad: Vector3
+    sd_rpy_rad: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """True heading of the body's forward axis (rad, from north, clockwise), one sigma if given."""
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    yaw_rad: float
+    sd_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Height:
+    """Ellipsoidal height of the body origin (m), one sigma if given."""
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    height_m: float
+    sd_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WheelSpeed:
+    """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given."""
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    speed_m_s: float
+    sd_m_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TimeReport:
+    """UTC as a device states it (NMEA RMC/ZDA, RDSS SJXX/BDZDA), to discipline the clock.
+
+    `trusted` is False while the device itself says its time is not yet valid.
+    """
+
+    source: str
+    t_seen_ns: int
+    utc_ns: int
+    trusted: bool
+
+
+Measurement = (
+    ImuSample | PositionFix | DelayedFix | Attitude | Heading | Height | WheelSpeed | TimeReport
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEvent:
+    """Something an operator should know about a device: a stable code and one sentence."""
+
+    source: str
+    t_seen_ns: int
+    code: str
+    text: str

@@ -1,0 +1,278 @@
+"""The configuration of a vehicle: one TOML file, in the units that data sheets print.
+
+Every section is a frozen pydantic model that refuses unknown keys. Units stand in the names;
+nothing else in the project converts them: `fusiond.settings` turns this into SI once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
+
+Vector = tuple[float, float, float]
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class Section(BaseModel):
+    """Base of every section: frozen, unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
+    letters = [a[-1] for a in axes]
+    if sorted(letters) != ["x", "y", "z"]:
+        raise ValueError("each of x, y and z once, such as ['-x', '+y', '-z']")
+    even = letters in (["x", "y", "z"], ["y", "z", "x"], ["z", "x", "y"])
+    negative = sum(a.startswith("-") for a in axes)
+    if (negative % 2 == 0) != even:
+        raise ValueError("these axes are left-handed: change one sign")
+    return axes
+
+
+Axis = Annotated[str, Field(pattern=r"^[+-]?[xyz]$")]
+Axes = Annotated[tuple[Axis, Axis, Axis], AfterValidator(_right_handed)]
+
+
+class Imu(Section):
+    """Inertial sensor: mounting and error model.
+
+    `axes` names the sensor axis that points along body forward, right and down;
+    `mounting_deg` is the small rest, roll, pitch, yaw from body to those nominal axes.
+    """
+
+    axes: Axes = ("+x", "+y", "+z")
+    mounting_deg: Vector = (0.0, 0.0, 0.0)
+    time_offset_s: float = 0.0
+    rate_hz: PositiveFloat = 100.0
+    gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
+    accel_noise_m_s_sqrt_h: PositiveFloat = 0.1
+    gyro_bias_instability_deg_h: PositiveFloat = 10.0
+    accel_bias_instability_mg: PositiveFloat = 0.1
+    bias_correlation_s: PositiveFloat = 3600.0
+    gyro_bias_initial_deg_h: PositiveFloat = 360.0
+    accel_bias_initial_mg: PositiveFloat = 10.0
+    gyro_scale_ppm: PositiveFloat = 2000.0
+    accel_scale_ppm: PositiveFloat = 2000.0
+    scale_correlation_s: PositiveFloat = 3600.0
+    gap_s: PositiveFloat = 0.5
+    """A pause longer than this is a gap: the solution says so and the covariance grows for it."""
+
+
+class Aiding(Section):
+    """What every aid has: where it sits, how it is gated."""
+
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """Body axes (forward, right, down), from the IMU to the aid's reference point."""
+    gate_probability: Probability = 0.9999
+    """A consistent innovation fails the gate with one minus this probability."""
+    sigma_scale: PositiveFloat = 1.0
+    """Multiplies every sigma the device states, where experience says it is too optimistic."""
+
+
+class GnssAiding(Aiding):
+    """Position and velocity fixes of a GNSS receiver."""
+
+    kind: Literal["gnss"] = "gnss"
+    use_velocity: bool = True
+    range_error_m: PositiveFloat = 3.0
+    """Times DOP gives sigma where the receiver sends no GST; see `docs`."""
+    velocity_sd_m_s: PositiveFloat = 0.1
+    min_position_sd_m: PositiveFloat = 0.02
+    min_velocity_sd_m_s: PositiveFloat = 0.02
+    time_sd_s: NonNegativeFloat = 0.0
+    """Timing error of the fix against the IMU; times the speed it adds to sigma."""
+
+
+class RdssAiding(Aiding):
+    """BeiDou RDSS fixes: late, horizontal, 20 or 100 m class."""
+
+    kind: Literal["rdss"] = "rdss"
+
+
+class AttitudeAiding(Aiding):
+    kind: Literal["attitude"] = "attitude"
+
+
+class HeadingAiding(Aiding):
+    kind: Literal["heading"] = "heading"
+    sd_deg: PositiveFloat = 1.0
+
+
+class HeightAiding(Aiding):
+    kind: Literal["height"] = "height"
+    sd_m: PositiveFloat = 5.0
+
+
+class WheelAiding(Aiding):
+    kind: Literal["wheel"] = "wheel"
+    sd_m_s: PositiveFloat = 0.1
+
+
+AnyAiding = Annotated[
+    GnssAiding | RdssAiding | AttitudeAiding | HeadingAiding | HeightAiding | WheelAiding,
+    Field(discriminator="kind"),
+]
+AIDING_KINDS = ("gnss", "rdss", "attitude", "heading", "height", "wheel")
+
+
+class ZeroVelocity(Section):
+    """Stationary detector: zero velocity and zero rate while the sensor is quiet."""
+
+    enabled: bool = True
+    window_s: PositiveFloat = 1.0
+    gyro_sd_deg_s: PositiveFloat = 0.5
+    accel_sd_m_s2: PositiveFloat = 0.15
+    max_rate_deg_s: PositiveFloat = 2.0
+    max_speed_m_s: PositiveFloat = 0.5
+    velocity_sd_m_s: PositiveFloat = 0.05
+    rate_sd_deg_s: PositiveFloat = 0.1
+    interval_s: PositiveFloat = 0.5
+
+
+class NonHolonomic(Section):
+    """A wheeled vehicle does not slide sideways nor jump: v_right = v_down = 0 at a point."""
+
+    enabled: bool = False
+    sd_m_s: PositiveFloat = 0.2
+    min_speed_m_s: NonNegativeFloat = 2.0
+    interval_s: PositiveFloat = 0.1
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """From the IMU to the point that does not slide (the rear axle)."""
+
+
+class Constraints(Section):
+    zero_velocity: ZeroVelocity = ZeroVelocity()
+    non_holonomic: NonHolonomic = NonHolonomic()
+
+
+class Alignment(Section):
+    """How attitude and position are found before navigation starts.
+
+    `heading` lists the allowed sources of the first heading in order of preference.
+    """
+
+    heading: tuple[
+        Literal["saved", "config", "dual_antenna", "gyrocompass", "gnss_course"], ...
+    ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course")
+    heading_deg: float | None = None
+    heading_sd_deg: PositiveFloat = 5.0
+    position_deg_m: Vector | None = None
+    """Latitude, longitude, height where the vehicle starts, if no aid will say it."""
+    position_sd_m: PositiveFloat = 100.0
+    levelling_s: PositiveFloat = 2.0
+    course_speed_m_s: PositiveFloat = 3.0
+    course_sd_deg: PositiveFloat = 5.0
+    gyrocompass_s: PositiveFloat = 120.0
+    gyrocompass_max_sd_deg: PositiveFloat = 5.0
+    """Gyrocompassing is used only if bias and noise allow this heading sigma."""
+    saved_max_age_s: PositiveFloat = 86400.0
+
+    @model_validator(mode="after")
+    def _heading_given(self) -> Alignment:
+        if "config" in self.heading and self.heading_deg is None:
+            raise ValueError("heading lists 'config': set heading_deg too")
+        return self
+
+
+class Estimator(Section):
+    model: Literal["ins15", "ins21", "planar15"] = "ins21"
+    buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
+    """History that late measurements may rewind into; at least 10 s."""
+    checkpoint_s: PositiveFloat = 0.5
+    coast_after_s: PositiveFloat = 10.0
+    invalid_sd_m: PositiveFloat = 5000.0
+
+
+class Scheduler(Section):
+    rate_hz: Annotated[float, Field(ge=1.0, le=1000.0)] = 100.0
+
+
+class ClockOptions(Section):
+    """Where UTC comes from.
+
+    `gnss`: the receiver's time, as the lower envelope of arrival minus `serial_latency_s`, and the
+    system clock until that is known. `system`: always CLOCK_REALTIME (NTP or PPS keeps it).
+    """
+
+    utc: Literal["gnss", "system"] = "gnss"
+    serial_latency_s: NonNegativeFloat = 0.05
+    """Least time between a receiver's epoch and the last byte of its sentences."""
+    rdss_latency_s: PositiveFloat = 0.8
+    """Assumed age of an RDSS fix whose time of day fits no candidate."""
+    max_clock_drift_ppm: PositiveFloat = 100.0
+
+
+class Mqtt(Section):
+    """Broker. Passwords come from FUSIOND_MQTT_PASSWORD or from `password_file`, never from here."""
+
+    enabled: bool = True
+    host: str = "localhost"
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    client_id: str | None = None
+    username: str | None = None
+    password_file: Path | None = None
+    tls: bool = False
+    ca_file: Path | None = None
+    cert_file: Path | None = None
+    key_file: Path | None = None
+    keepalive_s: PositiveInt = 20
+    nav_rate_hz: Annotated[float, Field(ge=1.0, le=100.0)] = 10.0
+    health_rate_hz: Annotated[float, Field(ge=0.1, le=10.0)] = 1.0
+    queue: Annotated[int, Field(ge=1, le=10000)] = 64
+    """Messages that may wait for the broker; beyond it the oldest is dropped and counted."""
+    commands: tuple[Literal["set_position", "request_fix", "reset_filter"], ...] = ()
+    """Commands accepted on `cmd/<name>`; none by default."""
+
+
+class Source(BaseModel):
+    """A device: which driver serves it; the other keys are that driver's options."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    driver: str
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return dict(self.model_extra or {})
+
+
+class Config(Section):
+    """A vehicle. `sources` are devices, `aiding` says how the filter uses what they send."""
+
+    vehicle: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")] = "vehicle"
+    state_file: Path | None = None
+    """Where the last solution is kept for the next start; the unit's state directory by default."""
+    imu: Imu = Imu()
+    sources: dict[str, Source] = Field(default_factory=dict)
+    aiding: dict[str, AnyAiding] = Field(default_factory=dict)
+    constraints: Constraints = Constraints()
+    alignment: Alignment = Alignment()
+    estimator: Estimator = Estimator()
+    scheduler: Scheduler = Scheduler()
+    clock: ClockOptions = ClockOptions()
+    mqtt: Mqtt = Mqtt()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _kind_from_name(cls, data: Any) -> Any:
+        """`[aiding.gnss]` needs no `kind`: the name says it."""
+        if isinstance(data, dict) and isinstance(data.get("aiding"), dict):
+            aiding = {
+                name: {"kind": name, **value}
+                if isinstance(value, dict) and name in AIDING_KINDS
+                else value
+                for name, value in data["aiding"].items()
+            }
+            data = {**data, "aiding": aiding}
+        return data

@@ -1,0 +1,49 @@
+"""The navigation solution as it leaves the navigator: frozen, in SI units and radians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import nan
+
+Vector3 = tuple[float, float, float]
+_UNKNOWN: Vector3 = (nan, nan, nan)
+
+
+class Mode(StrEnum):
+    """What the solution is worth.
+
+    WAITING: no IMU data yet. ALIGNING: levelling, or heading or position not known yet.
+    NAVIGATING: aided within the last `coast_after_s`. COASTING: inertial alone for longer than
+    that. INVALID: sigma beyond what the configuration allows, or the IMU has stopped.
+    """
+
+    WAITING = "waiting"
+    ALIGNING = "aligning"
+    NAVIGATING = "navigating"
+    COASTING = "coasting"
+    INVALID = "invalid"
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Navigation state of the body origin at one instant, with one sigma each.
+
+    `t_ns` host monotonic. Position geodetic (rad, rad, m, WGS 84); velocity NED (m/s); attitude
+    roll, pitch, yaw (rad, NED to body, 3-2-1). `sd_ned_m` metres north, east, down. Every figure is
+    NaN while `mode` is WAITING or ALIGNING and it is not known.
+    """
+
+    t_ns: int
+    mode: Mode
+    reason: str
+    lat_rad: float = nan
+    lon_rad: float = nan
+    height_m: float = nan
+    v_ned_m_s: Vector3 = _UNKNOWN
+    rpy_rad: Vector3 = _UNKNOWN
+    sd_ned_m: Vector3 = _UNKNOWN
+    sd_v_ned_m_s: Vector3 = _UNKNOWN
+    sd_rpy_rad: Vector3 = _UNKNOWN
+    gyro_bias_rad_s: Vector3 = field(default=_UNKNOWN)
+    accel_bias_m_s2: Vector3 = field(default=_UNKNOWN)
