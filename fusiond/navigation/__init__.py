@@ -1,0 +1,1 @@
+"""Pure, compiled navigation numerics: no I/O, no clock, no configuration."""
