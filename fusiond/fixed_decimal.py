@@ -1,0 +1,99 @@
+"""Fixed-decimal text of a table of numbers, compiled: tens of nanoseconds a number.
+
+A number v with d decimals is written as sign, floor(|v|), '.', and round(frac(|v|) 10^d). Both
+parts of the split are exact in binary, so only a fraction that lies on a rounding tie can differ
+from the correctly rounded decimal, by one unit of the last place. NaN is an empty cell; zero has
+no sign; beyond 1e18 the cell reads `inf`, which no reader takes for a number.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+MAX_CELL = 32
+"""Bytes of the longest cell with its comma: sign, 18 digits, point, 9 decimals, comma."""
+MAX_DECIMALS = 9
+
+_COMMA, _NEWLINE, _POINT, _MINUS, _ZERO = 44, 10, 46, 45, 48
+_LIMIT = 1e18
+
+_write_digits_signature = types.int64(types.uint8[::1], types.int64, types.uint64, types.int64)
+
+
+@njit(_write_digits_signature, cache=True, nogil=True)
+def _write_digits(out, at, number, width):  # type: ignore[no-untyped-def]
+    """Write `number` at `out[at:]` with at least `width` digits; returns the next position."""
+    rest = number
+    digits = 1
+    while rest >= np.uint64(10):
+        rest //= np.uint64(10)
+        digits += 1
+    digits = max(digits, width)
+    rest = number
+    for k in range(at + digits - 1, at - 1, -1):
+        out[k] = _ZERO + rest % np.uint64(10)
+        rest //= np.uint64(10)
+    return at + digits
+
+
+_format_signature = types.int64(
+    types.Array(types.float64, 2, "C"),
+    types.int64[::1],
+    types.int64[::1],
+    types.Array(types.uint8, 2, "C"),
+    types.uint8[::1],
+)
+
+
+@njit(_format_signature, cache=True, nogil=True)
+def format_rows(values, decimals, codes, labels, out):  # type: ignore[no-untyped-def]
+    """Write rows of numbers, each ended by a label and a newline; returns the bytes written.
+
+    `values` (n, m); `decimals` (m,), 0 to 9; `codes` (n,) choose a row of `labels` (k, w), ASCII
+    padded with zeros, and an unknown code gives an empty label; `out` holds at least
+    n (32 m + w + 1) bytes.
+    """
+    n, m = values.shape
+    at = 0
+    for i in range(n):
+        for j in range(m):
+            v = values[i, j]
+            magnitude = abs(v)
+            if magnitude < _LIMIT:
+                d = decimals[j]
+                unit = np.uint64(1)
+                for _ in range(d):
+                    unit *= np.uint64(10)
+                whole = np.uint64(magnitude)
+                part = np.uint64(np.rint((magnitude - np.float64(whole)) * np.float64(unit)))
+                if part >= unit:
+                    whole += np.uint64(1)
+                    part -= unit
+                if v < 0.0 and (whole > np.uint64(0) or part > np.uint64(0)):
+                    out[at] = _MINUS
+                    at += 1
+                at = _write_digits(out, at, whole, 1)
+                if d > 0:
+                    out[at] = _POINT
+                    at = _write_digits(out, at + 1, part, d)
+            elif magnitude >= _LIMIT:
+                if v < 0.0:
+                    out[at] = _MINUS
+                    at += 1
+                out[at] = 105
+                out[at + 1] = 110
+                out[at + 2] = 102
+                at += 3
+            out[at] = _COMMA
+            at += 1
+        code = codes[i]
+        if 0 <= code < labels.shape[0]:
+            for k in range(labels.shape[1]):
+                if labels[code, k] == 0:
+                    break
+                out[at] = labels[code, k]
+                at += 1
+        out[at] = _NEWLINE
+        at += 1
+    return at
