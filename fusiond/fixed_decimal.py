@@ -9,7 +9,9 @@ no sign; beyond 1e18 the cell reads `inf`, which no reader takes for a number.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
 
 MAX_CELL = 32
 """Bytes of the longest cell with its comma: sign, 18 digits, point, 9 decimals, comma."""
@@ -18,11 +20,9 @@ MAX_DECIMALS = 9
 _COMMA, _NEWLINE, _POINT, _MINUS, _ZERO = 44, 10, 46, 45, 48
 _LIMIT = 1e18
 
-_write_digits_signature = types.int64(types.uint8[::1], types.int64, types.uint64, types.int64)
 
-
-@njit(_write_digits_signature, cache=True, nogil=True)
-def _write_digits(out, at, number, width):  # type: ignore[no-untyped-def]
+@compiled("i8(u1[::1], i8, u8, i8)")
+def _write_digits(out: NDArray[np.uint8], at: int, number: np.uint64, width: int) -> int:
     """Write `number` at `out[at:]` with at least `width` digits; returns the next position."""
     rest = number
     digits = 1
@@ -37,17 +37,14 @@ def _write_digits(out, at, number, width):  # type: ignore[no-untyped-def]
     return at + digits
 
 
-_format_signature = types.int64(
-    types.Array(types.float64, 2, "C"),
-    types.int64[::1],
-    types.int64[::1],
-    types.Array(types.uint8, 2, "C"),
-    types.uint8[::1],
-)
-
-
-@njit(_format_signature, cache=True, nogil=True)
-def format_rows(values, decimals, codes, labels, out):  # type: ignore[no-untyped-def]
+@compiled("i8(f8[:, ::1], i8[::1], i8[::1], u1[:, ::1], u1[::1])", nogil=True)
+def format_rows(
+    values: NDArray[np.float64],
+    decimals: NDArray[np.int64],
+    codes: NDArray[np.int64],
+    labels: NDArray[np.uint8],
+    out: NDArray[np.uint8],
+) -> int:
     """Write rows of numbers, each ended by a label and a newline; returns the bytes written.
 
     `values` (n, m); `decimals` (m,), 0 to 9; `codes` (n,) choose a row of `labels` (k, w), ASCII
