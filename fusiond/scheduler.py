@@ -1,0 +1,184 @@
+"""The fixed-rate tick: absolute deadlines on the monotonic clock, no backlog, garbage out of ticks.
+
+    deadline_k = t_0 + k * period
+
+A tick that could not start within its own period is skipped and counted as an overrun; those that
+follow keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so a tick is up to
+1 ms late on an idle machine; the tick is told its deadline, not the time it woke.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from math import ceil, log10
+
+SECOND_NS = 1_000_000_000
+
+_FIRST_BIN_NS = 10_000
+_BINS_PER_DECADE = 10
+_BINS = 6 * _BINS_PER_DECADE + 1
+_SLACK_MARGIN_NS = 500_000
+_FORCE_AFTER_NS = 10 * SECOND_NS
+"""Cycles hold memory: if no slack was long enough for this time, collect all the same."""
+_GC_THRESHOLDS = (700, 10, 10)
+"""CPython's own thresholds of its three generations (gc.get_threshold)."""
+
+
+class LatenessHistogram:
+    """Lateness in fixed log-spaced bins, ten a decade from 10 us to 10 s; constant memory."""
+
+    def __init__(self) -> None:
+        self.bins = [0] * _BINS
+        self.count = 0
+        self.max_ns = 0
+
+    def add(self, lateness_ns: int) -> None:
+        index = 0
+        if lateness_ns > _FIRST_BIN_NS:
+            index = min(_BINS - 1, ceil(_BINS_PER_DECADE * log10(lateness_ns / _FIRST_BIN_NS)))
+        self.bins[index] += 1
+        self.count += 1
+        self.max_ns = max(self.max_ns, lateness_ns)
+
+    def quantile_ms(self, p: float) -> float:
+        """Upper edge of the bin that holds the quantile (at most 26 % high), in ms; 0 if empty."""
+        wanted = p * self.count
+        seen = 0
+        for index, n in enumerate(self.bins):
+            seen += n
+            if n and seen >= wanted:
+                edge_ns = _FIRST_BIN_NS * pow(10.0, index / _BINS_PER_DECADE)
+                return min(float(edge_ns), self.max_ns) / 1e6
+        return 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerStatus:
+    """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
+
+    ticks: int
+    overruns: int
+    lateness_p50_ms: float
+    lateness_p99_ms: float
+    lateness_max_ms: float
+    gc_collections: int
+    gc_forced: int
+    gc_max_ms: float
+
+
+class _Collector:
+    """Runs the cyclic garbage collector in the slack after a tick instead of anywhere."""
+
+    def __init__(self, now: Callable[[], int]) -> None:
+        self._now = now
+        self._cost_ns = [0, 0, 0]
+        self._due_ns: list[int | None] = [None, None, None]
+        self._was_enabled = gc.isenabled()
+        self.collections = 0
+        self.forced = 0
+        self.max_ns = 0
+
+    def start(self) -> None:
+        """What start-up made lives for ever: move it out of the collector's sight."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+
+    def stop(self) -> None:
+        gc.unfreeze()
+        if self._was_enabled:
+            gc.enable()
+
+    def use_slack(self, slack_ns: int) -> None:
+        """Collect the oldest generation that is due, if twice its last cost fits the slack."""
+        start = self._now()
+        counts = gc.get_count()
+        for generation in (2, 1, 0):
+            if counts[generation] <= _GC_THRESHOLDS[generation]:
+                continue
+            due_ns = self._due_ns[generation]
+            if due_ns is None:
+                due_ns = self._due_ns[generation] = start
+            fits = 2 * self._cost_ns[generation] + _SLACK_MARGIN_NS < slack_ns
+            if fits or start - due_ns > _FORCE_AFTER_NS:
+                gc.collect(generation)
+                cost_ns = self._now() - start
+                self._cost_ns[generation] = cost_ns
+                self._due_ns[: generation + 1] = [None] * (generation + 1)
+                self.max_ns = max(self.max_ns, cost_ns)
+                self.collections += 1
+                self.forced += not fits
+                return
+
+
+class Scheduler:
+    """Calls `tick(deadline_ns)` at `rate_hz` until cancelled.
+
+    `on_time(now_ns)` is called after every tick that started within its own period and ended
+    before the next: the watchdog's food. `now` and `sleep` (seconds) are the clock and may be a
+    test's. An exception of `tick` leaves `run`.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        tick: Callable[[int], None],
+        *,
+        now: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        on_time: Callable[[int], None] | None = None,
+    ) -> None:
+        self.period_ns = round(SECOND_NS / rate_hz)
+        self._tick = tick
+        self._now = now
+        self._sleep = sleep
+        self._on_time = on_time
+        self._collector = _Collector(now)
+        self.lateness = LatenessHistogram()
+        self.ticks = 0
+        self.overruns = 0
+
+    async def run(self) -> None:
+        """Tick until cancelled; the first deadline is one period from now."""
+        self._collector.start()
+        try:
+            await self._run()
+        finally:
+            self._collector.stop()
+
+    async def _run(self) -> None:
+        deadline = self._now() + self.period_ns
+        while True:
+            # Also when late: other tasks must run between two ticks.
+            await self._sleep(max(0, deadline - self._now()) / SECOND_NS)
+            late = self._now() - deadline
+            if late < 0:
+                continue
+            self.lateness.add(late)
+            missed = late // self.period_ns
+            self.overruns += missed
+            deadline += missed * self.period_ns
+            self._tick(deadline)
+            self.ticks += 1
+            deadline += self.period_ns
+            now = self._now()
+            if self._on_time is not None and not missed and now < deadline:
+                self._on_time(now)
+            self._collector.use_slack(deadline - now)
+
+    def status(self) -> SchedulerStatus:
+        """A snapshot for `health`."""
+        return SchedulerStatus(
+            ticks=self.ticks,
+            overruns=self.overruns,
+            lateness_p50_ms=self.lateness.quantile_ms(0.5),
+            lateness_p99_ms=self.lateness.quantile_ms(0.99),
+            lateness_max_ms=self.lateness.max_ns / 1e6,
+            gc_collections=self._collector.collections,
+            gc_forced=self._collector.forced,
+            gc_max_ms=self._collector.max_ns / 1e6,
+        )

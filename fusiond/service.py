@@ -1,0 +1,97 @@
+"""The service manager's side of the daemon: sd_notify(3), and what the process consumes."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Mapping
+
+
+class ServiceManager:
+    """State notifications to systemd over NOTIFY_SOCKET; does nothing where there is none.
+
+    Nothing here raises or blocks: a service manager that does not listen is counted in `failed`.
+    """
+
+    def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
+        address = environ.get("NOTIFY_SOCKET", "")
+        self._socket: socket.socket | None = None
+        self.failed = 0
+        if address.startswith(("/", "@")):
+            # "@" names a socket of the abstract namespace, whose address starts with NUL.
+            self._address = "\0" + address[1:] if address[0] == "@" else address
+            self._socket = socket.socket(
+                socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+            )
+        self._watchdog_ns = _watchdog_ns(environ)
+        self._fed_ns: int | None = None
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """The watchdog's period (WATCHDOG_USEC), None where it is off or not meant for us."""
+        return None if self._watchdog_ns is None else self._watchdog_ns / 1e9
+
+    def _send(self, state: str) -> None:
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendto(state.encode(), self._address)
+        except OSError:
+            self.failed += 1
+
+    def ready(self, status: str = "") -> None:
+        """Start-up is over."""
+        self._send("READY=1" + (f"\nSTATUS={_one_line(status)}" if status else ""))
+
+    def status(self, text: str) -> None:
+        """One sentence for `systemctl status`."""
+        self._send(f"STATUS={_one_line(text)}")
+
+    def stopping(self) -> None:
+        """Shutdown has begun."""
+        self._send("STOPPING=1")
+
+    def feed_watchdog(self, t_ns: int) -> None:
+        """A tick was on time at `t_ns` (monotonic); sends at a quarter of the period at most."""
+        if self._watchdog_ns is None:
+            return
+        if self._fed_ns is None or t_ns - self._fed_ns >= self._watchdog_ns // 4:
+            self._fed_ns = t_ns
+            self._send("WATCHDOG=1")
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _watchdog_ns(environ: Mapping[str, str]) -> int | None:
+    try:
+        period_ns = int(environ["WATCHDOG_USEC"]) * 1000
+        pid = int(environ.get("WATCHDOG_PID", os.getpid()))
+    except (KeyError, ValueError):
+        return None
+    return period_ns if period_ns > 0 and pid == os.getpid() else None
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+class ProcessUsage:
+    """CPU and memory of this process: `sample()` gives percent of one core since the last call
+    and resident memory in MB (10^6 bytes)."""
+
+    def __init__(self) -> None:
+        self._page_bytes = os.sysconf("SC_PAGESIZE")
+        self._wall_ns = time.monotonic_ns()
+        self._cpu_ns = time.process_time_ns()
+
+    def sample(self) -> tuple[float, float]:
+        wall_ns, cpu_ns = time.monotonic_ns(), time.process_time_ns()
+        percent = 100.0 * (cpu_ns - self._cpu_ns) / max(1, wall_ns - self._wall_ns)
+        self._wall_ns, self._cpu_ns = wall_ns, cpu_ns
+        with open("/proc/self/statm", encoding="ascii") as statm:
+            resident_pages = int(statm.read().split()[1])
+        return percent, resident_pages * self._page_bytes / 1e6
