@@ -1,0 +1,240 @@
+"""NMEA 0183 sentences out of a byte stream that may also carry UBX and RTCM 3 frames: no I/O.
+
+    sentence    $ address , fields * hh          hh = XOR of what stands between $ and *
+    UBX         B5 62 class id length16 payload ck_a ck_b     8-bit Fletcher from class on
+    RTCM 3      D3 000000 length10 payload crc24q             from D3 on
+
+Binary frames are skipped whole, so that a `$` inside one starts nothing. A frame whose check fails,
+or inside which a whole sentence verifies, was none: scanning goes on one byte behind its first.
+Sources: NMEA 0183 4.11 section 5.3; u-blox ZED-F9P interface description section 3; RTCM 10403.3
+section 4.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from functools import reduce
+from itertools import accumulate
+from operator import xor
+from typing import Literal
+
+MAX_SENTENCE = 256
+"""Bytes from `$` to the checksum. The standard says 82, receivers exceed it; a longer run of text
+is lines merged by an overrun."""
+MAX_UBX_PAYLOAD = 8192
+"""A RXM-RAWX of 255 measurements takes 8176; a longer length is a false header."""
+SLICE = 4096
+"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
+
+_START = re.compile(rb"[$\xb5\xd3]")
+_NOT_BODY = re.compile(rb"[^\x20-\x23\x25-\x29\x2b-\x7e]")  # anything but text, and $ and *
+_WHOLE = re.compile(rb"\$([\x20-\x23\x25-\x29\x2b-\x7e]{1,252})\*([0-9A-Fa-f]{2})")
+_ADDRESS = re.compile(r"[A-Z][A-Z0-9]{2,9}\Z")
+
+# What an RDSS terminal of the text family 2.1 (and its BDS-3 successor) says, talker BD.
+_RDSS = frozenset(
+    {"BSI", "BSS", "DWR", "FKI", "GXM", "HZR", "ICI", "ICP", "ICZ", "KLS", "KLT"}
+    | {"LZM", "PWI", "SBX", "SNR", "TCI", "TXR", "WAA", "WBA", "ZTI"}
+)
+_RDSS_ZDA_FIELDS = 11
+
+
+@dataclass(frozen=True, slots=True)
+class Sentence:
+    """A verified sentence: `address` such as GNGGA, fields between commas, `raw` `$` to `hh`."""
+
+    address: str
+    fields: tuple[str, ...]
+    raw: bytes
+
+    @property
+    def talker(self) -> str:
+        """Two letters, or `P` for a proprietary sentence."""
+        return "P" if self.address.startswith("P") else self.address[:2]
+
+    @property
+    def formatter(self) -> str:
+        return self.address[len(self.talker) :]
+
+
+def is_rdss_sentence(sentence: Sentence) -> bool:
+    """Whether this belongs to a BeiDou RDSS terminal, not to a GNSS receiver.
+
+    The one clash is BDZDA. The RDSS form has 11 fields, the first a mode of one digit; the NMEA
+    form has 6, the first a time of at least 6.
+    """
+    if sentence.talker == "CC":
+        return True
+    if sentence.talker != "BD":
+        return False
+    if sentence.formatter == "ZDA":
+        fields = sentence.fields
+        return len(fields) == _RDSS_ZDA_FIELDS or (bool(fields) and len(fields[0]) == 1)
+    return sentence.formatter in _RDSS
+
+
+class NmeaSplitter:
+    """Bytes in, verified sentences out, whatever the splits.
+
+    Counts in `counters`: `sentences`, `ubx_frames`, `rtcm_frames`; refused `checksum_bad`,
+    `checksum_missing`, `sentence_too_long`, `inner_dollar`, `not_text`, `address_bad`,
+    `ubx_damaged`, `rtcm_damaged`; and `garbage_bytes`, all that belonged to nothing.
+    """
+
+    def __init__(self, counters: Counter[str] | None = None) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[Sentence]:
+        """The sentences that `data` completes, in order."""
+        sentences: list[Sentence] = []
+        for start in range(0, len(data), SLICE):
+            self._buffer += data[start : start + SLICE]
+            self._scan(sentences, final=False)
+        return sentences
+
+    def finish(self) -> list[Sentence]:
+        """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
+        sentences: list[Sentence] = []
+        self._scan(sentences, final=True)
+        return sentences
+
+    def _scan(self, sentences: list[Sentence], *, final: bool) -> None:
+        buffer, at = self._buffer, 0
+        while True:
+            start = _START.search(buffer, at)
+            if start is None:
+                self._garbage(buffer[at:])
+                at = len(buffer)
+                break
+            self._garbage(buffer[at : start.start()])
+            at = start.start()
+            if buffer[at] == 0x24:
+                used = self._sentence(at, sentences)
+            elif buffer[at] == 0xB5:
+                used = self._binary(at, _ubx_length(buffer, at), "ubx")
+            else:
+                used = self._binary(at, _rtcm_length(buffer, at), "rtcm")
+            if used is None:
+                if not final:
+                    break
+                used = 1
+                self.counters["garbage_bytes"] += 1
+            at += used
+        del buffer[:at]
+
+    def _garbage(self, skipped: bytearray) -> None:
+        self.counters["garbage_bytes"] += len(skipped) - skipped.count(0x0D) - skipped.count(0x0A)
+
+    def _refuse(self, why: str, length: int) -> int:
+        self.counters[why] += 1
+        self.counters["garbage_bytes"] += length
+        return length
+
+    def _sentence(self, at: int, sentences: list[Sentence]) -> int | None:
+        """Bytes used by the sentence that starts at `at`, good or not; None: more are needed."""
+        buffer = self._buffer
+        stop = _NOT_BODY.search(buffer, at + 1, at + MAX_SENTENCE - 2)
+        if stop is None:
+            if len(buffer) - at < MAX_SENTENCE - 2:
+                return None
+            return self._refuse("sentence_too_long", MAX_SENTENCE - 2)
+        end = stop.start()
+        byte = buffer[end]
+        if byte == 0x2A:
+            if len(buffer) < end + 3:
+                return None
+            return self._verify(at, end, sentences)
+        why = {0x24: "inner_dollar", 0x0D: "checksum_missing", 0x0A: "checksum_missing"}
+        return self._refuse(why.get(byte, "not_text"), end - at)
+
+    def _verify(self, at: int, star: int, sentences: list[Sentence]) -> int:
+        raw = bytes(self._buffer[at : star + 3])
+        if not _verifies(raw):
+            # The two bytes behind the star may be the start of something else.
+            return self._refuse("checksum_bad", star + 1 - at)
+        address, *fields = raw[1:-3].decode("ascii").split(",")
+        if not _ADDRESS.match(address):
+            return self._refuse("address_bad", len(raw))
+        self.counters["sentences"] += 1
+        sentences.append(Sentence(address, tuple(fields), raw))
+        return len(raw)
+
+    def _binary(self, at: int, length: int | None, kind: Literal["ubx", "rtcm"]) -> int | None:
+        """As `_sentence`, for a frame of `length` (0: no such header; None: not known yet)."""
+        if length is None:
+            return None
+        if length == 0:
+            self.counters["garbage_bytes"] += 1
+            return 1
+        buffer = self._buffer
+        end = at + length
+        for inside in _WHOLE.finditer(buffer, at, min(end, len(buffer))):
+            if _verifies(inside.group()):
+                return self._refuse(f"{kind}_damaged", 1)
+        if len(buffer) < end:
+            return None
+        frame = bytes(buffer[at:end])
+        if not (_ubx_verifies(frame) if kind == "ubx" else crc24q(frame) == 0):
+            return self._refuse(f"{kind}_damaged", 1)
+        self.counters[f"{kind}_frames"] += 1
+        return length
+
+
+def _verifies(raw: bytes) -> bool:
+    """Whether `$`...`*hh` carries the XOR of what stands between `$` and `*`."""
+    return b"%02X" % reduce(xor, raw[1:-3], 0) == raw[-2:].upper()
+
+
+def _ubx_length(buffer: bytearray, at: int) -> int | None:
+    """Length of the UBX frame at `at`; 0 when it is none, None when that is not known yet."""
+    head = buffer[at : at + 6]
+    if len(head) > 1 and head[1] != 0x62:
+        return 0
+    if len(head) < 6:
+        return None
+    payload = int.from_bytes(head[4:6], "little")
+    return payload + 8 if payload <= MAX_UBX_PAYLOAD else 0
+
+
+def _rtcm_length(buffer: bytearray, at: int) -> int | None:
+    """Length of the RTCM 3 frame at `at`; 0 when it is none, None when that is not known yet."""
+    head = buffer[at : at + 5]
+    if len(head) > 1 and head[1] & 0xFC:
+        return 0
+    if len(head) < 5:
+        return None
+    number = int.from_bytes(head[3:5], "big") >> 4
+    if not (1001 <= number <= 1300 or number >= 4001):  # the numbers RTCM 10403.3 gives out
+        return 0
+    return (int.from_bytes(head[1:3], "big") & 0x3FF) + 6
+
+
+def _ubx_verifies(frame: bytes) -> bool:
+    covered = frame[2:-2]
+    if sum(covered) & 0xFF != frame[-2]:
+        return False
+    return sum(accumulate(covered)) & 0xFF == frame[-1]
+
+
+def _crc24q_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 16
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x1864CFB if crc & 0x800000 else 0)
+        table.append(crc & 0xFFFFFF)
+    return tuple(table)
+
+
+_CRC24Q = _crc24q_table()
+
+
+def crc24q(data: bytes) -> int:
+    """CRC-24Q (RTCM 10403.3 section 4.2, polynomial 1864CFB hex); 0 over a whole good frame."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8) & 0xFFFFFF ^ _CRC24Q[crc >> 16 ^ byte]
+    return crc
