@@ -1,0 +1,207 @@
+r"""Motion as smooth functions of time: speed, course and climb angle of a vehicle on a path.
+
+    v_n = s [cos(gamma) cos(chi), cos(gamma) sin(chi), -sin(gamma)]
+    roll = k atan(s chi' / g),   pitch = gamma + alpha,   yaw = chi
+
+s speed (m/s), chi course and gamma climb angle (rad), each a chain of minimum-jerk steps
+10 x^3 - 15 x^4 + 6 x^5 between knots: twice continuously differentiable, and exactly constant where
+two knots hold the same value, so that a stop is a real standstill. k is 1 for an aircraft in
+coordinated turns and slightly negative for a car, which leans outwards; alpha is the incidence.
+The velocity lies along the body's forward axis when alpha = 0 (no side slip).
+
+Source: Flash and Hogan, J. Neuroscience 5 (1985), for the step; Groves, 2nd ed., section 2.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+
+Array = NDArray[np.float64]
+
+
+class Profile:
+    """A function of time through knots (t_s increasing, values), constant outside them."""
+
+    def __init__(self, t_s: Sequence[float], values: Sequence[float]) -> None:
+        self._t = np.asarray(t_s, dtype=np.float64)
+        self._values = np.asarray(values, dtype=np.float64)
+        if self._t.shape != self._values.shape or np.any(np.diff(self._t) <= 0):
+            raise ValueError("knots: equally many times and values, times increasing")
+
+    def __call__(self, t_s: Array) -> tuple[Array, Array, Array]:
+        """Value and its first and second derivative in time at each of `t_s`."""
+        last = len(self._t) - 1
+        i = np.clip(np.searchsorted(self._t, t_s, side="right") - 1, 0, max(last - 1, 0))
+        j = np.minimum(i + 1, last)
+        length = np.where(j > i, self._t[j] - self._t[i], 1.0)
+        x = np.clip((t_s - self._t[i]) / length, 0.0, 1.0)
+        rise = self._values[j] - self._values[i]
+        x2 = x * x
+        value = self._values[i] + rise * x2 * x * (10.0 - 15.0 * x + 6.0 * x2)
+        first = rise / length * 30.0 * x2 * (1.0 - x) ** 2
+        second = rise / length**2 * 60.0 * x * (1.0 - 3.0 * x + 2.0 * x2)
+        return value, first, second
+
+
+@dataclass(frozen=True, slots=True)
+class Kinematics:
+    """Arrays (..., 3): velocity and its derivative in NED, roll-pitch-yaw and their rates, SI."""
+
+    v_ned: Array
+    v_ned_rate: Array
+    rpy: Array
+    rpy_rate: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Speed (m/s), course and climb angle (rad) over time; see the module for `bank_ratio` k."""
+
+    speed: Profile
+    course: Profile
+    climb: Profile
+    bank_ratio: float = 0.0
+    incidence_rad: float = 0.0
+
+    def kinematics(self, t_s: Array) -> Kinematics:
+        """Motion at the instants `t_s` (any shape); yaw is not wrapped."""
+        s, s1, _ = self.speed(t_s)
+        chi, chi1, chi2 = self.course(t_s)
+        gamma, gamma1, _ = self.climb(t_s)
+        sc, cc, sg, cg = np.sin(chi), np.cos(chi), np.sin(gamma), np.cos(gamma)
+        v_ned = np.stack((s * cg * cc, s * cg * sc, -s * sg), axis=-1)
+        horizontal1 = s1 * cg - s * sg * gamma1
+        v_ned_rate = np.stack(
+            (
+                horizontal1 * cc - s * cg * sc * chi1,
+                horizontal1 * sc + s * cg * cc * chi1,
+                -s1 * sg - s * cg * gamma1,
+            ),
+            axis=-1,
+        )
+        u = s * chi1 / STANDARD_GRAVITY_M_S2
+        u1 = (s1 * chi1 + s * chi2) / STANDARD_GRAVITY_M_S2
+        rpy = np.stack((self.bank_ratio * np.arctan(u), gamma + self.incidence_rad, chi), axis=-1)
+        rpy_rate = np.stack((self.bank_ratio * u1 / (1.0 + u * u), gamma1, chi1), axis=-1)
+        return Kinematics(v_ned, v_ned_rate, rpy, rpy_rate)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """Time in which speed and climb go to a new value (None: stay) and the course turns."""
+
+    duration_s: float
+    speed_m_s: float | None = None
+    turn_deg: float = 0.0
+    climb_deg: float | None = None
+
+
+def follow(
+    legs: Iterable[Leg],
+    duration_s: float,
+    *,
+    course_deg: float = 0.0,
+    bank_ratio: float = 0.0,
+    incidence_deg: float = 0.0,
+) -> Path:
+    """The path of a vehicle that starts at rest and does the legs in turn until `duration_s`."""
+    t, speed, course, climb = [0.0], [0.0], [course_deg], [0.0]
+    for leg in legs:
+        if t[-1] >= duration_s:
+            break
+        t.append(t[-1] + leg.duration_s)
+        speed.append(speed[-1] if leg.speed_m_s is None else leg.speed_m_s)
+        course.append(course[-1] + leg.turn_deg)
+        climb.append(climb[-1] if leg.climb_deg is None else leg.climb_deg)
+    return Path(
+        Profile(t, speed),
+        Profile(t, [float(np.radians(x)) for x in course]),
+        Profile(t, [float(np.radians(x)) for x in climb]),
+        bank_ratio,
+        float(np.radians(incidence_deg)),
+    )
+
+
+_BLOCK = (  # net turn 90 deg, net height 0: four of them close a ring
+    Leg(12, speed_m_s=14.0),
+    Leg(18),
+    Leg(6, speed_m_s=8.0),
+    Leg(8, turn_deg=90.0),
+    Leg(12, speed_m_s=20.0),
+    Leg(20),
+    Leg(3, turn_deg=6.0),
+    Leg(3, turn_deg=-6.0),
+    Leg(11, speed_m_s=0.0),
+    Leg(20),
+    Leg(9, speed_m_s=9.0),
+    Leg(8, turn_deg=-90.0),
+    Leg(8, speed_m_s=15.0),
+    Leg(6, climb_deg=4.0),
+    Leg(20),
+    Leg(8, climb_deg=-4.0),
+    Leg(20),
+    Leg(6, climb_deg=0.0),
+    Leg(8, speed_m_s=7.0),
+    Leg(24, turn_deg=270.0),
+    Leg(14, speed_m_s=26.0),
+    Leg(14, turn_deg=20.0),
+    Leg(14, turn_deg=-20.0),
+    Leg(13, speed_m_s=7.0),
+    Leg(12, turn_deg=-180.0),
+    Leg(6, speed_m_s=0.0),
+    Leg(13),
+)
+_CRUISE = (  # 1000 s at 300 m/s
+    Leg(200),
+    Leg(180, turn_deg=90.0),
+    Leg(120, climb_deg=2.0),
+    Leg(120, climb_deg=-2.0),
+    Leg(60, climb_deg=0.0),
+    Leg(180, turn_deg=-90.0),
+    Leg(140),
+)
+
+
+def _for_ever(legs: Sequence[Leg]) -> Iterable[Leg]:
+    while True:
+        yield from legs
+
+
+def static(duration_s: float) -> Path:
+    """At rest, facing north-east."""
+    return follow([Leg(duration_s)], duration_s, course_deg=45.0)
+
+
+def drive(duration_s: float) -> Path:
+    """A car: 60 s at rest, then town, hill, roundabout and fast road with stops, over and over."""
+    return follow(
+        chain([Leg(60)], _for_ever(_BLOCK)), duration_s, course_deg=40.0, bank_ratio=-0.08
+    )
+
+
+def flight(duration_s: float) -> Path:
+    """An aircraft: 60 s at rest, take-off, climb to about 10 km, cruise at 300 m/s with turns."""
+    climb_out = (
+        Leg(60),
+        Leg(40, speed_m_s=80.0),
+        Leg(15, climb_deg=10.0),
+        Leg(60, speed_m_s=160.0),
+        Leg(90, turn_deg=60.0),
+        Leg(120, speed_m_s=240.0),
+        Leg(60, climb_deg=0.0),
+        Leg(120, speed_m_s=300.0),
+    )
+    return follow(
+        chain(climb_out, _for_ever(_CRUISE)),
+        duration_s,
+        course_deg=110.0,
+        bank_ratio=1.0,
+        incidence_deg=2.0,
+    )

@@ -1,0 +1,318 @@
+"""The simulated vehicle in real time: its devices on a CAN bus and on pseudo terminals.
+
+    python -m fusiond.simulation.vehicle --scenario drive --can socketcan:vcan0 \\
+        --gnss-link /run/x/gnss --rdss-link /run/x/rdss --truth truth.csv --start-file start.json
+
+Everything random is drawn before the start; while it runs, the vehicle only looks up, formats and
+writes. Instant 0 of the trajectory is `start_ns` of the host's monotonic clock. Commands on
+standard input, a line each: `unplug NAME`, `plug NAME` (imu, gnss, rdss), `quit`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import select
+import sys
+import threading
+import time
+import tty
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import can
+import numpy as np
+
+from drivers.can_signals import CanImuOptions
+from fusiond.simulation.can_imu import SIM_IMU, CanImu
+from fusiond.simulation.files import write_truth
+from fusiond.simulation.gnss_receiver import GnssReceiver
+from fusiond.simulation.imu_truth import States
+from fusiond.simulation.rdss_terminal import RdssTerminal
+from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
+
+Device = Literal["imu", "gnss", "rdss"]
+
+SERIAL_POLL_S = 0.01
+"""How often the terminal's line is read: far below the 50 ms that its answers take."""
+_READ_BYTES = 4096
+
+
+class PtyLine:
+    """The device's end of a serial line: a pseudo terminal behind a symbolic link.
+
+    What is written while nobody has the line open is lost, as on a real line.
+    """
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self._master: int | None = None
+        self._hangup = select.poll()
+
+    def plug(self) -> None:
+        """Make the port appear. Raises OSError."""
+        if self._master is not None:
+            return
+        master, slave = os.openpty()
+        try:
+            tty.setraw(slave)
+            os.set_blocking(master, False)
+            path = os.ttyname(slave)
+            fresh = self.link.with_name(self.link.name + ".new")
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(path)
+            fresh.replace(self.link)
+        except OSError:
+            os.close(master)
+            raise
+        finally:
+            os.close(slave)
+        self._master = master
+        self._hangup = select.poll()
+        self._hangup.register(master, 0)
+
+    def unplug(self) -> None:
+        """Make the port vanish; whoever has it open sees a hang-up."""
+        if self._master is None:
+            return
+        self.link.unlink(missing_ok=True)
+        os.close(self._master)
+        self._master = None
+
+    def _open_by_host(self) -> bool:
+        """Linux reports a hang-up on the master while no slave is open."""
+        return self._master is not None and not self._hangup.poll(0)
+
+    def read(self) -> bytes:
+        """What the host has written, b"" for nothing."""
+        if self._master is not None and self._open_by_host():
+            with contextlib.suppress(OSError):
+                return os.read(self._master, _READ_BYTES)
+        return b""
+
+    def write(self, data: bytes) -> bool:
+        """Send; False if it was lost, in whole or in part: nobody listens, or does not read."""
+        if self._master is None or not self._open_by_host():
+            return False
+        try:
+            return os.write(self._master, data) == len(data)
+        except OSError:
+            return False
+
+
+class SimulatedVehicle:
+    """The devices of a scenario, driven in real time by `run`.
+
+    `gnss` and `terminal` are the simulated devices; `counters` holds frames, epochs and bytes sent
+    and lost. A link that is None leaves that device out. `can_imu` are the options of the driver
+    that will read the IMU: bus, DBC and signals.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        seed: int = 0,
+        duration_s: float | None = None,
+        can_imu: CanImuOptions = SIM_IMU,
+        gnss_link: Path | None = None,
+        rdss_link: Path | None = None,
+    ) -> None:
+        imu_rng, gnss_rng, rdss_rng = random_streams(seed)
+        self.scenario = scenario
+        self.truth = scenario.truth(duration_s)
+        self.imu = scenario.imu_output(self.truth, imu_rng)
+        self.gnss = GnssReceiver(self.truth, scenario.gnss, gnss_rng)
+        self.start_ns = time.monotonic_ns()
+        self.utc_start_ns = time.time_ns()
+        self.terminal = RdssTerminal(self.truth, scenario.rdss, rdss_rng, self.utc_start_ns)
+        self.counters: Counter[str] = Counter()
+        self._encoder = CanImu(can_imu)
+        self._can = (can_imu.interface, can_imu.channel)
+        self._bus: can.BusABC | None = None
+        self._lines: dict[Device, PtyLine] = {}
+        if gnss_link is not None:
+            self._lines["gnss"] = PtyLine(gnss_link)
+        if rdss_link is not None:
+            self._lines["rdss"] = PtyLine(rdss_link)
+        self._next_imu = 0
+        self._next_gnss = 0
+
+    # ------------------------------------------------------------------ truth
+
+    def truth_at(self, t_ns: int) -> States:
+        """True state (n = 1) at an instant of the monotonic clock, clipped to the trajectory."""
+        return self.truth.at(np.array([(t_ns - self.start_ns) * 1e-9]))
+
+    # ------------------------------------------------------------------ plugs
+
+    def plug(self, device: Device) -> None:
+        """Put a device (back) on its line. Raises OSError, can.CanError."""
+        if device == "imu":
+            if self._bus is None:
+                interface, channel = self._can
+                self._bus = can.Bus(interface=interface, channel=channel)
+        elif device in self._lines:
+            self._lines[device].plug()
+
+    def unplug(self, device: Device) -> None:
+        """Take a device off its line: the IMU falls silent, a serial port vanishes."""
+        if device == "imu":
+            if self._bus is not None:
+                self._bus.shutdown()
+                self._bus = None
+        elif device in self._lines:
+            self._lines[device].unplug()
+
+    # ------------------------------------------------------------------ real time
+
+    async def run(self) -> None:
+        """Plug everything in and drive to the end of the trajectory, or until cancelled."""
+        try:
+            for device in get_args(Device):
+                self.plug(device)
+            self.start_ns = time.monotonic_ns()
+            self.utc_start_ns = self.terminal.utc_start_ns = time.time_ns()
+            while (t_s := (time.monotonic_ns() - self.start_ns) * 1e-9) < self.truth.duration_s:
+                self._serve(t_s)
+                await asyncio.sleep(max(0.0, self._next_s(t_s) - self._now_s()))
+        finally:
+            for device in get_args(Device):
+                self.unplug(device)
+
+    def _now_s(self) -> float:
+        return (time.monotonic_ns() - self.start_ns) * 1e-9
+
+    def _next_s(self, t_s: float) -> float:
+        """When there is something to do again."""
+        due = [self.truth.duration_s, t_s + SERIAL_POLL_S]
+        if self._next_imu < len(self.imu.gyro):
+            due.append(float(self.truth.t_s[self._next_imu + 1]))
+        if self._next_gnss < len(self.gnss):
+            due.append(float(self.gnss.t_arrival_s[self._next_gnss]))
+        return min(due)
+
+    def _serve(self, t_s: float) -> None:
+        """Do everything that is due at `t_s`."""
+        while self._next_imu < len(self.imu.gyro):
+            k = self._next_imu
+            if self.truth.t_s[k + 1] > t_s:
+                break
+            self._next_imu += 1
+            self._send_sample(k)
+        while self._next_gnss < len(self.gnss):
+            k = self._next_gnss
+            if self.gnss.t_arrival_s[k] > t_s:
+                break
+            self._next_gnss += 1
+            if "gnss" in self._lines:
+                self._write("gnss", self.gnss.nmea(k, self.utc_start_ns))
+        if "rdss" in self._lines:
+            if data := self._lines["rdss"].read():
+                self.terminal.receive(data, t_s)
+            if data := self.terminal.take(t_s):
+                self._write("rdss", data)
+
+    def _send_sample(self, k: int) -> None:
+        if self._bus is None:
+            self.counters["imu_unplugged"] += 1
+            return
+        t_ns = round(float(self.truth.t_s[k + 1]) * 1e9)
+        gyro, accel = self.imu.gyro[k].tolist(), self.imu.accel[k].tolist()
+        for frame in self._encoder.frames(k + 1, t_ns, gyro, accel):
+            try:
+                self._bus.send(frame)
+                self.counters["imu_frames"] += 1
+            except (can.CanError, OSError):
+                self.counters["imu_lost"] += 1
+
+    def _write(self, device: Device, data: bytes) -> None:
+        sent = self._lines[device].write(data)
+        self.counters[f"{device}_{'sent' if sent else 'lost'}"] += 1
+
+
+# ---------------------------------------------------------------------- as a process
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="fusiond.simulation.vehicle")
+    parser.add_argument("--scenario", choices=sorted(SCENARIOS), default="drive")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--duration", type=float, help="s; the scenario's own by default")
+    parser.add_argument("--can", default="socketcan:vcan0", help="INTERFACE:CHANNEL")
+    parser.add_argument("--gnss-link", type=Path)
+    parser.add_argument("--rdss-link", type=Path)
+    parser.add_argument("--rdss-family", choices=("4.0", "2.1"), default="4.0")
+    parser.add_argument("--service-frequency", type=int, default=10, help="of the RDSS card, s")
+    parser.add_argument("--truth", type=Path, help="write truth.csv here")
+    parser.add_argument(
+        "--start-file", type=Path, help="write start_monotonic_ns and start_utc_ns here (JSON)"
+    )
+    return parser.parse_args()
+
+
+def _watch_commands(vehicle: SimulatedVehicle, main: asyncio.Task[None]) -> None:
+    """Read standard input in a thread and have the loop obey."""
+    loop = asyncio.get_running_loop()
+
+    def obey(line: str) -> None:
+        match line.split():
+            case ["quit"]:
+                main.cancel()
+            case [("plug" | "unplug") as verb, ("imu" | "gnss" | "rdss") as device]:
+                try:
+                    vehicle.plug(device) if verb == "plug" else vehicle.unplug(device)
+                    print(f"{verb}ged {device}", flush=True)
+                except (OSError, can.CanError) as error:
+                    print(f"cannot {verb} {device}: {error}", flush=True)
+            case _:
+                print(f"unknown command: {line.strip()}", flush=True)
+
+    def read() -> None:
+        for line in sys.stdin:
+            loop.call_soon_threadsafe(obey, line)
+
+    threading.Thread(target=read, daemon=True, name="commands").start()
+
+
+async def _main(args: argparse.Namespace) -> None:
+    interface, _, channel = args.can.partition(":")
+    scenario = SCENARIOS[args.scenario]
+    rdss = replace(
+        scenario.rdss, family=args.rdss_family, service_frequency_s=args.service_frequency
+    )
+    vehicle = SimulatedVehicle(
+        replace(scenario, rdss=rdss),
+        seed=args.seed,
+        duration_s=args.duration,
+        can_imu=SIM_IMU.model_copy(update={"interface": interface, "channel": channel}),
+        gnss_link=args.gnss_link,
+        rdss_link=args.rdss_link,
+    )
+    if args.truth:
+        write_truth(args.truth, vehicle.truth)
+    task = asyncio.create_task(vehicle.run())
+    await asyncio.sleep(0)  # `run` has taken its start instant, or has failed, when this returns
+    if not task.done():
+        if args.start_file:
+            start = {
+                "start_monotonic_ns": vehicle.start_ns,
+                "start_utc_ns": vehicle.utc_start_ns,
+            }
+            fresh = args.start_file.with_name(args.start_file.name + ".new")
+            fresh.write_text(json.dumps(start) + "\n")
+            fresh.replace(args.start_file)
+        _watch_commands(vehicle, task)
+        print("ready", flush=True)
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    print(json.dumps(dict(vehicle.counters)), flush=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(_main(_arguments()))
