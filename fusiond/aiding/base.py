@@ -1,0 +1,92 @@
+r"""What every aid is: an innovation that is linear in the error state.
+
+    z = h(x^) - y = H dx + v,   v ~ N(0, diag(r))
+
+x^ the computed state, y what was measured, dx computed minus true (fusiond.navigation.error_model).
+So a position row of z is "INS minus fix", as in the papers. H is dense, (m, n).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.model import Model
+from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigation.strapdown import Q0, VE, VN
+
+Array = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+
+
+class State(NamedTuple):
+    """What an aid may look at: navigation state (10,), parameters (n,), last step (18,), model."""
+
+    nav: Array
+    xi: Array
+    step: Array
+    model: Model
+
+    @property
+    def dcm(self) -> Array:
+        """C_nb (3, 3)."""
+        return dcm_from_quaternion(self.nav[Q0:])
+
+    @property
+    def rate_b(self) -> Array:
+        """Compensated angular rate (3,), rad/s, body axes, of the last step."""
+        return self.step[3:6]
+
+    @property
+    def speed(self) -> float:
+        """Horizontal speed, m/s."""
+        return float(np.hypot(self.nav[VN], self.nav[VE]))
+
+
+class Innovation(NamedTuple):
+    """z (m,), H (m, n), r (m,) variances of uncorrelated noise."""
+
+    z: Array
+    h: Array
+    r: Array
+
+
+class NotApplicable(NamedTuple):
+    """The aid does not hold in this state; `outcome` names why."""
+
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True)
+class Aid:
+    """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
+
+    `gate` is the probability with which a consistent innovation passes.
+    """
+
+    source: str
+    t_ns: int
+    gate: float
+
+
+class Linearised(Protocol):
+    """An aid that can say its innovation."""
+
+    @property
+    def source(self) -> str: ...
+    @property
+    def t_ns(self) -> int: ...
+    @property
+    def gate(self) -> float: ...
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        """The innovation at `state`."""
+
+
+def rate_columns(h: Array, rows: slice, model: Model, per_rate: Array) -> None:
+    """Write d(row)/d(rate error) (m, 3) into every block that is a rate error."""
+    for axis in range(3):
+        for slot in model.parameters(9 + axis):
+            h[rows, slot] = per_rate[:, axis]

@@ -1,0 +1,167 @@
+r"""Extended Kalman filter on the error state, closed loop.
+
+The error state is estimated, taken out of the navigation state at once and is zero again, so only its
+covariance is propagated. Parameters keep their estimates in `xi`.
+
+Gate: with S = H P H^T + R, nu^T S^-1 nu is chi-square with m degrees of freedom while filter and
+measurement agree; beyond the quantile of the aid's gate probability the measurement is left out.
+
+Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from fusiond.aiding.base import Linearised, NotApplicable, State
+from fusiond.estimators.kernels import (
+    feed_back,
+    normalised_innovation_squared,
+    propagate,
+    sigmas,
+    update,
+)
+from fusiond.estimators.model import Model
+from fusiond.imu_buffer import ImuBuffer
+from fusiond.navigation.error_model import STRIDE
+from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
+
+Array = NDArray[np.float64]
+
+
+@lru_cache(maxsize=256)
+def gate_threshold(probability: float, degrees: int) -> float:
+    """Chi-square quantile for a gate probability."""
+    return float(chi2.ppf(probability, degrees))
+
+
+class Outcome(NamedTuple):
+    """How an aid ended: its name, and the innovation that led to it (NIS and dimension)."""
+
+    name: str
+    nis: float = float("nan")
+    degrees: int = 0
+
+
+class Snapshot(NamedTuple):
+    """All that a later restore needs."""
+
+    t_ns: int
+    sample: int
+    nav: Array
+    xi: Array
+    cov: Array
+    step: Array
+
+
+class KalmanEstimator:
+    """State at `t_ns` (ns) after samples of the buffer up to, not including, `sample` (absolute)."""
+
+    def __init__(self, model: Model, gap_s: float) -> None:
+        self.model = model
+        self.gap_ns = round(gap_s * 1e9)
+        self.t_ns = 0
+        self.sample = 0
+        self.nav: Array = np.zeros(NAV_SIZE)
+        self.xi: Array = np.zeros(model.size)
+        self._cov: Array = np.zeros((model.size, STRIDE))
+        self.step: Array = np.zeros(STEP_SIZE)
+        self._dx: Array = np.zeros(model.size)
+
+    @property
+    def covariance(self) -> Array:
+        """P (n, n) of the error state, a view."""
+        return self._cov[:, : self.model.size]
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+        self.t_ns, self.sample = t_ns, sample
+        self.nav[:], self.xi[:] = nav, xi
+        self._cov[:] = 0.0
+        self.covariance[:] = covariance
+        self.covariance[~self.model.active] = 0.0
+        self.covariance[:, ~self.model.active] = 0.0
+        self.step[:] = 0.0
+        self.step[STEP_DCM:] = dcm_from_quaternion(self.nav[Q0:]).ravel()
+
+    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+        m = self.model
+        first, self.t_ns = propagate(
+            self.nav,
+            self.xi,
+            self._cov,
+            m.hold_height,
+            m.active,
+            m.column_of,
+            m.decay_rate,
+            m.white,
+            m.steady_variance,
+            imu.times,
+            imu.samples,
+            self.sample - imu.start,
+            imu.end,
+            self.t_ns,
+            target_ns,
+            self.gap_ns,
+            record,
+            imu.nav,
+            imu.sigmas,
+            self.step,
+        )
+        self.sample = first + imu.start
+
+    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
+        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes."""
+        state = State(self.nav, self.xi, self.step, self.model)
+        innovation = aid.innovation(state)
+        if isinstance(innovation, NotApplicable):
+            return Outcome(innovation.outcome)
+        z, h, r = innovation
+        degrees = z.shape[0]
+        nis = normalised_innovation_squared(self._cov, z, h, r)
+        if not np.isfinite(nis):
+            return Outcome("not_finite", nis, degrees)
+        if nis > gate_threshold(aid.gate, degrees):
+            if not inflate:
+                return Outcome("gated", nis, degrees)
+            self._widen(z, h)
+        self._dx[:] = 0.0
+        update(self._cov, self._dx, z, h, r)
+        feed_back(self.nav, self.xi, self._dx)
+        return Outcome("fused", nis, degrees)
+
+    def _widen(self, z: Array, h: Array) -> None:
+        """Add the innovation's own square to the states that it measures directly."""
+        for row, value in zip(h, z, strict=True):
+            slot = 3 + int(np.argmax(np.abs(row[3:9])))
+            if self.model.active[slot]:
+                self._cov[slot, slot] += value * value
+
+    def sigmas(self) -> Array:
+        """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
+        out = np.empty(9)
+        sigmas(self._cov, self.step, out)
+        return out
+
+    def snapshot(self) -> Snapshot:
+        """A copy of everything."""
+        return Snapshot(
+            self.t_ns,
+            self.sample,
+            self.nav.copy(),
+            self.xi.copy(),
+            self._cov.copy(),
+            self.step.copy(),
+        )
+
+    def restore(self, s: Snapshot) -> None:
+        """Back to a snapshot, bit for bit."""
+        self.t_ns, self.sample = s.t_ns, s.sample
+        self.nav[:], self.xi[:], self._cov[:], self.step[:] = s.nav, s.xi, s.cov, s.step

@@ -1,0 +1,122 @@
+"""The IMU's recent past in arrays that the kernels read: body axes, own time offset taken out.
+
+Samples keep an absolute number for ever: sample k lies at row k - start. Rows move to the front when the
+arrays are full, so that the kernels always see one contiguous run of at least `keep_s` seconds.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.strapdown import NAV_SIZE
+
+Array = NDArray[np.float64]
+
+# Beyond any vehicle and any sensor sold for one: such a row is damage, not motion.
+MAX_RATE_RAD_S = 100.0
+MAX_FORCE_M_S2 = 1000.0
+# Rows kept before the oldest needed one: the slopes of a sample use the two before it.
+MARGIN = 3
+
+
+class ImuBuffer:
+    """IMU samples of the last `keep_s` seconds and the solution recorded at each.
+
+    `times` (m,) ns, `samples` (m, 6) rate rad/s and force m/s^2 in body axes, `nav` (m, 10) and
+    `sigmas` (m, 9) as the filter first passed each sample; rows 0 ... `end`-1 hold samples `start`
+    ... `start + end - 1`. `counters` name what was refused.
+    """
+
+    def __init__(
+        self, rate_hz: float, keep_s: float, sensor_to_body: Array, time_offset_s: float, gap_s: float
+    ) -> None:
+        capacity = int(rate_hz * keep_s * 2.5) + 1000
+        self.times: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)
+        self.samples: Array = np.zeros((capacity, 6))
+        self.nav: Array = np.full((capacity, NAV_SIZE), np.nan)
+        self.sigmas: Array = np.full((capacity, 9), np.nan)
+        self.start = 0
+        self.end = 0
+        self.counters: Counter[str] = Counter()
+        self._keep_ns = round(keep_s * 1e9)
+        self._gap_ns = round(gap_s * 1e9)
+        self._offset_ns = round(time_offset_s * 1e9)
+        self._turn = np.zeros((6, 6))
+        self._turn[:3, :3] = self._turn[3:, 3:] = sensor_to_body.T
+
+    @property
+    def next_sample(self) -> int:
+        """Absolute number of the sample that will come next."""
+        return self.start + self.end
+
+    @property
+    def latest_ns(self) -> int:
+        """Time of the newest sample; 0 before the first."""
+        return int(self.times[self.end - 1]) if self.end else 0
+
+    @property
+    def oldest_ns(self) -> int:
+        """Time of the oldest sample still held; 0 before the first."""
+        return int(self.times[0]) if self.end else 0
+
+    def index_after(self, t_ns: int) -> int:
+        """Row of the first sample later than `t_ns`."""
+        return int(np.searchsorted(self.times[: self.end], t_ns, side="right"))
+
+    def append(self, times: NDArray[np.int64], samples: Array) -> int:
+        """Append samples (m,) ns and (m, 6) in sensor axes; return how many were taken.
+
+        Refused and counted: `not_finite`, `out_of_range`, `duplicate_stamp`, `backward_stamp`.
+        Counted and taken: `gap`.
+        """
+        sound = np.abs(samples[:, :3]).max(axis=1, initial=0.0) <= MAX_RATE_RAD_S
+        sound &= np.abs(samples[:, 3:]).max(axis=1, initial=0.0) <= MAX_FORCE_M_S2
+        if not sound.all():
+            bad = samples[~sound]
+            finite = int(np.isfinite(bad).all(axis=1).sum())
+            self.counters["out_of_range"] += finite
+            self.counters["not_finite"] += len(bad) - finite
+            times, samples = times[sound], samples[sound]
+        if not len(times):
+            return 0
+        times = times + self._offset_ns
+        before = np.concatenate(([self.latest_ns if self.end else times[0] - 1], times))
+        if (np.diff(before) <= 0).any():
+            highest = np.maximum.accumulate(before)[:-1]
+            self.counters["duplicate_stamp"] += int((times == highest).sum())
+            self.counters["backward_stamp"] += int((times < highest).sum())
+            forward = times > highest
+            times, samples = times[forward], samples[forward]
+            if not len(times):
+                return 0
+            before = np.concatenate(([before[0]], times))
+        gaps = int((np.diff(before) > self._gap_ns).sum())
+        if gaps:
+            self.counters["gap"] += gaps
+        taken = len(times)
+        for first in range(0, taken, self._room()):
+            part = slice(first, first + self._room())
+            self._store(times[part], samples[part])
+        return taken
+
+    def _room(self) -> int:
+        return len(self.times) // 4
+
+    def _store(self, times: NDArray[np.int64], samples: Array) -> None:
+        count = len(times)
+        if self.end + count > len(self.times):
+            needed = int(times[-1]) - self._keep_ns
+            drop = max(0, self.index_after(needed) - MARGIN)
+            drop = max(drop, self.end + count - len(self.times))
+            for array in (self.times, self.samples, self.nav, self.sigmas):
+                array[: self.end - drop] = array[drop : self.end].copy()
+            self.start += drop
+            self.end -= drop
+        rows = slice(self.end, self.end + count)
+        self.times[rows] = times
+        np.matmul(samples, self._turn, out=self.samples[rows])
+        self.nav[rows] = np.nan
+        self.end += count

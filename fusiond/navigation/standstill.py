@@ -1,0 +1,109 @@
+r"""Standstill detector: the sensor is quiet over a window.
+
+Over the samples of a window of the IMU (about 1 s), per axis,
+
+    s_w = std(w),  s_f = std(f),   quiet if max s_w < a, max s_f < b and |mean w| < c
+
+An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
+vehicle and stand in its configuration. Windows lie on a fixed grid of time, so the verdict is a
+function of the samples alone, however they were handed over.
+
+Source: Skog, Handel, Nilsson, Rantakokko, Zero-velocity detection: an algorithm evaluation, IEEE
+T-BME 57 (2010), the moving-variance and rate-energy detectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+
+# A window with fewer samples says nothing about a standard deviation.
+FEWEST_SAMPLES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class QuietLimits:
+    """Upper limits: standard deviations per axis and mean rate, SI units; the window in ns."""
+
+    window_ns: int
+    rate_sd: float
+    force_sd: float
+    mean_rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A finished window: its end, means (3,) and whether the sensor was quiet in all of it."""
+
+    end_ns: int
+    samples: int
+    mean_rate: Array
+    mean_force: Array
+    quiet: bool
+
+
+@compiled("void(f8[:, ::1], i8, i8, f8[::1], f8[::1])")
+def _moments(samples: Array, first: int, end: int, mean: Array, sd: Array) -> None:
+    count = end - first
+    for j in range(6):
+        total = 0.0
+        for i in range(first, end):
+            total += samples[i, j]
+        mean[j] = total / count
+        total = 0.0
+        for i in range(first, end):
+            d = samples[i, j] - mean[j]
+            total += d * d
+        sd[j] = np.sqrt(total / count)
+
+
+def judge(
+    times: NDArray[np.int64], samples: Array, first: int, end: int, limits: QuietLimits
+) -> Window:
+    """Judge rows first ... end-1 as one window."""
+    mean, sd = np.zeros(6), np.zeros(6)
+    _moments(samples, first, end, mean, sd)
+    quiet = (
+        end - first >= FEWEST_SAMPLES
+        and max(sd[:3]) < limits.rate_sd
+        and max(sd[3:]) < limits.force_sd
+        and max(abs(mean[:3])) < limits.mean_rate
+    )
+    return Window(int(times[end - 1]), end - first, mean[:3], mean[3:], bool(quiet))
+
+
+class StandstillDetector:
+    """Cuts the stream of samples into windows on a fixed grid and judges each once."""
+
+    def __init__(self, limits: QuietLimits) -> None:
+        self.limits = limits
+        self._first: int | None = None
+
+    def feed(
+        self, times: NDArray[np.int64], samples: Array, start: int, new: int, end: int
+    ) -> list[Window]:
+        """Judge the windows that rows `new` ... `end`-1 complete. `start` numbers row 0.
+
+        A window is complete with the first sample of the next one; it is judged if all of its
+        rows are still held.
+        """
+        windows: list[Window] = []
+        width = self.limits.window_ns
+        cells = times[new:end] // width
+        if self._first is None:
+            self._first = start + new
+        previous = times[new - 1] // width if new else cells[0]
+        changes = np.flatnonzero(np.diff(np.concatenate(([previous], cells))))
+        for change in changes:
+            stop = new + int(change)
+            first = self._first - start
+            if 0 <= first < stop:
+                windows.append(judge(times, samples, first, stop, self.limits))
+            self._first = start + stop
+        return windows
