@@ -6,7 +6,6 @@ refuses it refuses what pydantic would convert (`"100"` or `true` for a number) 
 
 from __future__ import annotations
 
-import datetime
 import json
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
@@ -91,9 +90,10 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
     expected = _described(annotation)
     if detail["type"] == "missing":
         return f": missing; expected {expected}"
-    choices = [c for arm in _arms(annotation) for c in get_args(arm) if get_origin(arm) is Literal]
-    if choices and isinstance(value, str):
-        return f"{_equals(value)}: {did_you_mean(value, map(str, choices))}"
+    arms = _arms(annotation)
+    if isinstance(value, str) and all(get_origin(arm) is Literal for arm in arms):
+        choices = [str(choice) for arm in arms for choice in get_args(arm)]
+        return f"{_equals(value)}: {did_you_mean(value, choices)}"
     return f"{_equals(value)}: expected {expected}"
 
 
@@ -247,13 +247,15 @@ def _converted(model: type[BaseModel], data: Any, at: Location) -> Iterator[tupl
 
 
 def _is_converted(annotation: Any, value: Any) -> bool:
-    if isinstance(value, datetime.date | datetime.time):
-        return True
-    arms = {arm for arm in _arms(annotation) if isinstance(arm, type)}
-    if not arms or arms != set(_arms(annotation)):
+    """Whether pydantic would turn a value of one basic type into another without a word."""
+    arms = _arms(annotation)
+    if any(value in get_args(arm) for arm in arms if get_origin(arm) is Literal):
+        return False
+    types = {arm for arm in arms if get_origin(arm) is not Literal}
+    if not types or not types <= {int, float, bool}:
         return False
     if isinstance(value, bool):
-        return bool not in arms and bool(arms & {int, float})
+        return bool not in types
     if isinstance(value, int | float):
-        return arms == {bool}
-    return isinstance(value, str) and arms <= {int, float, bool}
+        return types == {bool}
+    return isinstance(value, str)

@@ -45,11 +45,11 @@ def format_rows(
     labels: NDArray[np.uint8],
     out: NDArray[np.uint8],
 ) -> int:
-    """Write rows of numbers, each ended by a label and a newline; returns the bytes written.
+    """Write rows of numbers, each ended by its label and a newline; returns the bytes written.
 
     `values` (n, m); `decimals` (m,), 0 to 9; `codes` (n,) choose a row of `labels` (k, w), ASCII
-    padded with zeros, and an unknown code gives an empty label; `out` holds at least
-    n (32 m + w + 1) bytes.
+    padded with zeros, and an unknown code gives an empty label; with w = 0 rows end after their
+    last number. `out` holds at least n (32 m + w + 1) bytes.
     """
     n, m = values.shape
     at = 0
@@ -85,7 +85,9 @@ def format_rows(
             out[at] = _COMMA
             at += 1
         code = codes[i]
-        if 0 <= code < labels.shape[0]:
+        if labels.shape[1] == 0:
+            at -= 1
+        elif 0 <= code < labels.shape[0]:
             for k in range(labels.shape[1]):
                 if labels[code, k] == 0:
                     break

@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from drivers.base import PermanentDriverError, monotonic_ns
 from fusiond.config import AnyAiding, Config, GnssAiding, RdssAiding
 from fusiond.config_mistakes import Location, did_you_mean, mistake, validate
 
@@ -92,7 +93,8 @@ def _driver_options(sources: object, found: list[str], base: Path) -> dict[str, 
             found.append(mistake((*at, "driver"), driver, what))
             continue
         try:
-            model: type[BaseModel] = drivers[driver].load().Options
+            device = drivers[driver].load()
+            model: type[BaseModel] = device.Options
         except (ImportError, AttributeError) as error:
             what = f"this driver cannot be loaded: {error}"
             found.append(mistake((*at, "driver"), driver, what))
@@ -100,8 +102,14 @@ def _driver_options(sources: object, found: list[str], base: Path) -> dict[str, 
         given = {key: value for key, value in source.items() if key != "driver"}
         options, mistakes = validate(model, given, at)
         found.extend(mistakes)
-        if options is not None:
-            paths[name] = {k: str(v) for k, v in _absolute(options, base).items() if k in given}
+        if options is None:
+            continue
+        absolute = _absolute(options, base)
+        paths[name] = {key: str(path) for key, path in absolute.items() if key in given}
+        try:  # opens no device; finds what does not fit, such as a signal that the DBC lacks
+            device(name, options.model_copy(update=absolute), lambda _: None, monotonic_ns)
+        except PermanentDriverError as error:
+            found.append(mistake(at, {}, str(error)))
     return paths
 
 
