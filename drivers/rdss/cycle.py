@@ -1,0 +1,153 @@
+"""The tables of the request cycle: states, time-outs, actions, and what a refusal leads to.
+
+Figures come from PROTOCOLS 1.1 and 1.5 unless they say otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal
+
+from drivers.rdss.fraction import FractionUnit
+from drivers.rdss.messages import Family, Fix, Outcome
+
+SECOND = 1_000_000_000
+PROBE_BAUDS = (115200, 19200, 9600)
+PROBE_NS = 3 * SECOND
+"""Wait for the answer to a harmless read (PROTOCOLS 1.1)."""
+FEEDBACK_NS = 3 * SECOND
+FIX_EXPECTED_NS = 5 * SECOND
+GIVE_UP_NS = 10 * SECOND
+"""After the request was written; all three PROTOCOLS 1.5."""
+SPACING_MARGIN_NS = SECOND
+BEAM_POLL_NS = 5 * SECOND
+USABLE_LEVEL = 2
+"""Least beam level that carries a transmission (PROTOCOLS 1.2, ZJXX)."""
+HOLD_NS = 60 * SECOND
+"""Low battery (PROTOCOLS 1.5); also after an alarm that a retry did not clear (our choice)."""
+DEFAULT_SERVICE_S = 60
+"""For a card that states 0: the spacing most often seen in the field."""
+POLL_NS = 10 * SECOND
+"""Pace of the harmless reads between requests, so that a dead terminal is noticed (our choice)."""
+POLL_REPLY_NS = SECOND
+"""A request waits this long behind a read, so that replies do not interleave (our choice)."""
+BEAMS_STALE_NS = 30 * SECOND
+"""Beam levels older than this are read again before a request (our choice)."""
+BEAM_ATTEMPTS = 3
+"""Beam reads without an answer before the terminal is taken not to support them."""
+HINT_SD_M = 10.0
+"""A height better than this is given to the centre: a 10 m horizontal result needs it (1.5)."""
+HINT_AGE_NS = 5 * SECOND
+"""A 10 % grade at 72 km/h changes the height by 10 m in this time."""
+TIMEOUTS_ALARM = 3
+"""Requests in a row without a fix that an operator should know of (our choice)."""
+
+
+class State(StrEnum):
+    CLOSED = "closed"
+    PROBING = "probing"
+    NO_CARD = "no_card"
+    CHECKING = "checking"
+    READY = "ready"
+    AWAIT_FEEDBACK = "await_feedback"
+    AWAIT_FIX = "await_fix"
+    NO_BEAM = "no_beam"
+    HOLDING = "holding"
+    SUPPRESSED = "suppressed"
+    SILENT = "silent"
+
+
+IN_FLIGHT = frozenset({State.AWAIT_FEEDBACK, State.AWAIT_FIX})
+OFFLINE = frozenset({State.CLOSED, State.PROBING})
+
+SendKind = Literal["read", "request"]
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Write these bytes now; a `request` makes the terminal transmit, a `read` does not."""
+
+    data: bytes
+    kind: SendKind
+
+
+@dataclass(frozen=True, slots=True)
+class SetBaud:
+    baud: int
+
+
+@dataclass(frozen=True, slots=True)
+class FixReady:
+    """An own fix: its time of day (s, zone unknown), the bound of what the fraction leaves open
+    (s), and when its request was written."""
+
+    fix: Fix
+    time_of_day_s: float
+    uncertainty_s: float
+    requested_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """What an operator should know."""
+
+    code: str
+    text: str
+
+
+Action = Send | SetBaud | FixReady | Notice
+
+
+@dataclass(frozen=True, slots=True)
+class TerminalOptions:
+    """`bauds` and `families` are tried in order. None: not given, or no limit of our own."""
+
+    bauds: tuple[int, ...] = PROBE_BAUDS
+    families: tuple[Family, ...] = ("4.0", "2.1")
+    t_fraction: FractionUnit = "auto"
+    antenna_height_m: float = 0.0
+    height_m: float | None = None
+    use_solution_height: bool = True
+    request_interval_s: float | None = None
+    suppression_hold_s: float = 600.0
+    timeout_s: float = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """What a feedback that refuses our request leads to. `notice` once, until a request is
+    accepted; after `retries` in a row the state is HOLDING."""
+
+    counter: str
+    state: State
+    text: str = ""
+    retries: int | None = None
+
+
+REFUSALS = {
+    Outcome.FAILED: Refusal("refused", State.READY),
+    Outcome.OTHER: Refusal("refused_other", State.READY),
+    Outcome.FREQUENCY: Refusal("refused_frequency", State.READY),
+    Outcome.NOT_LOCKED: Refusal("no_beam", State.NO_BEAM),
+    Outcome.NOT_SENT: Refusal("not_sent", State.NO_BEAM),
+    Outcome.ENCRYPTION: Refusal(
+        "encryption_error", State.READY, "the card's encryption failed twice", retries=1
+    ),
+    Outcome.CRC: Refusal("crc_error", State.READY, "requests arrive damaged: CRC", retries=1),
+    Outcome.NO_PERMISSION: Refusal(
+        "no_permission", State.READY, "the card has no permission to ask for positions", retries=0
+    ),
+}
+"""Only for a request of ours in flight. The outcomes below count whenever they come."""
+ALWAYS = frozenset(
+    {
+        Outcome.LOW_BATTERY,
+        Outcome.SUPPRESSED,
+        Outcome.SILENCE,
+        Outcome.SILENCE_OR_LIFTED,
+        Outcome.NO_CARD,
+    }
+)
+POSITION_COMMANDS = frozenset({None, "DWSQ", "DWA"})
+INBOUND_COMMANDS = frozenset({"DWSQ", "DWA", "TXSQ", "TXA", "WAA", "WBA", "TCQ"})

@@ -1,0 +1,269 @@
+"""Driver of a BeiDou RDSS user terminal on a serial line, family 4.0 or 2.1.
+
+Ties the codecs and the request cycle to a `SerialLine`. Emits `DelayedFix` for every own fix,
+`TimeReport` for the terminal's clock, `DeviceEvent` for what an operator should know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import calendar
+import logging
+from collections import Counter
+from math import radians
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, PositiveFloat
+
+from drivers.base import DriverOptions, DriverStatus, Emit, Now, State
+from drivers.measurements import DelayedFix, DeviceEvent, TimeOfDayStamp, TimeReport
+from drivers.rdss import binary_4_0, text_2_1
+from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_ANTENNA_M, MAX_ORDINARY_HEIGHT_M
+from drivers.rdss.cycle import (
+    PROBE_BAUDS,
+    SECOND,
+    Action,
+    FixReady,
+    Notice,
+    Send,
+    SetBaud,
+    TerminalOptions,
+)
+from drivers.rdss.fraction import FractionUnit
+from drivers.rdss.messages import Decoder, DeviceClock, Family, Message, Unknown
+from drivers.rdss.terminal import Terminal
+from drivers.serial_line import SerialLine
+
+log = logging.getLogger(__name__)
+
+ZONES_H = (0, 8)
+"""T is UTC or Beijing time, by vendor; whoever holds the clock finds out which."""
+BITS_A_BYTE = 10
+FRAME_SLACK_NS = SECOND // 2
+"""A frame that has begun is overdue after its own length on the wire and this (PROTOCOLS 1.2)."""
+NAMES_LOGGED = 32
+STATUS_S = 1.0
+"""The status counts down in whole seconds."""
+
+
+class RdssOptions(DriverOptions):
+    """Keys of an RDSS source. Heights in metres."""
+
+    port: str
+    baud: Literal["auto"] | Annotated[int, Field(ge=1200, le=4_000_000)] = "auto"
+    family: Literal["auto", "4.0", "2.1"] = "auto"
+    t_fraction: FractionUnit = "auto"
+    """Unit of the last byte of T in family 4.0."""
+    antenna_height_m: Annotated[float, Field(ge=0.0, lt=MAX_ORDINARY_ANTENNA_M)] = 0.0
+    """Above the ground; goes into a request without a height."""
+    height_m: (
+        Annotated[float, Field(gt=-MAX_ORDINARY_HEIGHT_M, lt=MAX_ORDINARY_HEIGHT_M)] | None
+    ) = None
+    """Ellipsoidal height of the antenna where it is known and constant (a ship)."""
+    use_solution_height: bool = True
+    """Give the navigation solution's height to the centre while its sigma is below 10 m."""
+    request_interval_s: PositiveFloat | None = None
+    """Wanted spacing of requests; the card's service frequency is never undercut."""
+    suppression_hold_s: Annotated[float, Field(ge=60.0)] = 600.0
+    """After a suppression that nobody lifts, try again after this."""
+    timeout_s: Annotated[float, Field(ge=20.0)] = 30.0
+    """Nothing intelligible for this long: look again who is there. Reads go out every 10 s."""
+
+
+def _utc_ns(clock: DeviceClock) -> int:
+    """POSIX ns of a device clock taken as UTC; a leap second repeats the count of the last."""
+    time_of_day_s = clock.time_of_day_s - (clock.time_of_day_s >= 86400)
+    midnight = calendar.timegm((clock.year, clock.month, clock.day, 0, 0, 0))
+    return midnight * SECOND + round(time_of_day_s * SECOND)
+
+
+class RdssDriver:
+    """See the module. `counters` joins the line's, the codec's and the request cycle's."""
+
+    Options: ClassVar[type[DriverOptions]] = RdssOptions
+
+    def __init__(self, name: str, options: RdssOptions, emit: Emit, now_ns: Now) -> None:
+        self.name = name
+        self.counters: Counter[str] = Counter()
+        self.status = DriverStatus()
+        self._emit = emit
+        self._now_ns = now_ns
+        bauds = PROBE_BAUDS if options.baud == "auto" else (options.baud,)
+        families: tuple[Family, ...] = (
+            ("4.0", "2.1") if options.family == "auto" else (options.family,)
+        )
+        self._terminal = Terminal(
+            TerminalOptions(
+                bauds=bauds,
+                families=families,
+                t_fraction=options.t_fraction,
+                antenna_height_m=options.antenna_height_m,
+                height_m=options.height_m,
+                use_solution_height=options.use_solution_height,
+                request_interval_s=options.request_interval_s,
+                suppression_hold_s=options.suppression_hold_s,
+                timeout_s=options.timeout_s,
+            ),
+            self.counters,
+        )
+        self._families = families
+        self._decoders: dict[Family, Decoder] = {}
+        self._overdue_ns: int | None = None
+        self._logged: set[str] = set()
+        self._wake = asyncio.Event()
+        self._line = SerialLine(options.port, bauds[0], now_ns)
+        self._line.counters = self.counters
+
+    async def run(self) -> None:
+        """Serve the terminal until cancelled."""
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._line.run(self._on_bytes, self._on_open, self._on_close))
+            tasks.create_task(self._keep_time())
+
+    def height_hint(self, height_m: float, sd_m: float) -> None:
+        """Ellipsoidal height of the terminal's antenna from the solution, one sigma, as of now."""
+        self._terminal.height_hint(height_m, sd_m, self._now_ns())
+
+    def request_now(self) -> str:
+        """Ask for a fix as soon as the card's spacing allows; when, or why not, in words."""
+        text = self._terminal.request_now(self._now_ns()).text
+        self._wake.set()
+        return text
+
+    # ------------------------------------------------------------------ line
+
+    def _on_open(self) -> None:
+        self._listen()
+        self._perform(self._terminal.opened(self._now_ns()), 0)
+        self._wake.set()
+
+    def _on_close(self, why: str) -> None:
+        t_ns = self._now_ns()
+        self._perform(self._terminal.closed(t_ns), t_ns)
+        self._notify(t_ns, "rdss_closed", why)
+
+    def _on_bytes(self, data: bytes, t_ns: int) -> None:
+        for family, decoder in tuple(self._decoders.items()):
+            self._take(family, decoder.feed(data), t_ns)
+        awaited = max((d.awaited_bytes for d in self._decoders.values()), default=0)
+        if awaited:
+            wire_ns = awaited * BITS_A_BYTE * SECOND // self._terminal.baud
+            self._overdue_ns = t_ns + wire_ns + FRAME_SLACK_NS
+        else:
+            self._overdue_ns = None
+        self._wake.set()
+
+    async def _keep_time(self) -> None:
+        """Call the state machine when it is due, and give up frames whose rest does not come."""
+        while True:
+            self._wake.clear()
+            t_ns = self._now_ns()
+            if self._overdue_ns is not None and t_ns >= self._overdue_ns:
+                self._give_up_frames(t_ns)
+            self._perform(self._terminal.tick(t_ns), t_ns)
+            if not self._terminal.answered and len(self._decoders) < len(self._families):
+                self._listen()
+            self._say_status()
+            due = [d for d in (self._terminal.next_deadline_ns, self._overdue_ns) if d is not None]
+            wait_s = STATUS_S
+            if due:
+                wait_s = min(wait_s, max(0.0, (min(due) - self._now_ns()) / SECOND))
+            try:
+                async with asyncio.timeout(wait_s):
+                    await self._wake.wait()
+            except TimeoutError:
+                continue
+
+    def _say_status(self) -> None:
+        """`silent` once every baud rate has been probed in vain."""
+        state: State = "starting"
+        if not self._line.is_open:
+            state = "absent" if self._line.detail else "starting"
+        elif self._terminal.answered:
+            state = "running"
+        elif self._terminal.unanswered_round:
+            state = "silent"
+        self.status.state = state
+        self.status.detail = self._terminal.detail if self._line.is_open else self._line.detail
+
+    def _give_up_frames(self, t_ns: int) -> None:
+        self._overdue_ns = None
+        for family, decoder in tuple(self._decoders.items()):
+            while decoder.awaited_bytes:
+                self._take(family, decoder.expire(), t_ns)
+
+    # ------------------------------------------------------------------ messages and actions
+
+    def _decoder(self, family: Family) -> Decoder:
+        """Codecs that only guess keep their counters to themselves."""
+        counters = self.counters if len(self._families) == 1 else None
+        return binary_4_0.Decoder(counters) if family == "4.0" else text_2_1.Decoder(counters)
+
+    def _take(self, family: Family, messages: list[Message], t_ns: int) -> None:
+        for message in messages:
+            if family not in self._decoders:
+                return
+            if isinstance(message, Unknown):
+                self._log_once(message.name)
+            elif isinstance(message, DeviceClock) and self._terminal.answered:
+                self._report_time(message, t_ns)
+            self._perform(self._terminal.received(message, t_ns, family), t_ns)
+            if self._terminal.answered:
+                self._settle_family()
+
+    def _settle_family(self) -> None:
+        """Once the terminal has said who it is, only its family is listened to."""
+        family = self._terminal.family
+        if len(self._decoders) > 1 and family is not None:
+            decoder = self._decoders[family]
+            self.counters.update(decoder.counters)
+            decoder.counters = self.counters
+            self._decoders = {family: decoder}
+
+    def _perform(self, actions: list[Action], t_ns: int) -> None:
+        for action in actions:
+            match action:
+                case Send():
+                    self._line.write(action.data)
+                case SetBaud():
+                    self._line.set_baud(action.baud)
+                    self._listen()
+                case FixReady():
+                    self._emit(self._delayed_fix(action, t_ns))
+                case Notice():
+                    self._notify(t_ns, action.code, action.text)
+
+    def _listen(self) -> None:
+        """Start afresh for every family that may speak: what came before means nothing now."""
+        self._decoders = {family: self._decoder(family) for family in self._families}
+        self._overdue_ns = None
+
+    def _delayed_fix(self, ready: FixReady, t_ns: int) -> DelayedFix:
+        fix = ready.fix
+        stamp = TimeOfDayStamp(
+            ready.time_of_day_s, ZONES_H, ready.requested_ns, ready.uncertainty_s
+        )
+        return DelayedFix(
+            self.name,
+            t_ns,
+            stamp,
+            radians(fix.lat_deg),
+            radians(fix.lon_deg),
+            fix.height_m,
+            float(fix.precision_class_m),
+            fix.multi_value,
+        )
+
+    def _report_time(self, clock: DeviceClock, t_ns: int) -> None:
+        """SJXX names no zone and no lock: its report is never trusted. BDZDA prints UTC, as NMEA
+        0183 ZDA does, and is trusted while it says that it is locked."""
+        self.counters["time_reports"] += 1
+        self._emit(TimeReport(self.name, t_ns, _utc_ns(clock), trusted=clock.locked is True))
+
+    def _notify(self, t_ns: int, code: str, text: str) -> None:
+        self._emit(DeviceEvent(self.name, t_ns, code, text))
+
+    def _log_once(self, name: str) -> None:
+        if name not in self._logged and len(self._logged) < NAMES_LOGGED:
+            self._logged.add(name)
+            log.info("%s: the terminal sends %s, which is not read", self.name, name)
