@@ -114,7 +114,16 @@ def _preload(job: Path) -> dict[str, str]:
     if compiler is None:
         raise HarnessError("this processor has AMX, UML needs xstate.c: apt install gcc libc6-dev")
     library = job / "xstate.so"
-    build = [compiler, "-O2", "-Wall", "-shared", "-fPIC", "-o", library, HERE / "xstate.c"]
+    build = [
+        compiler,
+        "-O2",
+        "-Wall",
+        "-shared",
+        "-fPIC",
+        "-o",
+        str(library),
+        str(HERE / "xstate.c"),
+    ]
     subprocess.run(build, check=True, timeout=60)
     return {"LD_PRELOAD": str(library)}
 

@@ -1,0 +1,65 @@
+# The targets that a person runs are the ones that CI runs. `make help` lists them.
+PYTHON ?= python3
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
+	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
+	--no-emit-trusted-host --no-emit-options
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint unit hil format bench lock clean test-packages
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+install: $(STAMP) ## locked dependencies and fusiond (editable) in .venv
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer needed, this is {v[0]}.{v[1]}: make PYTHON=/path/to/python3.11")'
+	@PYTHON="$(PYTHON)" tools/debian-packages.sh run
+	@echo "creating $(VENV)"
+	$(PYTHON) -m venv $(VENV)
+
+$(STAMP): requirements-dev.lock pyproject.toml | $(BIN)/python
+	@echo "installing locked dependencies and fusiond into $(VENV)"
+	$(PIP) install --quiet --require-hashes -r requirements-dev.lock
+	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(STAMP) ## simulated vehicle, real daemon; ARGS="--duration 60 --headless"
+	$(BIN)/fusiond demo $(ARGS)
+
+test: lint unit hil ## everything that CI checks
+
+lint: $(STAMP) ## ruff and mypy
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+unit: $(STAMP) test-packages ## unit and property tests, on every core
+	$(BIN)/pytest -n auto --ignore tests/test_hil.py $(ARGS)
+
+hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
+	$(BIN)/pytest tests/test_hil.py
+
+test-packages:
+	@PYTHON="$(PYTHON)" tools/debian-packages.sh test
+
+format: $(STAMP) ## let ruff lay out the code
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+bench: $(STAMP) ## figures as JSON
+	$(BIN)/fusiond bench $(ARGS)
+
+lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
+	$(COMPILE) --all-extras $(ARGS) --output-file requirements-dev.lock pyproject.toml
+	cp requirements-dev.lock requirements.lock
+	$(COMPILE) --extra demo --output-file requirements.lock pyproject.toml
+
+clean: ## remove what the other targets made
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
