@@ -189,7 +189,7 @@ def _encode(m: Message) -> bytes:
             text = (
                 f"{m.mode},{_print_time(m.time_of_day_s, 2)},"
                 f"{m.day:02d},{m.month:02d},{m.year:04d},"
-                f"{zone},{m.zone_min:02d},00,000000.00,0,{m.precision},"
+                f"{zone},{m.zone_min:02d},000000.00,0,{m.precision},"
             )
             return sentence("BDZDA", text.encode() + (b"Y" if m.locked else b"N"))
         case Feedback():
