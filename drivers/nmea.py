@@ -25,6 +25,7 @@ _REFUSALS = {
     "dead_reckoning_refused": "only the receiver's own dead reckoning, which is not fused",
     "manual_refused": "the receiver repeats a position that was put in by hand",
     "simulator_refused": "the receiver simulates: allow_simulator would accept it",
+    "duplicate_epoch": "the receiver repeats an epoch or goes back in time",
     "unknown_quality": "the receiver states a GGA quality that NMEA does not know",
 }
 

@@ -1,7 +1,7 @@
 """Bytes of a GNSS receiver in, measurements out: epochs grouped, dated, judged. No I/O, no clock.
 
-An epoch closes when the time of day changes, when its last sentence came, or on `silence`. Which
-sentence is the last is configured, or learned: the same cycle of sentences seen twice in a row.
+An epoch closes when the time of day changes, when a sentence repeats, when its last one came, or
+on `silence`. Which one is the last is configured, or learned: the same cycle seen twice in a row.
 """
 
 from __future__ import annotations
@@ -83,6 +83,7 @@ class NmeaDecoder:
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
         self._closed_ns: int | None = None
+        self._closed_at_once = False
         self._last_cycle: tuple[str, ...] = ()
         self._learned: tuple[str, ...] = ()
         self._too_short: set[tuple[str, ...]] = set()
@@ -135,13 +136,19 @@ class NmeaDecoder:
         formatter, time_ns = sentence.formatter, time_of_day_ns(sentence)
         epoch = self._epoch
         if epoch is not None:
-            other = None not in (time_ns, epoch.time_of_day_ns) and time_ns != epoch.time_of_day_ns
             again = formatter in epoch.cycle and formatter != "GSA"
-            if other or (again and epoch.time_of_day_ns is None) or len(epoch.cycle) >= MAX_CYCLE:
+            if (
+                (time_ns is not None and epoch.time_of_day_ns not in (None, time_ns))
+                or (again and sentence.address in epoch.addresses)
+                or len(epoch.cycle) >= MAX_CYCLE
+            ):
                 self._close(found, learn=True)
-            elif again:
+            elif again:  # of another talker: the same fix by another name
                 self.counters["repeated_sentence"] += 1
                 return
+        elif time_ns is None and self._closed_at_once and formatter not in self._last_cycle:
+            self._late()
+            return
         epoch = self._epoch or Epoch()
         epoch.take(sentence, t_seen_ns)
         self._epoch = epoch
@@ -153,9 +160,10 @@ class NmeaDecoder:
             self._decoding.last_sentence is None and tuple(epoch.cycle) == self._learned
         ):
             self._close(found, learn=False)
+            self._closed_at_once = True
 
     def _late(self) -> None:
-        """More sentences of an epoch that is closed: what was learned is too short."""
+        """More of an epoch that was closed at once: what was learned is too short."""
         self.counters["late_sentence"] += 1
         if self._learned and len(self._too_short) < MAX_UNLEARNED:
             self._too_short.add(self._learned)
@@ -169,6 +177,7 @@ class NmeaDecoder:
         if learn and cycle == self._last_cycle and cycle not in self._too_short:
             self._learned = cycle
         self._last_cycle = cycle
+        self._closed_at_once = False
         self._closed_ns = epoch.time_of_day_ns
         self._judge(epoch, found)
 
@@ -190,6 +199,7 @@ class NmeaDecoder:
             self.counters["untimed_epoch"] += 1
             stamp, position = ArrivalStamp(), None
         elif not self._order.accept(day, epoch.time_of_day_ns):
+            self.refusal = "duplicate_epoch"
             return
         elif day is not None:
             stamp = UtcStamp(posix_ns(day, epoch.time_of_day_ns))

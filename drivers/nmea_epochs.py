@@ -56,6 +56,8 @@ class Epoch:
     """When the last sentence that counts came in."""
     cycle: list[str] = field(default_factory=list)
     """Formatters in the order they came."""
+    addresses: set[str] = field(default_factory=set)
+    """The same with their talkers."""
     day: date | None = None
     t_day_seen_ns: int = 0
     rmc_valid: bool | None = None
@@ -84,6 +86,7 @@ class Epoch:
         if sentence.formatter in ("RMC", "ZDA") and not self.t_day_seen_ns:
             self.t_day_seen_ns = t_seen_ns
         self.cycle.append(sentence.formatter)
+        self.addresses.add(sentence.address)
 
     def position(self) -> tuple[float, float, int] | None:
         """Latitude, longitude (deg) and quality, where the epoch has them."""
