@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.config import Imu
+from fusiond.config import Config, Imu
 from fusiond.files import read_gnss, read_imu, read_rdss, read_truth
 from fusiond.simulation.files import simulate
 from fusiond.simulation.gnss_receiver import GnssOptions
@@ -144,7 +145,7 @@ def test_files_are_what_the_readers_accept(tmp_path: Path) -> None:
         assert not table.rejected
     rows = {"imu": len(imu.t_s), "gnss": len(gnss.t_s), "rdss": len(rdss.t_s)}
     assert written.rows == rows | {"truth": len(truth.t_s)}
-    assert rows["imu"] == 12_000
+    assert rows["imu"] == 6_000
     assert rows["gnss"] == 500
     assert not np.any((gnss.t_s >= 20.0) & (gnss.t_s < 30.0))
     latency = gnss.t_arrival_s - gnss.t_s
@@ -157,3 +158,27 @@ def test_files_are_what_the_readers_accept(tmp_path: Path) -> None:
     error_m = (gnss.lat_rad - truth.lat_rad[0]) * 6.353e6
     assert error_m.std() == pytest.approx(0.8, rel=0.2)
     np.testing.assert_allclose(gnss.sd_position[0], [0.8, 0.8, 1.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario"), [("vehicle", "drive"), ("vehicle", "static"), ("tactical", "flight")]
+)
+def test_scenarios_fit_the_shipped_configurations(name: str, scenario: str) -> None:
+    path = Path(__file__).parents[1] / "config" / f"{name}.toml"
+    config = Config.model_validate(tomllib.loads(path.read_text()))
+    assert SCENARIOS[scenario].fitted(config) == SCENARIOS[scenario]
+
+
+def test_a_scenario_can_be_fitted_to_another_vehicle() -> None:
+    config = Config.model_validate(
+        {
+            "imu": {"rate_hz": 50.0},
+            "aiding": {"gnss": {"lever_arm_m": [1.0, 2.0, 3.0]}},
+            "constraints": {"non_holonomic": {"enabled": True, "lever_arm_m": [-2.0, 0.0, 0.0]}},
+        }
+    )
+    fitted = SCENARIOS["drive"].fitted(config)
+    assert fitted.gnss.lever_arm_m == (1.0, 2.0, 3.0)
+    assert fitted.rdss == SCENARIOS["drive"].rdss
+    assert fitted.truth(10.0).path.arm_m == (2.0, 0.0, 0.0)
+    assert len(fitted.truth(10.0).gyro) == 500

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.simulation.imu_truth import Truth, dcm_from_rpy
-from fusiond.simulation.trajectories import Leg, Path, Profile, drive, flight, follow, static
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.trajectories import (
+    Leg,
+    Path,
+    Profile,
+    dcm_from_rpy,
+    drive,
+    flight,
+    follow,
+    static,
+)
 
 Array = NDArray[np.float64]
 ORIGIN = (math.radians(30.5), math.radians(114.3), 40.0)
 RATE_HZ = 200.0
+ARM = (1.0, 0.2, -0.5)
 
 
 @numba.njit(cache=True)
@@ -86,7 +97,13 @@ def _closing_error(path: Path, seconds: float) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize(
-    ("path", "seconds"), [(static(60.0), 60.0), (drive(600.0), 600.0), (flight(600.0), 600.0)]
+    ("path", "seconds"),
+    [
+        (static(60.0), 60.0),
+        (drive(600.0), 600.0),
+        (replace(drive(600.0), arm_m=ARM), 600.0),
+        (flight(600.0), 600.0),
+    ],
 )
 def test_integrated_truth_returns_to_the_trajectory(path: Path, seconds: float) -> None:
     """Measured: 0.2 um (drive) and 0.4 um (flight) after 600 s at 200 Hz."""
@@ -110,10 +127,12 @@ def test_a_wrong_gyro_would_be_noticed() -> None:
 def test_profile_is_twice_continuous_and_constant_between_equal_knots() -> None:
     profile = Profile([0.0, 2.0, 5.0, 9.0], [1.0, 1.0, 4.0, -2.0])
     t = np.linspace(-1.0, 10.0, 11_001)
-    value, first, second = profile(t)
+    value, first, second, third = profile(t)
     assert np.max(np.abs(np.diff(second))) < 0.05
     np.testing.assert_allclose(np.gradient(value, t)[1:-1], first[1:-1], atol=1e-5)
     np.testing.assert_allclose(np.gradient(first, t)[1:-1], second[1:-1], atol=1e-2)
+    away = np.min(np.abs(t[:, None] - [0.0, 2.0, 5.0, 9.0]), axis=1) > 2e-3
+    np.testing.assert_allclose(np.gradient(second, t)[away], third[away], atol=1e-2)
     still = (t >= 0.0) & (t <= 2.0)
     assert np.all(value[still] == 1.0)
     assert np.all(first[still] == 0.0)
@@ -134,10 +153,14 @@ def test_stops_of_the_drive_are_real_standstill() -> None:
 
 
 def test_car_does_not_slip_and_stays_drivable() -> None:
-    truth = Truth(drive(1560.0), ORIGIN, 100.0, 1560.0)
-    states = truth.at(truth.t_s)
+    truth = Truth(replace(drive(1560.0), arm_m=ARM), ORIGIN, 100.0, 1560.0)
+    axle = (-ARM[0], -ARM[1], -ARM[2])
+    states = truth.at(truth.t_s, axle)
     v_body = np.einsum("nji,nj->ni", dcm_from_rpy(states.rpy), states.v_ned)
     assert np.abs(v_body[:, 1:]).max() < 1e-12
+    imu_states = truth.at(truth.t_s)
+    imu_body = np.einsum("nji,nj->ni", dcm_from_rpy(imu_states.rpy), imu_states.v_ned)
+    assert np.abs(imu_body[:, 1]).max() > 0.2
     assert np.abs(truth.accel[:, :2]).max() < 5.0
     assert np.ptp(states.position[:, 2]) < 60.0
     assert 20.0 < v_body[:, 0].max() < 30.0

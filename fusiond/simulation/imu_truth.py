@@ -27,7 +27,7 @@ from fusiond.navigation.earth import (
     meridian_radius,
     transverse_radius,
 )
-from fusiond.simulation.trajectories import Path
+from fusiond.simulation.trajectories import Path, body_rate, dcm_from_rpy
 
 Array = NDArray[np.float64]
 
@@ -197,7 +197,7 @@ class Truth:
         if any(lever_arm_m):
             arm = np.asarray(lever_arm_m, dtype=np.float64)
             dcm = dcm_from_rpy(motion.rpy)
-            rate = _body_rate(motion.rpy, motion.rpy_rate)
+            rate, _ = body_rate(motion.rpy, motion.rpy_rate, np.zeros_like(motion.rpy))
             offset = np.einsum("nij,j->ni", dcm, arm)
             position = position + metres_to_geodetic(position[:, 0], position[:, 2], offset)
             v_ned = v_ned + np.einsum("nij,nj->ni", dcm, np.cross(rate, arm))
@@ -218,24 +218,3 @@ def metres_to_geodetic(lat: Array, height: Array, ned_m: Array) -> Array:
         ),
         axis=-1,
     )
-
-
-def dcm_from_rpy(rpy: Array) -> Array:
-    """C_nb (n, 3, 3) from roll, pitch, yaw (n, 3) in rad."""
-    sr, cr = np.sin(rpy[:, 0]), np.cos(rpy[:, 0])
-    sp, cp = np.sin(rpy[:, 1]), np.cos(rpy[:, 1])
-    sy, cy = np.sin(rpy[:, 2]), np.cos(rpy[:, 2])
-    rows = (
-        (cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy),
-        (cp * sy, sr * sp * sy + cr * cy, cr * sp * sy - sr * cy),
-        (-sp, sr * cp, cr * cp),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _body_rate(rpy: Array, rpy_rate: Array) -> Array:
-    """w_nb^b (n, 3) in rad/s from Euler angles and their rates."""
-    sr, cr = np.sin(rpy[:, 0]), np.cos(rpy[:, 0])
-    sp, cp = np.sin(rpy[:, 1]), np.cos(rpy[:, 1])
-    p, q, r = rpy_rate[:, 0], rpy_rate[:, 1], rpy_rate[:, 2]
-    return np.stack((p - r * sp, q * cr + r * sr * cp, r * cr * cp - q * sr), axis=-1)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fusiond.config import Imu
+from fusiond.config import Config, GnssAiding, Imu, RdssAiding
 from fusiond.simulation.gnss_receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss_terminal import RdssOptions
 from fusiond.simulation.sensor_errors import ImuOutput, Vibration, imu_output
 from fusiond.simulation.trajectories import Path, drive, flight, static
 
-TACTICAL_IMU = Imu(
+ANTENNA_M = (0.0, 0.0, -1.0)
+"""Both antennas: on the roof, 1 m above the IMU."""
+CAR_IMU = Imu(axes=("+x", "-y", "-z"), rate_hz=100.0)
+"""As in `config/vehicle.toml`: MEMS, 10 deg/h and 0.1 mg, 0.3 deg/sqrt(h), 0.1 m/s/sqrt(h)."""
+REAR_AXLE_M = (-1.0, 0.0, 0.5)
+"""From the IMU of the car to the middle of its rear axle, body axes."""
+AIRCRAFT_IMU = Imu(
     rate_hz=200.0,
     gyro_noise_deg_sqrt_h=0.05,
     accel_noise_m_s_sqrt_h=0.02,
@@ -25,7 +31,7 @@ TACTICAL_IMU = Imu(
     gyro_scale_ppm=300.0,
     accel_scale_ppm=300.0,
 )
-"""1 deg/h and 50 ug bias instability, 0.05 deg/sqrt(h), 0.02 m/s/sqrt(h)."""
+"""As in `config/tactical.toml`: 1 deg/h and 50 ug, 0.05 deg/sqrt(h), 0.02 m/s/sqrt(h)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,29 +42,54 @@ class Scenario:
     path: Callable[[float], Path]
     duration_s: float
     origin_deg_m: tuple[float, float, float] = (30.5276, 114.3556, 38.0)
-    imu: Imu = field(default_factory=lambda: Imu(rate_hz=200.0))
-    gnss: GnssOptions = field(default_factory=GnssOptions)
-    rdss: RdssOptions = field(default_factory=RdssOptions)
+    imu: Imu = CAR_IMU
+    gnss: GnssOptions = field(default_factory=lambda: GnssOptions(lever_arm_m=ANTENNA_M))
+    rdss: RdssOptions = field(default_factory=lambda: RdssOptions(lever_arm_m=ANTENNA_M))
     vibration: Vibration = field(default_factory=Vibration)
+    no_slip_m: tuple[float, float, float] = REAR_AXLE_M
+    """From the IMU to the point that follows the path without side slip, body axes."""
 
     def truth(self, duration_s: float | None = None) -> Truth:
         """The trajectory, sampled at the IMU's rate."""
         length = self.duration_s if duration_s is None else duration_s
         lat, lon, height = self.origin_deg_m
         origin = (float(np.radians(lat)), float(np.radians(lon)), height)
-        return Truth(self.path(length), origin, self.imu.rate_hz, length)
+        x, y, z = self.no_slip_m
+        path = replace(self.path(length), arm_m=(-x, -y, -z))
+        return Truth(path, origin, self.imu.rate_hz, length)
 
     def imu_output(self, truth: Truth, rng: np.random.Generator) -> ImuOutput:
         """What this scenario's IMU says on that trajectory."""
         return imu_output(self.imu, truth.gyro, truth.accel, rng, vibration=self.vibration)
 
+    def fitted(self, config: Config) -> Scenario:
+        """This scenario with the IMU, the lever arms and the no-slip point of a configuration."""
+        gnss, rdss, no_slip = self.gnss, self.rdss, self.no_slip_m
+        for aiding in config.aiding.values():
+            match aiding:
+                case GnssAiding():
+                    gnss = replace(gnss, lever_arm_m=aiding.lever_arm_m)
+                case RdssAiding():
+                    rdss = replace(rdss, lever_arm_m=aiding.lever_arm_m)
+        if config.constraints.non_holonomic.enabled:
+            no_slip = config.constraints.non_holonomic.lever_arm_m
+        return replace(self, imu=config.imu, gnss=gnss, rdss=rdss, no_slip_m=no_slip)
 
+
+# Car and aircraft fit the shipped configurations `vehicle.toml` and `tactical.toml` unchanged.
 SCENARIOS = {
     scenario.name: scenario
     for scenario in (
         Scenario("static", static, 600.0),
         Scenario("drive", drive, 1560.0),
-        Scenario("flight", flight, 4000.0, imu=TACTICAL_IMU),
+        Scenario(
+            "flight",
+            flight,
+            4000.0,
+            imu=AIRCRAFT_IMU,
+            rdss=RdssOptions(lever_arm_m=ANTENNA_M, service_frequency_s=60),
+            no_slip_m=(0.0, 0.0, 0.0),
+        ),
     )
 }
 

@@ -24,7 +24,7 @@ from scipy.signal import lfilter
 
 from fusiond.config import Imu
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
-from fusiond.simulation.imu_truth import dcm_from_rpy
+from fusiond.simulation.trajectories import dcm_from_rpy
 
 Array = NDArray[np.float64]
 

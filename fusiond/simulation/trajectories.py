@@ -7,7 +7,10 @@ s speed (m/s), chi course and gamma climb angle (rad), each a chain of minimum-j
 10 x^3 - 15 x^4 + 6 x^5 between knots: twice continuously differentiable, and exactly constant where
 two knots hold the same value, so that a stop is a real standstill. k is 1 for an aircraft in
 coordinated turns and slightly negative for a car, which leans outwards; alpha is the incidence.
-The velocity lies along the body's forward axis when alpha = 0 (no side slip).
+v_n is the velocity of the point that follows the path; for a car that is the middle of the rear
+axle, where it lies along the forward axis (alpha = 0, no side slip). The IMU sits at l from it:
+
+    v = v_n + C_nb (w x l),   v' = v_n' + C_nb (w' x l + w x (w x l)),   w = w_nb^b
 
 Source: Flash and Hogan, J. Neuroscience 5 (1985), for the step; Groves, 2nd ed., section 2.2.
 """
@@ -35,19 +38,25 @@ class Profile:
         if self._t.shape != self._values.shape or np.any(np.diff(self._t) <= 0):
             raise ValueError("knots: equally many times and values, times increasing")
 
-    def __call__(self, t_s: Array) -> tuple[Array, Array, Array]:
-        """Value and its first and second derivative in time at each of `t_s`."""
+    def __call__(self, t_s: Array) -> tuple[Array, Array, Array, Array]:
+        """Value and its first, second and third derivative in time at each of `t_s`.
+
+        The third jumps at the knots, where it is that of the piece that begins.
+        """
         last = len(self._t) - 1
         i = np.clip(np.searchsorted(self._t, t_s, side="right") - 1, 0, max(last - 1, 0))
         j = np.minimum(i + 1, last)
         length = np.where(j > i, self._t[j] - self._t[i], 1.0)
-        x = np.clip((t_s - self._t[i]) / length, 0.0, 1.0)
+        x = (t_s - self._t[i]) / length
+        inside = (x >= 0.0) & (x < 1.0)
+        x = np.clip(x, 0.0, 1.0)
         rise = self._values[j] - self._values[i]
         x2 = x * x
         value = self._values[i] + rise * x2 * x * (10.0 - 15.0 * x + 6.0 * x2)
         first = rise / length * 30.0 * x2 * (1.0 - x) ** 2
         second = rise / length**2 * 60.0 * x * (1.0 - 3.0 * x + 2.0 * x2)
-        return value, first, second
+        third = np.where(inside, rise / length**3 * 60.0 * (1.0 - 6.0 * x + 6.0 * x2), 0.0)
+        return value, first, second, third
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +71,23 @@ class Kinematics:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Speed (m/s), course and climb angle (rad) over time; see the module for `bank_ratio` k."""
+    """Speed (m/s), course and climb angle (rad) over time.
+
+    `bank_ratio` is k and `arm_m` is l (body axes: forward, right, down) of the module's text.
+    """
 
     speed: Profile
     course: Profile
     climb: Profile
     bank_ratio: float = 0.0
     incidence_rad: float = 0.0
+    arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def kinematics(self, t_s: Array) -> Kinematics:
-        """Motion at the instants `t_s` (any shape); yaw is not wrapped."""
-        s, s1, _ = self.speed(t_s)
-        chi, chi1, chi2 = self.course(t_s)
-        gamma, gamma1, _ = self.climb(t_s)
+        """Motion of the IMU at the instants `t_s` (any shape); yaw is not wrapped."""
+        s, s1, s2, _ = self.speed(t_s)
+        chi, chi1, chi2, chi3 = self.course(t_s)
+        gamma, gamma1, gamma2, _ = self.climb(t_s)
         sc, cc, sg, cg = np.sin(chi), np.cos(chi), np.sin(gamma), np.cos(gamma)
         v_ned = np.stack((s * cg * cc, s * cg * sc, -s * sg), axis=-1)
         horizontal1 = s1 * cg - s * sg * gamma1
@@ -86,11 +99,58 @@ class Path:
             ),
             axis=-1,
         )
-        u = s * chi1 / STANDARD_GRAVITY_M_S2
-        u1 = (s1 * chi1 + s * chi2) / STANDARD_GRAVITY_M_S2
+        g = STANDARD_GRAVITY_M_S2
+        u = s * chi1 / g
+        u1 = (s1 * chi1 + s * chi2) / g
+        w = 1.0 + u * u
         rpy = np.stack((self.bank_ratio * np.arctan(u), gamma + self.incidence_rad, chi), axis=-1)
-        rpy_rate = np.stack((self.bank_ratio * u1 / (1.0 + u * u), gamma1, chi1), axis=-1)
+        rpy_rate = np.stack((self.bank_ratio * u1 / w, gamma1, chi1), axis=-1)
+        if any(self.arm_m):
+            u2 = (s2 * chi1 + 2.0 * s1 * chi2 + s * chi3) / g
+            roll2 = self.bank_ratio * (u2 / w - 2.0 * u * u1 * u1 / (w * w))
+            rate, acceleration = body_rate(rpy, rpy_rate, np.stack((roll2, gamma2, chi2), axis=-1))
+            arm = np.asarray(self.arm_m, dtype=np.float64)
+            across = np.cross(rate, arm)
+            dcm = dcm_from_rpy(rpy)
+            v_ned += _rotate(dcm, across)
+            v_ned_rate += _rotate(dcm, np.cross(acceleration, arm) + np.cross(rate, across))
         return Kinematics(v_ned, v_ned_rate, rpy, rpy_rate)
+
+
+def _rotate(dcm: Array, vectors: Array) -> Array:
+    product: Array = (dcm @ vectors[..., None])[..., 0]
+    return product
+
+
+def dcm_from_rpy(rpy: Array) -> Array:
+    """C_nb (..., 3, 3) from roll, pitch, yaw (..., 3) in rad."""
+    sr, cr = np.sin(rpy[..., 0]), np.cos(rpy[..., 0])
+    sp, cp = np.sin(rpy[..., 1]), np.cos(rpy[..., 1])
+    sy, cy = np.sin(rpy[..., 2]), np.cos(rpy[..., 2])
+    rows = (
+        (cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy),
+        (cp * sy, sr * sp * sy + cr * cy, cr * sp * sy - sr * cy),
+        (-sp, sr * cp, cr * cp),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def body_rate(rpy: Array, rate: Array, acceleration: Array) -> tuple[Array, Array]:
+    """w_nb^b (..., 3) and its time derivative from Euler angles and their two derivatives."""
+    sr, cr = np.sin(rpy[..., 0]), np.cos(rpy[..., 0])
+    sp, cp = np.sin(rpy[..., 1]), np.cos(rpy[..., 1])
+    a, b, c = rate[..., 0], rate[..., 1], rate[..., 2]
+    a2, b2, c2 = acceleration[..., 0], acceleration[..., 1], acceleration[..., 2]
+    first = np.stack((a - c * sp, b * cr + c * sr * cp, c * cr * cp - b * sr), axis=-1)
+    second = np.stack(
+        (
+            a2 - c2 * sp - c * b * cp,
+            b2 * cr - b * a * sr + c2 * sr * cp + c * (a * cr * cp - b * sr * sp),
+            c2 * cr * cp - c * (a * sr * cp + b * cr * sp) - b2 * sr - b * a * cr,
+        ),
+        axis=-1,
+    )
+    return first, second
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,9 +247,9 @@ def drive(duration_s: float) -> Path:
 
 
 def flight(duration_s: float) -> Path:
-    """An aircraft: 60 s at rest, take-off, climb to about 10 km, cruise at 300 m/s with turns."""
+    """An aircraft: 150 s at rest, take-off, climb to about 10 km, cruise at 300 m/s with turns."""
     climb_out = (
-        Leg(60),
+        Leg(150),  # time to gyrocompass
         Leg(40, speed_m_s=80.0),
         Leg(15, climb_deg=10.0),
         Leg(60, speed_m_s=160.0),
