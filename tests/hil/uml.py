@@ -70,7 +70,8 @@ def run_in_uml(command: Sequence[str], timeout_s: float, output: TextIO) -> int:
     job = Path(tempfile.mkdtemp(prefix="fusiond-hil-"))
     try:
         _write_job(job, command)
-        environment = {**_environment(), "TMPDIR": str(_memory_folder(job)), **_preload(job)}
+        environment = _environment() | _preload(job)
+        environment |= {"TMPDIR": str(_memory_folder(job)), "HOME": str(job)}  # HOME: for ~/.uml
         boot = [
             kernel,
             f"mem={GUEST_MEMORY_MIB}M",
