@@ -31,6 +31,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode="rich" if sys.stdout.isatty() and sys.stderr.isatty() else None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -213,7 +214,7 @@ def _load(path: Path) -> Config:
     try:
         return load_config(path)
     except ConfigError as error:
-        typer.echo(f"fusiond: {error}", err=True)
+        typer.echo(error, err=True)
         raise typer.Exit(EXIT_CONFIG) from error
 
 

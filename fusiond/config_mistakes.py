@@ -48,7 +48,7 @@ def mistake(location: Location, value: object, what: str) -> str:
 def did_you_mean(given: object, allowed: Iterable[str]) -> str:
     """A list of what is allowed, led by the nearest to what was given."""
     known = sorted(allowed)
-    near = get_close_matches(str(given), known, n=1)
+    near = get_close_matches(str(given), known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"{hint}allowed: {', '.join(known)}"
 
@@ -105,7 +105,8 @@ def _described(annotation: Any) -> str:
         arms = [arm for arm in get_args(base) if arm is not NoneType]
         return " or ".join(dict.fromkeys(map(_described, arms)))
     if origin is Literal:
-        return "one of " + ", ".join(json.dumps(c) for c in get_args(base))
+        choices = [json.dumps(choice) for choice in get_args(base)]
+        return choices[0] if len(choices) == 1 else "one of " + ", ".join(choices)
     if origin in (tuple, list):
         args = get_args(base)
         if origin is list or args[-1] is Ellipsis:
@@ -130,7 +131,7 @@ _BOUNDS = ((Gt, "gt", "above"), (Ge, "ge", "at least"), (Lt, "lt", "below"), (Le
 
 def _range(constraints: list[Any]) -> str:
     words = [
-        f"{word} {getattr(c, name):g}"
+        f"{word} {getattr(c, name):.12g}"
         for kind, name, word in _BOUNDS
         for c in constraints
         if isinstance(c, kind)
