@@ -32,7 +32,7 @@ def test_a_failure_inside_is_a_failure_outside() -> None:
 
 def test_a_run_that_does_not_end_is_an_error() -> None:
     with pytest.raises(HarnessError, match="killed"):
-        run_with_vcan(["sleep", "1000"], 8.0, io.StringIO())
+        run_with_vcan(["sleep", "1000"], 3.0, io.StringIO())
 
 
 def test_a_guest_without_a_status_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
