@@ -1,0 +1,70 @@
+"""How the broker lets us in: password and TLS, from the environment and from files only."""
+
+from __future__ import annotations
+
+import os
+import ssl
+from collections.abc import Mapping
+from pathlib import Path
+
+from fusiond.config import Mqtt
+from fusiond.load_config import ConfigError
+
+PASSWORD_VARIABLE = "FUSIOND_MQTT_PASSWORD"
+
+
+def password(options: Mqtt, environ: Mapping[str, str] = os.environ) -> str | None:
+    """The broker's password: the environment's, else the file's first line, else none.
+
+    Raises `ConfigError` if the file cannot be read.
+    """
+    if PASSWORD_VARIABLE in environ:
+        return environ[PASSWORD_VARIABLE]
+    if options.password_file is None:
+        return None
+    try:
+        lines = options.password_file.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise _unusable("password_file", options.password_file, error) from error
+    if not lines or not lines[0]:
+        raise ConfigError(
+            f"mqtt.password_file = {str(options.password_file)!r}: empty: "
+            "write the password in its first line"
+        )
+    return lines[0]
+
+
+def readable_by_all(path: Path | None) -> bool:
+    """True if everyone on this machine can read the file."""
+    return path is not None and path.exists() and bool(path.stat().st_mode & 0o004)
+
+
+def tls_context(options: Mqtt) -> ssl.SSLContext | None:
+    """A context that verifies the broker and its name, None if TLS is off.
+
+    Raises `ConfigError` for files that cannot be used, or that are given while TLS is off.
+    """
+    given = [k for k in ("ca_file", "cert_file", "key_file") if getattr(options, k) is not None]
+    if not options.tls:
+        if given:
+            raise ConfigError(f"mqtt.{given[0]} is set but mqtt.tls is false: set mqtt.tls = true")
+        return None
+    if options.key_file is not None and options.cert_file is None:
+        raise ConfigError("mqtt.key_file is set without mqtt.cert_file: give both, or neither")
+    context = ssl.create_default_context()
+    if options.ca_file is not None:
+        try:
+            context.load_verify_locations(options.ca_file)
+        except OSError as error:
+            raise _unusable("ca_file", options.ca_file, error) from error
+    if options.cert_file is not None:
+        try:
+            # The empty password keeps OpenSSL from asking for one on the terminal.
+            context.load_cert_chain(options.cert_file, options.key_file, password="")
+        except OSError as error:
+            raise _unusable("cert_file", options.cert_file, error) from error
+    return context
+
+
+def _unusable(key: str, path: Path, error: Exception) -> ConfigError:
+    return ConfigError(f"mqtt.{key} = {str(path)!r}: {error}: give a file that can be read")

@@ -1,0 +1,322 @@
+"""MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
+
+`publish_*` put a message in its place and return: they never wait and never raise. One task sends
+the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
+the next); both belong to one connection and end with it. A broker that accepts bytes and does
+nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
+every quarter of `keepalive_s`, and has half of it to be confirmed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections import Counter, deque
+from collections.abc import Callable
+
+import aiomqtt
+
+from drivers.base import Backoff, DriverStatus
+from fusiond.config import Mqtt
+from fusiond.outputs import broker_access
+from fusiond.outputs.commands import (
+    COMMANDS,
+    BadCommandError,
+    CommandRefusedError,
+    Handler,
+    parse,
+)
+from fusiond.outputs.messages import (
+    EVENT,
+    HEALTH,
+    NAV,
+    REPLY,
+    STATUS,
+    EventMessage,
+    HealthMessage,
+    Message,
+    NavMessage,
+    ReplyMessage,
+    StatusMessage,
+    Topic,
+    base_topic,
+    stamp,
+)
+
+_PATIENCE_S = 1.0
+"""An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
+_FAREWELL_S = 2.0
+"""Longest a shutdown waits for the broker."""
+_INCOMING = 16
+"""Commands that may wait; aiomqtt discards more."""
+
+
+class MqttPublisher:
+    """Publishes a vehicle's topics and takes its commands.
+
+    `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
+    `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out a configured command; without it, or with
+    none configured, nothing is subscribed. `utc_now` (ns, None if unknown) dates the replies.
+
+    `counters`: `mqtt_published`; `mqtt_dropped` (replaced by a newer one, pushed out of the full
+    event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_commands`,
+    `mqtt_commands_refused`. `status` is for `health`.
+
+    Raises `ConfigError` for a password file or TLS files that cannot be used.
+    """
+
+    def __init__(
+        self,
+        options: Mqtt,
+        vehicle: str,
+        *,
+        on_event: Callable[[str, str], None],
+        on_command: Handler | None = None,
+        utc_now: Callable[[], int | None] = lambda: None,
+    ) -> None:
+        self._options = options
+        self._base = base_topic(vehicle)
+        # A stable name: when we come back before the broker has noticed the old connection's
+        # end, it closes that one, and its will is out before our new `online`.
+        self._client_id = options.client_id or f"fusiond-{vehicle}"
+        self._password = broker_access.password(options)
+        self._tls = broker_access.tls_context(options)
+        self._on_event = on_event
+        self._on_command = on_command
+        self._utc_now = utc_now
+        self._confirm_s = max(1.0, options.keepalive_s / 2)
+        self._heartbeat_s = options.keepalive_s / 4
+        self._latest: dict[Topic, Message] = {}
+        self._queue: deque[tuple[Topic, Message]] = deque(maxlen=options.queue)
+        self._status: StatusMessage | None = None
+        self._status_due = False
+        self._latest_ready = asyncio.Event()
+        self._confirmed_ready = asyncio.Event()
+        self._flowing = asyncio.Event()
+        self.counters: Counter[str] = Counter()
+        self.status = DriverStatus()
+
+    # ------------------------------------------------------------------ for the tick
+
+    def publish_nav(self, message: NavMessage) -> None:
+        self._replace(NAV, message)
+
+    def publish_health(self, message: HealthMessage) -> None:
+        self._replace(HEALTH, message)
+
+    def publish_status(self, message: StatusMessage) -> None:
+        self.counters["mqtt_dropped"] += self._status_due
+        self._status = message
+        self._status_due = True
+        self._confirmed_ready.set()
+
+    def publish_event(self, message: EventMessage) -> None:
+        self._enqueue(EVENT, message)
+
+    def _replace(self, topic: Topic, message: Message) -> None:
+        self.counters["mqtt_dropped"] += topic in self._latest
+        self._latest[topic] = message
+        self._latest_ready.set()
+
+    def _enqueue(self, topic: Topic, message: Message) -> None:
+        self.counters["mqtt_dropped"] += len(self._queue) == self._queue.maxlen
+        self._queue.append((topic, message))
+        self._confirmed_ready.set()
+
+    # ------------------------------------------------------------------ the connection
+
+    async def run(self) -> None:
+        """Keep a connection until cancelled; then say `offline` and disconnect."""
+        if broker_access.readable_by_all(self._options.password_file):
+            path = self._options.password_file
+            self._on_event("mqtt_password_exposed", f"{path} is readable by all: chmod 600 {path}")
+        backoff = Backoff()
+        connected_before = False
+        while True:
+            client = self._client()
+            try:
+                async with client:
+                    backoff.reset()
+                    self.counters["mqtt_reconnects"] += connected_before
+                    connected_before = True
+                    where = f"{self._options.host}:{self._options.port}"
+                    self.status = DriverStatus("running", where)
+                    self._on_event("mqtt_connected", where)
+                    reason = await self._serve(client)
+                self.status = DriverStatus("absent", reason)
+                self._on_event("mqtt_lost", reason)
+            except aiomqtt.MqttError as error:
+                if self.status.state != "absent":
+                    self._on_event("mqtt_absent", str(error))
+                self.status = DriverStatus("absent", str(error))
+            finally:
+                _hang_up(client)
+            await asyncio.sleep(backoff.next())
+
+    def _client(self) -> aiomqtt.Client:
+        options = self._options
+        return aiomqtt.Client(
+            options.host,
+            options.port,
+            username=options.username,
+            password=self._password,
+            identifier=self._client_id,
+            will=aiomqtt.Will(f"{self._base}/online", b"offline", qos=1, retain=True),
+            keepalive=options.keepalive_s,
+            timeout=self._confirm_s,
+            max_queued_incoming_messages=_INCOMING,
+            tls_context=self._tls,
+        )
+
+    async def _serve(self, client: aiomqtt.Client) -> str:
+        """Send and receive until the connection fails; the reason it did."""
+        self._flowing.set()
+        try:
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(self._receive(client))
+                    tasks.create_task(self._send_confirmed(client))
+                    tasks.create_task(self._send_latest(client))
+            except* aiomqtt.MqttError as group:
+                reason = str(group.exceptions[0])
+        except asyncio.CancelledError:
+            try:
+                await asyncio.wait_for(self._say_farewell(client), _FAREWELL_S)
+            except (aiomqtt.MqttError, TimeoutError):
+                await _abandon(client)
+            raise
+        await _abandon(client)
+        return reason
+
+    async def _say_farewell(self, client: aiomqtt.Client) -> None:
+        self._status_due = self._status is not None
+        await self._send_waiting(client)
+        await self._publish(client, "online", b"offline", qos=1, retain=True)
+
+    # ------------------------------------------------------------------ sending
+
+    async def _publish(
+        self, client: aiomqtt.Client, topic: str, payload: bytes, qos: int, retain: bool
+    ) -> None:
+        await client.publish(f"{self._base}/{topic}", payload, qos=qos, retain=retain)
+        self.counters["mqtt_published"] += 1
+
+    async def _send_latest(self, client: aiomqtt.Client) -> None:
+        while True:
+            await self._latest_ready.wait()
+            await self._flowing.wait()
+            self._latest_ready.clear()
+            while self._latest and self._flowing.is_set():
+                topic = next(iter(self._latest))
+                payload = _encoded(self._latest.pop(topic))
+                try:
+                    await self._publish(client, topic.name, payload, topic.qos, topic.retained)
+                except aiomqtt.MqttError:
+                    self.counters["mqtt_dropped"] += 1
+                    raise
+            if self._latest:
+                self._latest_ready.set()
+
+    async def _send_confirmed(self, client: aiomqtt.Client) -> None:
+        await self._confirm(client, "online", b"online", retain=True)
+        self._status_due = self._status is not None
+        while True:
+            await self._send_waiting(client)
+            self._confirmed_ready.clear()
+            try:
+                await asyncio.wait_for(self._confirmed_ready.wait(), self._heartbeat_s)
+            except TimeoutError:
+                if self._status is None:
+                    await self._confirm(client, "online", b"online", retain=True)
+                else:
+                    self._status_due = True
+
+    async def _send_waiting(self, client: aiomqtt.Client) -> None:
+        """Send the status if it is due and every queued message, which stays queued if it fails."""
+        while self._status_due or self._queue:
+            if self._status_due and self._status is not None:
+                message = self._status
+                self._status_due = False
+                await self._confirm(client, STATUS.name, _encoded(message), STATUS.retained)
+            if self._queue:
+                first = self._queue[0]
+                topic, queued = first
+                await self._confirm(client, topic.name, _encoded(queued), topic.retained)
+                if self._queue and self._queue[0] is first:
+                    self._queue.popleft()
+
+    async def _confirm(
+        self, client: aiomqtt.Client, topic: str, payload: bytes, retain: bool
+    ) -> None:
+        """Publish with QoS 1; the QoS 0 flow stops while the confirmation is overdue."""
+        loop = asyncio.get_running_loop()
+        overdue = loop.call_later(_PATIENCE_S, self._flowing.clear)
+        try:
+            await self._publish(client, topic, payload, qos=1, retain=retain)
+        finally:
+            overdue.cancel()
+        self._flowing.set()
+
+    # ------------------------------------------------------------------ commands
+
+    async def _receive(self, client: aiomqtt.Client) -> None:
+        """Answer commands; ends with `MqttError` when the connection does."""
+        prefix = f"{self._base}/cmd/"
+        if self._on_command is not None and self._options.commands:
+            await client.subscribe([(prefix + name, 1) for name in self._options.commands])
+        async for message in client.messages:
+            name = message.topic.value.removeprefix(prefix)
+            payload = message.payload
+            if name in COMMANDS and isinstance(payload, bytes) and self._on_command is not None:
+                self._enqueue(REPLY, self._answer(name, payload, message.retain, self._on_command))
+
+    def _answer(self, name: str, payload: bytes, retained: bool, handler: Handler) -> ReplyMessage:
+        request_id: str | None = None
+        ok = False
+        try:
+            command = parse(name, payload)
+            request_id = command.id
+            if retained:
+                # It would be carried out again at every connection.
+                raise CommandRefusedError("commands must not be retained")
+            text = handler(command)
+            ok = True
+        except BadCommandError as error:
+            request_id, text = error.id, str(error)
+        except CommandRefusedError as error:
+            text = str(error)
+        except Exception as error:  # a fault of ours must not cost the connection
+            text = f"failed: {error!r}"
+            self._on_event("mqtt_command_failed", f"{name}: {error!r}")
+        self.counters["mqtt_commands" if ok else "mqtt_commands_refused"] += 1
+        t_utc, t_ms = stamp(self._utc_now())
+        return ReplyMessage(t_utc=t_utc, t_ms=t_ms, id=request_id, command=name, ok=ok, text=text)
+
+
+def _encoded(message: Message) -> bytes:
+    return message.model_dump_json().encode()
+
+
+def _hang_up(client: aiomqtt.Client) -> None:
+    """Shut the socket without DISCONNECT: the broker then publishes the will.
+
+    aiomqtt offers only the graceful way, which a frozen broker never confirms; its reader sees
+    the end of file and closes the connection's remains. `_client` is paho's public client.
+    """
+    sock = client._client.socket()
+    if isinstance(sock, socket.socket):
+        with contextlib.suppress(OSError):
+            sock.shutdown(socket.SHUT_RDWR)
+
+
+async def _abandon(client: aiomqtt.Client) -> None:
+    """Hang up and wait until aiomqtt has noticed, so that leaving its context is immediate."""
+
+    async def ended() -> None:
+        async for _ in client.messages:
+            pass
+
+    _hang_up(client)
+    with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+        await asyncio.wait_for(ended(), _FAREWELL_S)
