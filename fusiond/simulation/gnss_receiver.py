@@ -146,8 +146,8 @@ class GnssReceiver:
         where = (*lat, *lon) if ok else ("", "", "", "")
         north, east, _ = fix.v_ned_m_s
         speed = math.hypot(north, east)
-        # Below 0.1 m/s the course is noise: receivers leave it empty.
-        course = f"{math.degrees(math.atan2(east, north)) % 360.0:.3f}" if speed > 0.1 else ""
+        # Printed at any speed: leaving it out below a limit would pick velocities by their error.
+        course = f"{math.degrees(math.atan2(east, north)) % 360.0:.3f}"
         mode = _MODE.get(o.quality, "A") if ok else "N"
         system = f"{_SYSTEM_ID[o.talker]:X}"
         match name:

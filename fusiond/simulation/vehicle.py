@@ -128,9 +128,8 @@ class SimulatedVehicle:
         self.truth = scenario.truth(duration_s)
         self.imu = scenario.imu_output(self.truth, imu_rng)
         self.gnss = GnssReceiver(self.truth, scenario.gnss, gnss_rng)
-        self.start_ns = time.monotonic_ns()
-        self.utc_start_ns = time.time_ns()
-        self.terminal = RdssTerminal(self.truth, scenario.rdss, rdss_rng, self.utc_start_ns)
+        self.terminal = RdssTerminal(self.truth, scenario.rdss, rdss_rng, 0)
+        self._start_clock()
         self.counters: Counter[str] = Counter()
         self._encoder = CanImu(can_imu)
         self._can = (can_imu.interface, can_imu.channel)
@@ -142,6 +141,13 @@ class SimulatedVehicle:
             self._lines["rdss"] = PtyLine(rdss_link)
         self._next_imu = 0
         self._next_gnss = 0
+
+    def _start_clock(self) -> None:
+        """Start at the next full tenth of a UTC second, where receivers have their epochs."""
+        utc_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        wait_ns = -utc_ns % 100_000_000
+        self.start_ns = monotonic_ns + wait_ns
+        self.utc_start_ns = self.terminal.utc_start_ns = utc_ns + wait_ns
 
     # ------------------------------------------------------------------ truth
 
@@ -176,8 +182,7 @@ class SimulatedVehicle:
         try:
             for device in get_args(Device):
                 self.plug(device)
-            self.start_ns = time.monotonic_ns()
-            self.utc_start_ns = self.terminal.utc_start_ns = time.time_ns()
+            self._start_clock()
             while (t_s := (time.monotonic_ns() - self.start_ns) * 1e-9) < self.truth.duration_s:
                 self._serve(t_s)
                 await asyncio.sleep(max(0.0, self._next_s(t_s) - self._now_s()))
