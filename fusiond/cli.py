@@ -23,8 +23,6 @@ EXIT_DATA = 65
 EXIT_IO = 74
 EXIT_CONFIG = 78
 AID_KINDS = ("gnss", "rdss", "attitude", "wheel", "nmea", "raw")
-_SHOWN_ROWS = 5
-"""Rejected rows named in a summary; the JSON counts them all."""
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
@@ -179,12 +177,14 @@ def compare(
     from fusiond.compare import NothingToCompareError  # noqa: PLC0415
     from fusiond.compare import compare as run_compare  # noqa: PLC0415
     from fusiond.compare_report import print_report  # noqa: PLC0415
+    from fusiond.csv_tables import file_report  # noqa: PLC0415
     from fusiond.files import read_solution, read_truth  # noqa: PLC0415
 
     with _data_errors():
         tables = read_solution(solution), read_truth(truth)
         for path, table in zip((solution, truth), tables, strict=True):
-            _print_rejected(str(path), [str(r) for r in table.rejected])
+            if table.rejected:
+                _print_file(str(path), file_report(len(table.t_s), table.rejected), err=True)
         try:
             report = run_compare(*tables, after_s=after)
         except NothingToCompareError as error:
@@ -285,21 +285,18 @@ def _write_json(value: object, path: str | None) -> None:
         Path(path).write_text(text + "\n", encoding="utf-8")
 
 
-def _print_rejected(name: str, rows: list[str]) -> None:
-    if rows:
-        typer.echo(f"{name}: {len(rows)} rows rejected", err=True)
-    for row in rows[:_SHOWN_ROWS]:
-        typer.echo(f"  {row}", err=True)
+def _print_file(name: str, report: dict[str, Any], err: bool) -> None:
+    """One file as `csv_tables.file_report` describes it."""
+    rejected = sum(report["rejected"].values())
+    typer.echo(f"{name}: {report['rows']} rows, {rejected} rejected", err=err)
+    for row in report["first_rejected"]:
+        typer.echo(f"  {row}", err=err)
 
 
 def _print_summary(result: dict[str, Any], err: bool) -> None:
-    """Files with their rows and the first rejected ones; sources with what became of their data."""
-    for name, file in result.get("files", {}).items():
-        typer.echo(
-            f"{name}: {file['rows']} rows, {sum(file['rejected'].values())} rejected", err=err
-        )
-        for row in file["first_rejected"][:_SHOWN_ROWS]:
-            typer.echo(f"  {row}", err=err)
-    for name, source in result.get("sources", {}).items():
-        outcomes = ", ".join(f"{count} {outcome}" for outcome, count in source.items())
-        typer.echo(f"{name}: {outcomes}", err=err)
+    """`files`: what was read; `sources`: each aid's measurements by outcome."""
+    for name, report in result["files"].items():
+        _print_file(name, report, err)
+    for name, outcomes in result["sources"].items():
+        counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
+        typer.echo(f"{name}: {counts or 'nothing'}", err=err)

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,15 @@ class RawTable:
 def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
     """How many rows were rejected for each reason."""
     return dict(Counter(r.reason for r in rejected))
+
+
+def file_report(rows: int, rejected: Sequence[Rejection], first: int = 5) -> dict[str, Any]:
+    """What a summary says of a file: rows used, rejected by reason, the first of them in words."""
+    return {
+        "rows": rows,
+        "rejected": counts(rejected),
+        "first_rejected": [str(rejection) for rejection in rejected[:first]],
+    }
 
 
 def read_table(

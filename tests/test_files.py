@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusiond.csv_tables import TableError, counts
+from fusiond.csv_tables import TableError, counts, file_report
 from fusiond.files import (
     read_attitude,
     read_gnss,
@@ -108,6 +108,10 @@ def test_a_reason_has_a_count_and_rejections_stand_in_file_order(tmp_path: Path)
     ]
     table = read_imu(write(tmp_path, IMU, *rows))
     assert [r.line for r in table.rejected] == [3, 4, 6, 7]
+    report = file_report(len(table.t_s), table.rejected, first=1)
+    assert report["rows"] == 2
+    assert report["rejected"] == counts(table.rejected)
+    assert report["first_rejected"] == ["line 3: time_repeated: t_s = 0.000000 after 0.000000"]
     assert counts(table.rejected) == {"time_repeated": 2, "out_of_range": 1, "unreadable": 1}
 
 
