@@ -142,6 +142,31 @@ def test_simulate_writes_what_the_readers_read(tmp_path: Path) -> None:
     assert fusiond("simulate", "boat", "--out", tmp_path).returncode == 2
 
 
+def test_process_names_what_it_rejected(tmp_path: Path) -> None:
+    assert fusiond("simulate", "static", "--out", tmp_path, "--duration", "20").returncode == 0
+    imu, gnss = tmp_path / "imu.csv", tmp_path / "gnss.csv"
+    lines = imu.read_text().splitlines()
+    lines[10] = lines[9]
+    lines[500] = lines[500].rpartition(",")[0] + ",nan"
+    imu.write_text("\n".join(lines) + "\n")
+    aid, out = f"gnss={gnss}", tmp_path / "solution.csv"
+    done = fusiond("process", "config/vehicle.toml", "--imu", imu, "--aid", aid, "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"imu: {len(lines) - 3} rows, 2 rejected" in done.stdout.splitlines()
+    assert "  line 11: time_repeated: " in done.stdout
+    assert "  line 501: not_finite: accel_z_m_s2 = nan" in done.stdout
+    assert out.read_text().startswith("t_s,lat_deg,")
+    piped = fusiond("process", "config/vehicle.toml", "--imu", imu, "--aid", aid, "--json", "-")
+    assert json.loads(piped.stdout)["files"]["imu"]["rejected"] == {
+        "time_repeated": 1,
+        "not_finite": 1,
+    }
+    assert "line 11" in piped.stderr
+    absent = fusiond("process", "config/vehicle.toml", "--imu", tmp_path / "none.csv")
+    assert (absent.returncode, absent.stdout) == (65, "")
+    assert "none.csv: No such file or directory" in absent.stderr
+
+
 def test_interrupt_exits_130(tmp_path: Path) -> None:
     fifo = tmp_path / "truth.csv"
     os.mkfifo(fifo)
