@@ -33,7 +33,7 @@ RING_FRAMES = 1024
 """Most frames a thread may hold for the loop: 1.7 s of an IMU of 600 frames/s."""
 CHECK_S = 1.0
 """How often the kernel is asked how many frames it dropped for want of room in the socket."""
-LONGEST_WAIT_S = 2.0
+LONGEST_WAIT_S = 1.0
 """Longest wait between attempts to open: trying costs three system calls, so try often."""
 
 Interface = Literal["socketcan", "virtual", "udp_multicast"]
@@ -253,7 +253,7 @@ class CanBus:
     def _read_socket(self, sock: socket.socket) -> CanFrame | None:
         """One frame off a raw CAN socket with its kernel stamp, None when there is none.
 
-        Three times cheaper than `bus.recv(0)`, and the stamp keeps its nanoseconds.
+        A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds.
         """
         try:
             raw, control, _, _ = sock.recvmsg(_CANFD_MTU, 64, socket.MSG_DONTWAIT)

@@ -43,6 +43,8 @@ FORCE_UNITS = {
     "g": STANDARD_GRAVITY_M_S2,
     "mg": STANDARD_GRAVITY_M_S2 * 1e-3,
 }
+MOST_RAD_S, MOST_M_S2 = 175.0, 10_000.0
+"""Beyond any inertial sensor: 10,000 deg/s and 1,000 g; only a damaged float says more."""
 TIME_UNITS = {"s": Fraction(1), "ms": Fraction(1, 1000), "us": Fraction(1, 10**6)} | {
     "µs": Fraction(1, 10**6),
     "ns": Fraction(1, 10**9),
@@ -99,8 +101,8 @@ class MessagePlan:
         """Decode one frame's data.
 
         RefusedFrameError: `wrong_length` (shorter than the DBC says; padding is accepted),
-        `undecodable`, `not_finite` (NaN or infinite float), `out_of_range` (outside the DBC's
-        minimum and maximum: devices say "not available" so, SAE J1939-71, parameter ranges).
+        `undecodable`, `not_finite` (NaN or infinite float), `out_of_range` (beyond any sensor, or
+        outside the DBC's minimum and maximum: SAE J1939-71 says "not available" so).
         """
         if len(data) < self.message.length:
             raise RefusedFrameError("wrong_length")
@@ -185,11 +187,13 @@ def plan_axis(
     """
     factor = float(_unit(units, signal, override, "gyro" if slot < 3 else "accel"))
     signed = -factor if negative else factor
-    low, high = -math.inf, math.inf
+    high = MOST_RAD_S if slot < 3 else MOST_M_S2
+    low = -high
     least, most = signal.minimum, signal.maximum
     if least is not None and most is not None and least < most:
         slack = 0.5 * abs(signal.scale)
-        low, high = sorted(((least - slack) * signed, (most + slack) * signed))
+        ends = sorted(((least - slack) * signed, (most + slack) * signed))
+        low, high = max(low, ends[0]), min(high, ends[1])
     return Axis(slot, signal.name, signal.scale * signed, signal.offset * signed, low, high)
 
 

@@ -2,12 +2,13 @@
 
 An IMU spreads a sample over several messages. Two frames belong together when
 
-* both carry the device's counter (or its time) and it is the same, or else
+* both carry the device's counter, or its time, and it is the same; or else
 * the second came less than half a sample interval after the first, and its message is still
   missing. A message that carries only counter or time (Xsens 0x005/0x006, SBG 0x120) joins so too
   and lends its stamp to the whole sample.
 
-The interval T is the median distance of one message's frames. Lost samples: with a counter of
+The interval T is the median distance of one message's frames, by the device's time where there is
+one, else by arrival. Lost samples: with a counter of
 modulus M that advanced by c, the n = c (mod M) nearest to dt/T, minus one; without, the excess of
 dt over T, rounded once a sample is on time again, so that jitter makes no losses.
 """
@@ -22,8 +23,8 @@ from statistics import median
 
 from drivers.can_dbc import MessagePlan, Part
 
-INTERVALS = 15
-"""Distances of frames the median is taken of: odd, and outlives seven lost or late frames."""
+INTERVALS = 31
+"""Distances of frames the median is taken of: outlives a burst of fifteen late frames."""
 INTERVALS_NEEDED = 4
 """Fewer say nothing about the interval; unstamped frames are not paired before (`unpaired`)."""
 OPEN_GROUPS = 4
@@ -108,6 +109,7 @@ class _Last:
 
     data: bytes = b""
     arrival_ns: int = 0
+    ticks: int | None = None
     seen: bool = False
 
 
@@ -136,9 +138,10 @@ class Pairing:
         self._plans = list(plans)
         self._constants = list(constants)
         self._counters = counters
-        stamped = [p for p in plans if p.axes and (p.counter or p.time)]
-        self._keyed = len(stamped) > 1
-        self._lead = next(i for i, plan in enumerate(plans) if plan.axes)
+        self._by_counter = sum(plan.counter is not None for plan in plans) > 1
+        self._by_time = not self._by_counter and sum(p.time is not None for p in plans) > 1
+        timed = [i for i, plan in enumerate(plans) if plan.time]
+        self._lead = timed[0] if timed else next(i for i, p in enumerate(plans) if p.axes)
         self._counter_modulus = next((p.counter.modulus for p in plans if p.counter), 0)
         time = next((p.time for p in plans if p.time), None)
         self.device_time = DeviceTime(time.modulus, time.tick_ns) if time else None
@@ -157,12 +160,13 @@ class Pairing:
     ) -> Group | None:
         """Take the part that message `index` contributes; the sample it completes, if any."""
         arrival_ns = t_seen_ns if realtime_ns is None else realtime_ns
-        key = self._key(index, part)
+        key = self._key(part)
         if self._is_duplicate(index, data, arrival_ns):
             self._counters["duplicates"] += 1
             return None
-        self._learn_interval(index, arrival_ns)
-        self._last[index] = _Last(data, arrival_ns, True)
+        if index == self._lead:
+            self._learn_interval(index, part.ticks, arrival_ns)
+        self._last[index] = _Last(data, arrival_ns, part.ticks, True)
         group = self._group(index, key, arrival_ns)
         if group is None:
             missing = set(range(len(self._plans)))
@@ -183,11 +187,11 @@ class Pairing:
 
     # ----------------------------------------------------------------- which group
 
-    def _key(self, index: int, part: Part) -> int | None:
-        """The stamp to pair by, where several axis messages carry one each."""
-        if not self._keyed or not self._plans[index].axes:
-            return None
-        return part.counter if part.counter is not None else part.ticks
+    def _key(self, part: Part) -> int | None:
+        """The stamp to pair by, where several messages carry one each."""
+        if self._by_counter:
+            return part.counter
+        return part.ticks if self._by_time else None
 
     def _is_duplicate(self, index: int, data: bytes, arrival_ns: int) -> bool:
         """The same content again: with the same stamp inside, or too early to be a new sample."""
@@ -199,10 +203,13 @@ class Pairing:
         interval_ns = self.interval_ns
         return interval_ns is not None and abs(arrival_ns - last.arrival_ns) < interval_ns / 2
 
-    def _learn_interval(self, index: int, arrival_ns: int) -> None:
-        last = self._last[index]
-        if index == self._lead and last.seen and arrival_ns > last.arrival_ns:
-            self._intervals_ns.append(arrival_ns - last.arrival_ns)
+    def _learn_interval(self, index: int, ticks: int | None, arrival_ns: int) -> None:
+        last, time = self._last[index], self._plans[index].time
+        distance_ns = arrival_ns - last.arrival_ns
+        if time is not None and ticks is not None and last.ticks is not None:
+            distance_ns = int((ticks - last.ticks) % time.modulus * time.tick_ns)
+        if last.seen and distance_ns > 0:
+            self._intervals_ns.append(distance_ns)
             if len(self._intervals_ns) >= INTERVALS_NEEDED:
                 self.interval_ns = int(median(self._intervals_ns))
 

@@ -144,19 +144,19 @@ class CanImuDecoder:
             filters.append({"can_id": frame_id, "can_mask": mask, "extended": extended})
         return filters
 
-    def missing(self) -> list[str]:
-        """Mapped messages not received since the last `reset`, such as "0x121 ACC"."""
+    def take_missing(self) -> list[str]:
+        """Mapped messages not received since this was asked last, such as "0x121 IMU_ACCEL"."""
+        seen, self._seen = self._seen, set()
         return [
             f"0x{plan.message.frame_id:X} {plan.message.name}"
             for index, plan in enumerate(self.plans)
-            if index not in self._seen
+            if index not in seen
         ]
 
     def reset(self) -> None:
         """After a pause: start pairing afresh, take the first J1939 address that answers."""
         self._pairing.reset()
         self._address = self._options.source_address
-        self._seen.clear()
 
     def feed(
         self,
@@ -313,7 +313,7 @@ class CanImuDriver:
         self._up = up
         self._sample_ns = self._now_ns()
         if up:
-            self.status.state, self.status.detail = "silent", self._wanted()
+            self.status.state, self.status.detail = "silent", "open, nothing heard yet"
             if self._was_down:
                 self._event("interface_up", f"{self.options.channel} is back")
             return
@@ -333,14 +333,14 @@ class CanImuDriver:
         """Say `silent` when samples stop."""
         while True:
             await asyncio.sleep(self.options.timeout_s / 2)
+            missing = self._decoder.take_missing()
             quiet_s = (self._now_ns() - self._sample_ns) * 1e-9
             if self._up and quiet_s >= self.options.timeout_s:
                 if self._bus.controller != "bus_off":
-                    self.status.state, self.status.detail = "silent", self._wanted()
+                    self.status.state, self.status.detail = "silent", self._explain(missing)
                 self._decoder.reset()
 
-    def _wanted(self) -> str:
-        missing = self._decoder.missing()
+    def _explain(self, missing: list[str]) -> str:
         if not missing:
             return "frames arrive but make no samples: see the counters"
         detail = f"nothing heard of {', '.join(missing)}"
