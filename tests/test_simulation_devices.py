@@ -16,6 +16,7 @@ from drivers.can_signals import CanImuDecoder, CanImuOptions
 from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix, UtcStamp
 from drivers.nmea_decoder import NmeaDecoder
 from drivers.rdss import binary_4_0, text_2_1
+from drivers.rdss.cycle import FixReady, Send, TerminalOptions
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -38,6 +39,7 @@ from drivers.rdss.messages import (
     Unknown,
     VersionRequest,
 )
+from drivers.rdss.terminal import Terminal
 from fusiond.simulation.can_imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss_receiver import GnssOptions, GnssReceiver, latitude, longitude
 from fusiond.simulation.imu_truth import Truth
@@ -367,6 +369,42 @@ def test_errors_have_the_class_and_the_correlation(truth: Truth, correlation_s: 
         assert steps == pytest.approx(100.0 * math.sqrt(2.0 / 600.0), rel=0.2)
     else:
         assert north.std() == pytest.approx(100.0, rel=0.15)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_request_cycle_of_the_driver_is_satisfied(truth: Truth, family: Family) -> None:
+    """The driver's state machine against the terminal for 280 s, on a clock of our own."""
+    host = Host(truth, family, service_frequency_s=9, drop_probability=0.1)
+    cycle = Terminal(TerminalOptions(families=(family,), suppression_hold_s=40.0))
+    decoder = binary_4_0.Decoder() if family == "4.0" else text_2_1.Decoder()
+    actions = list(cycle.opened(0))
+    fixes: list[FixReady] = []
+    now_ns = 0
+    while now_ns < 280_000_000_000:
+        for action in actions:
+            if isinstance(action, Send):
+                host.terminal.receive(action.data, now_ns * 1e-9)
+            elif isinstance(action, FixReady):
+                fixes.append(action)
+        deadline = cycle.next_deadline_ns
+        assert deadline is not None
+        said_ns = min(host.terminal.next_s * 1e9, 1e12)
+        now_ns = max(now_ns, round(min(deadline, said_ns)) + 1)
+        actions = []
+        for message in decoder.feed(host.terminal.take(now_ns * 1e-9)):
+            actions += cycle.received(message, now_ns, family)
+        actions += cycle.tick(now_ns)
+        host.terminal.suppressed = 100e9 < now_ns < 130e9
+    counters = host.terminal.counters
+    assert counters["dropped"] > 0
+    assert counters["refused_frequency"] == 0
+    assert counters["refused_suppressed"] == 1
+    assert len(fixes) == counters["fixes"] >= 15
+    for fix in fixes:
+        # The fix is for the burst, 50 ms after the request was written.
+        start_s = 23 * 3600 + 59 * 60 + 30.123
+        age = (fix.time_of_day_s - start_s - fix.requested_ns * 1e-9) % 86400
+        assert abs(age - 0.05) <= 0.012 + fix.uncertainty_s
 
 
 def test_delays_fill_the_configured_range(truth: Truth) -> None:

@@ -15,7 +15,7 @@ from fusiond.files import read_gnss, read_imu, read_rdss, read_truth
 from fusiond.simulation.files import simulate
 from fusiond.simulation.gnss_receiver import GnssOptions
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
-from fusiond.simulation.sensor_errors import Vibration, body_to_sensor, gauss_markov, imu_output
+from fusiond.simulation.sensor_errors import Vibration, gauss_markov, imu_output
 from fusiond.simulation.trajectories import static
 
 Array = NDArray[np.float64]
@@ -64,18 +64,22 @@ def test_gauss_markov_has_its_sigma_and_correlation() -> None:
     assert lagged == pytest.approx(math.exp(-1.0), abs=0.02)
 
 
-def test_initial_bias_is_the_turn_on_bias_and_decays_to_the_instability() -> None:
-    x = gauss_markov(
-        np.random.default_rng(3),
-        (3000, 2000),
-        step_s=1.0,
-        correlation_s=300.0,
-        sigma=1.0,
-        initial_sigma=30.0,
+def test_bias_is_a_turn_on_constant_and_a_markov_part() -> None:
+    imu = QUIET.model_copy(
+        update={
+            "rate_hz": 1.0,
+            "gyro_bias_initial_deg_h": 360.0,
+            "gyro_bias_instability_deg_h": 10.0,
+            "bias_correlation_s": 100.0,
+        }
     )
-    assert x[0].std() == pytest.approx(30.0, rel=0.06)
-    assert x[300].std() == pytest.approx(math.hypot(30.0 / math.e, 0.93), rel=0.06)
-    assert x[-1].std() == pytest.approx(1.0, rel=0.06)
+    zero = np.zeros((1000, 3))
+    runs = [imu_output(imu, zero, zero, np.random.default_rng(s)).gyro_bias for s in range(300)]
+    deg_h = np.degrees(np.stack(runs)) * 3600.0
+    for row in (0, 500, 999):
+        assert deg_h[:, row].std() == pytest.approx(math.hypot(360.0, 10.0), rel=0.08)
+    change = deg_h[:, 500] - deg_h[:, 400]
+    assert change.std() == pytest.approx(10.0 * math.sqrt(2.0 * (1.0 - math.exp(-1.0))), rel=0.08)
 
 
 def test_turn_on_bias_and_scale_are_in_data_sheet_units() -> None:
@@ -101,7 +105,8 @@ def test_mounting_of_the_real_drive() -> None:
     np.testing.assert_allclose(output.accel, [[-1.0, 0.0, 0.0]], atol=1e-9)
     np.testing.assert_allclose(output.gyro, [[0.0, 0.0, -1.0]], atol=1e-9)
     turned = QUIET.model_copy(update={"mounting_deg": (0.0, 0.0, 90.0)})
-    np.testing.assert_allclose(body_to_sensor(turned) @ [1, 0, 0], [0, -1, 0], atol=1e-12)
+    output = imu_output(turned, down, forward, np.random.default_rng(0))
+    np.testing.assert_allclose(output.accel, [[0.0, -1.0, 0.0]], atol=1e-9)
 
 
 def test_vibration_and_resolution() -> None:

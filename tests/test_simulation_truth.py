@@ -106,7 +106,7 @@ def _closing_error(path: Path, seconds: float) -> tuple[float, float, float]:
     ],
 )
 def test_integrated_truth_returns_to_the_trajectory(path: Path, seconds: float) -> None:
-    """Measured: 0.2 um (drive) and 0.4 um (flight) after 600 s at 200 Hz."""
+    """Measured: 0.3 um (drive) and 0.2 nm (flight) after 600 s at 200 Hz."""
     position, velocity, attitude = _closing_error(path, seconds)
     print(f"after {seconds} s: {position:.2e} m, {velocity:.2e} m/s, {attitude:.2e} rad")
     assert position < 1e-5
