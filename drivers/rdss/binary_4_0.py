@@ -58,7 +58,7 @@ from drivers.rdss.messages import (
     check_range,
 )
 
-__all__ = ["Decoder", "checksum", "encode", "frame"]
+__all__ = ["LENGTHS", "MAX_USER", "Decoder", "checksum", "encode", "frame"]
 
 # --------------------------------------------------------------------------- numbers
 

@@ -72,6 +72,7 @@ from drivers.rdss.messages import (
     TimeRequest,
     Unknown,
 )
+from drivers.rdss.permit import TransmitPermit
 
 _ENCODE: dict[Family, Callable[[Message], bytes]] = {
     "4.0": binary_4_0.encode,
@@ -95,7 +96,7 @@ class Terminal:
     `timeout_feedback`, `timeout_fix`; one for each refusal: `refused`, `refused_other`,
     `refused_frequency`, `no_beam`, `not_sent`, `encryption_error`, `crc_error`, `no_permission`,
     `low_battery`, `suppressed`, `silence`, `no_card`; `feedback_unmatched`, `bad_fraction`,
-    `beams_unknown`, `probes`, `echo`.
+    `beams_unknown`, `probes`, `echo`, `before_identity`.
     """
 
     def __init__(self, options: TerminalOptions, counters: Counter[str] | None = None) -> None:
@@ -128,12 +129,7 @@ class Terminal:
         self._refused: Counter[Outcome] = Counter()
         self._hold_why, self._hold_until_ns = "", 0
         self._hint: tuple[float, float, int] | None = None
-        # transmission forbidden
-        self._suppressed_until_ns: int | None = None
-        self._silent = False
-        self._inbound: int | None = None
-        self._inbound_free: int | None = None
-        self._inbound_changed = False
+        self._permit = TransmitPermit(options.suppression_hold_s)
 
     # ------------------------------------------------------------------ inputs
 
@@ -160,7 +156,8 @@ class Terminal:
             self.counters["echo"] += 1
             return actions
         if self.state is State.PROBING and not isinstance(message, Identity):
-            return actions  # who speaks is not known yet
+            self.counters["before_identity"] += 1
+            return actions
         self._heard_ns = t_ns
         match message:
             case Identity():
@@ -264,7 +261,7 @@ class Terminal:
                 wait = self._seconds_to(self._hold_until_ns)
                 return f"{self._hold_why}: next attempt in {wait} s"
             case State.SUPPRESSED:
-                wait = self._seconds_to(self._suppressed_until_ns or 0)
+                wait = self._seconds_to(self._permit.suppressed_until_ns or 0)
                 return f"suppressed by the system: not transmitting, for {wait} s unless lifted"
             case State.SILENT:
                 return "radio silence is set on the terminal: not transmitting until it is lifted"
@@ -299,9 +296,9 @@ class Terminal:
 
     def _proceed(self, t_ns: int) -> None:
         """Card known, nothing in flight: on to the next request, or to why there is none."""
-        if self._silent:
+        if self._permit.silent:
             self._enter(State.SILENT, t_ns)
-        elif self._suppressed_until_ns is not None:
+        elif not self._permit.granted:
             self._enter(State.SUPPRESSED, t_ns)
         else:
             self._beam_reads = 0
@@ -394,7 +391,7 @@ class Terminal:
         until = self._blocked_until_ns()
         if until is not None and t_ns >= until:
             if self.state is State.SUPPRESSED:
-                self._suppressed_until_ns = None
+                self._permit.grant()
                 actions.append(Notice("rdss_hold_over", "suppression never lifted: trying again"))
             self._proceed(t_ns)
             return
@@ -407,7 +404,7 @@ class Terminal:
             case State.HOLDING:
                 return self._hold_until_ns
             case State.SUPPRESSED:
-                return self._suppressed_until_ns
+                return self._permit.suppressed_until_ns
             case _:
                 return None
 
@@ -461,18 +458,12 @@ class Terminal:
             return
         changed = before is not None and before.user != card.user
         if changed:
-            self._suppressed_until_ns, self._silent, self._answerable = None, False, False
+            self._permit.grant()
+            self._answerable = False
             self._refused.clear()
         self.identity = card
-        if (
-            before is None
-            or (before.user, before.service_frequency_s)
-            != (
-                card.user,
-                card.service_frequency_s,
-            )
-            or self.state is State.NO_CARD
-        ):
+        arrived = probing or changed or self.state is State.NO_CARD
+        if arrived or (before and before.service_frequency_s != card.service_frequency_s):
             actions.append(
                 Notice(
                     "rdss_card",
@@ -480,9 +471,8 @@ class Terminal:
                     f"service frequency {card.service_frequency_s} s",
                 )
             )
-        if changed:
+        if arrived:
             self._abandon()
-        if probing or changed or self.state is State.NO_CARD:
             self._next_poll_ns = t_ns
             self._proceed(t_ns)
 
@@ -517,18 +507,12 @@ class Terminal:
             self._faults = test.faults
             actions.append(Notice("rdss_self_test", f"faults: {', '.join(test.faults) or 'none'}"))
         self._on_levels(test.levels, t_ns, actions)
-        self._inbound = test.inbound_state
-        if self.state in (State.SUPPRESSED, State.SILENT) and self._inbound_free is not None:
-            # The bits of the inbound state differ by vendor, but back to the value it had while
-            # requests were accepted, after another one, means the same everywhere.
-            if test.inbound_state != self._inbound_free:
-                self._inbound_changed = True
-            elif self._inbound_changed:
-                self._lift(t_ns, actions)
+        if self._permit.lifted_by_self_test(test.inbound_state):
+            self._lift(t_ns, actions)
 
     def _on_feedback(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> None:
         outcome = feedback.outcome
-        if self._lifts(feedback, t_ns):
+        if self._permit.lifted_by_feedback(feedback, t_ns, self._last_ns):
             self._lift(t_ns, actions)
         elif outcome in ALWAYS:
             self._on_state_of_terminal(outcome, t_ns, actions)
@@ -540,7 +524,7 @@ class Terminal:
         elif outcome is Outcome.OK:
             self.counters["accepted"] += 1
             self._refused.clear()
-            self._inbound_free = self._inbound
+            self._permit.accepted()
             if self._last_ns is not None:
                 self._enter(State.AWAIT_FIX, self._last_ns + GIVE_UP_NS)
         else:
@@ -578,12 +562,13 @@ class Terminal:
 
     def _on_state_of_terminal(self, outcome: Outcome, t_ns: int, actions: list[Action]) -> None:
         self._forget_refused()
+        self._abandon()
         if outcome is Outcome.NO_CARD:
             self._on_no_card(t_ns, actions)
             return
         if outcome is Outcome.LOW_BATTERY:
             self.counters["low_battery"] += 1
-            if self.state not in (State.SUPPRESSED, State.SILENT):
+            if self.state not in (State.SUPPRESSED, State.SILENT, State.NO_CARD):
                 if self.state is not State.HOLDING:
                     actions.append(
                         Notice("rdss_low_battery", "battery low: transmission inhibited")
@@ -592,35 +577,17 @@ class Terminal:
             return
         if outcome is Outcome.SUPPRESSED:
             self.counters["suppressed"] += 1
-            if self._suppressed_until_ns is None:
+            if self._permit.suppress(t_ns):
                 actions.append(Notice("rdss_suppressed", "the system suppresses this user"))
-            self._suppressed_until_ns = t_ns + int(self._options.suppression_hold_s * SECOND)
         else:
             self.counters["silence"] += 1
-            if not self._silent:
+            if self._permit.silence():
                 actions.append(Notice("rdss_silence", "radio silence is set on the terminal"))
-            self._silent = True
-        self._inbound_changed = False
         if self.state is not State.NO_CARD:
             self._proceed(t_ns)
 
-    def _lifts(self, feedback: Feedback, t_ns: int) -> bool:
-        """Does this feedback say that transmission is allowed again?
-
-        Flag 8 while suppressed is read as "lifted" (one vendor); if it means radio silence, the
-        terminal refuses the next request with it and we fall silent. The feedback of a request
-        written just before the suppression does not count.
-        """
-        if not self._silent and self._suppressed_until_ns is None:
-            return False
-        if self._last_ns is not None and t_ns - self._last_ns <= FEEDBACK_NS:
-            return False
-        if feedback.outcome is Outcome.SILENCE_OR_LIFTED:
-            return not self._silent
-        return feedback.inhibited is False
-
     def _lift(self, t_ns: int, actions: list[Action]) -> None:
-        self._silent, self._suppressed_until_ns = False, None
+        self._permit.grant()
         actions.append(Notice("rdss_lifted", "the terminal may transmit again"))
         if self.state in (State.SUPPRESSED, State.SILENT):
             self._proceed(t_ns)
