@@ -91,6 +91,8 @@ class GnssAiding(Aiding):
     velocity_sd_m_s: PositiveFloat = 0.1
     min_position_sd_m: PositiveFloat = 0.02
     min_velocity_sd_m_s: PositiveFloat = 0.02
+    velocity_delay_s: NonNegativeFloat = 0.0
+    """Age of the velocity at the fix's instant: half an epoch where the receiver averages over one."""
     time_sd_s: NonNegativeFloat = 0.0
     """Timing error of the fix against the IMU; times the speed it adds to sigma."""
 

@@ -1,0 +1,160 @@
+"""The door of the navigator: a driver's measurement becomes aids, or is refused by name.
+
+Here the configuration meets the measurement: lever arm, sigma where the device states none, floors and
+gates. Behind it everything is in SI units with a settled instant.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TypeVar
+
+from drivers.measurements import (
+    Attitude,
+    DelayedFix,
+    Heading,
+    Height,
+    Measurement,
+    PositionFix,
+    WheelSpeed,
+)
+from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.aiding.base import Linearised
+from fusiond.aiding.body_velocity import WheelSpeedAid
+from fusiond.aiding.height import HeightAid
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.config import (
+    Aiding,
+    AnyAiding,
+    AttitudeAiding,
+    GnssAiding,
+    HeadingAiding,
+    HeightAiding,
+    RdssAiding,
+    WheelAiding,
+)
+from fusiond.settings import DEG
+
+S = TypeVar("S", bound=Aiding)
+
+# Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
+ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
+# RTK divides the ranging error by far more than code does; these factors scale the DOP rule only when
+# the receiver sends no GST (typical: 0.5 m differential, 0.3 m float, 0.02 m fixed for 3 m code).
+RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
+# A receiver's own velocity has no meaning below this sigma; none states less in practice.
+VERTICAL_VELOCITY_FACTOR = 1.5
+
+
+class Intake:
+    """Holds `aiding` by source name; a source without a section takes its kind's defaults."""
+
+    def __init__(self, aiding: dict[str, AnyAiding]) -> None:
+        self._aiding = aiding
+
+    def aids(self, m: Measurement, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+        """The aids that `m`, valid at `t_ns`, stands for, or the name of the refusal."""
+        match m:
+            case PositionFix():
+                return self._gnss(m, t_ns, sd_time_s)
+            case DelayedFix():
+                return self._rdss(m, t_ns, sd_time_s)
+            case Attitude():
+                o = self._section(m.source, AttitudeAiding)
+                sd = tuple(s * o.sigma_scale for s in m.sd_rpy_rad)
+                if not all(s > 0.0 or math.isnan(a) for s, a in zip(sd, m.rpy_rad, strict=True)):
+                    return "no_sigma"
+                return [AttitudeAid(m.source, t_ns, o.gate_probability, m.rpy_rad, sd)]  # type: ignore[arg-type]
+            case Heading():
+                h = self._section(m.source, HeadingAiding)
+                sd_rad = (m.sd_rad or h.sd_deg * DEG) * h.sigma_scale
+                return [HeadingAid(m.source, t_ns, h.gate_probability, m.yaw_rad, sd_rad)]
+            case Height():
+                e = self._section(m.source, HeightAiding)
+                sd_m = (m.sd_m or e.sd_m) * e.sigma_scale
+                return [HeightAid(m.source, t_ns, e.gate_probability, m.height_m, sd_m)]
+            case WheelSpeed():
+                w = self._section(m.source, WheelAiding)
+                sd_v = (m.sd_m_s or w.sd_m_s) * w.sigma_scale
+                return [
+                    WheelSpeedAid(
+                        m.source, t_ns, w.gate_probability, m.speed_m_s, sd_v, w.lever_arm_m
+                    )
+                ]
+            case _:
+                return "not_an_aid"
+
+    def _section(self, source: str, kind: type[S]) -> S:
+        section = self._aiding.get(source)
+        return section if isinstance(section, kind) else kind()
+
+    def _gnss(self, m: PositionFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+        o = self._section(m.source, GnssAiding)
+        if not (math.isfinite(m.lat_rad) and math.isfinite(m.lon_rad)):
+            return "not_finite"
+        if m.sd_ned_m is not None:
+            sd = m.sd_ned_m
+        else:
+            error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
+            horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
+            sd = (horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP))
+        if not all(s > 0.0 for s in sd):
+            return "no_sigma"
+        n, e, d = (max(s * o.sigma_scale, o.min_position_sd_m) for s in sd)
+        sd_time = math.hypot(sd_time_s, o.time_sd_s)
+        aids: list[Linearised] = [
+            PositionAid(
+                m.source,
+                t_ns,
+                o.gate_probability,
+                m.lat_rad,
+                m.lon_rad,
+                m.height_m,
+                (n, e, d),
+                o.lever_arm_m,
+                sd_time,
+            )
+        ]
+        if o.use_velocity and m.v_ned_m_s is not None:
+            v = tuple(c for c in m.v_ned_m_s if c is not None)
+            stated = m.sd_v_ned_m_s or (None, None, None)
+            typical = (o.velocity_sd_m_s, o.velocity_sd_m_s)
+            typical += (o.velocity_sd_m_s * VERTICAL_VELOCITY_FACTOR,)
+            sd_v = tuple(
+                max((s or t) * o.sigma_scale, o.min_velocity_sd_m_s)
+                for s, t in zip(stated, typical, strict=True)
+            )[: len(v)]
+            if all(math.isfinite(c) for c in v):
+                aids.append(
+                    VelocityAid(
+                        f"{m.source}_velocity",
+                        t_ns - round(o.velocity_delay_s * 1e9),
+                        o.gate_probability,
+                        v,
+                        sd_v,
+                        o.lever_arm_m,
+                    )
+                )
+        return aids
+
+    def _rdss(self, m: DelayedFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+        o = self._section(m.source, RdssAiding)
+        if m.multi_value:
+            return "multi_value"
+        if not m.precision_class_m > 0.0:
+            return "no_sigma"
+        sd = m.precision_class_m * o.sigma_scale
+        return [
+            PositionAid(
+                m.source,
+                t_ns,
+                o.gate_probability,
+                m.lat_rad,
+                m.lon_rad,
+                None,
+                (sd, sd, sd),
+                o.lever_arm_m,
+                sd_time_s,
+            )
+        ]

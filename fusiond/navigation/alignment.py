@@ -1,0 +1,91 @@
+r"""Alignment: attitude from gravity, from the Earth's rate, and from motion.
+
+At rest the specific force is -g along down and the rate is the Earth's:
+
+    roll = atan2(-f_y, -f_z)      pitch = atan2(f_x, sqrt(f_y^2 + f_z^2))
+    yaw:  C w = [W cos(lat), 0, -W sin(lat)]
+
+What the sensors get wrong becomes attitude error, fully correlated with it:
+
+    phi_N = (C a)_E / g     phi_E = -(C a)_N / g     phi_D = ((C e)_E + phi_N w_D) / w_N   (gyrocompass)
+
+Source: Groves, 2nd ed., section 5.6; Titterton and Weston, 2nd ed., section 10.3; signs by the error
+model (fusiond.navigation.error_model), checked in the tests.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
+from fusiond.navigation.rotation import dcm_from_rpy, quaternion_to_dcm, rotate_quaternion
+
+Array = NDArray[np.float64]
+
+
+def level(mean_force: Array) -> tuple[float, float]:
+    """Roll and pitch (rad) from the mean specific force (3,) of a body at rest."""
+    x, y, z = (float(v) for v in mean_force)
+    return math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))
+
+
+def gyrocompass(mean_rate: Array, roll: float, pitch: float) -> float:
+    """Yaw (rad) of a body at rest from its mean rate (3,) and its level."""
+    levelled = dcm_from_rpy(roll, pitch, 0.0) @ mean_rate
+    return math.atan2(-float(levelled[1]), float(levelled[0]))
+
+
+def gyrocompass_sd(lat: float, rate_bias: float, rate_noise: float, seconds: float) -> float:
+    """One sigma of gyrocompassed heading (rad): east rate error over the Earth's north rate."""
+    north_rate = EARTH_RATE_RAD_S * math.cos(lat)
+    return math.hypot(rate_bias, rate_noise / math.sqrt(seconds)) / north_rate
+
+
+def levelling_jacobian(dcm: Array, lat: float, height: float) -> Array:
+    """d phi / d(force error) (3, 3) of an attitude that was levelled at C_nb = `dcm`."""
+    g = gravity(lat, height)
+    return np.vstack([dcm[1] / g, -dcm[0] / g, np.zeros(3)])
+
+
+def level_in_motion(mean_force: Array, acceleration: Array, yaw: float, g: float) -> tuple[float, float]:
+    """Roll and pitch (rad) from mean force (3,) and known acceleration (3,) NED at a known yaw.
+
+    Solves R_x(roll) f = R_y(pitch)^T R_z(yaw)^T (a - g e_D).
+    """
+    n, e, d = acceleration[0], acceleration[1], acceleration[2] - g
+    x, y = math.cos(yaw) * n + math.sin(yaw) * e, -math.sin(yaw) * n + math.cos(yaw) * e
+    f_x, f_y, f_z = (float(v) for v in mean_force)
+    size = math.hypot(f_y, f_z)
+    # cos(roll) f_y - sin(roll) f_z = y, on the branch where gravity still points down.
+    roll = math.asin(max(-1.0, min(1.0, y / size))) + math.atan2(-f_y, -f_z)
+    down = math.sin(roll) * f_y + math.cos(roll) * f_z
+    pitch = math.atan2(d, x) - math.atan2(down, f_x)
+    return roll, (-pitch + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@compiled("void(i8[::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1])")
+def integrate_from_rest(
+    times: NDArray[np.int64], samples: Array, bias: Array, q: Array, g: float, velocity: Array
+) -> None:
+    """Turn `q` (4,) in place through samples (m, 6) and add the velocity gained to `velocity` (3,).
+
+    Over tens of seconds from rest: Earth rate, transport and Coriolis are left out. `times` (m + 1,) in
+    ns holds the start before the first sample. Velocity in the axes that `q` refers to.
+    """
+    dcm = np.empty((3, 3))
+    for i in range(samples.shape[0]):
+        h = (times[i + 1] - times[i]) * 1e-9
+        x = 0.5 * h * (samples[i, 0] - bias[0])
+        y = 0.5 * h * (samples[i, 1] - bias[1])
+        z = 0.5 * h * (samples[i, 2] - bias[2])
+        rotate_quaternion(q, x, y, z, False)
+        quaternion_to_dcm(q, dcm)
+        for r in range(3):
+            for j in range(3):
+                velocity[r] += h * dcm[r, j] * samples[i, 3 + j]
+        velocity[2] += g * h
+        rotate_quaternion(q, x, y, z, False)

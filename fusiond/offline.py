@@ -1,0 +1,313 @@
+"""`fusiond process`: the daemon's navigator over recorded files, causal, one solution an IMU sample.
+
+Rows are handed over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the solution at
+each sample is what the daemon would have said then, before anything that arrived later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.measurements import (
+    Attitude,
+    DelayedFix,
+    Measurement,
+    MonotonicStamp,
+    PositionFix,
+    UtcStamp,
+    WheelSpeed,
+)
+from drivers.nmea_decoder import NmeaDecoder
+from fusiond.config import Config
+from fusiond.csv_tables import Rejection, TableError, counts
+from fusiond.files import ImuTable, read_attitude, read_gnss, read_imu, read_rdss, read_wheel
+from fusiond.gps_time import utc_ns_to_gps_week_seconds
+from fusiond.navigator import Navigator
+from fusiond.solution_csv import STATUS, SolutionWriter
+
+Array = NDArray[np.float64]
+
+SECONDS_OF_WEEK = 604800.0
+# Samples handed over at once where no aid arrives in between: the solution's mode is judged at this
+# spacing, and memory stays bounded.
+CHUNK = 512
+_SHOWN = 20
+
+
+class _Arrival(NamedTuple):
+    t_arrival_ns: int
+    measurement: Measurement
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * 1e9)
+
+
+def process(
+    config: Config,
+    imu_path: Path,
+    aids: list[tuple[str, Path]],
+    outages: list[tuple[float, float]] | None = None,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
+
+    Raises `TableError` for a file that cannot be read as what it is said to be.
+    """
+    imu = read_imu(imu_path)
+    files: dict[str, Any] = {"imu": _account(len(imu.t_s), imu.rejected)}
+    arrivals: list[_Arrival] = []
+    withheld: dict[str, int] = {}
+    for kind, path in aids:
+        rows, rejected = _READERS[kind](path, imu)
+        files[kind] = _account(len(rows) + len(rejected), rejected)
+        kept = [row for row in rows if not _withheld(row.measurement, outages or [])]
+        withheld[kind] = withheld.get(kind, 0) + len(rows) - len(kept)
+        arrivals += kept
+    arrivals.sort(key=lambda a: a.t_arrival_ns)
+
+    events: list[dict[str, str]] = []
+    navigator = Navigator(
+        config, on_event=lambda code, text: events.append({"code": code, "text": text})
+    )
+    written = _run(navigator, imu, arrivals, out)
+    sources: dict[str, dict[str, int]] = {}
+    for source, outcomes in navigator.timeline.counters.outcomes.items():
+        sources[source] = {name: count for name, count in outcomes.items() if count}
+    for source, refused in navigator.refused.items():
+        sources.setdefault(source, {}).update(refused)
+    for source, count in withheld.items():
+        if count:
+            sources.setdefault(source, {})["withheld"] = count
+    if navigator.imu.counters:
+        sources["imu"] = dict(navigator.imu.counters)
+    return {
+        "files": files,
+        "sources": sources,
+        "events": events,
+        "solution_rows": written,
+        "aligned": None if navigator.started is None else navigator.started.how,
+        "mode": str(navigator.mode(navigator.imu.latest_ns)[0]),
+        "reason": navigator.mode(navigator.imu.latest_ns)[1],
+        "rewinds": navigator.timeline.counters.rewinds,
+    }
+
+
+def _account(rows: int, rejected: list[Rejection]) -> dict[str, Any]:
+    return {
+        "rows": rows,
+        "rejected": counts(rejected),
+        "first_rejected": [str(r) for r in rejected[:_SHOWN]],
+    }
+
+
+def _withheld(m: Measurement, outages: Iterable[tuple[float, float]]) -> bool:
+    stamp = getattr(m, "stamp", None)
+    if not isinstance(stamp, MonotonicStamp):
+        return False
+    t = stamp.t_ns * 1e-9
+    return any(start <= t < start + length for start, length in outages)
+
+
+def _run(navigator: Navigator, imu: ImuTable, arrivals: list[_Arrival], out: Path | None) -> int:
+    times = np.rint(imu.t_s * 1e9).astype(np.int64)
+    samples = np.hstack([imu.gyro, imu.accel])
+    # A sample is there once its time has come; its own time offset shifts validity, not arrival.
+    breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right")
+    writer = SolutionWriter(out) if out is not None else None
+    recorder = _Recorder(navigator, writer)
+    done = 0
+    for stop, arrival in zip([*breaks.tolist(), len(times)], [*arrivals, None], strict=True):
+        while done < stop:
+            upto = min(stop, done + CHUNK)
+            navigator.add_imu(times[done:upto], samples[done:upto])
+            navigator.advance(record=True)
+            recorder.take()
+            done = upto
+        if arrival is not None:
+            stamp = arrival.measurement.stamp  # type: ignore[union-attr]
+            assert isinstance(stamp, MonotonicStamp)
+            navigator.add(arrival.measurement, stamp.t_ns)
+            navigator.advance(record=True)
+            recorder.take()
+    if writer is not None:
+        writer.close()
+    return recorder.rows
+
+
+class _Recorder:
+    """Takes each sample's solution as it was first known."""
+
+    def __init__(self, navigator: Navigator, writer: SolutionWriter | None) -> None:
+        self._navigator = navigator
+        self._writer = writer
+        self._next = 0
+        self.rows = 0
+
+    def take(self) -> None:
+        navigator = self._navigator
+        if navigator.started is None:
+            return
+        imu, passed = navigator.imu, navigator.estimator.sample
+        first = max(self._next, imu.index_after(navigator.started.t_ns - 1) + imu.start)
+        if passed <= first:
+            return
+        rows = slice(first - imu.start, passed - imu.start)
+        nav, count = imu.nav[rows], passed - first
+        self._next = passed
+        self.rows += count
+        if self._writer is None:
+            return
+        mode, _ = navigator.mode(int(imu.times[rows.stop - 1]))
+        self._writer.rows(
+            imu.times[rows] * 1e-9,
+            nav[:, 0],
+            (nav[:, 1] + np.pi) % (2.0 * np.pi) - np.pi,
+            nav[:, 2],
+            nav[:, 3:6],
+            _rpy(nav[:, 6:]),
+            imu.sigmas[rows],
+            np.full(count, STATUS.index(mode), dtype=np.int64),
+        )
+
+
+def _rpy(q: Array) -> Array:
+    """Roll, pitch, yaw (n, 3) of quaternions (n, 4)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
+    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z)
+    return np.column_stack([roll, pitch, yaw])
+
+
+# --------------------------------------------------------------------------- aid files
+
+_Read = tuple[list[_Arrival], list[Rejection]]
+
+
+def _arrivals(t_s: Array, t_arrival_s: Array, make: Callable[[int, int, int], Measurement]) -> list[_Arrival]:
+    rows = []
+    for i in range(len(t_s)):
+        t_ns = _ns(float(t_s[i]))
+        seen = t_ns if math.isnan(t_arrival_s[i]) else _ns(float(t_arrival_s[i]))
+        rows.append(_Arrival(seen, make(i, t_ns, seen)))
+    return rows
+
+
+def _vector(row: Array) -> tuple[float, float, float] | None:
+    x, y, z = (float(v) for v in row)
+    return None if math.isnan(x) or math.isnan(y) or math.isnan(z) else (x, y, z)
+
+
+def _horizontal(row: Array) -> tuple[float, float, float | None] | None:
+    x, y, z = (float(v) for v in row)
+    if math.isnan(x) or math.isnan(y):
+        return None
+    return x, y, None if math.isnan(z) else z
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else float(value)
+
+
+def _read_gnss(path: Path, _: ImuTable) -> _Read:
+    table = read_gnss(path)
+
+    def fix(i: int, t_ns: int, seen: int) -> Measurement:
+        quality = table.quality[i]
+        return PositionFix(
+            "gnss",
+            seen,
+            MonotonicStamp(t_ns),
+            float(table.lat_rad[i]),
+            float(table.lon_rad[i]),
+            _or_none(table.height_m[i]),
+            quality=1 if math.isnan(quality) else int(quality),
+            sd_ned_m=_vector(table.sd_position[i]),
+            v_ned_m_s=_horizontal(table.v[i]),
+            sd_v_ned_m_s=_horizontal(table.sd_v[i]),
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
+
+
+def _read_rdss(path: Path, _: ImuTable) -> _Read:
+    table = read_rdss(path)
+
+    def fix(i: int, t_ns: int, seen: int) -> Measurement:
+        return DelayedFix(
+            "rdss",
+            seen,
+            MonotonicStamp(t_ns),
+            float(table.lat_rad[i]),
+            float(table.lon_rad[i]),
+            float(table.height_m[i]),
+            float(table.precision_class_m[i]),
+            bool(table.multi_value[i]),
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
+
+
+def _read_attitude(path: Path, _: ImuTable) -> _Read:
+    table = read_attitude(path)
+
+    def attitude(i: int, t_ns: int, seen: int) -> Measurement:
+        roll, pitch, yaw = (float(a) for a in table.rpy[i])
+        sd_roll, sd_pitch, sd_yaw = (float(a) for a in table.sd_rpy[i])
+        return Attitude(
+            "attitude", seen, MonotonicStamp(t_ns), (roll, pitch, yaw), (sd_roll, sd_pitch, sd_yaw)
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, attitude), table.rejected
+
+
+def _read_wheel(path: Path, _: ImuTable) -> _Read:
+    table = read_wheel(path)
+
+    def speed(i: int, t_ns: int, seen: int) -> Measurement:
+        return WheelSpeed(
+            "wheel",
+            seen,
+            MonotonicStamp(t_ns),
+            float(table.speed_m_s[i]),
+            _or_none(table.sd_m_s[i]),
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, speed), table.rejected
+
+
+def _read_nmea(path: Path, imu: ImuTable) -> _Read:
+    """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
+    maps to: GPS second of week (below 604800) or POSIX seconds."""
+    decoder = NmeaDecoder("gnss")
+    found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
+    of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    rows = []
+    for m in found:
+        if not isinstance(m, PositionFix) or not isinstance(m.stamp, UtcStamp):
+            continue
+        t_ns = m.stamp.utc_ns
+        if of_week:
+            t_ns = _ns(utc_ns_to_gps_week_seconds(t_ns))
+        rows.append(_Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
+    if found and not rows:
+        raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
+    refused = [Rejection(0, name, f"{count} times") for name, count in decoder.counters.items()]
+    return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
+
+
+_READERS: dict[str, Callable[[Path, ImuTable], _Read]] = {
+    "gnss": _read_gnss,
+    "rdss": _read_rdss,
+    "attitude": _read_attitude,
+    "wheel": _read_wheel,
+    "nmea": _read_nmea,
+}
