@@ -41,6 +41,10 @@ from drivers.measurements import (
     Stamp,
 )
 
+EVENT_SPACING_NS = 10_000_000_000
+"""The same state of the controller is told once in 10 s: a shorted bus changes it ten times a second
+(`restart-ms 100`), and the counters keep account."""
+
 AxisSource = str | float
 Triad = tuple[AxisSource, AxisSource, AxisSource]
 Signals = tuple[str, ...]
@@ -286,6 +290,7 @@ class CanImuDriver:
         self._was_down = False
         self._restarts = 0
         self._sample_ns = 0
+        self._told_ns: dict[str, int] = {}
 
     async def run(self) -> None:
         """Serve the device until cancelled."""
@@ -327,7 +332,10 @@ class CanImuDriver:
         text = text.format(channel=self.options.channel)
         if state == "bus_off":
             self.status.state, self.status.detail = "silent", text
-        self._event(code, f"{self.options.channel}: {text}")
+        now_ns = self._now_ns()
+        if now_ns - self._told_ns.get(code, now_ns - EVENT_SPACING_NS) >= EVENT_SPACING_NS:
+            self._told_ns[code] = now_ns
+            self._event(code, f"{self.options.channel}: {text}")
 
     async def _watch(self) -> None:
         """Say `silent` when samples stop."""
