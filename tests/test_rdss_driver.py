@@ -79,7 +79,7 @@ class PtyTerminal:
                 case BeamPowerRequest():
                     self.write(BeamPower((0, 3, 4, 0, 2, 0)))
                 case SelfTestRequest():
-                    self.write(SelfTest(80.0))
+                    self.write(SelfTest(80.0, inbound_state=2))
                 case PositionRequest():
                     self.write(Feedback(Outcome.OK, "DWA" if self.text else "DWSQ"), FIX)
 
@@ -91,7 +91,7 @@ class PtyTerminal:
 async def until(condition: Callable[[], Any], seconds: float = 20.0) -> None:
     """Wait for a condition; the limit only ends a test that has already failed."""
     async with asyncio.timeout(seconds):
-        while not condition():
+        while not condition():  # noqa: ASYNC110 - what is waited for is the driver's public state
             await asyncio.sleep(0.01)
 
 
@@ -119,8 +119,12 @@ async def test_finds_the_terminal_asks_and_hands_on_the_fix(family: Family, rate
     terminal.before = b"\x00$\xff$garbage\r\n"
     began = time.monotonic_ns()
     async with running({"port": terminal.port}) as (driver, said):
-        driver.height_hint(438.4, 3.0)
-        await until(lambda: of(DelayedFix, said))
+
+        def fix_came_while_hinting() -> bool:
+            driver.height_hint(438.4, 3.0)
+            return bool(of(DelayedFix, said))
+
+        await until(fix_came_while_hinting)
         (fix,) = of(DelayedFix, said)
         assert fix.lat_rad == pytest.approx(0.40207828, abs=1e-6)
         assert fix.lon_rad == pytest.approx(1.97910641, abs=1e-6)
@@ -132,7 +136,8 @@ async def test_finds_the_terminal_asks_and_hands_on_the_fix(family: Family, rate
         assert began < fix.stamp.requested_ns <= fix.t_seen_ns
         (request,) = [m for m in terminal.heard if isinstance(m, PositionRequest)]
         assert (request.user, request.period_s, request.emergency) == (USER, 0, False)
-        assert request.height_mode in (HeightMode.GIVEN, HeightMode.NONE)
+        assert request.height_mode is HeightMode.GIVEN
+        assert request.height_m == pytest.approx(438.4, abs=0.5)
         await until(lambda: "next request in" in driver.status.detail)
         assert driver.status.state == "running"
         assert driver.counters["fixes"] == driver.counters["multi_value"] == 1

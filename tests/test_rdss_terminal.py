@@ -11,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.cycle import SECOND, Action, FixReady, Notice, Send, SetBaud, TerminalOptions
+from drivers.rdss.cycle import (
+    SECOND,
+    Action,
+    FixReady,
+    Notice,
+    Send,
+    SetBaud,
+    State,
+    TerminalOptions,
+)
 from drivers.rdss.fraction import FractionReader
 from drivers.rdss.messages import (
     BeamPower,
@@ -28,7 +37,7 @@ from drivers.rdss.messages import (
     SelfTest,
     SelfTestRequest,
 )
-from drivers.rdss.terminal import State, Terminal
+from drivers.rdss.terminal import Terminal
 
 USER = 242286
 FIX = Fix(USER, 31776.0, 23.0, 113.0, 14.0, fraction=50)
@@ -327,6 +336,17 @@ def test_no_request_without_a_beam_from_the_start() -> None:
     assert bench.cycle.counters["no_beam"] == 1
 
 
+def test_empty_levels_in_the_self_test_do_not_end_the_beam() -> None:
+    bench = Bench()
+    bench.run(30)
+    states = []
+    for message in (SelfTest(80.0, levels=(0,) * 6), BeamPower((0,) * 6)):
+        bench.say(message)
+        bench.run(1)
+        states.append(bench.cycle.state)
+    assert states == [State.READY, State.NO_BEAM]
+
+
 def test_a_terminal_that_never_tells_its_beams_is_used_all_the_same() -> None:
     bench = Bench(answers_beams=False)
     bench.run(30)
@@ -535,10 +555,10 @@ def test_fraction_of_t() -> None:
     low, bound = auto.read(8)
     assert low - bound == pytest.approx(0.08)
     assert low + bound == pytest.approx(0.8)
-    assert auto.read(71) == (pytest.approx(0.71), 0.005)
-    assert auto.read(8) == (pytest.approx(0.08), 0.005)
-    assert FractionReader("0.1").read(8) == (pytest.approx(0.8), 0.05)
-    assert FractionReader("0.01").read(8) == (pytest.approx(0.08), 0.005)
+    assert auto.read(71) == pytest.approx((0.71, 0.005))
+    assert auto.read(8) == pytest.approx((0.08, 0.005))
+    assert FractionReader("0.1").read(8) == pytest.approx((0.8, 0.05))
+    assert FractionReader("0.01").read(8) == pytest.approx((0.08, 0.005))
     for unit, value in (("0.1", 71), ("auto", 200), ("0.01", 100)):
         assert FractionReader(unit).read(value) == (0.5, 0.5)  # type: ignore[arg-type]
 

@@ -506,7 +506,8 @@ class Terminal:
         if test.faults != self._faults:
             self._faults = test.faults
             actions.append(Notice("rdss_self_test", f"faults: {', '.join(test.faults) or 'none'}"))
-        self._on_levels(test.levels, t_ns, actions)
+        if any(test.levels):  # all zero: not filled in, or no beam, which the next GLZK says
+            self._on_levels(test.levels, t_ns, actions)
         if self._permit.lifted_by_self_test(test.inbound_state):
             self._lift(t_ns, actions)
 
