@@ -42,8 +42,8 @@ from drivers.measurements import (
 )
 
 EVENT_SPACING_NS = 10_000_000_000
-"""The same state of the controller is told once in 10 s: a shorted bus changes it ten times a second
-(`restart-ms 100`), and the counters keep account."""
+"""The same state of the controller is told once in 10 s: on a shorted bus it changes ten times a
+second (`restart-ms 100`); the counters keep account."""
 
 AxisSource = str | float
 Triad = tuple[AxisSource, AxisSource, AxisSource]
