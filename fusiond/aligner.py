@@ -77,6 +77,7 @@ class AlignmentOptions:
     position: tuple[float, float, float] | None
     position_sd_m: float
     levelling_s: float
+    rest_speed_m_s: float
     course_speed_m_s: float
     course_sd_rad: float
     gyrocompass_s: float
@@ -131,15 +132,25 @@ class Aligner:
         self._standing: _Standing | None = None
         self._at_rest = False
         self._ever_moved = False
+        self._pending: Window | None = None
+        self._speed = 0.0
         self._position: PositionAid | None = None
         self._heading: tuple[int, float, float] | None = None
         self._fixes: list[tuple[VelocityAid, PositionAid]] = []
 
-    def window(self, w: Window) -> None:
-        """A window of the standstill detector has ended."""
-        if not w.quiet:
+    def window(self, latest: Window) -> None:
+        """A window of the standstill detector has ended.
+
+        It counts as rest only once the next one is quiet too: the last before the start may hold
+        the first of the acceleration.
+        """
+        if not latest.quiet or self._speed > self.options.rest_speed_m_s:
             self._at_rest = False
             self._ever_moved = True
+            self._pending = None
+            return
+        w, self._pending = self._pending, latest
+        if w is None:
             return
         if not self._at_rest or self._standing is None:
             start = w.end_ns - round(self._window_s * 1e9)
@@ -162,6 +173,7 @@ class Aligner:
             elif isinstance(aid, AttitudeAid) and not math.isnan(aid.rpy[2]):
                 self._heading = (aid.t_ns, aid.rpy[2], aid.sd[2])
             elif isinstance(aid, VelocityAid):
+                self._speed = math.hypot(*aid.v_ned[:2])
                 position = [a for a in aids if isinstance(a, PositionAid)]
                 if position:
                     self._fixes = [*self._fixes, (aid, position[0])][-40:]

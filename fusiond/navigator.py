@@ -84,6 +84,7 @@ class Navigator:
             position=position and (position[0] * DEG, position[1] * DEG, position[2]),
             position_sd_m=a.position_sd_m,
             levelling_s=a.levelling_s,
+            rest_speed_m_s=self.config.constraints.zero_velocity.max_speed_m_s,
             course_speed_m_s=a.course_speed_m_s,
             course_sd_rad=a.course_sd_deg * DEG,
             gyrocompass_s=a.gyrocompass_s,

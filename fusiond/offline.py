@@ -156,7 +156,7 @@ class _Recorder:
         if navigator.started is None:
             return
         imu, passed = navigator.imu, navigator.estimator.sample
-        first = max(self._next, imu.index_after(navigator.started.t_ns - 1) + imu.start)
+        first = max(self._next, imu.index_after(navigator.started.t_ns) + imu.start)
         if passed <= first:
             return
         rows = slice(first - imu.start, passed - imu.start)

@@ -11,6 +11,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -33,6 +34,10 @@ from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
 
 Array = NDArray[np.float64]
+
+# One sigma (rad) added to the attitude when a filter that rejects everything is opened again: what a bad
+# alignment on the move can be wrong by.
+DOUBTED_ATTITUDE_RAD = math.radians(3.0)
 
 
 @lru_cache(maxsize=256)
@@ -138,7 +143,10 @@ class KalmanEstimator:
         return Outcome("fused", nis, degrees)
 
     def _widen(self, z: Array, h: Array) -> None:
-        """Add the innovation's own square to the states that it measures directly."""
+        """Add the innovation's own square to the states that it measures directly, and doubt the
+        attitude: a filter that was this wrong about position was wrong about more."""
+        for slot in range(3):
+            self._cov[slot, slot] += DOUBTED_ATTITUDE_RAD**2
         for row, value in zip(h, z, strict=True):
             slot = 3 + int(np.argmax(np.abs(row[3:9])))
             if self.model.active[slot]:

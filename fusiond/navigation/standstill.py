@@ -4,7 +4,7 @@ Over the samples of a window of the IMU (about 1 s), per axis,
 
     s_w = std(w),  s_f = std(f),   quiet if max s_w < a, max s_f < b and |mean w| < c
 
-An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
+and if the mean force is that of the rest's first window, to within b: a smooth start is not rest. An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
 vehicle and stand in its configuration. Windows lie on a fixed grid of time, so the verdict is a
 function of the samples alone, however they were handed over.
 
@@ -14,7 +14,7 @@ T-BME 57 (2010), the moving-variance and rate-energy detectors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +84,7 @@ class StandstillDetector:
     def __init__(self, limits: QuietLimits) -> None:
         self.limits = limits
         self._first: int | None = None
+        self._reference: Array | None = None
 
     def feed(
         self, times: NDArray[np.int64], samples: Array, start: int, new: int, end: int
@@ -104,6 +105,17 @@ class StandstillDetector:
             stop = new + int(change)
             first = self._first - start
             if 0 <= first < stop:
-                windows.append(judge(times, samples, first, stop, self.limits))
+                windows.append(self._same_force(judge(times, samples, first, stop, self.limits)))
             self._first = start + stop
         return windows
+
+    def _same_force(self, w: Window) -> Window:
+        """Not quiet if the mean force has left that of the first window of this rest."""
+        if not w.quiet:
+            self._reference = None
+        elif self._reference is None:
+            self._reference = w.mean_force
+        elif np.abs(w.mean_force - self._reference).max() > self.limits.force_sd:
+            self._reference = None
+            return replace(w, quiet=False)
+        return w
