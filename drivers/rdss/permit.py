@@ -1,11 +1,12 @@
-"""Whether the terminal may transmit: suppression by the system, radio silence by the operator.
+"""When the terminal may transmit: the card's spacing, suppression, radio silence.
 
-Neither is ever lifted from here; what lifts it is noticed here.
+Suppression (by the system) and silence (by the operator) are never lifted from here; what lifts
+them is noticed here.
 """
 
 from __future__ import annotations
 
-from drivers.rdss.cycle import FEEDBACK_NS, SECOND
+from drivers.rdss.cycle import DEFAULT_SERVICE_S, FEEDBACK_NS, SECOND, SPACING_MARGIN_NS
 from drivers.rdss.messages import Feedback, Outcome
 
 
@@ -71,3 +72,43 @@ class TransmitPermit:
             self._inbound_changed = True
             return False
         return self._inbound_changed
+
+
+class Pace:
+    """The spacing of requests: the card's service frequency and one second, at the least.
+
+    `service_s` is the card's (None: not read yet), `requested_ns` when the last request was
+    written. `asap` waives the wanted interval once, never the card's.
+    """
+
+    def __init__(self, interval_s: float | None) -> None:
+        self.service_s: int | None = None
+        self.requested_ns: int | None = None
+        self.asap = False
+        self._interval_ns = int((interval_s or 0.0) * SECOND)
+        self._not_before_ns = 0
+
+    @property
+    def due_ns(self) -> int:
+        """When the next request may be written."""
+        if self.requested_ns is None:
+            return self._not_before_ns
+        spacing = (self.service_s or DEFAULT_SERVICE_S) * SECOND + SPACING_MARGIN_NS
+        if not self.asap:
+            spacing = max(spacing, self._interval_ns)
+        return max(self._not_before_ns, self.requested_ns + spacing)
+
+    def written(self, t_ns: int) -> None:
+        """A request was written."""
+        self.requested_ns, self.asap = t_ns, False
+
+    def not_before(self, t_ns: int) -> None:
+        """Nothing before this instant."""
+        self._not_before_ns = max(self._not_before_ns, t_ns)
+
+    def wait(self, t_ns: int, stated_s: float | None) -> None:
+        """Not before the stated wait and one second. No wait, or one above twice the service
+        frequency, which nobody can mean, is the service frequency (PROTOCOLS 1.2)."""
+        service = self.service_s or DEFAULT_SERVICE_S
+        wait_s = stated_s if stated_s is not None and stated_s <= 2 * service else service
+        self.not_before(t_ns + int(wait_s * SECOND) + SPACING_MARGIN_NS)

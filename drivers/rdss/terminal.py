@@ -41,7 +41,6 @@ from drivers.rdss.cycle import (
     PROBE_NS,
     REFUSALS,
     SECOND,
-    SPACING_MARGIN_NS,
     TIMEOUTS_ALARM,
     USABLE_LEVEL,
     Action,
@@ -72,7 +71,7 @@ from drivers.rdss.messages import (
     TimeRequest,
     Unknown,
 )
-from drivers.rdss.permit import TransmitPermit
+from drivers.rdss.permit import Pace, TransmitPermit
 
 _ENCODE: dict[Family, Callable[[Message], bytes]] = {
     "4.0": binary_4_0.encode,
@@ -86,6 +85,21 @@ _POLLS: tuple[Callable[[int], Request], ...] = (
     IdentityRequest,
     BeamPowerRequest,
 )
+
+
+_DETAIL = {
+    State.CLOSED: "line closed",
+    State.PROBING: "asking at {baud} baud who is there (family {families})",
+    State.NO_CARD: f"no card in the terminal, asking every {POLL_NS // SECOND} s",
+    State.CHECKING: "reading beam power",
+    State.READY: "card {card}, {service} s: next request in {due} s, {beams}",
+    State.AWAIT_FEEDBACK: "request sent, awaiting feedback",
+    State.AWAIT_FIX: "awaiting the fix asked for {age} s ago",
+    State.NO_BEAM: f"no beam: {{beams}}, polling every {BEAM_POLL_NS // SECOND} s",
+    State.HOLDING: "{why}: next attempt in {hold} s",
+    State.SUPPRESSED: "suppressed by the system: not transmitting, for {hold} s unless lifted",
+    State.SILENT: "radio silence is set on the terminal: not transmitting until it is lifted",
+}
 
 
 class Terminal:
@@ -121,10 +135,8 @@ class Terminal:
         self._beam_reads = 0
         self._faults: tuple[str, ...] = ()
         # requests
-        self._last_ns: int | None = None
+        self._pace = Pace(options.request_interval_s)
         self._answerable = False
-        self._not_before_ns = 0
-        self._asap = False
         self._timeouts = 0
         self._refused: Counter[Outcome] = Counter()
         self._hold_why, self._hold_until_ns = "", 0
@@ -203,8 +215,8 @@ class Terminal:
             return Notice(code, "a request is in flight already")
         if self.state is not State.READY:
             return Notice(code, f"refused: {self.detail}")
-        self._asap = True
-        return Notice(code, f"request in {self._seconds_to(self._request_due_ns())} s")
+        self._pace.asap = True
+        return Notice(code, f"request in {self._seconds_to(self._pace.due_ns)} s")
 
     # ------------------------------------------------------------------ outputs
 
@@ -213,17 +225,10 @@ class Terminal:
         """When `tick` has something to do; None while the line is closed."""
         due = self._deadline_ns
         if self.state is State.READY:
-            due = max(min(self._next_poll_ns, self._request_due_ns()), self._quiet_until_ns)
+            due = max(min(self._next_poll_ns, self._pace.due_ns), self._quiet_until_ns)
         if due is not None and self.state not in OFFLINE:
             due = min(due, self._heard_ns + int(self._options.timeout_s * SECOND))
         return due
-
-    @property
-    def service_frequency_s(self) -> int | None:
-        """The card's smallest spacing of transmissions."""
-        if self.identity is None:
-            return None
-        return self.identity.service_frequency_s or DEFAULT_SERVICE_S
 
     @property
     def answered(self) -> bool:
@@ -236,44 +241,25 @@ class Terminal:
         return self.state is State.PROBING and self._probes > len(self._options.bauds)
 
     @property
-    def detail(self) -> str:
-        """What it is doing, in words."""
-        match self.state:
-            case State.CLOSED:
-                return "line closed"
-            case State.PROBING:
-                families = " and ".join(self._options.families)
-                return f"asking at {self.baud} baud who is there (family {families})"
-            case State.NO_CARD:
-                return f"no card in the terminal, asking every {POLL_NS // SECOND} s"
-            case State.CHECKING:
-                return "reading beam power"
-            case State.READY:
-                wait = self._seconds_to(self._request_due_ns())
-                return f"{self._card()}: next request in {wait} s, {self._beams()}"
-            case State.AWAIT_FEEDBACK:
-                return "request sent, awaiting feedback"
-            case State.AWAIT_FIX:
-                return f"awaiting the fix asked for {self._request_age_s():.1f} s ago"
-            case State.NO_BEAM:
-                return f"no beam: {self._beams()}, polling every {BEAM_POLL_NS // SECOND} s"
-            case State.HOLDING:
-                wait = self._seconds_to(self._hold_until_ns)
-                return f"{self._hold_why}: next attempt in {wait} s"
-            case State.SUPPRESSED:
-                wait = self._seconds_to(self._permit.suppressed_until_ns or 0)
-                return f"suppressed by the system: not transmitting, for {wait} s unless lifted"
-            case State.SILENT:
-                return "radio silence is set on the terminal: not transmitting until it is lifted"
-
-    @property
     def baud(self) -> int:
         """The rate in use or being tried."""
         return self._options.bauds[self._baud_at]
 
-    def _card(self) -> str:
-        card = self.identity
-        return "no card" if card is None else f"card {card.user:07d}, {self.service_frequency_s} s"
+    @property
+    def detail(self) -> str:
+        """What it is doing, in words."""
+        words = _DETAIL[self.state]
+        return words.format(
+            baud=self.baud,
+            families=" and ".join(self._options.families),
+            card=f"{self.identity.user:07d}" if self.identity is not None else "none",
+            service=self._pace.service_s,
+            beams=self._beams(),
+            due=self._seconds_to(self._pace.due_ns),
+            age=self._seconds_since(self._pace.requested_ns),
+            why=self._hold_why,
+            hold=self._seconds_to(self._blocked_until_ns() or 0),
+        )
 
     def _beams(self) -> str:
         return f"strongest level {max(self._levels)}" if self._levels else "beam levels unknown"
@@ -281,8 +267,8 @@ class Terminal:
     def _seconds_to(self, t_ns: int) -> int:
         return max(0, -((self._t_ns - t_ns) // SECOND))
 
-    def _request_age_s(self) -> float:
-        return (self._t_ns - (self._last_ns or self._t_ns)) / SECOND
+    def _seconds_since(self, t_ns: int | None) -> int:
+        return 0 if t_ns is None else (self._t_ns - t_ns) // SECOND
 
     # ------------------------------------------------------------------ states
 
@@ -306,21 +292,12 @@ class Terminal:
 
     def _abandon(self) -> None:
         """Stop waiting for the request in flight; the next keeps clear of its late answer."""
-        if self.state in IN_FLIGHT and self._last_ns is not None:
-            self._not_before_ns = max(self._not_before_ns, self._last_ns + GIVE_UP_NS)
+        if self.state in IN_FLIGHT and self._pace.requested_ns is not None:
+            self._pace.not_before(self._pace.requested_ns + GIVE_UP_NS)
 
     def _gone_quiet(self, t_ns: int) -> bool:
         quiet_ns = int(self._options.timeout_s * SECOND)
         return self.state not in OFFLINE and t_ns - self._heard_ns >= quiet_ns
-
-    def _request_due_ns(self) -> int:
-        due = self._not_before_ns
-        if self._last_ns is not None:
-            spacing = (self.service_frequency_s or DEFAULT_SERVICE_S) * SECOND + SPACING_MARGIN_NS
-            if self._options.request_interval_s is not None and not self._asap:
-                spacing = max(spacing, int(self._options.request_interval_s * SECOND))
-            due = max(due, self._last_ns + spacing)
-        return due
 
     # ------------------------------------------------------------------ deadlines
 
@@ -375,7 +352,7 @@ class Terminal:
 
     def _due_feedback(self, t_ns: int, actions: list[Action]) -> None:
         self.counters["timeout_feedback"] += 1
-        self._enter(State.AWAIT_FIX, (self._last_ns or t_ns) + GIVE_UP_NS)
+        self._enter(State.AWAIT_FIX, (self._pace.requested_ns or t_ns) + GIVE_UP_NS)
 
     def _due_fix(self, t_ns: int, actions: list[Action]) -> None:
         self.counters["timeout_fix"] += 1
@@ -434,9 +411,8 @@ class Terminal:
             return
         actions.append(Send(data, "request"))
         self.counters["requested"] += 1
-        self._last_ns = t_ns
+        self._pace.written(t_ns)
         self._answerable = True
-        self._asap = False
         self._enter(State.AWAIT_FEEDBACK, t_ns + FEEDBACK_NS)
 
     def _hold(self, t_ns: int, why: str) -> None:
@@ -462,6 +438,7 @@ class Terminal:
             self._answerable = False
             self._refused.clear()
         self.identity = card
+        self._pace.service_s = card.service_frequency_s or DEFAULT_SERVICE_S
         arrived = probing or changed or self.state is State.NO_CARD
         if arrived or (before and before.service_frequency_s != card.service_frequency_s):
             actions.append(
@@ -513,7 +490,7 @@ class Terminal:
 
     def _on_feedback(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> None:
         outcome = feedback.outcome
-        if self._permit.lifted_by_feedback(feedback, t_ns, self._last_ns):
+        if self._permit.lifted_by_feedback(feedback, t_ns, self._pace.requested_ns):
             self._lift(t_ns, actions)
         elif outcome in ALWAYS:
             self._on_state_of_terminal(outcome, t_ns, actions)
@@ -521,13 +498,13 @@ class Terminal:
             self.counters["feedback_unmatched"] += 1
             if outcome is Outcome.OK and feedback.command in INBOUND_COMMANDS:
                 # Somebody else's message or request left the antenna: it uses up the spacing.
-                self._wait(t_ns, None)
+                self._pace.wait(t_ns, None)
         elif outcome is Outcome.OK:
             self.counters["accepted"] += 1
             self._refused.clear()
             self._permit.accepted()
-            if self._last_ns is not None:
-                self._enter(State.AWAIT_FIX, self._last_ns + GIVE_UP_NS)
+            if self._pace.requested_ns is not None:
+                self._enter(State.AWAIT_FIX, self._pace.requested_ns + GIVE_UP_NS)
         else:
             self._on_refusal(feedback, t_ns, actions)
 
@@ -539,7 +516,7 @@ class Terminal:
         self._forget_refused()
         self._enter(State.READY, None)
         if outcome is Outcome.FREQUENCY:
-            self._wait(t_ns, feedback.wait_s)
+            self._pace.wait(t_ns, feedback.wait_s)
         elif refusal.state is State.NO_BEAM:
             self._levels = ()
             self._lose_beam(t_ns, actions)
@@ -552,14 +529,6 @@ class Terminal:
         """A request refused before it was accepted will have no fix."""
         if self.state is State.AWAIT_FEEDBACK:
             self._answerable = False
-
-    def _wait(self, t_ns: int, stated_s: float | None) -> None:
-        """Not before the stated wait and one second; a wait nobody can mean is the spacing."""
-        service = self.service_frequency_s or DEFAULT_SERVICE_S
-        wait = stated_s if stated_s is not None and stated_s <= 2 * service else service
-        self._not_before_ns = max(
-            self._not_before_ns, t_ns + int(wait * SECOND) + SPACING_MARGIN_NS
-        )
 
     def _on_state_of_terminal(self, outcome: Outcome, t_ns: int, actions: list[Action]) -> None:
         self._forget_refused()
@@ -597,14 +566,14 @@ class Terminal:
         if fix.kind != "own" or self.identity is None or fix.user != self.identity.user:
             self.counters["foreign_fix"] += 1
             return
-        if not self._answerable or self._last_ns is None:
+        if not self._answerable or self._pace.requested_ns is None:
             self.counters["unsolicited"] += 1
             return
         self._answerable = False
         self._timeouts = 0
         self._refused.clear()
         self.counters["fixes"] += 1
-        if t_ns - self._last_ns > FIX_EXPECTED_NS:
+        if t_ns - self._pace.requested_ns > FIX_EXPECTED_NS:
             self.counters["slow_fix"] += 1
         if fix.multi_value:
             self.counters["multi_value"] += 1
@@ -618,7 +587,7 @@ class Terminal:
             time_of_day += part
             if uncertainty >= 0.5:
                 self.counters["bad_fraction"] += 1
-        actions.append(FixReady(fix, time_of_day, uncertainty, self._last_ns))
+        actions.append(FixReady(fix, time_of_day, uncertainty, self._pace.requested_ns))
 
 
 _DUE: dict[State, Callable[[Terminal, int, list[Action]], None]] = {
