@@ -151,3 +151,18 @@ ALWAYS = frozenset(
 )
 POSITION_COMMANDS = frozenset({None, "DWSQ", "DWA"})
 INBOUND_COMMANDS = frozenset({"DWSQ", "DWA", "TXSQ", "TXA", "WAA", "WBA", "TCQ"})
+
+DETAIL = {
+    State.CLOSED: "line closed",
+    State.PROBING: "asking at {baud} baud who is there (family {families})",
+    State.NO_CARD: f"no card in the terminal, asking every {POLL_NS // SECOND} s",
+    State.CHECKING: "reading beam power",
+    State.READY: "card {card}, {service} s: next request in {due} s, {beams}",
+    State.AWAIT_FEEDBACK: "request sent, awaiting feedback",
+    State.AWAIT_FIX: "awaiting the fix asked for {age} s ago",
+    State.NO_BEAM: f"no beam: {{beams}}, polling every {BEAM_POLL_NS // SECOND} s",
+    State.HOLDING: "{why}: next attempt in {hold} s",
+    State.SUPPRESSED: "suppressed by the system: not transmitting, for {hold} s unless lifted",
+    State.SILENT: "radio silence is set on the terminal: not transmitting until it is lifted",
+}
+"""What a state says of itself to an operator."""

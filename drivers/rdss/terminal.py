@@ -18,19 +18,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_HEIGHT_M
 from drivers.rdss.cycle import (
     ALWAYS,
     BEAM_ATTEMPTS,
     BEAM_POLL_NS,
     BEAMS_STALE_NS,
     DEFAULT_SERVICE_S,
+    DETAIL,
     FEEDBACK_NS,
     FIX_EXPECTED_NS,
     GIVE_UP_NS,
-    HINT_AGE_NS,
-    HINT_SD_M,
     HOLD_NS,
     IN_FLIGHT,
     INBOUND_COMMANDS,
@@ -47,11 +44,11 @@ from drivers.rdss.cycle import (
     FixReady,
     Notice,
     Send,
-    SetBaud,
     State,
     TerminalOptions,
 )
 from drivers.rdss.fraction import FractionReader
+from drivers.rdss.height import HeightSource
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -59,12 +56,10 @@ from drivers.rdss.messages import (
     Family,
     Feedback,
     Fix,
-    HeightMode,
     Identity,
     IdentityRequest,
     Message,
     Outcome,
-    PositionRequest,
     Request,
     SelfTest,
     SelfTestRequest,
@@ -72,11 +67,8 @@ from drivers.rdss.messages import (
     Unknown,
 )
 from drivers.rdss.permit import Pace, TransmitPermit
+from drivers.rdss.probe import ENCODE, Probe
 
-_ENCODE: dict[Family, Callable[[Message], bytes]] = {
-    "4.0": binary_4_0.encode,
-    "2.1": text_2_1.encode,
-}
 _POLLS: tuple[Callable[[int], Request], ...] = (
     SelfTestRequest,
     BeamPowerRequest,
@@ -85,21 +77,6 @@ _POLLS: tuple[Callable[[int], Request], ...] = (
     IdentityRequest,
     BeamPowerRequest,
 )
-
-
-_DETAIL = {
-    State.CLOSED: "line closed",
-    State.PROBING: "asking at {baud} baud who is there (family {families})",
-    State.NO_CARD: f"no card in the terminal, asking every {POLL_NS // SECOND} s",
-    State.CHECKING: "reading beam power",
-    State.READY: "card {card}, {service} s: next request in {due} s, {beams}",
-    State.AWAIT_FEEDBACK: "request sent, awaiting feedback",
-    State.AWAIT_FIX: "awaiting the fix asked for {age} s ago",
-    State.NO_BEAM: f"no beam: {{beams}}, polling every {BEAM_POLL_NS // SECOND} s",
-    State.HOLDING: "{why}: next attempt in {hold} s",
-    State.SUPPRESSED: "suppressed by the system: not transmitting, for {hold} s unless lifted",
-    State.SILENT: "radio silence is set on the terminal: not transmitting until it is lifted",
-}
 
 
 class Terminal:
@@ -123,9 +100,7 @@ class Terminal:
         self._t_ns = 0
         self._deadline_ns: int | None = None
         self._heard_ns = 0
-        # probing
-        self._baud_at = 0
-        self._probes = 0
+        self._probe = Probe(options.bauds, options.families)
         # reads
         self._polls = 0
         self._next_poll_ns = 0
@@ -140,7 +115,7 @@ class Terminal:
         self._timeouts = 0
         self._refused: Counter[Outcome] = Counter()
         self._hold_why, self._hold_until_ns = "", 0
-        self._hint: tuple[float, float, int] | None = None
+        self._height = HeightSource(options)
         self._permit = TransmitPermit(options.suppression_hold_s)
 
     # ------------------------------------------------------------------ inputs
@@ -148,7 +123,7 @@ class Terminal:
     def opened(self, t_ns: int) -> list[Action]:
         """The line is open: look who is there."""
         self._t_ns = t_ns
-        self._probe(t_ns)
+        self._search(t_ns)
         return []
 
     def closed(self, t_ns: int) -> list[Action]:
@@ -199,13 +174,13 @@ class Terminal:
                     Notice("rdss_silent", f"nothing intelligible for {self._options.timeout_s:g} s")
                 )
                 self._abandon()
-                self._probe(t_ns)
+                self._search(t_ns)
             _DUE[self.state](self, t_ns, actions)
         return actions
 
     def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
         """Ellipsoidal height of the terminal's antenna from the navigation solution, one sigma."""
-        self._hint = (height_m, sd_m, t_ns)
+        self._height.hint(height_m, sd_m, t_ns)
 
     def request_now(self, t_ns: int) -> Notice:
         """An operator asks for a fix: as soon as the card's spacing allows, or why not."""
@@ -238,17 +213,17 @@ class Terminal:
     @property
     def unanswered_round(self) -> bool:
         """Every baud rate has been probed and nobody answered."""
-        return self.state is State.PROBING and self._probes > len(self._options.bauds)
+        return self.state is State.PROBING and self._probe.in_vain
 
     @property
     def baud(self) -> int:
         """The rate in use or being tried."""
-        return self._options.bauds[self._baud_at]
+        return self._probe.baud
 
     @property
     def detail(self) -> str:
         """What it is doing, in words."""
-        words = _DETAIL[self.state]
+        words = DETAIL[self.state]
         return words.format(
             baud=self.baud,
             families=" and ".join(self._options.families),
@@ -276,8 +251,8 @@ class Terminal:
         self.state = state
         self._deadline_ns = deadline_ns
 
-    def _probe(self, t_ns: int) -> None:
-        self._probes = 0
+    def _search(self, t_ns: int) -> None:
+        self._probe.restart()
         self._enter(State.PROBING, t_ns)
 
     def _proceed(self, t_ns: int) -> None:
@@ -304,7 +279,7 @@ class Terminal:
     def _read(self, kind: Callable[[int], Request], actions: list[Action]) -> None:
         if self.family is not None:
             user = self.identity.user if self.identity is not None else 0
-            actions.append(Send(_ENCODE[self.family](kind(user)), "read"))
+            actions.append(Send(ENCODE[self.family](kind(user)), "read"))
 
     def _poll(self, t_ns: int, actions: list[Action]) -> None:
         self._read(_POLLS[self._polls % len(_POLLS)], actions)
@@ -313,18 +288,8 @@ class Terminal:
         self._quiet_until_ns = t_ns + POLL_REPLY_NS
 
     def _due_probing(self, t_ns: int, actions: list[Action]) -> None:
-        bauds = self._options.bauds
-        if self._probes:
-            self._baud_at = (self._baud_at + 1) % len(bauds)
-        if len(bauds) > 1:
-            actions.append(SetBaud(self.baud))
-        if self._probes == len(bauds):
-            tried = ", ".join(map(str, bauds))
-            actions.append(Notice("rdss_no_answer", f"no RDSS terminal answers at {tried} baud"))
-        self._probes += 1
+        actions += self._probe.next()
         self.counters["probes"] += 1
-        for family in self._options.families:
-            actions.append(Send(_ENCODE[family](IdentityRequest()), "read"))
         self._deadline_ns = t_ns + PROBE_NS
 
     def _due_no_card(self, t_ns: int, actions: list[Action]) -> None:
@@ -387,25 +352,12 @@ class Terminal:
 
     # ------------------------------------------------------------------ requests
 
-    def _height(self, t_ns: int) -> PositionRequest:
-        """Height given where one is good enough, else by the centre's terrain model."""
-        height = self._options.height_m
-        if self._options.use_solution_height and self._hint is not None:
-            hint, sd, at = self._hint
-            if sd < HINT_SD_M and t_ns - at <= HINT_AGE_NS:
-                height = hint
-        user = self.identity.user if self.identity is not None else 0
-        if height is not None and abs(height) < MAX_ORDINARY_HEIGHT_M:
-            return PositionRequest(user, HeightMode.GIVEN, height_m=height)
-        antenna = self._options.antenna_height_m
-        return PositionRequest(user, HeightMode.NONE, antenna_height_m=antenna)
-
     def _request(self, t_ns: int, actions: list[Action]) -> None:
         if self.family is None or self.identity is None:
-            self._probe(t_ns)
+            self._search(t_ns)
             return
         try:
-            data = _ENCODE[self.family](self._height(t_ns))
+            data = ENCODE[self.family](self._height.request(self.identity.user, t_ns))
         except EncodeError as error:
             self._hold(t_ns, str(error))
             return
@@ -428,7 +380,6 @@ class Terminal:
         probing = self.state is State.PROBING
         if probing:
             self.family = family
-            self._probes = 0
         if card.user == 0:
             self._on_no_card(t_ns, actions)
             return
