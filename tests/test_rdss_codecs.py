@@ -223,7 +223,10 @@ TEXT: list[tuple[str, Message]] = [
     ("$BDFKI,TXA,Y,Y,0,0000*13", old(Outcome.OK, "TXA")),
     ("$BDFKI,TXA,N,Y,0,0000*04", old(Outcome.NOT_SENT, "TXA")),
     ("$BDFKI,TXA,Y,Y,0,0040*17", old(Outcome.OK, "TXA", wait=40.0)),
-    ("$BDFKI,082920,TCQ,Y,0,0*70", Feedback(Outcome.OK, "TCQ", time_of_day_s=30560)),
+    (
+        "$BDFKI,082920,TCQ,Y,0,0*70",
+        Feedback(Outcome.OK, "TCQ", inhibited=False, time_of_day_s=30560),
+    ),
     (
         "$BDDWR,1,0242286,235959.80,2302.2434,N,11323.6667,E,438.2,M,-6.0,M,0,V,V,L*25",
         text_fix(86399.8, 438.2, -6.0),
@@ -462,7 +465,10 @@ def test_high_altitude_fix_has_30_bytes() -> None:
 def test_bds3_feedback_reasons(reason: int, outcome: Outcome) -> None:
     raw = text_2_1.sentence("BDFKI", f"082920,DWA,N,{reason},17".encode())
     (feedback,) = text_2_1.Decoder().feed(raw)
-    assert feedback == Feedback(outcome, "DWA", 17.0, reason, time_of_day_s=30560)
+    inhibited = True if reason in (2, 3) else None
+    assert feedback == Feedback(
+        outcome, "DWA", 17.0, reason, inhibited=inhibited, time_of_day_s=30560
+    )
     assert text_2_1.encode(feedback) == raw
 
 

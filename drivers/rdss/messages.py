@@ -245,7 +245,7 @@ class Feedback:
     """FKXX, BDFKI. `command` as printed ("DWSQ", "DWA"), None where the frame names none.
 
     `wait_s` is the stated remaining wait; `code` the flag or reason as sent. `inhibited` is what
-    the old BDFKI form says of transmission (suppression, silence, battery), None elsewhere.
+    BDFKI says of transmission (suppression, silence, battery), None where it says nothing.
     `time_of_day_s` is set in, and only in, the BDS-3 form of BDFKI.
     """
 

@@ -170,11 +170,14 @@ def _feedback(f: Fields) -> Message:
     _count(f, 5)
     if f[0].isdigit():
         executed, reason = _choice(f[2], "Y", "N"), _int(f[3], 0, 99)
+        sent = executed and not reason
+        inhibited = False if sent else True if reason in (2, 3) else None
         return Feedback(
-            Outcome.OK if executed and not reason else REASONS.get(reason, Outcome.OTHER),
+            Outcome.OK if sent else REASONS.get(reason, Outcome.OTHER),
             command=f[1] or None,
             wait_s=_optional(f[4], 0, 1e6) or None,
             code=reason,
+            inhibited=inhibited,
             time_of_day_s=int(_time(f[0])),
         )
     executed, frequency_ok = _choice(f[1], "Y", "N"), _choice(f[2], "Y", "N")
