@@ -62,9 +62,7 @@ _Place = tuple[PositionAid | None, Array, float]
 def _as_geodetic(metres: Array, lat: float) -> Array:
     """A short way north, east, down (3,) in m as latitude, longitude (rad) and height (m)."""
     n, e, d = metres
-    return np.array(
-        [n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d]
-    )
+    return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,9 +209,7 @@ class Aligner:
             return None
         return s
 
-    def _at_standstill(
-        self, place: _Place, yaw: float, sd: float, how: str
-    ) -> Start | None:
+    def _at_standstill(self, place: _Place, yaw: float, sd: float, how: str) -> Start | None:
         standing = self._levelled()
         if standing is None:
             return None
@@ -231,32 +227,26 @@ class Aligner:
             levelled=True,
         )
 
-    def _from_saved(
-        self, imu: ImuBuffer, place: _Place
-    ) -> Start | None:
+    def _from_saved(self, imu: ImuBuffer, place: _Place) -> Start | None:
         if self._saved is None or self._ever_moved:
             return None
-        return self._at_standstill(place, self._saved.yaw_rad, self._saved.sd_yaw_rad, "saved state")
+        return self._at_standstill(
+            place, self._saved.yaw_rad, self._saved.sd_yaw_rad, "saved state"
+        )
 
-    def _from_config(
-        self, imu: ImuBuffer, place: _Place
-    ) -> Start | None:
+    def _from_config(self, imu: ImuBuffer, place: _Place) -> Start | None:
         if self.options.heading_rad is None or self._ever_moved:
             return None
         return self._at_standstill(
             place, self.options.heading_rad, self.options.heading_sd_rad, "configured heading"
         )
 
-    def _from_dual_antenna(
-        self, imu: ImuBuffer, place: _Place
-    ) -> Start | None:
+    def _from_dual_antenna(self, imu: ImuBuffer, place: _Place) -> Start | None:
         if self._heading is None or imu.latest_ns - self._heading[0] > HEADING_AGE_NS:
             return None
         return self._at_standstill(place, self._heading[1], self._heading[2], "dual antenna")
 
-    def _from_gyrocompass(
-        self, imu: ImuBuffer, place: _Place
-    ) -> Start | None:
+    def _from_gyrocompass(self, imu: ImuBuffer, place: _Place) -> Start | None:
         standing = self._levelled()
         if standing is None or standing.seconds < self.options.gyrocompass_s:
             return None
@@ -280,9 +270,7 @@ class Aligner:
             compassed=True,
         )
 
-    def _from_course(
-        self, imu: ImuBuffer, place: _Place
-    ) -> Start | None:
+    def _from_course(self, imu: ImuBuffer, place: _Place) -> Start | None:
         """Heading from the course over ground, forward or backward as the IMU felt it move off."""
         for velocity, position in reversed(self._fixes):
             speed = math.hypot(*velocity.v_ned[:2])

@@ -10,7 +10,13 @@ from __future__ import annotations
 GPS_EPOCH_POSIX_S = 315964800
 WEEK_S = 604800
 # POSIX second from which GPST - UTC has this value; years before 2006 do not matter to a receiver.
-LEAP_SECONDS = ((1136073600, 14), (1230768000, 15), (1341100800, 16), (1435708800, 17), (1483228800, 18))
+LEAP_SECONDS = (
+    (1136073600, 14),
+    (1230768000, 15),
+    (1341100800, 16),
+    (1435708800, 17),
+    (1483228800, 18),
+)
 
 
 def leap_seconds(utc_ns: int) -> int:

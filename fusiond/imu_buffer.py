@@ -31,7 +31,12 @@ class ImuBuffer:
     """
 
     def __init__(
-        self, rate_hz: float, keep_s: float, sensor_to_body: Array, time_offset_s: float, gap_s: float
+        self,
+        rate_hz: float,
+        keep_s: float,
+        sensor_to_body: Array,
+        time_offset_s: float,
+        gap_s: float,
     ) -> None:
         capacity = int(rate_hz * keep_s * 2.5) + 1000
         self.times: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)

@@ -281,5 +281,7 @@ class Navigator:
         rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
         return [
             ZeroVelocityAid("zero_velocity", w.end_ns, 0.9999, z.velocity_sd_m_s, z.max_speed_m_s),
-            ZeroRateAid("zero_rate", w.end_ns, 0.9999, rate, z.rate_sd_deg_s * DEG, z.max_speed_m_s),
+            ZeroRateAid(
+                "zero_rate", w.end_ns, 0.9999, rate, z.rate_sd_deg_s * DEG, z.max_speed_m_s
+            ),
         ]

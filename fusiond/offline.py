@@ -192,7 +192,9 @@ def _rpy(q: Array) -> Array:
 _Read = tuple[list[_Arrival], list[Rejection]]
 
 
-def _arrivals(t_s: Array, t_arrival_s: Array, make: Callable[[int, int, int], Measurement]) -> list[_Arrival]:
+def _arrivals(
+    t_s: Array, t_arrival_s: Array, make: Callable[[int, int, int], Measurement]
+) -> list[_Arrival]:
     rows = []
     for i in range(len(t_s)):
         t_ns = _ns(float(t_s[i]))

@@ -77,6 +77,8 @@ _POLLS: tuple[Callable[[int], Request], ...] = (
     IdentityRequest,
     BeamPowerRequest,
 )
+_BLOCKED_POLLS: tuple[Callable[[int], Request], ...] = (SelfTestRequest, BeamPowerRequest)
+"""While nothing may be transmitted: the self test may tell when that ends."""
 
 
 class Terminal:
@@ -282,7 +284,8 @@ class Terminal:
             actions.append(Send(ENCODE[self.family](kind(user)), "read"))
 
     def _poll(self, t_ns: int, actions: list[Action]) -> None:
-        self._read(_POLLS[self._polls % len(_POLLS)], actions)
+        polls = _POLLS if self._permit.granted else _BLOCKED_POLLS
+        self._read(polls[self._polls % len(polls)], actions)
         self._polls += 1
         self._next_poll_ns = t_ns + POLL_NS
         self._quiet_until_ns = t_ns + POLL_REPLY_NS

@@ -1,6 +1,6 @@
 r"""Ellipsoidal height of the body origin.
 
-    z = -(h^ - h) = dr_D + v
+z = -(h^ - h) = dr_D + v
 """
 
 from __future__ import annotations

@@ -100,7 +100,9 @@ class Model:
     initial: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        parameters = sum(len(b.columns) for b in self.blocks if b.columns[0] not in range(CORE_SIZE))
+        parameters = sum(
+            len(b.columns) for b in self.blocks if b.columns[0] not in range(CORE_SIZE)
+        )
         size = CORE_SIZE + parameters
         if size > STRIDE:
             raise ValueError(f"model {self.name}: {size} states, the kernels hold {STRIDE}")
@@ -154,7 +156,9 @@ def _navigation_blocks(noise: ImuNoise, planar: bool) -> list[Block]:
     horizontal = n_e if planar else n_e_d
     return [
         Block("attitude", "rad", n_e_d, (0, 1, 2), white=noise.rate_noise**2),
-        Block("velocity", "m/s", horizontal, (3, 4, 5)[: len(horizontal)], white=noise.force_noise**2),
+        Block(
+            "velocity", "m/s", horizontal, (3, 4, 5)[: len(horizontal)], white=noise.force_noise**2
+        ),
         Block("position", "m", horizontal, (6, 7, 8)[: len(horizontal)]),
     ]
 

@@ -51,7 +51,9 @@ def levelling_jacobian(dcm: Array, lat: float, height: float) -> Array:
     return np.vstack([dcm[1] / g, -dcm[0] / g, np.zeros(3)])
 
 
-def level_in_motion(mean_force: Array, acceleration: Array, yaw: float, g: float) -> tuple[float, float]:
+def level_in_motion(
+    mean_force: Array, acceleration: Array, yaw: float, g: float
+) -> tuple[float, float]:
     """Roll and pitch (rad) from mean force (3,) and known acceleration (3,) NED at a known yaw.
 
     Solves R_x(roll) f = R_y(pitch)^T R_z(yaw)^T (a - g e_D).

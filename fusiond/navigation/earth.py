@@ -59,7 +59,5 @@ def gravity(lat_rad: float, height_m: float) -> float:
     )
     h = height_m / SEMI_MAJOR_M
     return on_ellipsoid * (
-        1.0
-        - 2.0 * h * (1.0 + FLATTENING + GRAVITY_RATIO_M - 2.0 * FLATTENING * s2)
-        + 3.0 * h * h
+        1.0 - 2.0 * h * (1.0 + FLATTENING + GRAVITY_RATIO_M - 2.0 * FLATTENING * s2) + 3.0 * h * h
     )

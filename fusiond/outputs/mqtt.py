@@ -56,8 +56,9 @@ class MqttPublisher:
     """Publishes a vehicle's topics and takes its commands.
 
     `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
-    `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out a configured command; without it, or with
-    none configured, nothing is subscribed. `utc_now` (ns, None if unknown) dates the replies.
+    `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out a configured
+    command; without it, or with none configured, nothing is subscribed. `utc_now` (ns,
+    None if unknown) dates the replies.
 
     `counters`: `mqtt_published`; `mqtt_dropped` (replaced by a newer one, pushed out of the full
     event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_commands`,
@@ -137,6 +138,7 @@ class MqttPublisher:
             client = self._client()
             try:
                 async with client:
+                    _honour_cancellation()
                     backoff.reset()
                     self.counters["mqtt_reconnects"] += connected_before
                     connected_before = True
@@ -152,6 +154,7 @@ class MqttPublisher:
                 self.status = DriverStatus("absent", str(error))
             finally:
                 _hang_up(client)
+            _honour_cancellation()
             await asyncio.sleep(backoff.next())
 
     def _client(self) -> aiomqtt.Client:
@@ -201,6 +204,7 @@ class MqttPublisher:
     ) -> None:
         await client.publish(f"{self._base}/{topic}", payload, qos=qos, retain=retain)
         self.counters["mqtt_published"] += 1
+        _honour_cancellation()
 
     async def _send_latest(self, client: aiomqtt.Client) -> None:
         while True:
@@ -225,7 +229,8 @@ class MqttPublisher:
             await self._send_waiting(client)
             self._confirmed_ready.clear()
             try:
-                await asyncio.wait_for(self._confirmed_ready.wait(), self._heartbeat_s)
+                async with asyncio.timeout(self._heartbeat_s):
+                    await self._confirmed_ready.wait()
             except TimeoutError:
                 if self._status is None:
                     await self._confirm(client, "online", b"online", retain=True)
@@ -265,6 +270,7 @@ class MqttPublisher:
         prefix = f"{self._base}/cmd/"
         if self._on_command is not None and self._options.commands:
             await client.subscribe([(prefix + name, 1) for name in self._options.commands])
+            _honour_cancellation()
         async for message in client.messages:
             name = message.topic.value.removeprefix(prefix)
             payload = message.payload
@@ -296,6 +302,14 @@ class MqttPublisher:
 
 def _encoded(message: Message) -> bytes:
     return message.model_dump_json().encode()
+
+
+def _honour_cancellation() -> None:
+    """Raise the cancellation that `asyncio.wait_for` of Python 3.11, inside aiomqtt, swallows
+    when it comes together with the result (python/cpython issue 86296)."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
 
 
 def _hang_up(client: aiomqtt.Client) -> None:
