@@ -175,22 +175,27 @@ class MqttPublisher:
     async def _serve(self, client: aiomqtt.Client) -> str:
         """Send and receive until the connection fails; the reason it did."""
         self._flowing.set()
+        # Not a TaskGroup: in Python 3.11 it leaves its parent counted as cancelled.
+        tasks = [
+            asyncio.create_task(self._receive(client)),
+            asyncio.create_task(self._send_confirmed(client)),
+            asyncio.create_task(self._send_latest(client)),
+        ]
         try:
-            try:
-                async with asyncio.TaskGroup() as tasks:
-                    tasks.create_task(self._receive(client))
-                    tasks.create_task(self._send_confirmed(client))
-                    tasks.create_task(self._send_latest(client))
-            except* aiomqtt.MqttError as group:
-                reason = str(group.exceptions[0])
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError:
+            await _end(tasks)
             try:
                 await asyncio.wait_for(self._say_farewell(client), _FAREWELL_S)
             except (aiomqtt.MqttError, TimeoutError):
                 await _abandon(client)
             raise
+        errors = await _end(tasks)
         await _abandon(client)
-        return reason
+        for error in errors:
+            if not isinstance(error, aiomqtt.MqttError):
+                raise error
+        return str(errors[0])
 
     async def _say_farewell(self, client: aiomqtt.Client) -> None:
         self._status_due = self._status is not None
@@ -302,6 +307,14 @@ class MqttPublisher:
 
 def _encoded(message: Message) -> bytes:
     return message.model_dump_json().encode()
+
+
+async def _end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
+    """Cancel the tasks, wait for them; the errors they ended with."""
+    for task in tasks:
+        task.cancel()
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    return [r for r in results if isinstance(r, Exception)]
 
 
 def _honour_cancellation() -> None:
