@@ -1,0 +1,151 @@
+"""Simulated runs for the tests of the numerics: a drive, its IMU with known errors, its estimator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.config import Imu
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.model import Model, make_model
+from fusiond.imu_buffer import ImuBuffer
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.rotation import (
+    dcm_from_quaternion,
+    quaternion_from_rpy,
+    rotate_quaternion,
+    rotation_vector_from_dcm,
+)
+from fusiond.settings import imu_noise
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.sensor_errors import imu_output
+from fusiond.simulation.trajectories import Leg, follow
+
+Array = NDArray[np.float64]
+ORIGIN = (math.radians(30.5), math.radians(114.3), 40.0)
+SECOND = 1_000_000_000
+
+TOWN = (
+    Leg(8, speed_m_s=14.0),
+    Leg(8, turn_deg=90.0),
+    Leg(12, speed_m_s=18.0),
+    Leg(6, turn_deg=-60.0),
+    Leg(9, speed_m_s=6.0),
+    Leg(14, turn_deg=200.0),
+    Leg(8, speed_m_s=0.0),
+    Leg(10),
+)
+
+
+def town_truth(seconds: float, rate_hz: float, climb_deg: float = 3.0) -> Truth:
+    """Turns, stops and, unless `climb_deg` is 0, hills. Without them the height is constant."""
+    legs: list[Leg] = []
+    for k in range(1 + int(seconds // 75)):
+        legs += TOWN[:2]
+        legs += [Leg(6, climb_deg=climb_deg), Leg(8, climb_deg=-climb_deg), Leg(6, climb_deg=0.0)]
+        legs += TOWN[2:] if k % 2 == 0 else TOWN[:1:-1]
+    bank = -0.08 if climb_deg else 0.0
+    return Truth(follow(legs, seconds, course_deg=40.0, bank_ratio=bank), ORIGIN, rate_hz, seconds)
+
+
+def sample_times(truth: Truth, start_ns: int = 0) -> NDArray[np.int64]:
+    """Stamps (n,) in ns of the truth's samples."""
+    return start_ns + np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
+
+
+def true_nav(truth: Truth, t_s: Array) -> Array:
+    """Navigation states (n, 10) at the instants (n,)."""
+    states = truth.at(t_s)
+    q = np.array([quaternion_from_rpy(*rpy) for rpy in states.rpy])
+    return np.column_stack([states.position, states.v_ned, q])
+
+
+def metres(lat: float, height: float) -> Array:
+    """Metres north, east, down a unit of latitude, longitude (rad) and height (m)."""
+    return np.array(
+        [
+            meridian_radius(lat) + height,
+            (transverse_radius(lat) + height) * math.cos(lat),
+            -1.0,
+        ]
+    )
+
+
+def nav_error(computed: Array, true: Array) -> Array:
+    """Error state (9,) computed minus true: phi (rad), dv (m/s), dr (m), as the filter defines it."""
+    turn = dcm_from_quaternion(computed[6:]) @ dcm_from_quaternion(true[6:]).T
+    dr = (computed[:3] - true[:3]) * metres(float(true[0]), float(true[2]))
+    return np.concatenate([-rotation_vector_from_dcm(turn), computed[3:6] - true[3:6], dr])
+
+
+def with_error(true: Array, error: Array) -> Array:
+    """The computed state (10,) that is off from `true` by `error` (9,)."""
+    nav = true.copy()
+    rotate_quaternion(nav[6:], -float(error[0]), -float(error[1]), -float(error[2]), True)
+    nav[3:6] += error[3:6]
+    nav[:3] += error[6:9] / metres(float(true[0]), float(true[2]))
+    return nav
+
+
+@dataclass(frozen=True, slots=True)
+class ImuRun:
+    """One IMU on one trajectory: samples (n, 6), and its errors, biases (n, 6), scales (6,)."""
+
+    samples: Array
+    biases: Array
+    scales: Array
+
+
+def imu_run(imu: Imu, truth: Truth, seed: int) -> ImuRun:
+    """What that IMU says; the same seed without motion tells biases and noise from scale factors."""
+    out = imu_output(imu, truth.gyro, truth.accel, np.random.default_rng(seed))
+    nothing = np.zeros_like(truth.gyro)
+    still = imu_output(imu, nothing, nothing, np.random.default_rng(seed))
+    scales = [
+        np.sum((y - y0) * x, axis=0) / np.maximum(np.sum(x * x, axis=0), 1e-30) - 1.0
+        for y, y0, x in (
+            (out.gyro, still.gyro, truth.gyro),
+            (out.accel, still.accel, truth.accel),
+        )
+    ]
+    return ImuRun(
+        np.hstack([out.gyro, out.accel]),
+        np.hstack([out.gyro_bias, out.accel_bias]),
+        np.concatenate(scales),
+    )
+
+
+def filled_buffer(imu: Imu, times: NDArray[np.int64], samples: Array) -> ImuBuffer:
+    """A buffer that holds all of the samples (body axes)."""
+    seconds = float(times[-1] - times[0]) * 1e-9 + 10.0
+    buffer = ImuBuffer(imu.rate_hz, seconds, np.eye(3), 0.0, imu.gap_s)
+    assert buffer.append(times, samples) == len(times)
+    return buffer
+
+
+def make_estimator(name: str, imu: Imu) -> tuple[Model, KalmanEstimator]:
+    """A shipped model and its filter for an IMU."""
+    model = make_model(name, imu_noise(imu))
+    return model, KalmanEstimator(model, imu.gap_s)
+
+
+def initial_sd(model: Model, attitude: Array, velocity: float, position: float) -> Array:
+    """One sigma (n,) at the start: what is given for the navigation errors, the model's for the rest."""
+    sd = model.initial.copy()
+    sd[0:3], sd[3:6], sd[6:9] = attitude, velocity, position
+    sd[~model.active] = 0.0
+    return sd
+
+
+def random_attitude(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Roll, pitch, yaw anywhere short of the vertical."""
+    roll, pitch, yaw = rng.uniform(-1.0, 1.0, 3) * [math.pi, 1.3, math.pi]
+    return float(roll), float(pitch), float(yaw)
+
+
+def level_nav(rpy: tuple[float, float, float], v: tuple[float, float, float]) -> Array:
+    """A navigation state (10,) at ORIGIN."""
+    return np.array([*ORIGIN, *v, *quaternion_from_rpy(*rpy)])
