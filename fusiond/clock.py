@@ -166,7 +166,8 @@ class Clock:
     def resolve(self, stamp: Stamp, source: str, t_seen_ns: int) -> Instant:
         """The instant at which a measurement of `source`, seen at `t_seen_ns`, was true.
 
-        Never after `t_seen_ns`, except for a `MonotonicStamp`, which is taken as it is.
+        Not after `t_seen_ns`, but for a `MonotonicStamp`, which is taken as it is, and for the
+        nanosecond that keeps a device's samples apart.
         """
         match stamp:
             case KernelStamp():

@@ -93,7 +93,10 @@ class DeviceClock:
         self._t_ns = 0
 
     def to_monotonic(self, ticks_ns: int, t_seen_ns: int) -> int:
-        """Monotonic instant (ns) of `ticks_ns`, which came in at `t_seen_ns`; not after it."""
+        """Monotonic instant (ns) of `ticks_ns`, which came in at `t_seen_ns`.
+
+        Not after it, but for one nanosecond a sample where only that keeps them in order.
+        """
         offset = self._filter.offset_ns
         last = self._ticks_ns
         if (

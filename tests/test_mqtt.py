@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -106,23 +107,29 @@ async def test_every_topic_arrives_and_shutdown_says_offline(tmp_path: Path) -> 
         assert it.publisher.counters["mqtt_reconnects"] == 0
 
 
+DAEMON = """
+import asyncio, sys
+from fusiond.config import Mqtt
+from fusiond.outputs.mqtt import MqttPublisher
+
+async def main():
+    options = Mqtt(host="127.0.0.1", port=int(sys.argv[1]))
+    await MqttPublisher(options, "truck", on_event=print).run()
+
+asyncio.run(main())
+"""
+
+
 async def test_will_says_offline_when_the_daemon_dies(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with listening(broker) as (listener, _):
-            it = Running(options(broker))
-            task = asyncio.create_task(it.publisher.run())
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-c", DAEMON, str(broker.port), stdout=asyncio.subprocess.DEVNULL
+            )
             await listener.until(heard("online"))
-            # The process ends without a word: its socket goes away under it.
-            client = next(r for r in _clients(task))
-            client.socket().close()
-            await listener.until(lambda li: heard("online")(li)[1:2] == [b"offline"])
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-
-
-def _clients(task: asyncio.Task[None]) -> list[Any]:
-    frame = task.get_coro().cr_frame  # type: ignore[union-attr]
-    return [frame.f_locals["client"]._client]
+            process.kill()
+            await listener.until(lambda li: heard("online")(li) == [b"online", b"offline"])
+            await process.wait()
 
 
 async def test_slow_broker_gets_the_newest_and_the_rest_is_counted(tmp_path: Path) -> None:
