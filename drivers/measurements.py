@@ -165,7 +165,8 @@ class Height:
 
 @dataclass(frozen=True, slots=True)
 class WheelSpeed:
-    """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given."""
+    """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if
+    given."""
 
     source: str
     t_seen_ns: int

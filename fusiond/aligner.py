@@ -1,8 +1,8 @@
 """Initial alignment: waits for level, heading and position, and starts the filter when it has all.
 
-Level comes from a standstill (or from motion known by two velocity fixes), heading from the first of the
-allowed sources that can give it, position from a fix, the configuration or the saved state. No
-heading, no navigation: `reason` says what is missing.
+Level comes from a standstill (or from motion known by two velocity fixes), heading from the first
+of the allowed sources that can give it, position from a fix, the configuration or the saved state.
+No heading, no navigation: `reason` says what is missing.
 """
 
 from __future__ import annotations
@@ -42,10 +42,11 @@ Array = NDArray[np.float64]
 
 # A heading that came this long ago no longer describes a body at rest that may have been moved.
 HEADING_AGE_NS = 2_000_000_000
-# Course and integrated motion must agree this well (rad), forward or backward, or the vehicle slid or the
-# integration is poor: the next fix decides.
+# Course and integrated motion must agree this well (rad), forward or backward, or the vehicle slid
+# or the integration is poor: the next fix decides.
 COURSE_AGREEMENT_RAD = math.radians(45.0)
-# Levelling in motion: one sigma of tilt (rad), and the turn rate (rad/s) above which it is not tried.
+# Levelling in motion: one sigma of tilt (rad), and the turn rate (rad/s) above which it is not
+# tried.
 MOTION_LEVEL_SD_RAD = math.radians(2.0)
 MOTION_MAX_RATE_RAD_S = math.radians(5.0)
 MOTION_INTERVAL_NS = (800_000_000, 3_500_000_000)

@@ -111,7 +111,7 @@ def doctor(
 
 
 @app.command()
-def process(  # noqa: PLR0917 - typer takes the command line from the arguments
+def process(
     config: ConfigPath,
     imu: Annotated[Path, typer.Option(metavar="F.csv", help="IMU samples.")],
     aid: Annotated[

@@ -92,7 +92,8 @@ class GnssAiding(Aiding):
     min_position_sd_m: PositiveFloat = 0.02
     min_velocity_sd_m_s: PositiveFloat = 0.02
     velocity_delay_s: NonNegativeFloat = 0.0
-    """Age of the velocity at the fix's instant: half an epoch where the receiver averages over one."""
+    """Age of the velocity at the fix's instant: half an epoch where the receiver averages over
+    one."""
     time_sd_s: NonNegativeFloat = 0.0
     """Timing error of the fix against the IMU; times the speed it adds to sigma."""
 
@@ -217,7 +218,8 @@ class ClockOptions(Section):
 
 
 class Mqtt(Section):
-    """Broker. Passwords come from FUSIOND_MQTT_PASSWORD or from `password_file`, never from here."""
+    """Broker. Passwords come from FUSIOND_MQTT_PASSWORD or from `password_file`, never from
+    here."""
 
     enabled: bool = True
     host: str = "localhost"

@@ -1,7 +1,7 @@
 """The daemon: drivers, clock, navigator, scheduler and outputs put together.
 
-Everything runs in one event loop. Drivers hand measurements over as they come; the tick alone runs the
-filter and reads the solution, and outputs take the latest of it.
+Everything runs in one event loop. Drivers hand measurements over as they come; the tick alone runs
+the filter and reads the solution, and outputs take the latest of it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """GPS time and UTC.
 
-GPS time started at 1980-01-06 and counts no leap seconds: GPST = UTC + 18 s since 2017-01-01. The table
-holds the dates since which each offset is valid (IERS Bulletin C); the last entry serves until a new
-one is announced.
+GPS time started at 1980-01-06 and counts no leap seconds: GPST = UTC + 18 s since 2017-01-01. The
+table holds the dates since which each offset is valid (IERS Bulletin C); the last entry serves
+until a new one is announced.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The IMU's recent past in arrays that the kernels read: body axes, own time offset taken out.
 
-Samples keep an absolute number for ever: sample k lies at row k - start. Rows move to the front when the
-arrays are full, so that the kernels always see one contiguous run of at least `keep_s` seconds.
+Samples keep an absolute number for ever: sample k lies at row k - start. Rows move to the front
+when the arrays are full, so that the kernels always see one contiguous run of at least `keep_s`
+seconds.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The door of the navigator: a driver's measurement becomes aids, or is refused by name.
 
-Here the configuration meets the measurement: lever arm, sigma where the device states none, floors and
-gates. Behind it everything is in SI units with a settled instant.
+Here the configuration meets the measurement: lever arm, sigma where the device states none, floors
+and gates. Behind it everything is in SI units with a settled instant.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ S = TypeVar("S", bound=Aiding)
 
 # Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
 ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
-# RTK divides the ranging error by far more than code does; these factors scale the DOP rule only when
-# the receiver sends no GST (typical: 0.5 m differential, 0.3 m float, 0.02 m fixed for 3 m code).
+# RTK divides the ranging error by far more than code does; these factors scale the DOP rule only
+# when the receiver sends no GST (typical: 0.5 m differential, 0.3 m float, 0.02 m fixed for 3 m
+# code).
 RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
 # A receiver's own velocity has no meaning below this sigma; none states less in practice.
 VERTICAL_VELOCITY_FACTOR = 1.5
@@ -119,8 +120,8 @@ class Intake:
         if o.use_velocity and m.v_ned_m_s is not None:
             v = tuple(c for c in m.v_ned_m_s if c is not None)
             stated = m.sd_v_ned_m_s or (None, None, None)
-            typical = (o.velocity_sd_m_s, o.velocity_sd_m_s)
-            typical += (o.velocity_sd_m_s * VERTICAL_VELOCITY_FACTOR,)
+            horizontal, vertical = o.velocity_sd_m_s, o.velocity_sd_m_s * VERTICAL_VELOCITY_FACTOR
+            typical = (horizontal, horizontal, vertical)
             sd_v = tuple(
                 max((s or t) * o.sigma_scale, o.min_velocity_sd_m_s)
                 for s, t in zip(stated, typical, strict=True)

@@ -75,7 +75,7 @@ class Navigator:
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
-        a, imu = self.config.alignment, self.config.imu
+        a = self.config.alignment
         position = a.position_deg_m
         options = AlignmentOptions(
             heading=a.heading,

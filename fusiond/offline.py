@@ -1,7 +1,7 @@
-"""`fusiond process`: the daemon's navigator over recorded files, causal, one solution an IMU sample.
+"""`fusiond process`: the daemon's navigator over recorded files, causal, a solution a sample.
 
-Rows are handed over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the solution at
-each sample is what the daemon would have said then, before anything that arrived later.
+Rows are handed over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the
+solution at each sample is what the daemon would have said then, before anything that arrived later.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class _Recorder:
             return
         mode, _ = navigator.mode(int(imu.times[rows.stop - 1]))
         self._writer.rows(
-            imu.times[rows] * 1e-9,
+            np.asarray(imu.times[rows] * 1e-9, dtype=np.float64),
             nav[:, 0],
             (nav[:, 1] + np.pi) % (2.0 * np.pi) - np.pi,
             nav[:, 2],

@@ -40,7 +40,8 @@ def imu_noise(imu: Imu) -> ImuNoise:
 def sensor_to_body(imu: Imu) -> NDArray[np.float64]:
     """Rotation (3, 3) from sensor axes to body axes.
 
-    Nominal axes first (`axes`), then the mounting: `mounting_deg` is the attitude of the nominal sensor frame
+    Nominal axes first (`axes`), then the mounting: `mounting_deg` is the attitude of the nominal
+    sensor frame
     against the body, so its matrix turns nominal sensor axes into body axes.
     """
     nominal = np.zeros((3, 3))

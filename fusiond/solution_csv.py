@@ -59,7 +59,7 @@ class SolutionWriter:
         self._buffer = np.empty(_CHUNK_ROWS * row_bytes, dtype=np.uint8)
         self._stream.write((",".join(COLUMNS) + "\n").encode("ascii"))
 
-    def rows(  # noqa: PLR0917 - one argument a group of columns
+    def rows(
         self,
         t_s: Floats,
         lat_rad: Floats,

@@ -136,7 +136,8 @@ class Sources:
         return [ask() for ask in asks if ask is not None]
 
     def health(self, now_ns: int) -> dict[str, SourceHealth]:
-        """`health` by source; what the filter makes by itself (`zero_velocity`) has its own line."""
+        """`health` by source; what the filter makes by itself (`zero_velocity`) has its own
+        line."""
         navigator = self._navigator
         outcomes = navigator.timeline.counters.outcomes
         health: dict[str, SourceHealth] = {}

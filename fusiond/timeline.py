@@ -1,9 +1,9 @@
 """The timeline: aids in order of validity, checkpoints of the filter, exact rewinding.
 
-An aid whose instant has passed takes the filter back to the last checkpoint before it; it is applied at its
-own instant, and everything after it runs again. The state that results is, bit for bit, the one
-that would have come of arrival in order of validity, as long as the aid is younger than the oldest
-checkpoint. Aids of one instant are ordered by source, not by arrival.
+An aid whose instant has passed takes the filter back to the last checkpoint before it; it is
+applied at its own instant, and everything after it runs again. The state that results is, bit for
+bit, the one that would have come of arrival in order of validity, as long as the aid is younger
+than the oldest checkpoint. Aids of one instant are ordered by source, not by arrival.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Attitude: the rotation from measured to computed attitude is -phi, in navigation
 
     z = rotation vector of C^ C_y^T = -phi + v,   cov(v) = J diag(sd^2) J^T
 
-J's columns are the axes about which roll, pitch and yaw turn: C e_x, [-sin yaw, cos yaw, 0], e_z. Its noise is
-whitened, so that the rows are uncorrelated. Heading alone:
+J's columns are the axes about which roll, pitch and yaw turn: C e_x, [-sin yaw, cos yaw, 0], e_z.
+Its noise is whitened, so that the rows are uncorrelated. Heading alone:
 
     z = yaw^ - yaw,   d yaw = -[tan(pitch) cos yaw, tan(pitch) sin yaw, 1] phi
 

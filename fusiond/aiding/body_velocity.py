@@ -6,8 +6,8 @@ At a point l of the vehicle (rear axle, wheel), with the body's rate w:
 
 Non-holonomic: v_b right and down are 0. Wheel speed: v_b forward is what the wheel says.
 
-Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE T-RA
-17 (2001), eq. 8; Groves, 2nd ed., section 15.4.1.
+Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
+T-RA 17 (2001), eq. 8; Groves, 2nd ed., section 15.4.1.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@ r"""Standstill: zero velocity and zero rate.
     z = v^ - 0 = dv + v
     z = mean of w^ over the window - C^T w_ie = e + v
 
-The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill). A quiet
-sensor alone cannot tell rest from smooth driving, so the aid holds only while the computed speed
-can be zero: below `max_speed_m_s`.
+The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill). A
+quiet sensor alone cannot tell rest from smooth driving, so the aid holds only while the computed
+speed can be zero: below `max_speed_m_s`.
 
 Source: Groves, 2nd ed., section 15.3.
 """
@@ -41,7 +41,8 @@ class ZeroVelocityAid(Aid):
 
 @dataclass(frozen=True, slots=True)
 class ZeroRateAid(Aid):
-    """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s` of what the vehicle may turn."""
+    """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s` of what the vehicle may
+    turn."""
 
     mean_rate: Vector3
     sd_rad_s: float

@@ -2,7 +2,8 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 
     z = v^ + C^ (w x l) - v_fix = dv + (C (w x l)) x phi - C [l x] e + v
 
-w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s per 10 m.
+w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s
+per 10 m.
 
 Source: Groves, 2nd ed., eq. 14.109.
 """

@@ -1,7 +1,7 @@
 r"""Extended Kalman filter on the error state, closed loop.
 
-The error state is estimated, taken out of the navigation state at once and is zero again, so only its
-covariance is propagated. Parameters keep their estimates in `xi`.
+The error state is estimated, taken out of the navigation state at once and is zero again, so only
+its covariance is propagated. Parameters keep their estimates in `xi`.
 
 Gate: with S = H P H^T + R, nu^T S^-1 nu is chi-square with m degrees of freedom while filter and
 measurement agree; beyond the quantile of the aid's gate probability the measurement is left out.
@@ -35,8 +35,8 @@ from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
 
 Array = NDArray[np.float64]
 
-# One sigma (rad) added to the attitude when a filter that rejects everything is opened again: what a bad
-# alignment on the move can be wrong by.
+# One sigma (rad) added to the attitude when a filter that rejects everything is opened again: what
+# a bad alignment on the move can be wrong by.
 DOUBTED_ATTITUDE_RAD = math.radians(3.0)
 
 
@@ -66,7 +66,8 @@ class Snapshot(NamedTuple):
 
 
 class KalmanEstimator:
-    """State at `t_ns` (ns) after samples of the buffer up to, not including, `sample` (absolute)."""
+    """State at `t_ns` (ns) after samples of the buffer up to, not including, `sample`
+    (absolute)."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         self.model = model

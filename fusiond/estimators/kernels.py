@@ -178,7 +178,8 @@ def sigmas(cov: Array, step: Array, out: Array) -> None:
     for i in range(3):
         out[i] = math.sqrt(cov[6 + i, 6 + i])
         out[3 + i] = math.sqrt(cov[3 + i, 3 + i])
-    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw, 0],
+    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
+    # 0],
     # and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
     sp = -step[STEP_DCM + 6]
     cp = math.sqrt(max(1e-12, 1.0 - sp * sp))

@@ -5,8 +5,8 @@ filter estimates beside it. A parameter block is a first-order Gauss-Markov proc
 
     x' = -x / tau + w,   steady sigma s,   variance over h: s^2 (1 - exp(-2 h / tau))
 
-or, with tau infinite, a random constant. What a block does to the navigation errors is said by its `columns`
-(fusiond.navigation.error_model).
+or, with tau infinite, a random constant. What a block does to the navigation errors is said by its
+`columns` (fusiond.navigation.error_model).
 
 Blocks of the papers' models: 000 (15 states, planar, constant and Markov gyro drift, Markov
 accelerometer); the 15 and 21 states for vehicles are those of Groves, 2nd ed., section 14.2.
@@ -83,7 +83,8 @@ class Block:
 class Model:
     """A list of blocks, laid out in slots for the kernels.
 
-    Slots 0 to 8 are always the navigation errors (attitude, velocity, position, each n, e, d); a slot that no
+    Slots 0 to 8 are always the navigation errors (attitude, velocity, position, each n, e, d); a
+    slot that no
     block fills is not `active` and stays zero (planar models). Parameters follow in the order of
     their blocks. `size` counts slots; arrays are (size,).
     """

@@ -7,10 +7,11 @@ At rest the specific force is -g along down and the rate is the Earth's:
 
 What the sensors get wrong becomes attitude error, fully correlated with it:
 
-    phi_N = (C a)_E / g     phi_E = -(C a)_N / g     phi_D = ((C e)_E + phi_N w_D) / w_N   (gyrocompass)
+    phi_N = (C a)_E / g     phi_E = -(C a)_N / g
+    phi_D = ((C e)_E + phi_N w_D) / w_N                 after gyrocompassing
 
-Source: Groves, 2nd ed., section 5.6; Titterton and Weston, 2nd ed., section 10.3; signs by the error
-model (fusiond.navigation.error_model), checked in the tests.
+Source: Groves, 2nd ed., section 5.6; Titterton and Weston, 2nd ed., section 10.3; signs by the
+error model (fusiond.navigation.error_model), checked in the tests.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ def integrate_from_rest(
 ) -> None:
     """Turn `q` (4,) in place through samples (m, 6) and add the velocity gained to `velocity` (3,).
 
-    Over tens of seconds from rest: Earth rate, transport and Coriolis are left out. `times` (m + 1,) in
+    Over tens of seconds from rest: Earth rate, transport and Coriolis are left out. `times` (m +
+    1,) in
     ns holds the start before the first sample. Velocity in the axes that `q` refers to.
     """
     dcm = np.empty((3, 3))

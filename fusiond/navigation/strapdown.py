@@ -10,8 +10,8 @@ One interval of length h (s) with mean rate w and mean specific force f (body), 
     velocity change   u = f h + 1/2 (w h) x (f h) + h^3/12 (w x fd + f x wd)     rotation, sculling
 
 which for equal intervals and wd = (w - w_before) / h are the two-sample terms 1/12 ds' x ds and
-1/12 (ds' x du + du' x ds). Gravity and Coriolis are taken at the middle of the interval. Written with slopes, an
-interval may be split at the instant of a measurement.
+1/12 (ds' x du + du' x ds). Gravity and Coriolis are taken at the middle of the interval. Written
+with slopes, an interval may be split at the instant of a measurement.
 
 Source: Savage, Strapdown Inertial Navigation Integration Algorithm Design, J. Guidance 21 (1998),
 parts 1 (eq. 34, 38) and 2 (eq. 36, 46); Groves, 2nd ed., section 5.4.

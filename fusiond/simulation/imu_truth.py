@@ -55,7 +55,7 @@ def _position_rate(position: Array, v: Array, rate: Array) -> None:
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
-def _inverse_strapdown(  # noqa: PLR0917 - compiled functions take no keywords
+def _inverse_strapdown(
     position: Array, v: Array, v_rate: Array, rpy: Array, rpy_rate: Array, gyro: Array, accel: Array
 ) -> None:
     """Write body rate and specific force at one instant."""
@@ -87,7 +87,7 @@ def _inverse_strapdown(  # noqa: PLR0917 - compiled functions take no keywords
     "void(f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8, f8[:, ::1], f8[:, ::1],"
     "f8[:, ::1], f8[:, ::1])"
 )
-def _integrate(  # noqa: PLR0917 - compiled functions take no keywords
+def _integrate(
     v: Array,
     v_rate: Array,
     rpy: Array,
