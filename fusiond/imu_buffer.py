@@ -2,7 +2,7 @@
 
 Samples keep an absolute number for ever: sample k lies at row k - start. Rows move to the front
 when the arrays are full, so that the kernels always see one contiguous run of at least `keep_s`
-seconds.
+seconds, and of all that the filter may still rewind to.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ class ImuBuffer:
         self.sigmas: Array = np.full((capacity, 9), np.nan)
         self.start = 0
         self.end = 0
+        self.needed: int | None = None
+        """Absolute number of the oldest sample that a rewind would use; nobody needs any: None."""
         self.counters: Counter[str] = Counter()
         self._keep_ns = round(keep_s * 1e9)
         self._gap_ns = round(gap_s * 1e9)
@@ -115,14 +117,26 @@ class ImuBuffer:
         count = len(times)
         if self.end + count > len(self.times):
             needed = int(times[-1]) - self._keep_ns
-            drop = max(0, self.index_after(needed) - MARGIN)
-            drop = max(drop, self.end + count - len(self.times))
+            drop = self.index_after(needed)
+            if self.needed is not None:
+                drop = min(drop, self.needed - self.start)
+            drop = max(0, drop - MARGIN)
             for array in (self.times, self.samples, self.nav, self.sigmas):
                 array[: self.end - drop] = array[drop : self.end].copy()
             self.start += drop
             self.end -= drop
+            if self.end + count > len(self.times):
+                self._grow(2 * (self.end + count))
         rows = slice(self.end, self.end + count)
         self.times[rows] = times
         np.matmul(samples, self._turn, out=self.samples[rows])
         self.nav[rows] = np.nan
         self.end += count
+
+    def _grow(self, capacity: int) -> None:
+        """More rows: the IMU is faster than configured, or the filter has not run for long."""
+        more = capacity - len(self.times)
+        self.times = np.concatenate([self.times, np.zeros(more, dtype=np.int64)])
+        self.samples = np.concatenate([self.samples, np.zeros((more, 6))])
+        self.nav = np.concatenate([self.nav, np.full((more, NAV_SIZE), np.nan)])
+        self.sigmas = np.concatenate([self.sigmas, np.full((more, 9), np.nan)])

@@ -24,6 +24,9 @@ Key = tuple[int, str, int]
 # are longer than any multipath burst at a street crossing; five fixes are more than chance.
 RECOVERY_NS = 10_000_000_000
 RECOVERY_COUNT = 5
+# Aids that may wait for the start or for the IMU: more than a minute of all that a well-equipped
+# vehicle sends. Beyond it the oldest are given up.
+MOST_WAITING = 4096
 
 
 @dataclass(slots=True)
@@ -82,16 +85,21 @@ class Timeline:
         self._next = 0
         self._failing.clear()
         self._checkpoints = [_Checkpoint(self.estimator.snapshot(), None, {})]
-        while self._entries and self._keys[0][0] < self.estimator.t_ns:
-            self._count(self._entries.pop(0), Outcome("before_start"))
-            self._keys.pop(0)
+        self._give_up(bisect_left(self._keys, (self.estimator.t_ns, "", 0)), "before_start")
+        self.imu.needed = self.estimator.sample
 
     def clear(self) -> None:
         """Forget all that waits (the estimator is about to be started anew)."""
-        self._entries.clear()
-        self._keys.clear()
-        self._checkpoints.clear()
+        del self._entries[: self._next], self._keys[: self._next]
         self._next = 0
+        self._give_up(len(self._entries), "no_alignment")
+        self._checkpoints.clear()
+        self.imu.needed = None
+
+    @property
+    def waiting(self) -> int:
+        """Number of aids whose instant the filter has not reached."""
+        return len(self._entries) - self._next
 
     @property
     def oldest_ns(self) -> int:
@@ -102,7 +110,7 @@ class Timeline:
         """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
         key = (aid.t_ns, aid.source, serial)
         entry = Entry(key, aid)
-        if aid.t_ns < self.oldest_ns:
+        if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
             return entry
         at = bisect_left(self._keys, key)
@@ -117,6 +125,8 @@ class Timeline:
             if at < self._next:
                 self._next += 1
             self._rewind(key)
+        elif self.waiting > MOST_WAITING:
+            self._give_up(1, "no_imu" if self._checkpoints else "no_alignment")
         return entry
 
     def run(self, record: bool = False) -> None:
@@ -132,6 +142,13 @@ class Timeline:
         estimator.propagate(self.imu, latest, record)
         self._checkpoint()
         self._forget(latest - self._keep_ns)
+
+    def _give_up(self, count: int, name: str) -> None:
+        """Drop the first `count` of those that wait."""
+        rows = slice(self._next, self._next + count)
+        for entry in self._entries[rows]:
+            self._count(entry, Outcome(name))
+        del self._entries[rows], self._keys[rows]
 
     def _apply(self, entry: Entry) -> Outcome:
         source, t_ns = entry.aid.source, entry.key[0]
@@ -192,6 +209,7 @@ class Timeline:
         if drop:
             del self._checkpoints[:drop]
         oldest = self._checkpoints[0]
+        self.imu.needed = oldest.snapshot.sample
         stale = 0
         while stale < self._next and (
             oldest.last_key is not None and self._keys[stale] < oldest.last_key

@@ -1,4 +1,4 @@
-"""Simulated runs for the tests of the numerics: a drive, its IMU with known errors, its estimator."""
+"""Simulated runs for the tests of the numerics: a drive, its IMU with known errors, its filter."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def metres(lat: float, height: float) -> Array:
 
 
 def nav_error(computed: Array, true: Array) -> Array:
-    """Error state (9,) computed minus true: phi (rad), dv (m/s), dr (m), as the filter defines it."""
+    """Error state (9,), computed minus true as the filter has it: phi (rad), dv (m/s), dr (m)."""
     turn = dcm_from_quaternion(computed[6:]) @ dcm_from_quaternion(true[6:]).T
     dr = (computed[:3] - true[:3]) * metres(float(true[0]), float(true[2]))
     return np.concatenate([-rotation_vector_from_dcm(turn), computed[3:6] - true[3:6], dr])
@@ -100,7 +100,7 @@ class ImuRun:
 
 
 def imu_run(imu: Imu, truth: Truth, seed: int) -> ImuRun:
-    """What that IMU says; the same seed without motion tells biases and noise from scale factors."""
+    """What that IMU says; the same seed without motion tells biases from scale factors."""
     out = imu_output(imu, truth.gyro, truth.accel, np.random.default_rng(seed))
     nothing = np.zeros_like(truth.gyro)
     still = imu_output(imu, nothing, nothing, np.random.default_rng(seed))
@@ -133,7 +133,7 @@ def make_estimator(name: str, imu: Imu) -> tuple[Model, KalmanEstimator]:
 
 
 def initial_sd(model: Model, attitude: Array, velocity: float, position: float) -> Array:
-    """One sigma (n,) at the start: what is given for the navigation errors, the model's for the rest."""
+    """One sigma (n,) at the start: as given for the navigation errors, else the model's."""
     sd = model.initial.copy()
     sd[0:3], sd[3:6], sd[6:9] = attitude, velocity, position
     sd[~model.active] = 0.0

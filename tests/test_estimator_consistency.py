@@ -1,10 +1,10 @@
 """Monte Carlo: the filter's sigma is honest (NEES, NIS) for every shipped model.
 
-Each run draws its sensor errors from `fusiond.simulation.sensor_errors` with the very `Imu` that the
-filter is configured with, starts from the true state plus an error drawn from P0, and feeds back.
-With N runs the sum of NEES over the runs is chi-square with N x dof degrees of freedom at each
-instant; NIS of all aids of all runs is chi-square with the sum of their dimensions, as innovations
-are white (Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2).
+Each run draws its sensor errors from `fusiond.simulation.sensor_errors` with the very `Imu` that
+the filter is configured with, starts from the true state plus an error drawn from P0, and feeds
+back. With N runs the sum of NEES over the runs is chi-square with N x dof degrees of freedom at
+each instant; NIS of all aids of all runs is chi-square with the sum of their dimensions, as
+innovations are white (Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2).
 """
 
 from __future__ import annotations
@@ -179,7 +179,8 @@ def test_stated_sigma_is_honest(name: str) -> None:
     for source, (total, degrees) in figures.nis.items():
         low, high = interval(degrees, probability)
         print(
-            f"{name} NIS {source}: {total / degrees:.4f} [{low / degrees:.4f}, {high / degrees:.4f}]"
+            f"{name} NIS {source}: {total / degrees:.4f} "
+            f"[{low / degrees:.4f}, {high / degrees:.4f}]"
         )
         if not low <= total <= high:
             failures.append((source, math.nan, total / degrees, low / degrees, high / degrees))
