@@ -173,15 +173,7 @@ class Navigator:
         if ahead > 0 and self.imu.end:
             nav = nav.copy()
             rate, force, zero = np.zeros(3), np.zeros(3), np.zeros(3)
-            compensate(
-                self.imu.samples,
-                self.imu.end - 1,
-                e.xi,
-                self.model.column_of,
-                np.zeros(12),
-                rate,
-                force,
-            )
+            compensate(self.imu.samples, self.imu.end - 1, e.sensor_errors, rate, force)
             strapdown_step(
                 nav,
                 rate,
@@ -194,8 +186,7 @@ class Navigator:
             )
         sd = [float(s) for s in e.sigmas()]
         values = [float(v) for v in nav]
-        bias = np.zeros(12)
-        compensate(np.zeros((1, 6)), 0, e.xi, self.model.column_of, bias, np.zeros(3), np.zeros(3))
+        bias = e.sensor_errors
         lon = (values[1] + math.pi) % (2.0 * math.pi) - math.pi
         return Solution(
             t_ns,

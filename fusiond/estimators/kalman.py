@@ -24,6 +24,7 @@ from fusiond.estimators.kernels import (
     feed_back,
     normalised_innovation_squared,
     propagate,
+    sensor_estimates,
     sigmas,
     update,
 )
@@ -76,14 +77,14 @@ class KalmanEstimator:
         self.sample = 0
         self.nav: Array = np.zeros(NAV_SIZE)
         self.xi: Array = np.zeros(model.size)
-        self._cov: Array = np.zeros((model.size, STRIDE))
+        self._cov: Array = np.zeros((STRIDE, STRIDE))
         self.step: Array = np.zeros(STEP_SIZE)
         self._dx: Array = np.zeros(model.size)
 
     @property
     def covariance(self) -> Array:
         """P (n, n) of the error state, a view."""
-        return self._cov[:, : self.model.size]
+        return self._cov[: self.model.size, : self.model.size]
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -105,7 +106,8 @@ class KalmanEstimator:
             self._cov,
             m.hold_height,
             m.active,
-            m.column_of,
+            m.sensor_slot,
+            m.sensor_kind,
             m.decay_rate,
             m.white,
             m.steady_variance,
@@ -149,9 +151,18 @@ class KalmanEstimator:
         for slot in range(3):
             self._cov[slot, slot] += DOUBTED_ATTITUDE_RAD**2
         for row, value in zip(h, z, strict=True):
-            slot = 3 + int(np.argmax(np.abs(row[3:9])))
+            # Position or velocity before the attitude that turns a lever arm.
+            group = next(g for g in (slice(3, 9), slice(0, 3), slice(0, len(row))) if row[g].any())
+            slot = group.start + int(np.argmax(np.abs(row[group])))
             if self.model.active[slot]:
                 self._cov[slot, slot] += value * value
+
+    @property
+    def sensor_errors(self) -> Array:
+        """Estimates (12,): rate bias (rad/s), force bias (m/s^2), rate and force scale (1)."""
+        estimate = np.empty(12)
+        sensor_estimates(self.xi, self.model.sensor_slot, self.model.sensor_kind, estimate)
+        return estimate
 
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""

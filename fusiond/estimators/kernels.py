@@ -18,18 +18,18 @@ Source: Bierman, Factorization Methods (1977), section V.2; Groves, 2nd ed., eq.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
+from fusiond.estimators.model import PLAIN, SCALE
 from fusiond.navigation.error_model import (
     COEFFICIENTS,
     CORE_SIZE,
     CORE_STRIDE,
-    RATE_ERROR,
-    RATE_SCALE,
     STRIDE,
     apply_to_core,
     apply_to_state,
@@ -50,38 +50,42 @@ from fusiond.navigation.strapdown import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SIGMA_SIZE = 9
 # What the vehicle may do while the IMU is silent, one sigma of the unknown mean rate (rad/s) and
 # force (m/s^2): a car that turns or brakes at a comfortable limit.
 GAP_RATE_RAD_S = 0.1
 GAP_FORCE_M_S2 = 1.0
 
 
-WORK_SIZE = 6 * STRIDE + 9 * STRIDE + STRIDE * CORE_STRIDE + 6 * CORE_STRIDE + 9 * CORE_STRIDE
+WORK_SIZE = (6 + 9 + CORE_STRIDE) * STRIDE + (6 + 9) * CORE_STRIDE + 12
 
 
-@compiled("void(f8[::1], i8, i8[::1], f8[::1], f8[::1])")
-def _gather_sensor_rows(
-    rows: Array, width: int, column_of: Indices, step: Array, sensor: Array
-) -> None:
-    """Sum the parameters' rows of `rows` into the six of `sensor`, by what each acts on."""
-    sensor[:] = 0.0
-    for i in range(CORE_SIZE, column_of.shape[0]):
-        kind = column_of[i] - RATE_ERROR
-        if kind < 0:
-            continue
-        source, target = i * width, (kind % 6) * width
-        if kind < RATE_SCALE - RATE_ERROR:
-            for j in range(width):
-                sensor[target + j] += rows[source + j]
-        else:
-            weight = step[3 + kind % 6]
-            for j in range(width):
-                sensor[target + j] += weight * rows[source + j]
+def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
+    """`gather` for rows of `width` doubles: a constant, so that the loops become vector code."""
+    unsigned = np.uint64  # an index that cannot be negative needs no check
+    wide = np.uint64(width)
+
+    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])")
+    def gather(rows: Array, sensor_slot: Indices, weight: Array, sensor: Array) -> None:
+        """sensor (6 rows): the parameters' rows of `rows`, two an axis error, weighted."""
+        for k in range(6):
+            first = unsigned(sensor_slot[2 * k]) * wide
+            second = unsigned(sensor_slot[2 * k + 1]) * wide
+            of_first, of_second = weight[2 * k], weight[2 * k + 1]
+            target = unsigned(k) * wide
+            for i in range(width):
+                j = unsigned(i)
+                sensor[target + j] = of_first * rows[first + j] + of_second * rows[second + j]
+
+    return gather
+
+
+_gather_state = _gather_for(STRIDE)
+_gather_core = _gather_for(CORE_STRIDE)
 
 
 @compiled(
-    "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
+    "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1],"
+    "i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
 )
 def propagate_covariance(
     cov: Array,
@@ -89,84 +93,93 @@ def propagate_covariance(
     c: Array,
     h: float,
     active: NDArray[np.bool_],
-    column_of: Indices,
+    sensor_slot: Indices,
+    sensor_kind: Indices,
     decay_rate: Array,
     white: Array,
     steady_variance: Array,
     work: Array,
 ) -> None:
-    """Advance `cov` (n, STRIDE) in place by h seconds with transition coefficients `c`."""
-    n = cov.shape[0]
-    flat = cov.reshape(n * STRIDE)
+    """Advance `cov` (STRIDE, STRIDE) in place by h seconds with transition coefficients `c`.
+
+    The model's arrays are (n,); rows and columns of `cov` from n on are zero and stay so.
+    """
+    n = white.shape[0]
+    flat = cov.reshape(STRIDE * STRIDE)
+    weight = work[WORK_SIZE - 12 :]
+    for i in range(12):
+        weight[i] = 0.0
+        if sensor_kind[i] == PLAIN:
+            weight[i] = 1.0
+        elif sensor_kind[i] == SCALE:
+            weight[i] = step[3 + i // 2]
     a = 6 * STRIDE
     b = a + 9 * STRIDE
     d = b + STRIDE * CORE_STRIDE
     e = d + 6 * CORE_STRIDE
     sensor, top, turned = work[:a], work[a:b], work[b:d]
-    core_sensor, core = work[d:e], work[e:]
+    core_sensor, core = work[d:e], work[e : WORK_SIZE - 12]
     for i in range(CORE_SIZE):
         flat[i * STRIDE + i] += 0.5 * h * white[i]
 
-    _gather_sensor_rows(flat, STRIDE, column_of, step, sensor)
+    _gather_state(flat, sensor_slot, weight, sensor)
     apply_to_state(flat, sensor, c, top)
     for i in range(CORE_SIZE):
-        if active[i]:
-            for j in range(n):
-                turned[j * CORE_STRIDE + i] = top[i * STRIDE + j]
-        else:
-            for j in range(n):
-                turned[j * CORE_STRIDE + i] = 0.0
+        if not active[i]:
+            for j in range(STRIDE):
                 top[i * STRIDE + j] = 0.0
-    _gather_sensor_rows(turned, CORE_STRIDE, column_of, step, core_sensor)
-    apply_to_core(turned, core_sensor, c, core)
-
+    for j in range(STRIDE):
+        for i in range(CORE_SIZE):
+            turned[j * CORE_STRIDE + i] = top[i * STRIDE + j]
+    # Written back before `turned` is read again: the processor has its scalar stores done by then.
     for i in range(CORE_SIZE):
-        for j in range(i):
-            value = 0.5 * (core[i * CORE_STRIDE + j] + core[j * CORE_STRIDE + i])
-            flat[i * STRIDE + j] = value
-            flat[j * STRIDE + i] = value
-        flat[i * STRIDE + i] = core[i * CORE_STRIDE + i] + 0.5 * h * white[i]
-        for j in range(CORE_SIZE, n):
+        for j in range(STRIDE):
             flat[i * STRIDE + j] = top[i * STRIDE + j]
+    for j in range(CORE_SIZE, STRIDE):
+        for i in range(CORE_SIZE):
+            flat[j * STRIDE + i] = top[i * STRIDE + j]
+    _gather_core(turned, sensor_slot, weight, core_sensor)
+    apply_to_core(turned, core_sensor, c, core)
+    for i in range(CORE_SIZE):
         if not active[i]:
             for j in range(CORE_SIZE):
-                flat[i * STRIDE + j] = 0.0
-                flat[j * STRIDE + i] = 0.0
-    for i in range(CORE_SIZE, n):
+                core[i * CORE_STRIDE + j] = 0.0
+    for i in range(CORE_SIZE):
         for j in range(CORE_SIZE):
-            flat[i * STRIDE + j] = turned[i * CORE_STRIDE + j]
+            lower, upper = core[i * CORE_STRIDE + j], core[j * CORE_STRIDE + i]
+            flat[i * STRIDE + j] = 0.5 * (lower + upper)
+        flat[i * STRIDE + i] += 0.5 * h * white[i]
     for i in range(CORE_SIZE, n):
         variance = h * white[i]
         if decay_rate[i] > 0.0:
             decay = math.exp(-h * decay_rate[i])
-            for j in range(n):
+            for j in range(STRIDE):
                 flat[i * STRIDE + j] *= decay
                 flat[j * STRIDE + i] *= decay
             variance += steady_variance[i] * (1.0 - decay * decay)
         flat[i * STRIDE + i] += variance
 
 
-@compiled("void(f8[:, ::1], i8, f8[::1], i8[::1], f8[::1], f8[::1], f8[::1])")
-def compensate(
-    samples: Array,
-    i: int,
-    xi: Array,
-    column_of: Indices,
-    bias: Array,
-    rate: Array,
-    force: Array,
+@compiled("void(f8[::1], i8[::1], i8[::1], f8[::1])")
+def sensor_estimates(
+    xi: Array, sensor_slot: Indices, sensor_kind: Indices, estimate: Array
 ) -> None:
-    """Write `rate` and `force` (3,) of sample i of `samples` (m, 6), the estimates `xi` taken out.
+    """Write `estimate` (12,) of the parameters `xi` (n,): rate bias, force bias, their scales."""
+    for k in range(12):
+        estimate[k] = 0.0
+    for i in range(12):
+        if sensor_kind[i] == PLAIN:
+            estimate[i // 2] += xi[sensor_slot[i]]
+        elif sensor_kind[i] == SCALE:
+            estimate[6 + i // 2] += xi[sensor_slot[i]]
 
-    `bias` (12,) is left as rate bias, force bias, rate scale, force scale.
-    """
-    bias[:] = 0.0
-    for k in range(CORE_SIZE, xi.shape[0]):
-        if column_of[k] >= RATE_ERROR:
-            bias[column_of[k] - RATE_ERROR] += xi[k]
+
+@compiled("void(f8[:, ::1], i8, f8[::1], f8[::1], f8[::1])")
+def compensate(samples: Array, i: int, estimate: Array, rate: Array, force: Array) -> None:
+    """Write `rate` and `force` (3,) of sample i of `samples` (m, 6), `estimate` (12,) taken out."""
     for j in range(3):
-        rate[j] = (samples[i, j] - bias[j]) / (1.0 + bias[6 + j])
-        force[j] = (samples[i, 3 + j] - bias[3 + j]) / (1.0 + bias[9 + j])
+        rate[j] = (samples[i, j] - estimate[j]) / (1.0 + estimate[6 + j])
+        force[j] = (samples[i, 3 + j] - estimate[3 + j]) / (1.0 + estimate[9 + j])
 
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")
@@ -196,7 +209,7 @@ def sigmas(cov: Array, step: Array, out: Array) -> None:
 
 @compiled(
     "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, ::1], b1,"
-    "b1[::1], i8[::1], f8[::1], f8[::1], f8[::1],"
+    "b1[::1], i8[::1], i8[::1], f8[::1], f8[::1], f8[::1],"
     "i8[::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], f8[::1])"
 )
 def propagate(
@@ -205,7 +218,8 @@ def propagate(
     cov: Array,
     hold_height: bool,
     active: NDArray[np.bool_],
-    column_of: Indices,
+    sensor_slot: Indices,
+    sensor_kind: Indices,
     decay_rate: Array,
     white: Array,
     steady_variance: Array,
@@ -231,15 +245,19 @@ def propagate(
     """
     c = np.zeros(COEFFICIENTS)
     work = np.zeros(WORK_SIZE)
-    rate, force, bias = np.empty(3), np.empty(3), np.empty(12)
+    rate, force, estimate = np.empty(3), np.empty(3), np.empty(12)
     rate_slope, force_slope = np.zeros(3), np.zeros(3)
+    decaying = False
+    for j in range(CORE_SIZE, xi.shape[0]):
+        decaying = decaying or decay_rate[j] > 0.0
+    sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
     i = first
     while i < end and now < target:
         stop = min(times[i], target)
         if stop > now:
             h = (stop - now) * 1e-9
             silent = i > 0 and times[i] - times[i - 1] > gap_ns
-            compensate(samples, i, xi, column_of, bias, rate, force)
+            compensate(samples, i, estimate, rate, force)
             if i > 1 and not silent and times[i - 1] - times[i - 2] <= gap_ns:
                 between = 2e9 / (times[i] - times[i - 2])
                 for j in range(3):
@@ -256,15 +274,18 @@ def propagate(
                 c,
                 h,
                 active,
-                column_of,
+                sensor_slot,
+                sensor_kind,
                 decay_rate,
                 white,
                 steady_variance,
                 work,
             )
-            for j in range(CORE_SIZE, xi.shape[0]):
-                if decay_rate[j] > 0.0:
-                    xi[j] *= math.exp(-h * decay_rate[j])
+            if decaying:
+                for j in range(CORE_SIZE, xi.shape[0]):
+                    if decay_rate[j] > 0.0:
+                        xi[j] *= math.exp(-h * decay_rate[j])
+                sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
             if silent:
                 # The held sample is a guess: its error acts over the whole of the gap.
                 whole = (times[i] - times[i - 1]) * 1e-9

@@ -32,6 +32,9 @@ from fusiond.navigation.error_model import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+# What a term of an axis error is (`Model.sensor_kind`); 0 is none.
+PLAIN, SCALE = 1, 2
+
 PARAMETER_COLUMNS = {
     "gyro": RATE_ERROR,
     "accel": FORCE_ERROR,
@@ -86,7 +89,8 @@ class Model:
     Slots 0 to 8 are always the navigation errors (attitude, velocity, position, each n, e, d); a
     slot that no
     block fills is not `active` and stays zero (planar models). Parameters follow in the order of
-    their blocks. `size` counts slots; arrays are (size,).
+    their blocks. `size` counts slots; arrays are (size,). `sensor_slot` and `sensor_kind`
+    (12,) list two terms of each axis error (rate x y z, force x y z) as the kernels gather them.
     """
 
     name: str
@@ -95,6 +99,8 @@ class Model:
     size: int = field(init=False)
     active: NDArray[np.bool_] = field(init=False)
     column_of: Indices = field(init=False)
+    sensor_slot: Indices = field(init=False)
+    sensor_kind: Indices = field(init=False)
     decay_rate: Array = field(init=False)
     white: Array = field(init=False)
     steady_variance: Array = field(init=False)
@@ -117,10 +123,22 @@ class Model:
             arrays["white"][slots] = block.white
             arrays["steady_variance"][slots] = block.steady**2
             arrays["initial"][slots] = block.initial
+        slot, kind = np.zeros(12, dtype=np.int64), np.zeros(12, dtype=np.int64)
+        for axis in range(6):
+            terms = [(i, PLAIN) for i in np.flatnonzero(column_of == RATE_ERROR + axis)]
+            terms += [(i, SCALE) for i in np.flatnonzero(column_of == RATE_SCALE + axis)]
+            if len(terms) > 2:
+                raise ValueError(
+                    f"model {self.name}: the kernels hold two parameters an axis error"
+                )
+            for i, (slot_of_term, kind_of_term) in enumerate(terms):
+                slot[2 * axis + i], kind[2 * axis + i] = slot_of_term, kind_of_term
         for name, value in {
             "size": size,
             "active": active,
             "column_of": column_of,
+            "sensor_slot": slot,
+            "sensor_kind": kind,
             **arrays,
         }.items():
             object.__setattr__(self, name, value)

@@ -20,19 +20,33 @@ from fusiond.navigation.compiled import compiled
 Array = NDArray[np.float64]
 
 
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@compiled("UniTuple(f8, 9)(f8[::1])")
+def dcm_elements(q: Array) -> Nine:
+    """C(q) of a unit quaternion (4,), its nine elements by rows."""
+    q0, q1, q2, q3 = q[0], q[1], q[2], q[3]
+    return (
+        q0 * q0 + q1 * q1 - q2 * q2 - q3 * q3,
+        2.0 * (q1 * q2 - q0 * q3),
+        2.0 * (q1 * q3 + q0 * q2),
+        2.0 * (q1 * q2 + q0 * q3),
+        q0 * q0 - q1 * q1 + q2 * q2 - q3 * q3,
+        2.0 * (q2 * q3 - q0 * q1),
+        2.0 * (q1 * q3 - q0 * q2),
+        2.0 * (q2 * q3 + q0 * q1),
+        q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3,
+    )
+
+
 @compiled("void(f8[::1], f8[:, ::1])")
 def quaternion_to_dcm(q: Array, dcm: Array) -> None:
     """Write C(q) (3, 3) of a unit quaternion (4,)."""
-    q0, q1, q2, q3 = q[0], q[1], q[2], q[3]
-    dcm[0, 0] = q0 * q0 + q1 * q1 - q2 * q2 - q3 * q3
-    dcm[0, 1] = 2.0 * (q1 * q2 - q0 * q3)
-    dcm[0, 2] = 2.0 * (q1 * q3 + q0 * q2)
-    dcm[1, 0] = 2.0 * (q1 * q2 + q0 * q3)
-    dcm[1, 1] = q0 * q0 - q1 * q1 + q2 * q2 - q3 * q3
-    dcm[1, 2] = 2.0 * (q2 * q3 - q0 * q1)
-    dcm[2, 0] = 2.0 * (q1 * q3 - q0 * q2)
-    dcm[2, 1] = 2.0 * (q2 * q3 + q0 * q1)
-    dcm[2, 2] = q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
+    elements = dcm_elements(q)
+    for i in range(3):
+        for j in range(3):
+            dcm[i, j] = elements[3 * i + j]
 
 
 @compiled("UniTuple(f8, 4)(f8, f8, f8)")

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, ECCENTRICITY_SQUARED, SEMI_MAJOR_M, gravity
-from fusiond.navigation.rotation import quaternion_to_dcm, rotate_quaternion
+from fusiond.navigation.rotation import dcm_elements, rotate_quaternion
 
 Array = NDArray[np.float64]
 
@@ -56,8 +56,7 @@ def strapdown_step(
     the slopes their time derivatives. `hold_height` keeps height and v_D = 0 (planar models).
     """
     q = nav[Q0:]
-    dcm = np.empty((3, 3))
-    quaternion_to_dcm(q, dcm)
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(q)
     w0, w1, w2 = rate[0], rate[1], rate[2]
     f0, f1, f2 = force[0], force[1], force[2]
     a0, a1, a2 = rate_slope[0], rate_slope[1], rate_slope[2]
@@ -87,9 +86,9 @@ def strapdown_step(
     z0 = 0.5 * h * (earth_n + transport_n)
     z1 = 0.5 * h * transport_e
     z2 = 0.5 * h * (earth_d + transport_d)
-    p0 = dcm[0, 0] * u0 + dcm[0, 1] * u1 + dcm[0, 2] * u2
-    p1 = dcm[1, 0] * u0 + dcm[1, 1] * u1 + dcm[1, 2] * u2
-    p2 = dcm[2, 0] * u0 + dcm[2, 1] * u1 + dcm[2, 2] * u2
+    p0 = c00 * u0 + c01 * u1 + c02 * u2
+    p1 = c10 * u0 + c11 * u1 + c12 * u2
+    p2 = c20 * u0 + c21 * u1 + c22 * u2
     d0 = p0 - (z1 * p2 - z2 * p1)
     d1 = p1 - (z2 * p0 - z0 * p2)
     d2 = p2 - (z0 * p1 - z1 * p0)
@@ -136,8 +135,9 @@ def strapdown_step(
     for j in range(3):
         step[STEP_RATE_B + j] = rate[j]
         step[STEP_FORCE_B + j] = force[j]
-    old = dcm.copy()
-    quaternion_to_dcm(q, dcm)
-    for i in range(3):
-        for j in range(3):
-            step[STEP_DCM + 3 * i + j] = 0.5 * (old[i, j] + dcm[i, j])
+    n00, n01, n02, n10, n11, n12, n20, n21, n22 = dcm_elements(q)
+    step[STEP_DCM], step[STEP_DCM + 1] = 0.5 * (c00 + n00), 0.5 * (c01 + n01)
+    step[STEP_DCM + 2], step[STEP_DCM + 3] = 0.5 * (c02 + n02), 0.5 * (c10 + n10)
+    step[STEP_DCM + 4], step[STEP_DCM + 5] = 0.5 * (c11 + n11), 0.5 * (c12 + n12)
+    step[STEP_DCM + 6], step[STEP_DCM + 7] = 0.5 * (c20 + n20), 0.5 * (c21 + n21)
+    step[STEP_DCM + 8] = 0.5 * (c22 + n22)
