@@ -85,7 +85,7 @@ class Timeline:
         self._next = 0
         self._failing.clear()
         self._checkpoints = [_Checkpoint(self.estimator.snapshot(), None, {})]
-        self._give_up(bisect_left(self._keys, (self.estimator.t_ns, "", 0)), "before_start")
+        self._give_up(bisect_left(self._keys, (self.estimator.t_ns, "", 0)), "no_alignment")
         self.imu.needed = self.estimator.sample
 
     def clear(self) -> None:

@@ -23,9 +23,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
-from fusiond.estimators.model import PLAIN, SCALE
 from fusiond.navigation.error_model import (
     COEFFICIENTS,
     CORE_SIZE,
