@@ -70,7 +70,9 @@ class Intake:
             case Heading():
                 h = self._section(m.source, HeadingAiding)
                 sd_rad = (m.sd_rad or h.sd_deg * DEG) * h.sigma_scale
-                return [HeadingAid(m.source, t_ns, h.gate_probability, m.yaw_rad, sd_rad)]
+                # One receiver may send position and heading of the same instant: two names.
+                name = m.source if m.source == h.kind else f"{m.source}_heading"
+                return [HeadingAid(name, t_ns, h.gate_probability, m.yaw_rad, sd_rad)]
             case Height():
                 e = self._section(m.source, HeightAiding)
                 sd_m = (m.sd_m or e.sd_m) * e.sigma_scale
@@ -87,8 +89,12 @@ class Intake:
                 return "not_an_aid"
 
     def _section(self, source: str, kind: type[S]) -> S:
-        section = self._aiding.get(source)
-        return section if isinstance(section, kind) else kind()
+        """The source's own section, else the one named after the kind, else its defaults."""
+        for name in (source, str(kind.model_fields["kind"].default)):
+            section = self._aiding.get(name)
+            if isinstance(section, kind):
+                return section
+        return kind.model_validate({})
 
     def _gnss(self, m: PositionFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
         o = self._section(m.source, GnssAiding)
