@@ -1,7 +1,8 @@
 """The command line. Each command imports what it needs when it runs, so that `--help` is quick.
 
-Exit codes follow sysexits.h: 65 a data file that cannot be used, 74 a file that cannot be written,
-78 a configuration mistake; 2 a wrong command line; 130 after Ctrl-C.
+Exit codes follow sysexits.h: 65 a data file that cannot be used, 69 a package that a command needs
+is not installed, 74 a file that cannot be written, 78 a configuration mistake; 2 a
+wrong command line; 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from fusiond.config import Config
 
 EXIT_DATA = 65
+EXIT_UNAVAILABLE = 69
 EXIT_IO = 74
 EXIT_CONFIG = 78
 AID_KINDS = ("gnss", "rdss", "attitude", "wheel", "nmea", "raw")
@@ -77,8 +79,13 @@ def demo(
 ) -> None:
     """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
     from fusiond.demo import demo as run_demo  # noqa: PLC0415
+    from fusiond.demo_broker import DemoError  # noqa: PLC0415
 
-    summary = run_demo(duration, headless or not sys.stdout.isatty())
+    try:
+        summary = run_demo(duration, headless or not sys.stdout.isatty())
+    except DemoError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
     typer.echo(json.dumps(_plain(summary), allow_nan=False))
 
 
