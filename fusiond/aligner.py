@@ -35,7 +35,7 @@ from fusiond.navigation.rotation import (
     rpy_from_dcm,
     wrap_angle,
 )
-from fusiond.navigation.standstill import Window
+from fusiond.navigation.standstill import FEWEST_SAMPLES, Window
 from fusiond.saved_state import SavedState
 
 Array = NDArray[np.float64]
@@ -141,8 +141,13 @@ class Aligner:
         """A window of the standstill detector has ended.
 
         It counts as rest only once the next one is quiet too: the last before the start may hold
-        the first of the acceleration.
+        the first of the acceleration. One with too few samples (the first after a start or a gap)
+        tells neither rest nor motion.
         """
+        if latest.samples < FEWEST_SAMPLES:
+            self._at_rest = False
+            self._pending = None
+            return
         if not latest.quiet or self._speed > self.options.rest_speed_m_s:
             self._at_rest = False
             self._ever_moved = True

@@ -325,6 +325,7 @@ async def _cancel(*tasks: asyncio.Task[Any]) -> None:
 def run(config: Config, config_path: Path) -> None:
     """Run until SIGTERM or SIGINT."""
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
+    logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
     log.info("configuration %s", config_path)
 
     async def main() -> None:

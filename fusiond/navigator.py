@@ -37,8 +37,6 @@ Array = NDArray[np.float64]
 
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
-# The solution is carried ahead of the newest sample at most this far by holding its rates.
-EXTRAPOLATE_NS = 100_000_000
 
 
 class Navigator:
@@ -163,13 +161,16 @@ class Navigator:
         self.timeline.run(record)
 
     def solution(self, t_ns: int) -> Solution:
-        """The solution at `t_ns`, carried ahead of the newest sample by at most 0.1 s."""
+        """The solution at `t_ns`, carried ahead of the newest sample by holding its rates.
+
+        At most for `gap_s`: beyond it the mode says that the IMU is silent.
+        """
         mode, reason = self.mode(t_ns)
         if self.started is None:
             return Solution(t_ns, mode, reason)
         e = self.estimator
         nav = e.nav
-        ahead = min(t_ns - e.t_ns, EXTRAPOLATE_NS)
+        ahead = min(t_ns - e.t_ns, round(self.config.imu.gap_s * 1e9))
         if ahead > 0 and self.imu.end:
             nav = nav.copy()
             rate, force, zero = np.zeros(3), np.zeros(3), np.zeros(3)

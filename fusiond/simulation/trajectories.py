@@ -239,10 +239,10 @@ def static(duration_s: float) -> Path:
     return follow([Leg(duration_s)], duration_s, course_deg=45.0)
 
 
-def drive(duration_s: float) -> Path:
-    """A car: 60 s at rest, then town, hill, roundabout and fast road with stops, over and over."""
+def drive(duration_s: float, rest_s: float = 60.0) -> Path:
+    """A car: at rest, then town, hill, roundabout and fast road with stops, over and over."""
     return follow(
-        chain([Leg(60)], _for_ever(_BLOCK)), duration_s, course_deg=40.0, bank_ratio=-0.08
+        chain([Leg(rest_s)], _for_ever(_BLOCK)), duration_s, course_deg=40.0, bank_ratio=-0.08
     )
 
 

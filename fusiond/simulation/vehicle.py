@@ -22,6 +22,7 @@ import time
 import tty
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -35,6 +36,7 @@ from fusiond.simulation.gnss_receiver import GnssReceiver
 from fusiond.simulation.imu_truth import States
 from fusiond.simulation.rdss_terminal import RdssTerminal
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
+from fusiond.simulation.trajectories import drive
 
 Device = Literal["imu", "gnss", "rdss"]
 
@@ -249,6 +251,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--scenario", choices=sorted(SCENARIOS), default="drive")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--duration", type=float, help="s; the scenario's own by default")
+    parser.add_argument("--rest", type=float, help="s at rest before the drive; 60 by default")
     parser.add_argument("--can", default="socketcan:vcan0", help="INTERFACE:CHANNEL")
     parser.add_argument("--gnss-link", type=Path)
     parser.add_argument("--rdss-link", type=Path)
@@ -288,6 +291,8 @@ def _watch_commands(vehicle: SimulatedVehicle, main: asyncio.Task[None]) -> None
 async def _main(args: argparse.Namespace) -> None:
     interface, _, channel = args.can.partition(":")
     scenario = SCENARIOS[args.scenario]
+    if args.rest is not None:
+        scenario = replace(scenario, path=partial(drive, rest_s=args.rest))
     rdss = replace(
         scenario.rdss, family=args.rdss_family, service_frequency_s=args.service_frequency
     )

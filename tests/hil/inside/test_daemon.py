@@ -1,0 +1,252 @@
+"""The daemon as systemd starts it, on a real CAN bus, serial lines and broker, through its faults.
+
+Truth is the simulated vehicle's; the daemon sees only its frames and bytes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from math import hypot
+from pathlib import Path
+
+import pytest
+
+from tests.broker import Broker, listening
+from tests.hil.processes import (
+    FUSIOND,
+    SIM_IMU,
+    DaemonProcess,
+    Heard,
+    VehicleProcess,
+    nav_errors,
+)
+
+VEHICLE = "bench"
+RATE_HZ = 50.0
+CONFIG = """
+vehicle = "bench"
+state_file = "state.json"
+[imu]
+axes = ["+x", "-y", "-z"]
+rate_hz = 100.0
+{imu}
+[sources.gnss]
+driver = "nmea"
+port = "{gnss}"
+timeout_s = 2.0
+[aiding.gnss]
+lever_arm_m = [0.0, 0.0, -1.0]
+[sources.rdss]
+driver = "rdss"
+port = "{rdss}"
+baud = 115200
+family = "4.0"
+[aiding.rdss]
+lever_arm_m = [0.0, 0.0, -1.0]
+[constraints.non_holonomic]
+enabled = true
+lever_arm_m = [-1.0, 0.0, 0.5]
+[estimator]
+coast_after_s = 6.0
+[scheduler]
+rate_hz = {rate}
+[mqtt]
+host = "127.0.0.1"
+port = {port}
+nav_rate_hz = 10.0
+"""
+# A consistent error exceeds five sigma once in two million. What no error may exceed whatever the
+# stated sigma: the receiver's white noise is 0.8 m and 1.5 m (fusiond.simulation.gnss_receiver).
+SIGMAS = 5.0
+BOUNDS = {"m": 4.0, "m_s": 1.0, "deg": 5.0}
+# The sensor's figures are printed to 1e-4 m/s, the instant to 1 ms: 0.03 m at 30 m/s.
+PRINTED = {"m": 0.03, "m_s": 0.01, "deg": 0.05}
+
+
+def _link(state: str) -> None:
+    subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
+
+
+@asynccontextmanager
+async def _heard(broker: Broker) -> AsyncIterator[Heard]:
+    async with listening(broker) as (listener, _):
+        yield Heard(listener, VEHICLE)
+
+
+async def _check_against_truth(heard: Heard, vehicle: VehicleProcess, messages: int = 20) -> None:
+    """The next solutions lie within their sigma, and within reason."""
+    since = heard.count
+    while len(heard.all("nav", since)) < messages:
+        await heard.until("nav")
+    for nav in heard.all("nav", since):
+        assert nav["mode"] == "navigating"
+        for name, (error, sigma) in nav_errors(nav, vehicle.truth(nav["t_ms"])).items():
+            unit = name.split("_", 1)[1]
+            at = f"{name} at t_s = {vehicle.t_s(nav['t_ms']):.2f}"
+            assert abs(error) < SIGMAS * sigma + PRINTED[unit], f"{at}: {error}, sigma {sigma}"
+            assert abs(error) < BOUNDS[unit], f"{at}: {error}"
+
+
+async def _start_with_nothing(daemon: DaemonProcess, broker: Broker) -> None:
+    """No bus, no receiver, no terminal, no broker: the daemon starts and says so."""
+    _link("down")
+    await daemon.start()
+    while "bus_open_failed" not in daemon.log and "vcan0 is down" not in daemon.log:  # noqa: ASYNC110
+        await asyncio.sleep(0.05)
+    broker.start()
+    async with _heard(broker) as heard:
+        await heard.online(b"online")
+        status = await heard.until("status")
+        assert (status["mode"], status["why"]) == ("waiting", "waiting for IMU data")
+        health = await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
+        assert health["sources"]["imu"]["state"] == "absent"
+        assert "vcan0 is down" in health["sources"]["imu"]["detail"]
+        assert health["sources"]["gnss"]["state"] == "absent"
+        # Not all devices send, but what waits for this service need not wait for ever.
+        await daemon.ready()
+    _link("up")
+
+
+async def _align(heard: Heard, vehicle: VehicleProcess) -> None:
+    """Everything appears; level at rest, heading on first motion."""
+    await heard.until("status", lambda m: m["mode"] == "aligning" and "no heading" in m["why"])
+    status = await heard.until("status", lambda m: m["mode"] == "navigating")
+    assert status["why"] == "heading from GNSS course"
+    modes = [m["mode"] for m in heard.all("status")]
+    order = sorted(set(modes), key=modes.index)
+    assert order == ["waiting", "aligning", "navigating"]
+    await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
+    await _check_against_truth(heard, vehicle)
+
+
+async def _lose_position(heard: Heard, vehicle: VehicleProcess) -> None:
+    """Receiver and terminal are unplugged: coasting; each is taken up again when it is back."""
+    await vehicle.unplug("gnss")
+    health = await heard.until("health", lambda m: m["sources"]["gnss"]["state"] == "absent")
+    assert "gnss" in health["sources"]["gnss"]["detail"]  # names the port
+    await vehicle.unplug("rdss")
+    await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
+    status = await heard.until("status", lambda m: m["mode"] == "coasting")
+    assert status["why"].startswith("no position fused for")
+    fused = heard.all("health")[-1]["sources"]
+    await vehicle.plug("gnss")
+    await heard.until("status", lambda m: m["mode"] == "navigating")
+    await heard.until(
+        "health", lambda m: m["sources"]["gnss"]["fused"] > fused["gnss"]["fused"] + 10
+    )
+    await vehicle.plug("rdss")
+    await _check_against_truth(heard, vehicle)
+    await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] > fused["rdss"]["fused"])
+
+
+async def _lose_imu(heard: Heard, vehicle: VehicleProcess) -> None:
+    """The IMU falls silent, then its interface goes down: invalid at once, and back again."""
+    await vehicle.unplug("imu")
+    status = await heard.until("status", lambda m: m["mode"] == "invalid")
+    assert status["why"].startswith("IMU silent for")
+    health = await heard.until("health", lambda m: m["sources"]["imu"]["state"] == "silent")
+    assert "nothing heard" in health["sources"]["imu"]["detail"]
+    await vehicle.plug("imu")
+    await heard.until("status", lambda m: m["mode"] == "navigating")
+    _link("down")
+    health = await heard.until("health", lambda m: m["sources"]["imu"]["state"] == "absent")
+    assert "vcan0 is down" in health["sources"]["imu"]["detail"]
+    await heard.until("status", lambda m: m["mode"] == "invalid")
+    _link("up")
+    await heard.until("status", lambda m: m["mode"] == "navigating")
+    health = await heard.until("health", lambda m: m["sources"]["imu"]["state"] == "running")
+    assert health["sources"]["imu"]["counters"]["gap"] == 2
+    await _check_against_truth(heard, vehicle)
+    codes = [(m["source"], m["code"]) for m in heard.all("event")]
+    assert ("imu", "interface_down") in codes
+    assert ("imu", "interface_up") in codes
+    assert ("gnss", "device_absent") in codes
+
+
+async def _lose_broker(broker: Broker, before: dict[str, float]) -> None:
+    """The broker dies and returns: messages resume, and no tick was missed for it."""
+    broker.kill()
+    await asyncio.sleep(3.0)
+    broker.start()
+    async with _heard(broker) as heard:
+        await heard.online(b"online")
+        await heard.until("nav", lambda m: m["mode"] == "navigating")
+        status = await heard.until("status", lambda m: m["mqtt_reconnects"] == 1)
+    # Every period of the scheduler is a tick or a counted overrun; a blocked loop would be neither.
+    periods = status["ticks"] + status["overruns"] - before["ticks"] - before["overruns"]
+    elapsed_s = status["uptime_s"] - before["uptime_s"]
+    assert periods == pytest.approx(elapsed_s * RATE_HZ, abs=2)
+    assert status["overruns"] - before["overruns"] < 0.1 * periods
+
+
+async def _restart_at_rest(
+    heard: Heard, daemon: DaemonProcess, vehicle: VehicleProcess, folder: Path
+) -> None:
+    """Stopped where the vehicle stands, it starts again with the heading it had."""
+    stands = await heard.until(
+        "nav", lambda m: hypot(m["v_n_m_s"], m["v_e_m_s"]) < 0.05, patience_s=400.0
+    )
+    print(f"stands at t_s = {vehicle.t_s(stands['t_ms']):.1f}")
+    assert await daemon.terminate() == 0
+    await heard.online(b"offline")
+    assert "STOPPING=1" in daemon.told
+    state = json.loads((folder / "state.json").read_text())
+    assert state["utc_s"] > stands["t_ms"] * 1e-3 - 1.0
+    await daemon.start()
+    await daemon.ready()
+    await heard.online(b"online")
+    status = await heard.until("status", lambda m: m["mode"] == "navigating")
+    assert status["why"] == "heading from saved state"
+    print(f"restart: first status after {status['uptime_s']:.1f} s of the clock's start")
+    await _check_against_truth(heard, vehicle)
+
+
+async def test_a_drive_through_every_fault(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    # 8 s at rest; stops again for 20 s at 101 s.
+    vehicle = VehicleProcess(
+        tmp_path,
+        *("--scenario", "drive", "--rest", "8", "--duration", "420", "--seed", "7"),
+        *("--can", "socketcan:vcan0", "--service-frequency", "2"),
+    )
+    config = tmp_path / "bench.toml"
+    imu = SIM_IMU.format(interface="socketcan", channel="vcan0")
+    config.write_text(
+        CONFIG.format(imu=imu, gnss=vehicle.gnss, rdss=vehicle.rdss, rate=RATE_HZ, port=broker.port)
+    )
+    daemon = DaemonProcess(config)
+    try:
+        await _start_with_nothing(daemon, broker)
+        async with _heard(broker) as heard:
+            await vehicle.start()
+            await _align(heard, vehicle)
+            await _lose_position(heard, vehicle)
+            await _lose_imu(heard, vehicle)
+            before = await heard.until("status")
+        await _lose_broker(broker, before)
+        async with _heard(broker) as heard:
+            await _restart_at_rest(heard, daemon, vehicle, tmp_path)
+        assert await daemon.terminate() == 0
+    except BaseException:
+        print(daemon.log)
+        raise
+    finally:
+        await daemon.kill()
+        await vehicle.quit()
+        broker.stop()
+        _link("up")
+
+
+def test_a_config_mistake_exits_78(tmp_path: Path) -> None:
+    config = tmp_path / "bench.toml"
+    config.write_text('[scheduler]\nrate_hz = 0\n[sources.imu]\ndriver = "can_imy"\n')
+    ended = subprocess.run(
+        [FUSIOND, "run", config], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 78
+    for word in (str(config), "rate_hz", "0", "can_imy", "can_imu"):
+        assert word in ended.stderr

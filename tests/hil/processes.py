@@ -1,0 +1,237 @@
+"""The processes of a bench: the daemon as systemd starts it, and the simulated vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from math import degrees, radians
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.files import read_truth
+from tests.broker import Listener
+from tests.runs import metres
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FUSIOND = Path(sys.executable).with_name("fusiond")
+PATIENCE_S = 60.0
+"""Only bounds a broken run; nothing passes or fails by its length."""
+
+SIM_IMU = """
+[sources.imu]
+driver = "can_imu"
+interface = "{interface}"
+channel = "{channel}"
+dbc = "fusiond_sim_imu"
+gyro = ["SIM_GYRO.GYRO_X", "SIM_GYRO.GYRO_Y", "SIM_GYRO.GYRO_Z"]
+accel = ["SIM_ACCEL.ACCEL_X", "SIM_ACCEL.ACCEL_Y", "SIM_ACCEL.ACCEL_Z"]
+counter = ["SIM_TIME.TIME_COUNTER", "SIM_GYRO.GYRO_COUNTER", "SIM_ACCEL.ACCEL_COUNTER"]
+device_time = "SIM_TIME.TIME"
+"""
+"""The section of an IMU that speaks `config/dbc/fusiond_sim_imu.dbc`."""
+
+
+class DaemonProcess:
+    """`fusiond run CONFIG` with a service manager that listens; `log` is its standard error."""
+
+    def __init__(self, config: Path) -> None:
+        self._config = config
+        self._log = config.with_suffix(".log")
+        self._notify = config.with_suffix(".notify")
+        self._socket: socket.socket | None = None
+        self._process: asyncio.subprocess.Process | None = None
+        self.told: list[str] = []
+        """What the service manager was told, a line each."""
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text() if self._log.exists() else ""
+
+    async def start(self) -> None:
+        """Start it; returns at once."""
+        self.told.clear()
+        self._notify.unlink(missing_ok=True)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._socket.bind(str(self._notify))
+        asyncio.get_running_loop().add_reader(self._socket, self._hear, self._socket)
+        environment = {**os.environ, "NOTIFY_SOCKET": str(self._notify)}
+        with self._log.open("ab") as log:
+            self._process = await asyncio.create_subprocess_exec(
+                FUSIOND, "run", self._config, env=environment, stdout=log, stderr=log
+            )
+
+    def _hear(self, notifications: socket.socket) -> None:
+        while True:
+            try:
+                self.told += notifications.recv(4096).decode().splitlines()
+            except BlockingIOError:
+                return
+
+    async def ready(self) -> None:
+        """Wait until it has told the service manager that it is up."""
+        assert self._process is not None
+        async with asyncio.timeout(PATIENCE_S):
+            while "READY=1" not in self.told:
+                assert self._process.returncode is None, self.log
+                await asyncio.sleep(0.02)
+
+    async def terminate(self) -> int:
+        """SIGTERM, as systemd stops it; the exit status."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGTERM)
+        async with asyncio.timeout(PATIENCE_S):
+            status = await self._process.wait()
+        self._hang_up()
+        return status
+
+    async def kill(self) -> None:
+        """End it whatever it does."""
+        if self._process is not None and self._process.returncode is None:
+            self._process.kill()
+            await self._process.wait()
+        self._hang_up()
+
+    def _hang_up(self) -> None:
+        if self._socket is not None:
+            self._hear(self._socket)
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
+
+
+class Heard:
+    """What a vehicle has published, to look at and to wait for."""
+
+    def __init__(self, listener: Listener, vehicle: str) -> None:
+        self._listener = listener
+        self._base = f"fusiond/{vehicle}"
+
+    def all(self, name: str, since: int = 0) -> list[dict[str, Any]]:
+        """The messages of a topic since number `since` of all messages."""
+        messages = self._listener.messages[since:]
+        topic = f"{self._base}/{name}"
+        return [json.loads(_payload(m)) for m in messages if m.topic.value == topic]
+
+    @property
+    def count(self) -> int:
+        """How many messages have come."""
+        return len(self._listener.messages)
+
+    async def until(
+        self,
+        name: str,
+        condition: Callable[[dict[str, Any]], Any] = lambda message: True,
+        patience_s: float = PATIENCE_S,
+    ) -> dict[str, Any]:
+        """The first message of a topic from now on that fulfils `condition`."""
+        since = self.count
+        try:
+            found = await self._listener.until(
+                lambda _: [m for m in self.all(name, since) if condition(m)], patience_s
+            )
+        except TimeoutError:
+            raise AssertionError(f"{name} never came so; last: {self.all(name)[-1:]}") from None
+        message: dict[str, Any] = found[0]
+        return message
+
+    async def online(self, word: bytes) -> None:
+        """Wait for `online` to say so."""
+        await self._listener.until(
+            lambda heard: heard.payloads(f"{self._base}/online")[-1:] == [word], PATIENCE_S
+        )
+
+
+def _payload(message: aiomqtt.Message) -> bytes:
+    assert isinstance(message.payload, bytes)
+    return message.payload
+
+
+def nav_errors(nav: dict[str, Any], truth: NDArray[np.float64]) -> dict[str, tuple[float, float]]:
+    """Error and stated sigma of each figure of a `nav` message; m, m/s and degrees."""
+    lat, lon, height, v_n, v_e, v_d, roll, pitch, yaw = (float(x) for x in truth)
+    north, east, _ = metres(lat, height)
+    errors = {
+        "n_m": (radians(nav["lat_deg"]) - lat) * north,
+        "e_m": (radians(nav["lon_deg"]) - lon) * east,
+        "d_m": height - nav["height_m"],
+        "vn_m_s": nav["v_n_m_s"] - v_n,
+        "ve_m_s": nav["v_e_m_s"] - v_e,
+        "vd_m_s": nav["v_d_m_s"] - v_d,
+        "roll_deg": nav["roll_deg"] - degrees(roll),
+        "pitch_deg": nav["pitch_deg"] - degrees(pitch),
+        "yaw_deg": (nav["yaw_deg"] - degrees(yaw) + 180.0) % 360.0 - 180.0,
+    }
+    return {name: (error, nav[f"sd_{name}"]) for name, error in errors.items()}
+
+
+class VehicleProcess:
+    """`python -m fusiond.simulation.vehicle`, its plugs, and the truth at any instant of UTC."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.gnss, self.rdss = folder / "gnss", folder / "rdss"
+        self._truth, self._start = folder / "truth.csv", folder / "start.json"
+        self._arguments = arguments
+        self._process: asyncio.subprocess.Process | None = None
+        self._times: NDArray[np.float64] = np.zeros(0)
+        self._states: NDArray[np.float64] = np.zeros((0, 9))
+        self._utc_start_s = 0.0
+
+    async def start(self) -> None:
+        """Start it, and wait until its devices are there."""
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            *("-m", "fusiond.simulation.vehicle", *self._arguments),
+            *("--gnss-link", str(self.gnss), "--rdss-link", str(self.rdss)),
+            *("--truth", str(self._truth), "--start-file", str(self._start)),
+            cwd=REPOSITORY,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+        )
+        assert await self._line() == "ready"
+        table = read_truth(self._truth)
+        self._times = table.t_s
+        self._states = np.column_stack(
+            [table.lat_rad, table.lon_rad, table.height_m, table.v, np.unwrap(table.rpy, axis=0)]
+        )
+        self._utc_start_s = json.loads(self._start.read_text())["start_utc_ns"] * 1e-9
+
+    async def _line(self) -> str:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        async with asyncio.timeout(PATIENCE_S):
+            return (await self._process.stdout.readline()).decode().strip()
+
+    async def _command(self, verb: str, device: str) -> None:
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{verb} {device}\n".encode())
+        assert await self._line() == f"{verb}ged {device}"
+
+    async def plug(self, device: str) -> None:
+        await self._command("plug", device)
+
+    async def unplug(self, device: str) -> None:
+        await self._command("unplug", device)
+
+    def t_s(self, utc_ms: float) -> float:
+        """Time of the trajectory at a POSIX instant in ms."""
+        return utc_ms * 1e-3 - self._utc_start_s
+
+    def truth(self, utc_ms: float) -> NDArray[np.float64]:
+        """True latitude, longitude (rad), height (m), v_ned (m/s), roll, pitch, yaw (rad): (9,)."""
+        t_s = self.t_s(utc_ms)
+        return np.array([np.interp(t_s, self._times, column) for column in self._states.T])
+
+    async def quit(self) -> None:
+        if self._process is not None and self._process.returncode is None:
+            self._process.kill()
+            await self._process.wait()
