@@ -81,7 +81,7 @@ def test_coning() -> None:
     -2 w sin^2 b/2]. Means alone drift by (w sin b)^2 / 2w (1 - sin(wh)/wh) about z.
     """
     b, omega, h, seconds = math.radians(1.0), 2.0 * math.pi * 5.0, 0.01, 10.0
-    t = h * np.arange(1, round(seconds / h) + 1)
+    t = h * np.arange(1.0, round(seconds / h) + 1)
     sine, cosine = _mean_sin_cos(omega, t, h)
     z = np.full_like(t, -2.0 * omega * math.sin(b / 2.0) ** 2)
     rate = np.column_stack([-omega * math.sin(b) * sine, omega * math.sin(b) * cosine, z])
@@ -106,7 +106,7 @@ def test_coning() -> None:
 def test_sculling() -> None:
     """Roll by b sin wt while the force along y is A sin wt: rectified to A J1(b) along z."""
     b, a, omega, h, seconds = math.radians(1.0), 5.0, 2.0 * math.pi * 5.0, 0.01, 10.0
-    t = h * np.arange(1, round(seconds / h) + 1)
+    t = h * np.arange(1.0, round(seconds / h) + 1)
     sine, cosine = _mean_sin_cos(omega, t, h)
     lat = runs.ORIGIN[0]
     earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
