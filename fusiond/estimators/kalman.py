@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from fusiond.aiding.base import Linearised, NotApplicable, State
 from fusiond.estimators.kernels import (
+    SCRATCH_SIZE,
     feed_back,
     normalised_innovation_squared,
     propagate,
@@ -64,6 +65,8 @@ class Snapshot(NamedTuple):
     xi: Array
     cov: Array
     step: Array
+    dx: Array
+    holding: bool
 
 
 class KalmanEstimator:
@@ -80,6 +83,17 @@ class KalmanEstimator:
         self._cov: Array = np.zeros((STRIDE, STRIDE))
         self.step: Array = np.zeros(STEP_SIZE)
         self._dx: Array = np.zeros(model.size)
+        self._holding = False
+        self._scratch: Array = np.zeros(SCRATCH_SIZE)
+        self._fixed = (
+            self.nav,
+            self.xi,
+            self._cov,
+            model.hold_height,
+            model.active,
+            model.sensor_terms,
+            model.noise,
+        )
 
     @property
     def covariance(self) -> Array:
@@ -94,23 +108,14 @@ class KalmanEstimator:
         self.covariance[:] = covariance
         self.covariance[~self.model.active] = 0.0
         self.covariance[:, ~self.model.active] = 0.0
+        self._dx[:], self._holding = 0.0, False
         self.step[:] = 0.0
         self.step[STEP_DCM:] = dcm_from_quaternion(self.nav[Q0:]).ravel()
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
-        m = self.model
         first, self.t_ns = propagate(
-            self.nav,
-            self.xi,
-            self._cov,
-            m.hold_height,
-            m.active,
-            m.sensor_slot,
-            m.sensor_kind,
-            m.decay_rate,
-            m.white,
-            m.steady_variance,
+            *self._fixed,
             imu.times,
             imu.samples,
             self.sample - imu.start,
@@ -122,6 +127,9 @@ class KalmanEstimator:
             imu.nav,
             imu.sigmas,
             self.step,
+            self._dx,
+            self._holding,
+            self._scratch,
         )
         self.sample = first + imu.start
 
@@ -133,6 +141,8 @@ class KalmanEstimator:
             return Outcome(innovation.outcome)
         z, h, r = innovation
         degrees = z.shape[0]
+        if self._holding:
+            z = z - h @ self._dx
         nis = normalised_innovation_squared(self._cov, z, h, r)
         if not np.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
@@ -140,10 +150,27 @@ class KalmanEstimator:
             if not inflate:
                 return Outcome("gated", nis, degrees)
             self._widen(z, h)
+        held = self._dx.copy() if self._holding else None
         self._dx[:] = 0.0
         update(self._cov, self._dx, z, h, r)
-        feed_back(self.nav, self.xi, self._dx)
+        if held is None:
+            self._feed_back()
+        else:
+            self._dx += held
         return Outcome("fused", nis, degrees)
+
+    def hold(self) -> None:
+        """From now on estimate without feedback: errors are carried along with the state."""
+        self._holding = True
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        self._holding = False
+        self._feed_back()
+
+    def _feed_back(self) -> None:
+        feed_back(self.nav, self.xi, self._dx)
+        self._dx[:] = 0.0
 
     def _widen(self, z: Array, h: Array) -> None:
         """Add the innovation's own square to the states that it measures directly, and doubt the
@@ -161,7 +188,8 @@ class KalmanEstimator:
     def sensor_errors(self) -> Array:
         """Estimates (12,): rate bias (rad/s), force bias (m/s^2), rate and force scale (1)."""
         estimate = np.empty(12)
-        sensor_estimates(self.xi, self.model.sensor_slot, self.model.sensor_kind, estimate)
+        slot, kind = self.model.sensor_terms
+        sensor_estimates(self.xi, slot, kind, estimate)
         return estimate
 
     def sigmas(self) -> Array:
@@ -179,9 +207,12 @@ class KalmanEstimator:
             self.xi.copy(),
             self._cov.copy(),
             self.step.copy(),
+            self._dx.copy(),
+            self._holding,
         )
 
     def restore(self, s: Snapshot) -> None:
         """Back to a snapshot, bit for bit."""
         self.t_ns, self.sample = s.t_ns, s.sample
         self.nav[:], self.xi[:], self._cov[:], self.step[:] = s.nav, s.xi, s.cov, s.step
+        self._dx[:], self._holding = s.dx, s.holding

@@ -58,13 +58,15 @@ GAP_FORCE_M_S2 = 1.0
 
 WORK_SIZE = (6 + 9 + CORE_STRIDE) * STRIDE + (6 + 9) * CORE_STRIDE + 12
 
+SCRATCH_SIZE = COEFFICIENTS + 24 + WORK_SIZE
+
 
 def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
     """`gather` for rows of `width` doubles: a constant, so that the loops become vector code."""
     unsigned = np.uint64  # an index that cannot be negative needs no check
     wide = np.uint64(width)
 
-    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])")
+    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])", forceinline=True)
     def gather(rows: Array, sensor_slot: Indices, weight: Array, sensor: Array) -> None:
         """sensor (6 rows): the parameters' rows of `rows`, two an axis error, weighted."""
         for k in range(6):
@@ -83,27 +85,23 @@ _gather_state = _gather_for(STRIDE)
 _gather_core = _gather_for(CORE_STRIDE)
 
 
-@compiled(
-    "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1],"
-    "i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1])"
-)
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], f8[:, ::1], f8[::1])")
 def propagate_covariance(
     cov: Array,
     step: Array,
     c: Array,
     h: float,
     active: NDArray[np.bool_],
-    sensor_slot: Indices,
-    sensor_kind: Indices,
-    decay_rate: Array,
-    white: Array,
-    steady_variance: Array,
+    sensor_terms: Indices,
+    noise: Array,
     work: Array,
 ) -> None:
     """Advance `cov` (STRIDE, STRIDE) in place by h seconds with transition coefficients `c`.
 
     The model's arrays are (n,); rows and columns of `cov` from n on are zero and stay so.
     """
+    decay_rate, white, steady_variance = noise[0], noise[1], noise[2]
+    sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
     n = white.shape[0]
     flat = cov.reshape(STRIDE * STRIDE)
     weight = work[WORK_SIZE - 12 :]
@@ -207,10 +205,44 @@ def sigmas(cov: Array, step: Array, out: Array) -> None:
     out[8] = math.sqrt(max(0.0, t * t * along + c + 2.0 * t * (cy * e + sy * f)))
 
 
+@compiled("void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[::1], i8[::1], f8[::1], f8[::1])")
+def propagate_error(
+    dx: Array,
+    step: Array,
+    c: Array,
+    h: float,
+    active: NDArray[np.bool_],
+    sensor_slot: Indices,
+    sensor_kind: Indices,
+    decay_rate: Array,
+    work: Array,
+) -> None:
+    """dx (n,) <- Phi dx over h seconds: an estimate that is not fed back yet (paper 000, 1.1)."""
+    sensor = work[: 6 * CORE_STRIDE]
+    rows = work[6 * CORE_STRIDE : 15 * CORE_STRIDE]
+    out = work[15 * CORE_STRIDE : 24 * CORE_STRIDE]
+    sensor[:] = 0.0
+    for i in range(12):
+        if sensor_kind[i] == PLAIN:
+            sensor[i // 2 * CORE_STRIDE] += dx[sensor_slot[i]]
+        elif sensor_kind[i] == SCALE:
+            sensor[i // 2 * CORE_STRIDE] += step[3 + i // 2] * dx[sensor_slot[i]]
+    rows[:] = 0.0
+    for i in range(CORE_SIZE):
+        rows[i * CORE_STRIDE] = dx[i]
+    apply_to_core(rows, sensor, c, out)
+    for i in range(CORE_SIZE):
+        dx[i] = out[i * CORE_STRIDE] if active[i] else 0.0
+    for i in range(CORE_SIZE, dx.shape[0]):
+        if decay_rate[i] > 0.0:
+            dx[i] *= math.exp(-h * decay_rate[i])
+
+
 @compiled(
     "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, ::1], b1,"
-    "b1[::1], i8[::1], i8[::1], f8[::1], f8[::1], f8[::1],"
-    "i8[::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], f8[::1])"
+    "b1[::1], i8[:, ::1], f8[:, ::1],"
+    "i8[::1], f8[:, ::1], i8, i8, i8, i8, i8,"
+    "b1, f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1, f8[::1])"
 )
 def propagate(
     nav: Array,
@@ -218,11 +250,8 @@ def propagate(
     cov: Array,
     hold_height: bool,
     active: NDArray[np.bool_],
-    sensor_slot: Indices,
-    sensor_kind: Indices,
-    decay_rate: Array,
-    white: Array,
-    steady_variance: Array,
+    sensor_terms: Indices,
+    noise: Array,
     times: Indices,
     samples: Array,
     first: int,
@@ -234,6 +263,9 @@ def propagate(
     nav_out: Array,
     sigma_out: Array,
     step: Array,
+    dx: Array,
+    carry: bool,
+    scratch: Array,
 ) -> tuple[int, int]:
     """Propagate from `now` to `target` (ns); return the next sample's index and the new time.
 
@@ -241,12 +273,19 @@ def propagate(
     (times[i-1], times[i]]. Samples first ... end-1 may be used; the last one only as far as
     `target`, so a target inside an interval splits it. With `record`, the solution and its sigmas
     at the end of each whole sample go to nav_out[i] (10,) and sigma_out[i] (9,). `step` (18,) is
-    left as of the last step.
+    left as of the last step. With `carry`, the error estimate `dx` (n,) is propagated too. `scratch` has
+    SCRATCH_SIZE doubles, zero at first.
     """
-    c = np.zeros(COEFFICIENTS)
-    work = np.zeros(WORK_SIZE)
-    rate, force, estimate = np.empty(3), np.empty(3), np.empty(12)
-    rate_slope, force_slope = np.zeros(3), np.zeros(3)
+    decay_rate = noise[0]
+    sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
+    c, work = scratch[:COEFFICIENTS], scratch[COEFFICIENTS + 24 :]
+    rate, force = (
+        scratch[COEFFICIENTS : COEFFICIENTS + 3],
+        scratch[COEFFICIENTS + 3 : COEFFICIENTS + 6],
+    )
+    rate_slope = scratch[COEFFICIENTS + 6 : COEFFICIENTS + 9]
+    force_slope = scratch[COEFFICIENTS + 9 : COEFFICIENTS + 12]
+    estimate = scratch[COEFFICIENTS + 12 : COEFFICIENTS + 24]
     decaying = False
     for j in range(CORE_SIZE, xi.shape[0]):
         decaying = decaying or decay_rate[j] > 0.0
@@ -274,13 +313,12 @@ def propagate(
                 c,
                 h,
                 active,
-                sensor_slot,
-                sensor_kind,
-                decay_rate,
-                white,
-                steady_variance,
+                sensor_terms,
+                noise,
                 work,
             )
+            if carry:
+                propagate_error(dx, step, c, h, active, sensor_slot, sensor_kind, decay_rate, work)
             if decaying:
                 for j in range(CORE_SIZE, xi.shape[0]):
                     if decay_rate[j] > 0.0:

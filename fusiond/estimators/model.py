@@ -32,7 +32,7 @@ from fusiond.navigation.error_model import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# What a term of an axis error is (`Model.sensor_kind`); 0 is none.
+# What a term of an axis error is (`Model.sensor_terms`); 0 is none.
 PLAIN, SCALE = 1, 2
 
 PARAMETER_COLUMNS = {
@@ -89,8 +89,9 @@ class Model:
     Slots 0 to 8 are always the navigation errors (attitude, velocity, position, each n, e, d); a
     slot that no
     block fills is not `active` and stays zero (planar models). Parameters follow in the order of
-    their blocks. `size` counts slots; arrays are (size,). `sensor_slot` and `sensor_kind`
-    (12,) list two terms of each axis error (rate x y z, force x y z) as the kernels gather them.
+    their blocks. `size` counts slots; arrays are (size,). `sensor_terms`
+    (2, 12) holds slot and kind of two terms of each axis error (rate x y z, force x y z), `noise`
+    (3, size) the rows 1 / tau, white density and steady variance, all as the kernels read them.
     """
 
     name: str
@@ -99,11 +100,8 @@ class Model:
     size: int = field(init=False)
     active: NDArray[np.bool_] = field(init=False)
     column_of: Indices = field(init=False)
-    sensor_slot: Indices = field(init=False)
-    sensor_kind: Indices = field(init=False)
-    decay_rate: Array = field(init=False)
-    white: Array = field(init=False)
-    steady_variance: Array = field(init=False)
+    sensor_terms: Indices = field(init=False)
+    noise: Array = field(init=False)
     initial: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -113,16 +111,14 @@ class Model:
         size = CORE_SIZE + parameters
         if size > STRIDE:
             raise ValueError(f"model {self.name}: {size} states, the kernels hold {STRIDE}")
-        arrays = {n: np.zeros(size) for n in ("decay_rate", "white", "steady_variance", "initial")}
+        noise, initial = np.zeros((3, size)), np.zeros(size)
         active = np.zeros(size, dtype=np.bool_)
         column_of = np.full(size, -1, dtype=np.int64)
         for block, slots in self._slots():
             active[slots] = True
             column_of[slots] = block.columns
-            arrays["decay_rate"][slots] = 1.0 / block.tau_s
-            arrays["white"][slots] = block.white
-            arrays["steady_variance"][slots] = block.steady**2
-            arrays["initial"][slots] = block.initial
+            noise[:, slots] = [[1.0 / block.tau_s], [block.white], [block.steady**2]]
+            initial[slots] = block.initial
         slot, kind = np.zeros(12, dtype=np.int64), np.zeros(12, dtype=np.int64)
         for axis in range(6):
             terms = [(i, PLAIN) for i in np.flatnonzero(column_of == RATE_ERROR + axis)]
@@ -137,9 +133,9 @@ class Model:
             "size": size,
             "active": active,
             "column_of": column_of,
-            "sensor_slot": slot,
-            "sensor_kind": kind,
-            **arrays,
+            "sensor_terms": np.vstack([slot, kind]),
+            "noise": noise,
+            "initial": initial,
         }.items():
             object.__setattr__(self, name, value)
 

@@ -56,7 +56,7 @@ STRIDE = 24
 CORE_STRIDE = 16
 
 
-@compiled("void(f8[::1], f8[::1], f8, f8[::1])")
+@compiled("void(f8[::1], f8[::1], f8, f8[::1])", forceinline=True)
 def coefficients(nav: Array, step: Array, h: float, c: Array) -> None:
     """Write `c` (58,) for the interval of `h` seconds that ends at `nav` (10,).
 
@@ -115,7 +115,7 @@ def coefficients(nav: Array, step: Array, h: float, c: Array) -> None:
 def _apply_for(width: int):  # type: ignore[no-untyped-def]
     """`apply` for rows of `width` doubles: a constant, so that the loop becomes vector code."""
 
-    @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])")
+    @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])", forceinline=True)
     def apply(rows: Array, sensor: Array, c: Array, out: Array) -> None:
         """out (9 rows) = transition times the nine rows of `rows` and the six of `sensor`.
 

@@ -39,7 +39,7 @@ STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM = 0, 3, 6, 9
 STEP_SIZE = 18
 
 
-@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, b1, f8[::1])")
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, b1, f8[::1])", forceinline=True)
 def strapdown_step(
     nav: Array,
     rate: Array,
