@@ -273,7 +273,8 @@ def propagate(
     (times[i-1], times[i]]. Samples first ... end-1 may be used; the last one only as far as
     `target`, so a target inside an interval splits it. With `record`, the solution and its sigmas
     at the end of each whole sample go to nav_out[i] (10,) and sigma_out[i] (9,). `step` (18,) is
-    left as of the last step. With `carry`, the error estimate `dx` (n,) is propagated too. `scratch` has
+    left as of the last step. With `carry`, the error estimate `dx` (n,) is propagated too.
+    `scratch` has
     SCRATCH_SIZE doubles, zero at first.
     """
     decay_rate = noise[0]
