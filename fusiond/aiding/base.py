@@ -8,6 +8,7 @@ So a position row of z is "INS minus fix", as in the papers. H is dense, (m, n).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -43,7 +44,7 @@ class State(NamedTuple):
     @property
     def speed(self) -> float:
         """Horizontal speed, m/s."""
-        return float(np.hypot(self.nav[VN], self.nav[VE]))
+        return math.hypot(self.nav[VN], self.nav[VE])
 
 
 class Innovation(NamedTuple):

@@ -15,28 +15,65 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, rate_columns
-from fusiond.navigation.rotation import skew
-from fusiond.navigation.strapdown import VN
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
+from fusiond.navigation.rotation import dcm_elements
+from fusiond.navigation.strapdown import Q0, STEP_RATE_B, VN
 
-FORWARD, RIGHT, DOWN = 0, 1, 2
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+FORWARD, RIGHT = 0, 1
+
+
+@compiled("void(f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8, f8[::1], f8[:, ::1])")
+def _rows(
+    nav: Array,
+    step: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    first: int,
+    z: Array,
+    h: Array,
+) -> None:
+    """Write the point's velocity along body axes first, first + 1 ... to z (m,), and H (m, n)."""
+    c = dcm_elements(nav[Q0:])
+    w0, w1, w2 = step[STEP_RATE_B], step[STEP_RATE_B + 1], step[STEP_RATE_B + 2]
+    v0, v1, v2 = nav[VN], nav[VN + 1], nav[VN + 2]
+    turning = (w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0)
+    # Rows of -[l x].
+    arm = (0.0, l2, -l1, -l2, 0.0, l0, l1, -l0, 0.0)
+    for i in range(z.shape[0]):
+        axis = first + i
+        a, b, e = c[axis], c[3 + axis], c[6 + axis]
+        z[i] = a * v0 + b * v1 + e * v2 + turning[axis]
+        h[i, 0] = e * v1 - b * v2
+        h[i, 1] = a * v2 - e * v0
+        h[i, 2] = b * v0 - a * v1
+        h[i, 3], h[i, 4] = a, b
+        if not hold_height:
+            h[i, 5] = e
+        for slot in range(CORE_SIZE, column_of.shape[0]):
+            kind = column_of[slot] - RATE_ERROR
+            if 0 <= kind < 3:
+                h[i, slot] = arm[3 * axis + kind]
 
 
 def _body_velocity(
-    state: State, lever: Vector3, axes: tuple[int, ...], measured: float, sd: float
+    state: State, lever: Vector3, first: int, count: int, measured: float, sd: float
 ) -> Innovation:
-    c_bn = state.dcm.T
-    v_n, arm = state.nav[VN : VN + 3], np.array(lever)
-    rows = list(axes)
-    z = (c_bn @ v_n + np.cross(state.rate_b, arm))[rows] - measured
-    h = np.zeros((len(rows), state.model.size))
-    h[:, 3:6] = c_bn[rows]
-    if state.model.hold_height:
-        h[:, 5] = 0.0
-    h[:, 0:3] = -(c_bn @ skew(v_n))[rows]
-    rate_columns(h, slice(None), state.model, -skew(arm)[rows])
-    return Innovation(z, h, np.full(len(rows), sd**2))
+    """Innovation along `count` body axes from `first` on."""
+    model = state.model
+    z, h = np.empty(count), np.zeros((count, model.size))
+    _rows(state.nav, state.step, model.column_of, model.hold_height, *lever, first, z, h)
+    z -= measured
+    return Innovation(z, h, np.full(count, sd**2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +87,8 @@ class NonHolonomicAid(Aid):
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
-        axes = (RIGHT,) if state.model.hold_height else (RIGHT, DOWN)
-        return _body_velocity(state, self.lever, axes, 0.0, self.sd_m_s)
+        count = 1 if state.model.hold_height else 2  # right, down
+        return _body_velocity(state, self.lever, RIGHT, count, 0.0, self.sd_m_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,4 +100,4 @@ class WheelSpeedAid(Aid):
     lever: Vector3
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        return _body_velocity(state, self.lever, (FORWARD,), self.speed_m_s, self.sd_m_s)
+        return _body_velocity(state, self.lever, FORWARD, 1, self.speed_m_s, self.sd_m_s)

@@ -15,11 +15,45 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.rotation import skew
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
+from fusiond.navigation.rotation import dcm_elements
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
+
+Array = NDArray[np.float64]
+
+
+@compiled("void(f8[::1], f8, f8, f8, f8, f8, f8, f8[::1], f8[:, ::1])")
+def _position(
+    nav: Array,
+    lat: float,
+    lon: float,
+    height: float,
+    l0: float,
+    l1: float,
+    l2: float,
+    z: Array,
+    h: Array,
+) -> None:
+    """Write z (m,) and H (m, n), zero before, for the first m of north, east, down."""
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
+    x = c00 * l0 + c01 * l1 + c02 * l2
+    y = c10 * l0 + c11 * l1 + c12 * l2
+    d = c20 * l0 + c21 * l1 + c22 * l2
+    east = nav[LON] - lon
+    east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
+    z[0] = (nav[LAT] - lat) * (meridian_radius(nav[LAT]) + nav[HEIGHT]) + x
+    z[1] = east * (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT]) + y
+    h[0, 1], h[0, 2] = -d, y
+    h[1, 0], h[1, 2] = d, -x
+    h[0, 6] = h[1, 7] = 1.0
+    if z.shape[0] > 2:
+        z[2] = height - nav[HEIGHT] + d
+        h[2, 0], h[2, 1] = -y, x
+        h[2, 8] = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,23 +69,11 @@ class PositionAid(Aid):
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav = state.nav
-        height = nav[HEIGHT]
-        lever = state.dcm @ np.array(self.lever)
         rows = 2 if self.height_m is None or state.model.hold_height else 3
-        east = nav[LON] - self.lon_rad
-        east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
-        z = np.array(
-            [
-                (nav[LAT] - self.lat_rad) * (meridian_radius(nav[LAT]) + height),
-                east * (transverse_radius(nav[LAT]) + height) * math.cos(nav[LAT]),
-                0.0 if self.height_m is None else self.height_m - height,
-            ]
-        )
-        z += lever
-        h = np.zeros((rows, state.model.size))
-        for i in range(rows):
-            h[i, 6 + i] = 1.0
-        h[:, 0:3] = skew(lever)[:rows]
-        moved = nav[VN : VN + 3] * self.sd_time_s
-        r = np.square(self.sd) + np.square(moved)
-        return Innovation(z[:rows], h, r[:rows])
+        height = 0.0 if self.height_m is None else self.height_m
+        z, h = np.empty(rows), np.zeros((rows, state.model.size))
+        _position(nav, self.lat_rad, self.lon_rad, height, *self.lever, z, h)
+        r = np.square(self.sd[:rows])
+        if self.sd_time_s:
+            r += np.square(nav[VN : VN + rows] * self.sd_time_s)
+        return Innovation(z, h, r)
