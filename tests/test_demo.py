@@ -149,10 +149,8 @@ def _live() -> Live:
         "height_m": 38.0,
         **dict.fromkeys(("v_n_m_s", "v_e_m_s", "v_d_m_s", "roll_deg", "pitch_deg"), 1.0),
         "yaw_deg": 40.0,
-        **{
-            f"sd_{name}": 0.5
-            for name in "n_m e_m d_m vn_m_s ve_m_s vd_m_s roll_deg pitch_deg yaw_deg".split()
-        },
+        **{f"sd_{name}": 0.5 for name in ("n_m", "e_m", "d_m", "vn_m_s", "ve_m_s", "vd_m_s")},
+        **dict.fromkeys(("sd_roll_deg", "sd_pitch_deg", "sd_yaw_deg"), 0.5),
     }
     source = {
         "state": "running",

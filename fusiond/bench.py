@@ -1,0 +1,212 @@
+"""`fusiond bench`: what the filter costs, as ratios to one numpy covariance product.
+
+    Phi @ P @ Phi.T + Q,   21x21, float64
+
+is timed before and after every single measurement, and each ratio is taken to the mean of those
+two, so that a machine which changes its clock or serves others in between does not matter. Every
+figure is the median over the repetitions. OpenBLAS uses one thread for matrices of this size (its
+threshold is 2 m n k > 50 000 multiplications; here 9261).
+
+The IMU runs at 200 Hz, but for `process` (100 Hz); the model is `ins21`.
+"""
+
+from __future__ import annotations
+
+import gc
+import platform
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.position import PositionAid
+from fusiond.config import Config, Imu
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.model import Model, make_model
+from fusiond.imu_buffer import ImuBuffer
+from fusiond.navigation.earth import gravity
+from fusiond.offline import process
+from fusiond.settings import imu_noise
+from fusiond.simulation.files import simulate
+from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
+from fusiond.timeline import Timeline
+
+Array = NDArray[np.float64]
+
+REPETITIONS = 15
+PROCESS_S = 600.0
+"""Length of the drive for `process`: what is done once (opening files) is then below 1 %."""
+STATES = 21
+IMU_RATE_HZ = 200.0
+STEP_NS = round(1e9 / IMU_RATE_HZ)
+BLOCK_STEPS = 4000
+SINGLE_STEPS = 1000
+PRODUCTS = 300
+"""Timed at once: 1 to 3 ms, long against the resolution of the clock, short against a throttle."""
+FIX_NS = 200_000_000
+LATE_NS = 2_000_000_000
+HISTORY_S = 4.0
+LAT, LON, HEIGHT = np.radians(30.5276), np.radians(114.3556), 38.0
+
+
+def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[str, Any]:
+    """The figures, with the versions and the processor that they hold for.
+
+    `numpy_product_us`: the product. As ratios to it: `block_step_ratio`, strapdown and covariance
+    over one of 4000 samples propagated in one call; `single_step_ratio`, a call from Python for
+    one sample; `rewind_2s_ratio`, a position 2 s old inserted into the timeline and everything run
+    again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
+    `process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
+    velocity in order of validity, files read and the solution written at every row.
+    """
+    product = _product()
+    figures: dict[str, Any] = {}
+    products: list[float] = []
+
+    def ratio(make: Callable[[int], Callable[[], int]], count: int) -> float:
+        """Median over runs of (seconds a unit of work) / (seconds a product)."""
+        ratios = []
+        for number in range(count):
+            work = make(number)
+            before = product()
+            gc.collect()
+            start = time.perf_counter()
+            units = work()
+            seconds = (time.perf_counter() - start) / units
+            after = product()
+            products.extend((before, after))
+            ratios.append(seconds / (0.5 * (before + after)))
+        return statistics.median(ratios[1:] or ratios)  # the first warms caches
+
+    figures["block_step_ratio"] = ratio(_block, repetitions)
+    figures["single_step_ratio"] = ratio(_single, repetitions)
+    figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
+    with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
+        make = _process(Path(folder), process_s)
+        figures["process_epoch_ratio"] = ratio(make, max(2, repetitions // 3))
+    return {
+        "numpy_product_us": round(statistics.median(products) * 1e6, 3),
+        **{name: round(value, 4) for name, value in figures.items()},
+        "repetitions": repetitions,
+        "cpu": _cpu(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("fusiond", "numpy", "numba")},
+    }
+
+
+def _product() -> Callable[[], float]:
+    """Seconds of one `Phi @ P @ Phi.T + Q`."""
+    rng = np.random.default_rng(0)
+    phi = np.eye(STATES) + 1e-3 * rng.standard_normal((STATES, STATES))
+    p, q = np.eye(STATES), 1e-9 * np.eye(STATES)
+
+    def timed() -> float:
+        start = time.perf_counter()
+        for _ in range(PRODUCTS):
+            _ = phi @ p @ phi.T + q
+        return (time.perf_counter() - start) / PRODUCTS
+
+    timed()
+    return timed
+
+
+# --------------------------------------------------------------------------- what is timed
+
+
+def _filter(steps: int) -> tuple[Model, KalmanEstimator, ImuBuffer]:
+    """A filter at rest at time 0 and `steps` noisy samples ahead of it."""
+    imu = Imu(rate_hz=IMU_RATE_HZ)
+    model = make_model("ins21", imu_noise(imu))
+    buffer = ImuBuffer(IMU_RATE_HZ, steps / IMU_RATE_HZ, np.eye(3), 0.0, imu.gap_s)
+    rng = np.random.default_rng(1)
+    samples = rng.standard_normal((steps, 6)) * np.array([1e-3] * 3 + [1e-2] * 3)
+    samples[:, 5] -= gravity(LAT, HEIGHT)
+    buffer.append(STEP_NS * np.arange(1, steps + 1, dtype=np.int64), samples)
+    estimator = KalmanEstimator(model, imu.gap_s)
+    nav = np.array([LAT, LON, HEIGHT, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    sigma = model.initial.copy()
+    sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [1.0] * 3
+    estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sigma**2))
+    return model, estimator, buffer
+
+
+def _block(_: int) -> Callable[[], int]:
+    _model, estimator, buffer = _filter(BLOCK_STEPS)
+
+    def work() -> int:
+        estimator.propagate(buffer, buffer.latest_ns)
+        return BLOCK_STEPS
+
+    return work
+
+
+def _single(_: int) -> Callable[[], int]:
+    _model, estimator, buffer = _filter(SINGLE_STEPS)
+
+    def work() -> int:
+        for k in range(1, SINGLE_STEPS + 1):
+            estimator.propagate(buffer, k * STEP_NS)
+        return SINGLE_STEPS
+
+    return work
+
+
+def _fix(source: str, t_ns: int) -> PositionAid:
+    lever = (0.3, 0.0, -1.0)
+    return PositionAid(source, t_ns, 0.9999, LAT, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
+
+
+def _rewind(number: int) -> Callable[[], int]:
+    # One sample more each time: the fix falls anywhere between two checkpoints.
+    steps = round(HISTORY_S * IMU_RATE_HZ) + 7 * number
+    _model, estimator, buffer = _filter(steps)
+    timeline = Timeline(estimator, buffer, keep_s=15.0, checkpoint_s=0.5)
+    timeline.start()
+    for t_ns in range(FIX_NS, steps * STEP_NS + 1, FIX_NS):
+        timeline.insert(_fix("gnss", t_ns))
+    timeline.run()
+    late = _fix("rdss", buffer.latest_ns - LATE_NS)
+
+    def work() -> int:
+        timeline.insert(late)
+        timeline.run()
+        assert timeline.counters.rewinds == 1
+        return 1
+
+    return work
+
+
+def _process(folder: Path, duration_s: float) -> Callable[[int], Callable[[], int]]:
+    drive = SCENARIOS["drive"]
+    gnss = replace(drive.gnss, rate_hz=4.0, latency_s=(0.0, 0.0))
+    written = simulate(replace(drive, gnss=gnss), folder, duration_s=duration_s)
+    config = Config.model_validate(
+        {"imu": CAR_IMU, "aiding": {"gnss": {"lever_arm_m": [0, 0, -1]}}}
+    )
+
+    def make(_: int) -> Callable[[], int]:
+        def work() -> int:
+            aids = [("gnss", written.files["gnss"])]
+            process(config, written.files["imu"], aids, out=folder / "solution.csv")
+            return written.rows["imu"]
+
+        return work
+
+    return make
+
+
+def _cpu() -> str:
+    """The processor's name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
