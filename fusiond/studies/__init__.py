@@ -1,0 +1,1 @@
+"""Studies: the papers' experiments, one module each."""
