@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.aiding.base import Linearised
+from fusiond.aiding.height import HeightAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.model import ImuNoise, Model
 from fusiond.imu_buffer import ImuBuffer
@@ -169,6 +171,20 @@ class Aligner:
     def aids(self, aids: list[Linearised]) -> None:
         """A measurement has arrived, as the aids it stands for."""
         for aid in aids:
+            if isinstance(aid, RdssPositionAid):
+                height = next((a.height_m for a in aids if isinstance(a, HeightAid)), None)
+                sd_n, sd_e = math.sqrt(aid.covariance[0]), math.sqrt(aid.covariance[2])
+                sd_d = next((a.sd_m for a in aids if isinstance(a, HeightAid)), sd_n)
+                aid = PositionAid(  # noqa: PLW2901 - a horizontal fix is a fix
+                    aid.source,
+                    aid.t_ns,
+                    aid.gate,
+                    aid.lat_rad,
+                    aid.lon_rad,
+                    height,
+                    (sd_n, sd_e, sd_d),
+                    aid.lever,
+                )
             if isinstance(aid, PositionAid):
                 if self._position is None or aid.t_ns >= self._position.t_ns:
                     self._position = aid

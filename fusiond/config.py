@@ -102,6 +102,24 @@ class RdssAiding(Aiding):
     """BeiDou RDSS fixes: late, horizontal, 20 or 100 m class."""
 
     kind: Literal["rdss"] = "rdss"
+    strategy: Literal["rewind", "optimal_prediction", "position_compensation", "none"] = "rewind"
+    """What becomes of the delay; see `docs/rdss-strategies.md`. `rewind` is exact."""
+    noise: Literal["geometry", "class"] = "geometry"
+    """Covariance from the satellites' geometry with the terminal's class as its floor, or the class
+    alone on both axes."""
+    satellites_deg: tuple[float, float] = (80.0, 140.0)
+    """Longitudes of the two geostationary satellites, east positive."""
+    range_sd_m: PositiveFloat = 15.3
+    """Of a slant range after differential correction: 8 m satellite drift and 13 m ranging."""
+    height_sd_m: PositiveFloat = 10.0
+    """Of the height that the centre solves with."""
+    fix_height_sd_m: PositiveFloat | None = 30.0
+    """The fix's height aids the height channel with this sigma; null: it does not. Without any
+    other
+    height an inertial height runs away."""
+    bias_sd_m: NonNegativeFloat = 0.0
+    """Error that successive fixes share, one sigma an axis; 0: none is estimated."""
+    bias_correlation_s: PositiveFloat = 600.0
 
 
 class AttitudeAiding(Aiding):

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import TypeVar
 
+import numpy as np
+
 from drivers.measurements import (
     Attitude,
     DelayedFix,
@@ -19,10 +21,12 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Linearised, NotApplicable
 from fusiond.aiding.body_velocity import WheelSpeedAid
 from fusiond.aiding.height import HeightAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
+from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import (
     Aiding,
@@ -35,6 +39,10 @@ from fusiond.config import (
     WheelAiding,
 )
 from fusiond.settings import DEG
+
+# What a fix moved forward by the computed velocity is wrong by: a velocity error of 2 m/s over a
+# delay of 1.5 s, which lasts as long as the velocity error of an inertial unit between turns.
+COMPENSATION_SD_M, COMPENSATION_TAU_S = 3.0, 60.0
 
 S = TypeVar("S", bound=Aiding)
 
@@ -54,13 +62,15 @@ class Intake:
     def __init__(self, aiding: dict[str, AnyAiding]) -> None:
         self._aiding = aiding
 
-    def aids(self, m: Measurement, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+    def aids(
+        self, m: Measurement, t_ns: int, sd_time_s: float, seen_ns: int = 0
+    ) -> list[Linearised] | str:
         """The aids that `m`, valid at `t_ns`, stands for, or the name of the refusal."""
         match m:
             case PositionFix():
                 return self._gnss(m, t_ns, sd_time_s)
             case DelayedFix():
-                return self._rdss(m, t_ns, sd_time_s)
+                return self._rdss(m, t_ns, sd_time_s, seen_ns)
             case Attitude():
                 o = self._section(m.source, AttitudeAiding)
                 sd = tuple(s * o.sigma_scale for s in m.sd_rpy_rad)
@@ -87,6 +97,20 @@ class Intake:
                 ]
             case _:
                 return "not_an_aid"
+
+    def position_bias(self) -> tuple[float, float] | None:
+        """Sigma (m) and correlation time (s) of the error that RDSS fixes share; None: not
+        modelled.
+
+        Position compensation needs it for what the moved fix is wrong by.
+        """
+        for o in self._aiding.values():
+            if isinstance(o, RdssAiding):
+                if o.bias_sd_m > 0.0:
+                    return o.bias_sd_m, o.bias_correlation_s
+                if o.strategy == "position_compensation":
+                    return COMPENSATION_SD_M, COMPENSATION_TAU_S
+        return None
 
     def _section(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""
@@ -145,23 +169,47 @@ class Intake:
                 )
         return aids
 
-    def _rdss(self, m: DelayedFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+    def _rdss(
+        self, m: DelayedFix, t_ns: int, sd_time_s: float, seen_ns: int
+    ) -> list[Linearised] | str:
         o = self._section(m.source, RdssAiding)
         if m.multi_value:
             return "multi_value"
         if not m.precision_class_m > 0.0:
             return "no_sigma"
-        sd = m.precision_class_m * o.sigma_scale
-        return [
-            PositionAid(
+        class_m = m.precision_class_m
+        r = np.eye(2) * class_m**2
+        if o.noise == "geometry":
+            geometry = RdssGeometry(o.satellites_deg).covariance(
+                m.lat_rad, m.lon_rad, m.height_m, o.range_sd_m, o.height_sd_m
+            )
+            if isinstance(geometry, NotApplicable):
+                return geometry.outcome
+            r = with_floor(geometry.total, class_m)
+        r *= o.sigma_scale**2
+        arrival_ns = max(t_ns, seen_ns)
+        at_arrival = o.strategy in {"position_compensation", "none"}
+        holds = o.strategy == "optimal_prediction" and arrival_ns > t_ns
+        when_ns = arrival_ns if at_arrival else t_ns
+        moved_s = (arrival_ns - t_ns) * 1e-9 if o.strategy == "position_compensation" else 0.0
+        gate = o.gate_probability
+        aids: list[Linearised] = [
+            RdssPositionAid(
                 m.source,
-                t_ns,
-                o.gate_probability,
+                when_ns,
+                gate,
                 m.lat_rad,
                 m.lon_rad,
-                None,
-                (sd, sd, sd),
+                (float(r[0, 0]), float(r[0, 1]), float(r[1, 1])),
                 o.lever_arm_m,
                 sd_time_s,
+                moved_s,
+                holds,
             )
         ]
+        if holds:
+            aids.append(FeedBackAid(f"{m.source}_feedback", arrival_ns, gate))
+        if o.fix_height_sd_m is not None:
+            sd = o.fix_height_sd_m * o.sigma_scale
+            aids.append(HeightAid(f"{m.source}_height", when_ns, gate, m.height_m, sd))
+        return aids

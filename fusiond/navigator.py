@@ -17,12 +17,13 @@ from drivers.measurements import Measurement
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aligner import Aligner, AlignmentOptions, Start
 from fusiond.config import Config
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.kernels import compensate
-from fusiond.estimators.model import make_model
+from fusiond.estimators.model import make_model, position_bias
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.intake import Intake
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
@@ -54,7 +55,10 @@ class Navigator:
         self._event = on_event or (lambda code, text: None)
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
-        self.model = make_model(e.model, self._noise)
+        self._intake = Intake(config.aiding)
+        bias = self._intake.position_bias()
+        extra = [] if bias is None else [position_bias(BIAS_BLOCK, *bias)]
+        self.model = make_model(e.model, self._noise, *extra)
         self.imu = ImuBuffer(
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
         )
@@ -63,7 +67,6 @@ class Navigator:
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
         self._on_outcome = on_outcome
-        self._intake = Intake(config.aiding)
         self._detector = StandstillDetector(quiet_limits(config.constraints.zero_velocity))
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
@@ -112,7 +115,7 @@ class Navigator:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self._refuse(m.source, "from_future")
-        aids = self._intake.aids(m, t_ns, sd_time_s)
+        aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
@@ -157,6 +160,7 @@ class Navigator:
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             self.timeline.start()
             self.started = start
+            self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
 
@@ -236,7 +240,7 @@ class Navigator:
         if outcome is not None and outcome.name == "fused":
             source, t_ns = entry.aid.source, entry.key[0]
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
-            if isinstance(entry.aid, PositionAid):
+            if isinstance(entry.aid, PositionAid | RdssPositionAid):
                 self._last_position_ns = max(t_ns, self._last_position_ns)
         if self._on_outcome is not None:
             self._on_outcome(entry)

@@ -25,7 +25,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from drivers.nmea_decoder import NmeaDecoder
-from fusiond.config import Config
+from fusiond.config import Config, GnssAiding
 from fusiond.csv_tables import Rejection, TableError, counts
 from fusiond.files import ImuTable, read_attitude, read_gnss, read_imu, read_rdss, read_wheel
 from fusiond.gps_time import utc_ns_to_gps_week_seconds
@@ -35,9 +35,9 @@ from fusiond.solution_csv import STATUS, SolutionWriter
 Array = NDArray[np.float64]
 
 SECONDS_OF_WEEK = 604800.0
-# Samples handed over at once where no aid arrives in between: the solution's mode is judged at this
-# spacing, and memory stays bounded.
-CHUNK = 512
+# Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
+# this spacing, and memory stays bounded.
+CHUNK = 256
 _SHOWN = 20
 
 
@@ -120,26 +120,59 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[_Arrival], out: Pat
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
     samples = np.hstack([imu.gyro, imu.accel])
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
-    breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right")
+    # So many samples have come when arrival k comes.
+    breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
+    late = [_is_late(a, navigator.config) for a in arrivals]
+    gap_ns = round(navigator.config.imu.gap_s * 1e9)
     writer = SolutionWriter(out) if out is not None else None
     recorder = _Recorder(navigator, writer)
-    done = 0
-    for stop, arrival in zip([*breaks.tolist(), len(times)], [*arrivals, None], strict=True):
-        while done < stop:
-            upto = min(stop, done + CHUNK)
+    done = given = 0
+    while done < len(times) or given < len(arrivals):
+        # Samples up to the next arrival that must find the filter where it then stood. One that is
+        # valid when it comes need not: the timeline keeps it until the samples reach it.
+        ahead = given
+        upto = min(len(times), done + CHUNK)
+        alone = navigator.started is None or _has_gap(times[max(done - 1, 0) : upto], gap_ns)
+        while ahead < len(arrivals) and breaks[ahead] <= upto:
+            if alone or late[ahead]:
+                upto = breaks[ahead]
+                break
+            ahead += 1
+        for arrival in arrivals[given:ahead]:
+            _give(navigator, arrival)
+        if upto > done:
             navigator.add_imu(times[done:upto], samples[done:upto])
-            navigator.advance(record=True)
-            recorder.take()
-            done = upto
-        if arrival is not None:
-            stamp = arrival.measurement.stamp  # type: ignore[union-attr]
-            assert isinstance(stamp, MonotonicStamp)
-            navigator.add(arrival.measurement, stamp.t_ns)
+        navigator.advance(record=True)
+        recorder.take()
+        given, done = ahead, upto
+        if given < len(arrivals) and breaks[given] <= done and (alone or late[given]):
+            _give(navigator, arrivals[given])
+            given += 1
             navigator.advance(record=True)
             recorder.take()
     if writer is not None:
         writer.close()
     return recorder.rows
+
+
+def _give(navigator: Navigator, arrival: _Arrival) -> None:
+    stamp = arrival.measurement.stamp  # type: ignore[union-attr]
+    assert isinstance(stamp, MonotonicStamp)
+    navigator.add(arrival.measurement, stamp.t_ns)
+
+
+def _is_late(arrival: _Arrival, config: Config) -> bool:
+    """Whether samples of its validity, or of an aid that it holds, come before it does."""
+    m = arrival.measurement
+    stamp = m.stamp  # type: ignore[union-attr]
+    assert isinstance(stamp, MonotonicStamp)
+    section = config.aiding.get(m.source)
+    delayed = isinstance(section, GnssAiding) and section.velocity_delay_s > 0.0
+    return delayed or config.imu.time_offset_s > 0.0 or stamp.t_ns < arrival.t_arrival_ns
+
+
+def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
+    return bool((np.diff(times) > gap_ns).any())
 
 
 class _Recorder:
@@ -195,46 +228,46 @@ _Read = tuple[list[_Arrival], list[Rejection]]
 def _arrivals(
     t_s: Array, t_arrival_s: Array, make: Callable[[int, int, int], Measurement]
 ) -> list[_Arrival]:
-    rows = []
-    for i in range(len(t_s)):
-        t_ns = _ns(float(t_s[i]))
-        seen = t_ns if math.isnan(t_arrival_s[i]) else _ns(float(t_arrival_s[i]))
-        rows.append(_Arrival(seen, make(i, t_ns, seen)))
-    return rows
+    valid = np.rint(t_s * 1e9).astype(np.int64)
+    arrival = np.where(np.isnan(t_arrival_s), valid, np.rint(t_arrival_s * 1e9))
+    instants = zip(valid.tolist(), arrival.astype(np.int64).tolist(), strict=True)
+    return [_Arrival(seen, make(i, t_ns, seen)) for i, (t_ns, seen) in enumerate(instants)]
 
 
-def _vector(row: Array) -> tuple[float, float, float] | None:
-    x, y, z = (float(v) for v in row)
-    return None if math.isnan(x) or math.isnan(y) or math.isnan(z) else (x, y, z)
+def _vector(row: list[float]) -> tuple[float, float, float] | None:
+    x, y, z = row
+    return None if math.isnan(x + y + z) else (x, y, z)
 
 
-def _horizontal(row: Array) -> tuple[float, float, float | None] | None:
-    x, y, z = (float(v) for v in row)
-    if math.isnan(x) or math.isnan(y):
+def _horizontal(row: list[float]) -> tuple[float, float, float | None] | None:
+    x, y, z = row
+    if math.isnan(x + y):
         return None
     return x, y, None if math.isnan(z) else z
 
 
 def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else float(value)
+    return None if math.isnan(value) else value
 
 
 def _read_gnss(path: Path, _: ImuTable) -> _Read:
     table = read_gnss(path)
+    lat, lon, height = table.lat_rad.tolist(), table.lon_rad.tolist(), table.height_m.tolist()
+    quality = np.where(np.isnan(table.quality), 1, table.quality).astype(int).tolist()
+    sd, v, sd_v = table.sd_position.tolist(), table.v.tolist(), table.sd_v.tolist()
 
     def fix(i: int, t_ns: int, seen: int) -> Measurement:
-        quality = table.quality[i]
         return PositionFix(
             "gnss",
             seen,
             MonotonicStamp(t_ns),
-            float(table.lat_rad[i]),
-            float(table.lon_rad[i]),
-            _or_none(table.height_m[i]),
-            quality=1 if math.isnan(quality) else int(quality),
-            sd_ned_m=_vector(table.sd_position[i]),
-            v_ned_m_s=_horizontal(table.v[i]),
-            sd_v_ned_m_s=_horizontal(table.sd_v[i]),
+            lat[i],
+            lon[i],
+            _or_none(height[i]),
+            quality=quality[i],
+            sd_ned_m=_vector(sd[i]),
+            v_ned_m_s=_horizontal(v[i]),
+            sd_v_ned_m_s=_horizontal(sd_v[i]),
         )
 
     return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
@@ -280,7 +313,7 @@ def _read_wheel(path: Path, _: ImuTable) -> _Read:
             seen,
             MonotonicStamp(t_ns),
             float(table.speed_m_s[i]),
-            _or_none(table.sd_m_s[i]),
+            _or_none(float(table.sd_m_s[i])),
         )
 
     return _arrivals(table.t_s, table.t_arrival_s, speed), table.rejected

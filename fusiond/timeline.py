@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fusiond.aiding.base import Linearised
+from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.estimators.kalman import KalmanEstimator, Outcome, Snapshot
 from fusiond.imu_buffer import ImuBuffer
 
@@ -154,6 +155,10 @@ class Timeline:
         source, t_ns = entry.aid.source, entry.key[0]
         since, count = self._failing.get(source, (t_ns, 0))
         recover = count >= RECOVERY_COUNT and t_ns - since >= RECOVERY_NS
+        if isinstance(entry.aid, FeedBackAid):
+            self.estimator.release()
+        elif isinstance(entry.aid, RdssPositionAid) and entry.aid.holds:
+            self.estimator.hold()
         outcome = self.estimator.update(entry.aid, inflate=recover)
         if outcome.name == "gated":
             self._failing[source] = (since, count + 1)

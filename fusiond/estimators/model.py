@@ -184,8 +184,16 @@ def _parameter(name: str, unit: str, kind: str, axes: str = "xyz", **noise: floa
     return Block(name, unit, tuple(axes), columns, **noise)
 
 
-def make_model(name: str, noise: ImuNoise) -> Model:
-    """One of the shipped models, with an IMU's noise; KeyError for a name that is not one."""
+def position_bias(name: str, sd_m: float, tau_s: float) -> Block:
+    """A first-order Gauss-Markov error north and east (m) that an aid's fixes share."""
+    return Block(name, "m", ("n", "e"), (-1, -1), initial=sd_m, steady=sd_m, tau_s=tau_s)
+
+
+def make_model(name: str, noise: ImuNoise, *extra: Block) -> Model:
+    """One of the shipped models, with an IMU's noise and further blocks.
+
+    KeyError for a name that is not one.
+    """
     tau = noise.bias_correlation_s
     if name == "planar15":
         blocks = [
@@ -209,7 +217,7 @@ def make_model(name: str, noise: ImuNoise) -> Model:
                 tau_s=tau,
             ),
         ]
-        return Model(name, tuple(blocks), hold_height=True)
+        return Model(name, (*blocks, *extra), hold_height=True)
 
     # One state for turn-on bias and its Markov part: a random walk that grows as the Markov process
     # does while t << tau (variance 2 s^2 t / tau), and faster, so never too sure, later.
@@ -234,4 +242,4 @@ def make_model(name: str, noise: ImuNoise) -> Model:
         _parameter("accel_scale", "1", "accel_scale", initial=noise.force_scale),
     ]
     models = {"ins15": biases, "ins21": biases + scales}
-    return Model(name, (*_navigation_blocks(noise, planar=False), *models[name]))
+    return Model(name, (*_navigation_blocks(noise, planar=False), *models[name], *extra))

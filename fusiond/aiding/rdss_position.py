@@ -1,0 +1,84 @@
+r"""Horizontal position of a BeiDou RDSS terminal's antenna: late, with correlated errors.
+
+    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi ] + C l - b
+      = dr + (C l) x phi - b + v,   cov(v) = R (2, 2)
+
+b is an error that successive fixes share (height model, delays): a first-order Gauss-Markov pair
+of the error state where the model has the block `BIAS_BLOCK`, else nothing. R has a correlation
+between north and east, so the rows are whitened by its Cholesky factor. A timing error s_t adds v
+v^T s_t^2 to R.
+
+How a fix that is late is used is its strategy:
+
+`rewind`                 at its own instant; everything after it runs again.
+`optimal_prediction`     at its own instant, but not fed back there: the error estimate x(k|k) and P
+                         are predicted to the instant of arrival, and x(k+1|k) is fed back
+                         (paper 000, section 1.1). `FeedBackAid` marks that instant.
+`position_compensation`  at its arrival, moved forward by the computed velocity times the delay;
+what
+                         that leaves is the coloured noise b (paper 000, reference 2).
+`none`                   at its arrival, as if it were true then.
+
+Source: paper 000, eq. 2 to 4.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.rotation import skew
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
+
+BIAS_BLOCK = "rdss_bias"
+
+
+@dataclass(frozen=True, slots=True)
+class RdssPositionAid(Aid):
+    """Fix (rad, rad) with `covariance` (nn, ne, ee) in m^2.
+
+    `moved_s`: the computed velocity times this is added to the fix (position compensation).
+    `holds`: the
+    estimate is not fed back until a `FeedBackAid` comes (optimal prediction).
+    """
+
+    lat_rad: float
+    lon_rad: float
+    covariance: Vector3
+    lever: Vector3
+    sd_time_s: float = 0.0
+    moved_s: float = 0.0
+    holds: bool = False
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        nav = state.nav
+        lever = state.dcm @ np.array(self.lever)
+        v = nav[VN : VN + 2]
+        east = nav[LON] - self.lon_rad
+        east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
+        z = lever[:2] - v * self.moved_s
+        z[0] += (nav[LAT] - self.lat_rad) * (meridian_radius(nav[LAT]) + nav[HEIGHT])
+        z[1] += east * (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT])
+        h = np.zeros((2, state.model.size))
+        h[0, 6] = h[1, 7] = 1.0
+        h[:, 0:3] = skew(lever)[:2]
+        h[0, 3] = h[1, 4] = -self.moved_s
+        for row, slot in enumerate(state.model.slots_of(BIAS_BLOCK)):
+            h[row, slot] = -1.0
+            z[row] += state.xi[slot]
+        nn, ne, ee = self.covariance
+        r = np.array([[nn, ne], [ne, ee]]) + np.outer(v, v) * self.sd_time_s**2
+        whiten = np.linalg.inv(np.linalg.cholesky(r))
+        return Innovation(whiten @ z, whiten @ h, np.ones(2))
+
+
+@dataclass(frozen=True, slots=True)
+class FeedBackAid(Aid):
+    """The instant at which an estimate that was held is fed back."""
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        return NotApplicable("fed_back")
