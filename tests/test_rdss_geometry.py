@@ -167,7 +167,7 @@ def test_which_satellite_interrogates_does_not_matter() -> None:
 
 def test_paths_that_no_place_has_are_refused() -> None:
     lat, lon = BEIJING
-    paths = rdss_map.path_lengths(*(np.array([x]) for x in (lat, lon, 0.0)), (80.0, 140.0))
+    paths = rdss_map.path_lengths(np.array([lat]), np.array([lon]), np.zeros(1), (80.0, 140.0))
     with pytest.raises(ArithmeticError):
         rdss_map.locate(paths * 0.5, np.zeros(1), (lat, lon), (80.0, 140.0))
 
