@@ -27,9 +27,8 @@ from fusiond.navigation.alignment import (
     integrate_from_rest,
     level,
     level_in_motion,
-    levelling_jacobian,
 )
-from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity, meridian_radius, transverse_radius
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.rotation import (
     dcm_from_quaternion,
     dcm_from_rpy,
@@ -39,6 +38,7 @@ from fusiond.navigation.rotation import (
 )
 from fusiond.navigation.standstill import FEWEST_SAMPLES, Window
 from fusiond.saved_state import SavedState
+from fusiond.start import Place, Start, as_geodetic, build_start
 
 Array = NDArray[np.float64]
 
@@ -47,25 +47,11 @@ HEADING_AGE_NS = 2_000_000_000
 # Course and integrated motion must agree this well (rad), forward or backward, or the vehicle slid
 # or the integration is poor: the next fix decides.
 COURSE_AGREEMENT_RAD = math.radians(45.0)
-# Levelling in motion: one sigma of tilt (rad), and the turn rate (rad/s) above which it is not
-# tried.
-MOTION_LEVEL_SD_RAD = math.radians(2.0)
+# Turn rate (rad/s) above which levelling in motion is not tried.
 MOTION_MAX_RATE_RAD_S = math.radians(5.0)
 MOTION_INTERVAL_NS = (800_000_000, 3_500_000_000)
-# One sigma of tilt (rad) of a vehicle that stands with its engine on.
-LEVEL_SD_RAD = math.radians(0.1)
 # One sigma of velocity (m/s) of a vehicle that stands.
 REST_VELOCITY_SD = 0.1
-
-
-_Place = tuple[PositionAid | None, Array, float]
-"""The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
-
-
-def _as_geodetic(metres: Array, lat: float) -> Array:
-    """A short way north, east, down (3,) in m as latitude, longitude (rad) and height (m)."""
-    n, e, d = metres
-    return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,17 +69,6 @@ class AlignmentOptions:
     course_sd_rad: float
     gyrocompass_s: float
     gyrocompass_max_sd_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found."""
-
-    t_ns: int
-    nav: Array
-    xi: Array
-    covariance: Array
-    how: str
 
 
 @dataclass(slots=True)
@@ -231,13 +206,14 @@ class Aligner:
             return None
         return s
 
-    def _at_standstill(self, place: _Place, yaw: float, sd: float, how: str) -> Start | None:
+    def _at_standstill(self, place: Place, yaw: float, sd: float, how: str) -> Start | None:
         standing = self._levelled()
         if standing is None:
             return None
         roll, pitch = level(standing.mean_force)
         dcm = dcm_from_rpy(roll, pitch, yaw)
-        return self._start(
+        return build_start(
+            self.model,
             standing.end_ns,
             place,
             dcm,
@@ -249,26 +225,26 @@ class Aligner:
             levelled=True,
         )
 
-    def _from_saved(self, imu: ImuBuffer, place: _Place) -> Start | None:
+    def _from_saved(self, imu: ImuBuffer, place: Place) -> Start | None:
         if self._saved is None or self._ever_moved:
             return None
         return self._at_standstill(
             place, self._saved.yaw_rad, self._saved.sd_yaw_rad, "saved state"
         )
 
-    def _from_config(self, imu: ImuBuffer, place: _Place) -> Start | None:
+    def _from_config(self, imu: ImuBuffer, place: Place) -> Start | None:
         if self.options.heading_rad is None or self._ever_moved:
             return None
         return self._at_standstill(
             place, self.options.heading_rad, self.options.heading_sd_rad, "configured heading"
         )
 
-    def _from_dual_antenna(self, imu: ImuBuffer, place: _Place) -> Start | None:
+    def _from_dual_antenna(self, imu: ImuBuffer, place: Place) -> Start | None:
         if self._heading is None or imu.latest_ns - self._heading[0] > HEADING_AGE_NS:
             return None
         return self._at_standstill(place, self._heading[1], self._heading[2], "dual antenna")
 
-    def _from_gyrocompass(self, imu: ImuBuffer, place: _Place) -> Start | None:
+    def _from_gyrocompass(self, imu: ImuBuffer, place: Place) -> Start | None:
         standing = self._levelled()
         if standing is None or standing.seconds < self.options.gyrocompass_s:
             return None
@@ -280,7 +256,8 @@ class Aligner:
         roll, pitch = level(standing.mean_force)
         yaw = gyrocompass(standing.mean_rate, roll, pitch)
         white = self.noise.rate_noise / math.sqrt(standing.seconds)
-        return self._start(
+        return build_start(
+            self.model,
             standing.end_ns,
             place,
             dcm_from_rpy(roll, pitch, yaw),
@@ -292,7 +269,7 @@ class Aligner:
             compassed=True,
         )
 
-    def _from_course(self, imu: ImuBuffer, place: _Place) -> Start | None:
+    def _from_course(self, imu: ImuBuffer, place: Place) -> Start | None:
         """Heading from the course over ground, forward or backward as the IMU felt it move off."""
         for velocity, position in reversed(self._fixes):
             speed = math.hypot(*velocity.v_ned[:2])
@@ -314,7 +291,7 @@ class Aligner:
         velocity: VelocityAid,
         course: float,
         sd: float,
-        place: _Place,
+        place: Place,
     ) -> Start | None:
         lat, _, height = (float(v) for v in place[1])
         q = quaternion_from_rpy(*level(standing.mean_force), 0.0)
@@ -337,7 +314,8 @@ class Aligner:
             return None
         yaw = course + (math.pi if backward else 0.0)
         at_rest = dcm_from_rpy(*level(standing.mean_force), yaw - turned)
-        return self._start(
+        return build_start(
+            self.model,
             velocity.t_ns,
             place,
             dcm_from_rpy(roll, pitch, yaw),
@@ -355,7 +333,7 @@ class Aligner:
         velocity: VelocityAid,
         course: float,
         sd: float,
-        place: _Place,
+        place: Place,
     ) -> Start | None:
         shortest, longest = MOTION_INTERVAL_NS
         for earlier, _ in reversed(self._fixes):
@@ -371,7 +349,8 @@ class Aligner:
             roll, pitch = level_in_motion(
                 mean[3:], change / (interval * 1e-9), course, gravity(lat, height)
             )
-            return self._start(
+            return build_start(
+                self.model,
                 velocity.t_ns,
                 place,
                 dcm_from_rpy(roll, pitch, course),
@@ -388,15 +367,15 @@ class Aligner:
     def _velocity(aid: VelocityAid) -> Array:
         return np.array([*aid.v_ned, 0.0][:3])
 
-    def _place_of(self, p: PositionAid, velocity: VelocityAid | None = None) -> _Place:
+    def _place_of(self, p: PositionAid, velocity: VelocityAid | None = None) -> Place:
         """A fix's place; with a velocity, moved to the velocity's instant."""
         where = np.array([p.lat_rad, p.lon_rad, p.height_m or 0.0])
         if velocity is not None:
             moved = self._velocity(velocity) * ((velocity.t_ns - p.t_ns) * 1e-9)
-            where += _as_geodetic(moved, p.lat_rad)
+            where += as_geodetic(moved, p.lat_rad)
         return p, where, max(p.sd[:2])
 
-    def _place(self) -> _Place | None:
+    def _place(self) -> Place | None:
         """Position (rad, rad, m) to start at, the fix it came from, and its sigma."""
         if self._position is not None:
             fix, where, sd = self._place_of(self._position)
@@ -416,69 +395,3 @@ class Aligner:
         return standing.mean_rate - dcm.T @ earth, self.noise.rate_noise / math.sqrt(
             standing.seconds
         )
-
-    def _start(
-        self,
-        t_ns: int,
-        place: _Place,
-        dcm: Array,
-        sd_yaw: float,
-        velocity: Array,
-        sd_velocity: float,
-        how: str,
-        *,
-        bias: tuple[Array, float] | None = None,
-        levelled: bool = False,
-        compassed: bool = False,
-    ) -> Start:
-        fix, where, sd_position = place
-        model = self.model
-        lat, height = float(where[0]), float(where[2])
-        nav = np.zeros(10)
-        nav[:3] = where
-        nav[3:6] = velocity
-        nav[6:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
-        if fix is not None:
-            nav[:3] -= _as_geodetic(dcm @ np.array(fix.lever), lat)
-        p = np.diag(model.initial**2)
-        tilt_sd = LEVEL_SD_RAD if levelled else MOTION_LEVEL_SD_RAD
-        p[0, 0] = p[1, 1] = tilt_sd**2
-        p[2, 2] = sd_yaw**2
-        p[3:6, 3:6] = np.eye(3) * max(sd_velocity, 0.05) ** 2
-        vertical = fix.sd[2] if fix is not None and fix.height_m is not None else sd_position
-        p[6:9, 6:9] = np.diag([sd_position**2, sd_position**2, vertical**2])
-        xi = np.zeros(model.size)
-        if bias is not None:
-            self._start_biases(p, xi, *bias)
-        if levelled:
-            self._correlate(p, dcm, lat, height, compassed)
-        return Start(t_ns, nav, xi, p, how)
-
-    def _start_biases(self, p: Array, xi: Array, bias: Array, sd: float) -> None:
-        """Take the rate bias seen at rest, where it is better known than the sheet says."""
-        for axis in range(3):
-            slot = self.model.parameters(9 + axis)[0]
-            prior = p[slot, slot]
-            floor = LEVEL_SD_RAD / 60.0  # a vehicle at rest that settles 0.1 deg in a minute
-            variance = sd**2 + floor**2
-            xi[slot] = bias[axis] * prior / (prior + variance)
-            p[slot, slot] = prior * variance / (prior + variance)
-
-    def _correlate(self, p: Array, dcm: Array, lat: float, height: float, compassed: bool) -> None:
-        """Attitude errors that come of sensor errors: J Pss J^T on attitude, J Pss across."""
-        size = self.model.size
-        jacobian = np.zeros((3, size))
-        by_force = levelling_jacobian(dcm, lat, height)
-        for axis in range(3):
-            for slot in self.model.parameters(12 + axis):
-                jacobian[:, slot] = by_force[:, axis]
-        if compassed:
-            north, down = EARTH_RATE_RAD_S * math.cos(lat), -EARTH_RATE_RAD_S * math.sin(lat)
-            jacobian[2] = jacobian[0] * down / north
-            for axis in range(3):
-                for slot in self.model.parameters(9 + axis):
-                    jacobian[2, slot] += dcm[1, axis] / north
-        cross = jacobian @ p
-        p[:3, :3] += cross @ jacobian.T
-        p[:3, 9:] += cross[:, 9:]
-        p[9:, :3] = p[:3, 9:].T

@@ -19,7 +19,7 @@ from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
-from fusiond.aligner import Aligner, AlignmentOptions, Start
+from fusiond.aligner import Aligner, AlignmentOptions
 from fusiond.config import Config
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.kernels import compensate
@@ -32,6 +32,7 @@ from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
 from fusiond.saved_state import SavedState
 from fusiond.settings import DEG, imu_noise, quiet_limits, sensor_to_body
 from fusiond.solution import Mode, Solution
+from fusiond.start import Start
 from fusiond.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
