@@ -24,7 +24,7 @@ EXIT_DATA = 65
 EXIT_UNAVAILABLE = 69
 EXIT_IO = 74
 EXIT_CONFIG = 78
-AID_KINDS = ("gnss", "rdss", "attitude", "wheel", "nmea", "raw")
+AID_KINDS = ("gnss", "rdss", "attitude", "wheel", "nmea")
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
@@ -90,9 +90,16 @@ def demo(
 
 
 @app.command()
-def check(config: ConfigPath) -> None:
+def check(
+    config: ConfigPath,
+    compile_kernels: Annotated[
+        bool, typer.Option("--compile", help="Also compile what the daemon would compile at start.")
+    ] = False,
+) -> None:
     """Validate a configuration: 0, or 78 with every mistake."""
     loaded = _load(config)
+    if compile_kernels:
+        import fusiond.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
     typer.echo(f"{config}: ok, vehicle {loaded.vehicle}")
     for name, source in loaded.sources.items():
         aid = loaded.aiding.get(name)
