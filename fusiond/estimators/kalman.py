@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from fusiond.aiding.base import Linearised, NotApplicable, State
 from fusiond.estimators.kernels import (
@@ -45,7 +45,7 @@ DOUBTED_ATTITUDE_RAD = math.radians(3.0)
 @lru_cache(maxsize=256)
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
-    return float(chi2.ppf(probability, degrees))
+    return float(chdtri(degrees, 1.0 - probability))
 
 
 class Outcome(NamedTuple):
