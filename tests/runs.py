@@ -100,17 +100,12 @@ class ImuRun:
 
 
 def imu_run(imu: Imu, truth: Truth, seed: int) -> ImuRun:
-    """What that IMU says; the same seed without motion tells biases from scale factors."""
+    """What that IMU says; the same seed with unit and no motion tells its scale factors."""
     out = imu_output(imu, truth.gyro, truth.accel, np.random.default_rng(seed))
-    nothing = np.zeros_like(truth.gyro)
-    still = imu_output(imu, nothing, nothing, np.random.default_rng(seed))
-    scales = [
-        np.sum((y - y0) * x, axis=0) / np.maximum(np.sum(x * x, axis=0), 1e-30) - 1.0
-        for y, y0, x in (
-            (out.gyro, still.gyro, truth.gyro),
-            (out.accel, still.accel, truth.accel),
-        )
-    ]
+    zero, one = np.zeros_like(truth.gyro), np.ones_like(truth.gyro)
+    still = imu_output(imu, zero, zero, np.random.default_rng(seed))
+    unit = imu_output(imu, one, one, np.random.default_rng(seed))
+    scales = [(unit.gyro - still.gyro)[0] - 1.0, (unit.accel - still.accel)[0] - 1.0]
     return ImuRun(
         np.hstack([out.gyro, out.accel]),
         np.hstack([out.gyro_bias, out.accel_bias]),

@@ -217,8 +217,8 @@ def test_before_the_start() -> None:
     entry = timeline.insert(early)
     timeline.insert(d.aids[1])
     timeline.start()
-    assert entry.outcome == Outcome("before_start")
-    assert timeline.counters.outcomes[early.source] == {"before_start": 1}
+    assert entry.outcome == Outcome("no_alignment")
+    assert timeline.counters.outcomes[early.source] == {"no_alignment": 1}
     assert timeline.insert(early).outcome == Outcome("too_old")
     timeline.imu.append(d.times, d.samples)
     timeline.run()
