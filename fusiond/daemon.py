@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from drivers.base import Backoff
 from fusiond.clock import Clock
 from fusiond.config import Config
-from fusiond.load_config import config_digest
+from fusiond.load_config import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.navigator import Navigator
 from fusiond.outputs.commands import (
     Command,
@@ -56,6 +57,9 @@ SAVE_EVERY_S = 60.0
 STATUS_EVERY_S = 1.0
 # Beyond this speed (m/s) the vehicle does not stand, and its heading is not worth keeping.
 SAVE_MAX_SPEED_M_S = 0.2
+# Beyond this one (m/s) it drives for certain, whatever the velocity's sigma (0.05 m/s aided): the
+# heading on disk is no longer its own, and a power cut must not bring it back.
+FORGET_SPEED_M_S = 1.0
 # Words in an event's code that make it a warning or an error for whoever filters by level.
 WARNINGS = (
     "absent",
@@ -122,6 +126,7 @@ class Daemon:
         self._since_ns = self._started_ns
         self._ready = False
         self._saving: asyncio.Task[None] | None = None
+        self._kept = saved is not None
         self._nav = _Every(round(1e9 / config.mqtt.nav_rate_hz))
         self._health = _Every(round(1e9 / config.mqtt.health_rate_hz))
         self._status = _Every(round(STATUS_EVERY_S * 1e9))
@@ -132,7 +137,7 @@ class Daemon:
         log.info(
             "fusiond %s, vehicle %s, config %s", self._version, self.config.vehicle, self._digest
         )
-        outputs = asyncio.create_task(self.mqtt.run()) if self.mqtt is not None else None
+        outputs = asyncio.create_task(self._publish(self.mqtt)) if self.mqtt is not None else None
         work = [
             asyncio.create_task(self.sources.run(), name="sources"),
             asyncio.create_task(self.scheduler.run(), name="scheduler"),
@@ -176,8 +181,7 @@ class Daemon:
             self._each_second(t_ns, solution)
         if self.mqtt is not None and self._health.due(t_ns):
             self._publish_health(t_ns)
-        if self._save.due(t_ns) and (self._saving is None or self._saving.done()):
-            self._saving = asyncio.create_task(asyncio.to_thread(self._write_state, self._state()))
+        self._keep_state(t_ns)
 
     def _each_second(self, t_ns: int, solution: Solution) -> None:
         text = f"{solution.mode}: {solution.reason}"
@@ -228,6 +232,17 @@ class Daemon:
         )
 
     # ------------------------------------------------------------------ events and commands
+
+    async def _publish(self, mqtt: MqttPublisher) -> None:
+        """Keep the output alive: a fault of it costs messages, never a tick."""
+        backoff = Backoff()
+        while True:
+            try:
+                await mqtt.run()
+            except Exception as error:
+                log.exception("output mqtt failed")
+                self._event("mqtt", "output_fault", f"{error!r}: restarting it")
+            await asyncio.sleep(backoff.next())
 
     def _event(self, source: str, code: str, text: str) -> None:
         level: Level = "info"
@@ -284,6 +299,27 @@ class Daemon:
         log.info("%s: %s", self._state_file, why)
         return state
 
+    def _keep_state(self, t_ns: int) -> None:
+        """Renew the file while the vehicle stands; remove it once the vehicle drives."""
+        if self._saving is not None and not self._saving.done():
+            return
+        if self._save.due(t_ns):
+            state = self._state()
+            if state is not None:
+                self._kept = True
+                self._saving = asyncio.create_task(asyncio.to_thread(self._write_state, state))
+        elif self._kept and self._drives():
+            self._kept = False
+            self._saving = asyncio.create_task(asyncio.to_thread(self._remove_state))
+
+    def _drives(self) -> bool:
+        s = self.solution
+        return (
+            s is not None
+            and s.mode in (Mode.NAVIGATING, Mode.COASTING)
+            and math.hypot(*s.v_ned_m_s) > FORGET_SPEED_M_S
+        )
+
     def _state(self) -> SavedState | None:
         """What to keep: only a solution at rest, for only then the heading lasts."""
         s = self.solution
@@ -308,6 +344,14 @@ class Daemon:
         except OSError as error:
             log.warning("state not saved: %s", error)
 
+    def _remove_state(self) -> None:
+        if self._state_file is None:
+            return
+        try:
+            self._state_file.unlink(missing_ok=True)
+        except OSError as error:
+            log.warning("state not removed: %s", error)
+
 
 def _state_file(config: Config) -> Path | None:
     if config.state_file is not None:
@@ -323,7 +367,7 @@ async def _cancel(*tasks: asyncio.Task[Any]) -> None:
 
 
 def run(config: Config, config_path: Path) -> None:
-    """Run until SIGTERM or SIGINT."""
+    """Run until SIGTERM or SIGINT. Exits 78 if the configuration leaves nothing to run."""
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
     log.info("configuration %s", config_path)
@@ -333,6 +377,12 @@ def run(config: Config, config_path: Path) -> None:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, stop.set)
+        if not config.sources:
+            raise ConfigError("sources: there is none: add [sources.imu] with a driver")
         await Daemon(config).run(stop)
 
-    asyncio.run(main())
+    try:
+        asyncio.run(main())
+    except ConfigError as error:
+        log.error("%s: %s", config_path, error)
+        sys.exit(EXIT_CONFIG)

@@ -167,7 +167,8 @@ class Sources:
                 gaps = rejected.pop("gap", 0)
                 counters["gap"] = gaps
                 fused = navigator.imu.next_sample
-                fused_age = round((now_ns - navigator.imu.latest_ns) * 1e-9, 3)
+                if navigator.imu.end:
+                    fused_age = round((now_ns - navigator.imu.latest_ns) * 1e-9, 3)
             if source.faults:
                 counters["driver_fault"] = source.faults
             seen = source.last_seen_ns
