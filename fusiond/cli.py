@@ -210,6 +210,16 @@ def compare(
 
 
 @app.command()
+def schema(
+    vehicle: Annotated[str, typer.Option(help="The name in the topics.")] = "vehicle",
+) -> None:
+    """Print the MQTT topics and messages as an AsyncAPI document."""
+    from fusiond.outputs.messages import asyncapi  # noqa: PLC0415
+
+    typer.echo(json.dumps(asyncapi(vehicle), indent=2))
+
+
+@app.command()
 def bench() -> None:
     """Time the kernels against one numpy product; prints JSON."""
     from fusiond.bench import bench as run_bench  # noqa: PLC0415
