@@ -105,13 +105,11 @@ class ImuBuffer:
         if gaps:
             self.counters["gap"] += gaps
         taken = len(times)
-        for first in range(0, taken, self._room()):
-            part = slice(first, first + self._room())
+        room = len(self.times) // 4  # at a time: a long chunk before the start needs no more
+        for first in range(0, taken, room):
+            part = slice(first, first + room)
             self._store(times[part], samples[part])
         return taken
-
-    def _room(self) -> int:
-        return len(self.times) // 4
 
     def _store(self, times: NDArray[np.int64], samples: Array) -> None:
         count = len(times)

@@ -109,7 +109,7 @@ class Navigator:
                 self.reset("IMU was silent")
         taken = self.imu.append(times, samples)
         if taken:
-            self._constrain(self.imu.end - taken)
+            self._constrain(max(0, self.imu.end - taken))
         return taken
 
     def add(self, m: Measurement, t_ns: int, sd_time_s: float = 0.0, seen_ns: int = 0) -> str:
