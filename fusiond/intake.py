@@ -130,9 +130,10 @@ class Intake:
             error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
             horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
             sd = (horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP))
-        if not all(s > 0.0 for s in sd):
+        if not (sd[0] > 0.0 and sd[1] > 0.0 and sd[2] > 0.0):
             return "no_sigma"
-        n, e, d = (max(s * o.sigma_scale, o.min_position_sd_m) for s in sd)
+        scale, least = o.sigma_scale, o.min_position_sd_m
+        n, e, d = max(sd[0] * scale, least), max(sd[1] * scale, least), max(sd[2] * scale, least)
         sd_time = math.hypot(sd_time_s, o.time_sd_s)
         aids: list[Linearised] = [
             PositionAid(
@@ -148,15 +149,19 @@ class Intake:
             )
         ]
         if o.use_velocity and m.v_ned_m_s is not None:
-            v = tuple(c for c in m.v_ned_m_s if c is not None)
-            stated = m.sd_v_ned_m_s or (None, None, None)
-            horizontal, vertical = o.velocity_sd_m_s, o.velocity_sd_m_s * VERTICAL_VELOCITY_FACTOR
-            typical = (horizontal, horizontal, vertical)
-            sd_v = tuple(
-                max((s or t) * o.sigma_scale, o.min_velocity_sd_m_s)
-                for s, t in zip(stated, typical, strict=True)
-            )[: len(v)]
-            if all(math.isfinite(c) for c in v):
+            north, east, down = m.v_ned_m_s
+            sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
+            horizontal, least = o.velocity_sd_m_s, o.min_velocity_sd_m_s
+            v: tuple[float, ...] = (north, east)
+            sd_v: tuple[float, ...] = (
+                max((sd_n or horizontal) * scale, least),
+                max((sd_e or horizontal) * scale, least),
+            )
+            if down is not None:
+                v = (north, east, down)
+                vertical = horizontal * VERTICAL_VELOCITY_FACTOR
+                sd_v = (*sd_v, max((sd_d or vertical) * scale, least))
+            if math.isfinite(sum(v)):
                 aids.append(
                     VelocityAid(
                         f"{m.source}_velocity",
