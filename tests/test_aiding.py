@@ -18,10 +18,11 @@ from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
 from fusiond.aiding.height import HeightAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Imu
-from fusiond.estimators.model import Model, make_model
+from fusiond.estimators.model import Model, make_model, position_bias
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.rotation import dcm_from_quaternion, dcm_from_rpy, rpy_from_dcm
 from fusiond.navigation.strapdown import STEP_SIZE
@@ -39,7 +40,7 @@ RPY = (0.08, -0.12, 2.3)
 
 
 def _model(name: str) -> Model:
-    return make_model(name, imu_noise(Imu()))
+    return make_model(name, imu_noise(Imu()), position_bias(BIAS_BLOCK, 30.0, 600.0))
 
 
 def _state(model: Model, nav: Array, xi: Array) -> State:
@@ -104,9 +105,16 @@ def _position(nav: Array, height: bool = True) -> PositionAid:
     return PositionAid(*SOURCE, lat + 1e-6, lon - 2e-6, up + 3.0 if height else None, sd, LEVER)
 
 
+def _rdss(nav: Array, moved_s: float = 0.0) -> RdssPositionAid:
+    lat, lon = float(nav[0]) + 1e-6, float(nav[1]) - 2e-6
+    return RdssPositionAid(*SOURCE, lat, lon, (400.0, -150.0, 200.0), LEVER, moved_s=moved_s)
+
+
 AIDS: dict[str, Callable[[Array], Linearised]] = {
     "position": _position,
     "horizontal position": lambda nav: _position(nav, False),
+    "rdss": _rdss,
+    "rdss, moved by the delay": lambda nav: _rdss(nav, 1.5),
     "velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
     "horizontal velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2), (0.1, 0.1), LEVER),
     "heading": lambda nav: HeadingAid(*SOURCE, 2.25, 0.01),
@@ -181,6 +189,25 @@ def test_position_across_the_date_line() -> None:
     fix = PositionAid(*SOURCE, float(nav[0]), -math.pi + 1e-7, 40.0, (1.0, 1.0, 1.0), (0.0,) * 3)
     z = _innovation(fix, _state(model, nav, np.zeros(model.size))).z
     assert z[1] == pytest.approx(-2e-7 * runs.metres(*nav[[0, 2]])[1], rel=1e-6)
+
+
+def test_rdss_rows_are_whitened_by_the_covariance_of_the_fix() -> None:
+    """z and H in units of sigma: with R the fix's covariance, H^T H = R^-1 for its position."""
+    model = _model("ins15")
+    nav = runs.level_nav(RPY, VELOCITY)
+    state = _state(model, nav, np.zeros(model.size))
+    z, h, r = _innovation(_rdss(nav), state)
+    whiten = h[:, 6:8]
+    cov = np.array([[400.0, -150.0], [-150.0, 200.0]])
+    assert whiten.T @ whiten == pytest.approx(np.linalg.inv(cov), rel=1e-9)
+    assert r == pytest.approx([1.0, 1.0])
+    lever = state.dcm @ LEVER
+    metres = np.array([-1e-6, 2e-6]) * runs.metres(*nav[[0, 2]])[:2] + lever[:2]
+    assert z == pytest.approx(whiten @ metres, rel=1e-6)
+    timed = _innovation(replace(_rdss(nav), sd_time_s=0.5), state).h[:, 6:8]
+    v = np.array(VELOCITY[:2])
+    expected = np.linalg.inv(cov + 0.25 * np.outer(v, v))
+    assert timed.T @ timed == pytest.approx(expected, rel=1e-9)
 
 
 def test_timing_error_adds_along_the_velocity() -> None:

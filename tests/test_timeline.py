@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.attitude import HeadingAid
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Imu
 from fusiond.estimators.kalman import KalmanEstimator, Outcome
@@ -53,10 +54,16 @@ class Drive:
             if 11.0 < t < 13.0:
                 lat += 1e-4  # an outlier of 640 m
             t_ns = START_NS + round(t * 1e9)
+            lever_v = (0.0, 0.0, 0.0)
             yaw = rpy_from_dcm(dcm_from_quaternion(nav[6:]))[2]
             sd = (1.5, 1.5, 1.5)
             lever = (0.4, -0.3, -1.2)
-            lever_v = (0.0, 0.0, 0.0)
+            if round(t) % 4 == 0:  # carried without feedback for 1.3 s, across other aids
+                late = t_ns + 1_300_000_000
+                held = RdssPositionAid(
+                    "rdss", t_ns + 3, GATE, lat, lon, (400.0, 50.0, 300.0), lever_v, holds=True
+                )
+                self.aids += [held, FeedBackAid("rdss_feedback", late, GATE)]
             self.aids += [
                 HeadingAid("compass", t_ns, GATE, yaw, 0.01),
                 PositionAid("gnss", t_ns, GATE, lat, lon, height, sd, lever),
@@ -93,6 +100,10 @@ def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
     outcomes = []
     for aid in d.aids:
         estimator.propagate(buffer, aid.t_ns)
+        if isinstance(aid, FeedBackAid):
+            estimator.release()
+        elif isinstance(aid, RdssPositionAid):
+            estimator.hold()
         outcomes.append(estimator.update(aid))
     estimator.propagate(buffer, buffer.latest_ns)
     return estimator, outcomes
@@ -110,8 +121,9 @@ def assert_same_state(a: KalmanEstimator, b: KalmanEstimator) -> None:
 def test_the_reference_has_outliers_and_navigates() -> None:
     estimator, outcomes = in_order()
     names = Counter(o.name for o in outcomes)
-    assert names["gated"] == 2
-    assert names["fused"] == len(outcomes) - 2
+    assert names["gated"] == 3
+    assert names["fed_back"] > 5
+    assert names["fused"] == len(outcomes) - 3 - names["fed_back"]
     assert np.sqrt(np.diag(estimator.covariance)[6:8]).max() < 1.5
 
 
