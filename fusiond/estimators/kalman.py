@@ -23,11 +23,10 @@ from fusiond.aiding.base import Linearised, NotApplicable, State
 from fusiond.estimators.kernels import (
     SCRATCH_SIZE,
     feed_back,
-    normalised_innovation_squared,
+    fuse,
     propagate,
     sensor_estimates,
     sigmas,
-    update,
 )
 from fusiond.estimators.model import Model
 from fusiond.imu_buffer import ImuBuffer
@@ -141,22 +140,17 @@ class KalmanEstimator:
             return Outcome(innovation.outcome)
         z, h, r = innovation
         degrees = z.shape[0]
-        if self._holding:
-            z = z - h @ self._dx
-        nis = normalised_innovation_squared(self._cov, z, h, r)
-        if not np.isfinite(nis):
+        state_arrays = self.nav, self.xi, self._cov, self._dx
+        threshold = gate_threshold(aid.gate, degrees)
+        nis = fuse(*state_arrays, z, h, r, threshold, self._holding)
+        if nis <= threshold:
+            return Outcome("fused", nis, degrees)
+        if not math.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
-        if nis > gate_threshold(aid.gate, degrees):
-            if not inflate:
-                return Outcome("gated", nis, degrees)
-            self._widen(z, h)
-        held = self._dx.copy() if self._holding else None
-        self._dx[:] = 0.0
-        update(self._cov, self._dx, z, h, r)
-        if held is None:
-            self._feed_back()
-        else:
-            self._dx += held
+        if not inflate:
+            return Outcome("gated", nis, degrees)
+        self._widen(z - h @ self._dx, h)
+        fuse(*state_arrays, z, h, r, math.inf, self._holding)
         return Outcome("fused", nis, degrees)
 
     def hold(self) -> None:

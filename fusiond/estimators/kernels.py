@@ -440,3 +440,38 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
     nav[LAT] -= d[6] / radius_m
     nav[LON] -= d[7] / (radius_n * cos_lat)
     nav[HEIGHT] += d[8]
+
+
+@compiled("f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1)")
+def fuse(
+    nav: Array,
+    xi: Array,
+    cov: Array,
+    dx: Array,
+    z: Array,
+    h: Array,
+    r: Array,
+    threshold: float,
+    holding: bool,
+) -> float:
+    """Gate, update and feedback in one; the normalised innovation squared.
+
+    Nothing changes if it is above `threshold` or not finite. With `holding` the estimate `dx` (n,)
+    is kept and added to instead of fed back; `z` is then the innovation before `dx` is taken off.
+    """
+    n = dx.shape[0]
+    innovation = z
+    if holding:
+        innovation = z.copy()
+        for a in range(z.shape[0]):
+            for i in range(n):
+                innovation[a] -= h[a, i] * dx[i]
+    nis = normalised_innovation_squared(cov, innovation, h, r)
+    if nis <= threshold:
+        if not holding:
+            dx[:] = 0.0
+        update(cov, dx, z, h, r)
+        if not holding:
+            feed_back(nav, xi, dx)
+            dx[:] = 0.0
+    return nis
