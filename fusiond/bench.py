@@ -3,9 +3,10 @@
     Phi @ P @ Phi.T + Q,   21x21, float64
 
 is timed before and after every single measurement, and each ratio is taken to the mean of those
-two, so that a machine which changes its clock or serves others in between does not matter. Every
-figure is the median over the repetitions. OpenBLAS uses one thread for matrices of this size (its
-threshold is 2 m n k > 50 000 multiplications; here 9261).
+two, so that a processor which changes its clock in between does not matter. Time is CPU time of the
+process (user and system), so that what else runs does not count. Every figure is the median over
+the repetitions. OpenBLAS uses one thread for matrices of this size (interface/gemm.c:
+up to m n k = 262 144; here 9261).
 
 The IMU runs at 200 Hz, but for `process` (100 Hz); the model is `ins21`.
 """
@@ -77,9 +78,9 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
             work = make(number)
             before = product()
             gc.collect()
-            start = time.perf_counter()
+            start = time.process_time()
             units = work()
-            seconds = (time.perf_counter() - start) / units
+            seconds = (time.process_time() - start) / units
             after = product()
             products.extend((before, after))
             ratios.append(seconds / (0.5 * (before + after)))
@@ -108,10 +109,10 @@ def _product() -> Callable[[], float]:
     p, q = np.eye(STATES), 1e-9 * np.eye(STATES)
 
     def timed() -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         for _ in range(PRODUCTS):
             _ = phi @ p @ phi.T + q
-        return (time.perf_counter() - start) / PRODUCTS
+        return (time.process_time() - start) / PRODUCTS
 
     timed()
     return timed

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 SECONDS_OF_WEEK = 604800.0
 # Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
 # this spacing, and memory stays bounded.
-CHUNK = 256
+CHUNK = 512
 _SHOWN = 20
 
 

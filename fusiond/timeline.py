@@ -114,8 +114,9 @@ class Timeline:
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
             return entry
-        at = bisect_left(self._keys, key)
-        if at < len(self._keys) and self._keys[at] == key:
+        last = len(self._keys)
+        at = last if not last or self._keys[-1] < key else bisect_left(self._keys, key)
+        if at < last and self._keys[at] == key:
             self._count(entry, Outcome("duplicate"))
             return entry
         self._keys.insert(at, key)
@@ -136,8 +137,9 @@ class Timeline:
         estimator = self.estimator
         while self._next < len(self._entries) and self._keys[self._next][0] <= latest:
             entry = self._entries[self._next]
-            estimator.propagate(self.imu, entry.key[0], record)
-            self._checkpoint()
+            if entry.key[0] > estimator.t_ns:
+                estimator.propagate(self.imu, entry.key[0], record)
+                self._checkpoint()
             self._count(entry, self._apply(entry))
             self._next += 1
         estimator.propagate(self.imu, latest, record)

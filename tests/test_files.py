@@ -19,6 +19,7 @@ from fusiond.files import (
     read_truth,
     read_wheel,
 )
+from fusiond.fixed_decimal import parse_rows
 
 IMU = "t_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2"
 
@@ -244,3 +245,40 @@ def test_truth_needs_its_position_and_a_solution_does_not(tmp_path: Path) -> Non
     assert truth.status == []
     assert solution.status == ["aligning", "navigating"]
     np.testing.assert_array_equal(solution.height_m, [np.nan, 5.0])
+
+
+# --------------------------------------------------------------------------- the compiled reader
+
+DECIMALS = st.from_regex(r"-?[0-9]{1,16}(\.[0-9]{0,16})?", fullmatch=True)
+
+
+def parse(text: str, columns: int, rows: int) -> list[list[float]] | None:
+    values = np.full((columns, rows), np.nan)
+    data = np.frombuffer(text.encode(), dtype=np.uint8).copy()
+    return values.T.tolist() if parse_rows(data, 0, values) else None
+
+
+@given(
+    st.lists(st.tuples(DECIMALS, DECIMALS), min_size=1, max_size=4), st.sampled_from(["\n", "\r\n"])
+)
+def test_plain_decimals_are_read_to_the_last_bit_or_left_to_others(
+    table: list[tuple[str, str]], newline: str
+) -> None:
+    read = parse(newline.join(",".join(row) for row in table), 2, len(table))
+    largest = max(int(cell.replace(".", "").replace("-", "")) for row in table for cell in row)
+    if read is None:
+        assert largest > 2**53
+    else:
+        assert read == [[float(cell) for cell in row] for row in table]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("1e3", "", "-", ".", "1.2.3", " 1", "1 ", "+1", "nan", "inf", "1_0", "1,2"),
+        *("1\n\n", "1\n2", "x", "0." + "1" * 23, "9007199254740993", "1\r", "\u0663"),
+    ],
+)
+def test_what_is_no_plain_decimal_is_left_to_others(text: str) -> None:
+    expected = [[1.0]] if text == "1\r" else None
+    assert parse(text, 1, 1) == expected
