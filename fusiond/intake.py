@@ -61,6 +61,7 @@ class Intake:
 
     def __init__(self, aiding: dict[str, AnyAiding]) -> None:
         self._aiding = aiding
+        self._sections: dict[tuple[str, type[Aiding]], Aiding] = {}
 
     def aids(
         self, m: Measurement, t_ns: int, sd_time_s: float, seen_ns: int = 0
@@ -114,11 +115,13 @@ class Intake:
 
     def _section(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""
-        for name in (source, str(kind.model_fields["kind"].default)):
-            section = self._aiding.get(name)
-            if isinstance(section, kind):
-                return section
-        return kind.model_validate({})
+        section = self._sections.get((source, kind))
+        if not isinstance(section, kind):
+            names = (source, str(kind.model_fields["kind"].default))
+            named = (self._aiding.get(name) for name in names)
+            section = next((s for s in named if isinstance(s, kind)), None) or kind()
+            self._sections[source, kind] = section
+        return section
 
     def _gnss(self, m: PositionFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
         o = self._section(m.source, GnssAiding)
@@ -133,7 +136,9 @@ class Intake:
         if not (sd[0] > 0.0 and sd[1] > 0.0 and sd[2] > 0.0):
             return "no_sigma"
         scale, least = o.sigma_scale, o.min_position_sd_m
-        n, e, d = max(sd[0] * scale, least), max(sd[1] * scale, least), max(sd[2] * scale, least)
+        n, e, d = sd[0] * scale, sd[1] * scale, sd[2] * scale
+        if n < least or e < least or d < least:
+            n, e, d = max(n, least), max(e, least), max(d, least)
         sd_time = math.hypot(sd_time_s, o.time_sd_s)
         aids: list[Linearised] = [
             PositionAid(

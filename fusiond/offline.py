@@ -68,7 +68,9 @@ def process(
     for kind, path in aids:
         rows, rejected = _READERS[kind](path, imu)
         files[kind] = _account(len(rows) + len(rejected), rejected)
-        kept = [row for row in rows if not _withheld(row.measurement, outages or [])]
+        kept = rows
+        if outages:
+            kept = [row for row in rows if not _withheld(row.measurement, outages)]
         withheld[kind] = withheld.get(kind, 0) + len(rows) - len(kept)
         arrivals += kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
