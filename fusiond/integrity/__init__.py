@@ -1,0 +1,1 @@
+"""Integrity: whether what the filter says about itself can be believed."""
