@@ -10,7 +10,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit hil format bench lock clean test-packages
+.PHONY: help install demo test lint unit hil format bench load lock clean test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -54,6 +54,9 @@ format: $(STAMP) ## let ruff lay out the code
 
 bench: $(STAMP) ## figures as JSON
 	$(BIN)/fusiond bench $(ARGS)
+
+load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
+	$(BIN)/python benchmarks/daemon_load.py $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
 	$(COMPILE) --all-extras $(ARGS) --output-file requirements-dev.lock pyproject.toml

@@ -42,7 +42,7 @@ from fusiond.outputs.messages import (
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.saved_state import SavedState, load_state, save_state
 from fusiond.scheduler import Scheduler
-from fusiond.service import ProcessUsage, ServiceManager
+from fusiond.service import ProcessUsage, ServiceManager, release_compiler_pages
 from fusiond.settings import DEG
 from fusiond.solution import Mode, Solution
 from fusiond.sources import Sources
@@ -379,7 +379,9 @@ def run(config: Config, config_path: Path) -> None:
             loop.add_signal_handler(number, stop.set)
         if not config.sources:
             raise ConfigError("sources: there is none: add [sources.imu] with a driver")
-        await Daemon(config).run(stop)
+        daemon = Daemon(config)
+        release_compiler_pages()
+        await daemon.run(stop)
 
     try:
         asyncio.run(main())

@@ -1,0 +1,161 @@
+"""What the daemon takes of a machine: `python benchmarks/daemon_load.py [--seconds S]` prints JSON.
+
+The daemon's own process serves a simulated vehicle in another: IMU 200 Hz, ticks 100 Hz, GNSS
+10 Hz, RDSS, `nav` 20 Hz to a Mosquitto that one client listens to. CPU and memory are the kernel's
+account of the process (/proc/PID/stat, /proc/PID/statm) over the time after alignment.
+
+The IMU is on `vcan0` where that interface is up, else on python-can's `udp_multicast`, whose frames
+cost more: UDP, msgpack and a Python object for each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from fusiond.simulation.can_imu import SIM_IMU as SIM_IMU_OPTIONS
+from fusiond.simulation.scenarios import SCENARIOS
+from fusiond.simulation.trajectories import drive
+from fusiond.simulation.vehicle import SimulatedVehicle
+from tests.broker import Broker, listening
+from tests.hil.processes import SIM_IMU, DaemonProcess, Heard
+
+IMU_HZ, TICK_HZ, GNSS_HZ, NAV_HZ = 200.0, 100.0, 10.0, 20.0
+SETTLE_S = 5.0
+REST_S = 5.0
+CONFIG = """
+vehicle = "load"
+[imu]
+axes = ["+x", "-y", "-z"]
+rate_hz = {imu_hz}
+{imu}
+[sources.gnss]
+driver = "nmea"
+port = "{folder}/gnss"
+[aiding.gnss]
+lever_arm_m = [0.0, 0.0, -1.0]
+[sources.rdss]
+driver = "rdss"
+port = "{folder}/rdss"
+baud = 115200
+[aiding.rdss]
+lever_arm_m = [0.0, 0.0, -1.0]
+[constraints.non_holonomic]
+enabled = true
+lever_arm_m = [-1.0, 0.0, 0.5]
+[scheduler]
+rate_hz = {tick_hz}
+[mqtt]
+host = "127.0.0.1"
+port = {port}
+nav_rate_hz = {nav_hz}
+"""
+
+
+def _vehicle(folder: str, interface: str, channel: str) -> None:
+    scenario = SCENARIOS["drive"]
+    vehicle = SimulatedVehicle(
+        replace(
+            scenario,
+            path=partial(drive, rest_s=REST_S),
+            imu=scenario.imu.model_copy(update={"rate_hz": IMU_HZ}),
+            gnss=replace(scenario.gnss, rate_hz=GNSS_HZ),
+        ),
+        duration_s=600.0,
+        can_imu=SIM_IMU_OPTIONS.model_copy(update={"interface": interface, "channel": channel}),
+        gnss_link=Path(folder, "gnss"),
+        rdss_link=Path(folder, "rdss"),
+    )
+    asyncio.run(vehicle.run())
+
+
+def _cpu_s(pid: int) -> float:
+    """User and system time of all threads (proc(5): utime, stime)."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _resident_mb(pid: int) -> float:
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def _bus() -> tuple[str, str]:
+    up = subprocess.run(["ip", "link", "show", "vcan0", "up"], capture_output=True, check=False)
+    return ("socketcan", "vcan0") if up.stdout else ("udp_multicast", "239.74.163.2")
+
+
+async def measure(folder: Path, seconds: float) -> dict[str, object]:
+    """Run both processes for `seconds` after alignment; the figures."""
+    interface, channel = _bus()
+    broker = Broker(folder)
+    config = folder / "load.toml"
+    config.write_text(
+        CONFIG.format(
+            imu=SIM_IMU.format(interface=interface, channel=channel),
+            imu_hz=IMU_HZ,
+            tick_hz=TICK_HZ,
+            nav_hz=NAV_HZ,
+            folder=folder,
+            port=broker.port,
+        )
+    )
+    vehicle = multiprocessing.get_context("spawn").Process(
+        target=_vehicle, args=(str(folder), interface, channel), daemon=True
+    )
+    daemon = DaemonProcess(config)
+    try:
+        with broker:
+            vehicle.start()
+            await daemon.start()
+            async with listening(broker) as (listener, _):
+                heard = Heard(listener, "load")
+                await heard.until("nav", lambda m: m["mode"] == "navigating")
+                await asyncio.sleep(SETTLE_S)
+                since, before = heard.count, await heard.until("health")
+                start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
+                await asyncio.sleep(seconds)
+                elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
+                resident_mb = _resident_mb(daemon.pid)
+                after = await heard.until("health")
+                nav = len(heard.all("nav", since))
+            await daemon.terminate()
+    finally:
+        await daemon.kill()
+        vehicle.kill()
+    return {
+        "cpu_percent": round(100.0 * used_s / elapsed_s, 1),
+        "resident_mb": round(resident_mb, 1),
+        "seconds": round(elapsed_s, 1),
+        "interface": interface,
+        "imu_received": after["sources"]["imu"]["received"] - before["sources"]["imu"]["received"],
+        "gnss_fused": after["sources"]["gnss"]["fused"] - before["sources"]["gnss"]["fused"],
+        "nav_messages": nav,
+        "ticks": after["ticks"] - before["ticks"],
+        "overruns": after["overruns"] - before["overruns"],
+        "lateness_p99_ms": after["lateness_p99_ms"],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=30.0)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="fusiond-load-") as folder:
+        print(json.dumps(asyncio.run(measure(Path(folder), args.seconds)), indent=2))
+
+
+if __name__ == "__main__":
+    main()
