@@ -27,7 +27,7 @@ from tests import runs
 
 Array = NDArray[np.float64]
 
-RATE_HZ, SECONDS, RUNS = 50.0, 240.0, 40
+RATE_HZ, SECONDS, RUNS = 50.0, 240.0, 100
 FIRST_FIX_S = 0.303  # inside an IMU interval, so that every fix splits one
 INSTANTS_S = (20.0, 90.0, 160.0, 239.0)
 LEVER = (0.4, -0.3, -1.2)
