@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -396,7 +397,7 @@ def test_hysteresis_of_the_study_is_the_monitors() -> None:
     assert not held[0, :100].any()
 
 
-def test_study_runs_repeats_and_is_json() -> None:
+def test_study_runs_and_is_json(tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
     result = study.run(1000, seed=3, progress=lambda done, of: seen.append((done, of)))
     assert json.loads(json.dumps(result, allow_nan=False)) == result
@@ -417,3 +418,10 @@ def test_study_runs_repeats_and_is_json() -> None:
     assert power["gnss", "delay off by 0.5 s"]["100"]["epochs"] < 200
     assert result["paper"]["variance_1_k"]["lags_outside"] == [1]
     assert "rho(1)" in result["finding"]
+    study.plot(result, tmp_path / "consistency.png")
+    assert (tmp_path / "consistency.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_study_repeats_with_its_seed() -> None:
+    alarms = [study.false_alarms(300, 0.01, np.random.default_rng([seed, 0])) for seed in (5, 5, 6)]
+    assert alarms[0] == alarms[1] != alarms[2]

@@ -381,16 +381,13 @@ class ConsistencyMonitor:
         )
         dof = k * self._m
         self._average = self._sums[0] / dof
-        limits = self._limits(k, dof)
+        o = self.options
+        limits = _limits(k, dof, o.alpha, o.gate, o.whitened)
         q = float(limits.weights @ (self._rho * self._rho))
         self.window_verdict = _verdict(self._average, q, limits)
         self._contradicted = self._contradicted + 1 if self.window_verdict != self.verdict else 0
         if self._contradicted >= k // 2:
             self.verdict, self._contradicted = self.window_verdict, 0
-
-    def _limits(self, k: int, dof: int) -> _Limits:
-        o = self.options
-        return _limits(k, dof, o.alpha, o.gate, o.whitened)
 
     def report(self) -> Consistency:
         """The figures of the window and the verdict; changes nothing."""
