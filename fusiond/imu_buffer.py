@@ -48,6 +48,8 @@ class ImuBuffer:
         self.end = 0
         self.needed: int | None = None
         """Absolute number of the oldest sample that a rewind would use; nobody needs any: None."""
+        self.backward_in_a_row = 0
+        """Samples refused as `backward_stamp` since the last that was taken."""
         self.counters: Counter[str] = Counter()
         self._keep_ns = round(keep_s * 1e9)
         self._gap_ns = round(gap_s * 1e9)
@@ -74,6 +76,11 @@ class ImuBuffer:
         """Row of the first sample later than `t_ns`."""
         return int(np.searchsorted(self.times[: self.end], t_ns, side="right"))
 
+    def restart(self) -> None:
+        """Forget all samples: the next may have any stamp."""
+        self.start, self.end, self.needed = self.next_sample, 0, None
+        self.backward_in_a_row = 0
+
     def append(self, times: NDArray[np.int64], samples: Array) -> int:
         """Append samples (m,) ns and (m, 6) in sensor axes; return how many were taken.
 
@@ -95,7 +102,9 @@ class ImuBuffer:
         if (np.diff(before) <= 0).any():
             highest = np.maximum.accumulate(before)[:-1]
             self.counters["duplicate_stamp"] += int((times == highest).sum())
-            self.counters["backward_stamp"] += int((times < highest).sum())
+            backward = int((times < highest).sum())
+            self.counters["backward_stamp"] += backward
+            self.backward_in_a_row += backward
             forward = times > highest
             times, samples = times[forward], samples[forward]
             if not len(times):
@@ -105,6 +114,7 @@ class ImuBuffer:
         if gaps:
             self.counters["gap"] += gaps
         taken = len(times)
+        self.backward_in_a_row = 0
         room = len(self.times) // 4  # at a time: a long chunk before the start needs no more
         for first in range(0, taken, room):
             part = slice(first, first + room)

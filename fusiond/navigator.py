@@ -108,6 +108,12 @@ class Navigator:
                 self._event("imu_gap", f"IMU silent for {silence:.1f} s: aligning anew")
                 self.reset("IMU was silent")
         taken = self.imu.append(times, samples)
+        stuck_s = self.imu.backward_in_a_row / self.config.imu.rate_hz
+        if stuck_s > self.config.imu.gap_s:
+            # One stamp far ahead, or a clock set back: nothing would be taken until it is made up.
+            self._event("imu_time", f"IMU stamps went back {stuck_s:.1f} s ago: aligning anew")
+            self.imu.restart()
+            self.reset("IMU stamps went back")
         if taken:
             self._constrain(max(0, self.imu.end - taken))
         return taken

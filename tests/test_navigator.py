@@ -293,6 +293,25 @@ def test_a_long_silence_aligns_anew() -> None:
     assert navigator.solution(int(parked[-1])).mode is Mode.NAVIGATING
 
 
+def test_a_stamp_far_ahead_does_not_silence_the_imu() -> None:
+    """One sample an hour ahead: what follows is backward, until that is plain; then anew."""
+    d = drive()
+    events: list[str] = []
+    navigator, row = _started(on_event=lambda code, text: events.append(code))
+    hour = 3600 * runs.SECOND
+    navigator.add_imu(d.times[row : row + 1] + hour, d.samples[row : row + 1])
+    navigator.advance()
+    parked = d.times[:400] + int(d.times[row] - d.times[0]) + 20_000_000
+    for first in range(0, len(parked), 10):
+        navigator.add_imu(parked[first : first + 10], d.samples[first : first + 10])
+        navigator.advance()
+    assert events == ["aligned", "imu_gap", "imu_time", "aligned"]
+    # Half a second of samples, by chunks of ten, is what it took to believe them.
+    assert navigator.imu.counters["backward_stamp"] == 30
+    assert navigator.estimator.t_ns == parked[-1]
+    assert navigator.solution(int(parked[-1])).mode is Mode.NAVIGATING
+
+
 def test_coasting_and_invalid() -> None:
     d = drive()
     settings_ = {**CONFIG, "estimator": {"coast_after_s": 5.0, "invalid_sd_m": 20.0}}
