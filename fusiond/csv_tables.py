@@ -28,7 +28,6 @@ from fusiond.fixed_decimal import parse_rows
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_NEWLINE = 10
 _TEXT_DTYPE = "U64"
 _MAX_TIME_S = 9e9
 """Seconds beyond which nanoseconds leave a 64-bit integer."""
@@ -161,14 +160,13 @@ def _check_header(path: Path, header: list[str], columns: Sequence[Column]) -> N
 
 def _read_plain(path: Path, header: list[str]) -> _Parsed | None:
     """A file of plain decimals, such as this project writes; None if there is anything else."""
-    data = np.fromfile(path, dtype=np.uint8)
-    newlines = np.flatnonzero(data == _NEWLINE)
-    if not len(newlines):
+    data = bytearray(path.read_bytes())
+    start = data.find(b"\n") + 1
+    rows = data.count(b"\n", start) + (not data.endswith(b"\n"))
+    if not start or start == len(data):
         return None
-    start = int(newlines[0]) + 1
-    rows = len(newlines) - 1 + (start < len(data) and data[-1] != _NEWLINE)
     values = np.empty((len(header), rows))
-    if rows == 0 or not parse_rows(data, start, values):
+    if not parse_rows(np.frombuffer(data, dtype=np.uint8), start, values):
         return None
     lines = np.arange(2, rows + 2, dtype=np.int64)
     return dict(zip(header, values, strict=True)), {}, lines, []

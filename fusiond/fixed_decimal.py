@@ -25,15 +25,14 @@ _COMMA, _NEWLINE, _POINT, _MINUS, _ZERO = 44, 10, 46, 45, 48
 _LIMIT = 1e18
 
 
-@compiled("i8(u1[::1], i8, u8, i8)")
-def _write_digits(out: NDArray[np.uint8], at: int, number: np.uint64, width: int) -> int:
-    """Write `number` at `out[at:]` with at least `width` digits; returns the next position."""
+@compiled("i8(u1[::1], i8, u8)")
+def _write_digits(out: NDArray[np.uint8], at: int, number: np.uint64) -> int:
+    """Write `number` at `out[at:]`; returns the next position."""
     rest = number
     digits = 1
     while rest >= np.uint64(10):
         rest //= np.uint64(10)
         digits += 1
-    digits = max(digits, width)
     rest = number
     for k in range(at + digits - 1, at - 1, -1):
         out[k] = _ZERO + rest % np.uint64(10)
@@ -74,10 +73,14 @@ def format_rows(
                 if v < 0.0 and (whole > np.uint64(0) or part > np.uint64(0)):
                     out[at] = _MINUS
                     at += 1
-                at = _write_digits(out, at, whole, 1)
+                at = _write_digits(out, at, whole)
                 if d > 0:
                     out[at] = _POINT
-                    at = _write_digits(out, at + 1, part, d)
+                    at += 1
+                    for k in range(at + d - 1, at - 1, -1):
+                        out[k] = _ZERO + part % np.uint64(10)
+                        part //= np.uint64(10)
+                    at += d
             elif magnitude >= _LIMIT:
                 if v < 0.0:
                     out[at] = _MINUS

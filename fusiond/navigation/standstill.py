@@ -70,13 +70,15 @@ def judge(
     """Judge rows first ... end-1 as one window."""
     mean, sd = np.zeros(6), np.zeros(6)
     _moments(samples, first, end, mean, sd)
+    x, y, z, *force_sd = sd.tolist()
+    mx, my, mz = mean[:3].tolist()
     quiet = (
         end - first >= FEWEST_SAMPLES
-        and max(sd[:3]) < limits.rate_sd
-        and max(sd[3:]) < limits.force_sd
-        and max(abs(mean[:3])) < limits.mean_rate
+        and max(x, y, z) < limits.rate_sd
+        and max(force_sd) < limits.force_sd
+        and max(abs(mx), abs(my), abs(mz)) < limits.mean_rate
     )
-    return Window(int(times[end - 1]), end - first, mean[:3], mean[3:], bool(quiet))
+    return Window(int(times[end - 1]), end - first, mean[:3], mean[3:], quiet)
 
 
 class StandstillDetector:
