@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.hil.bench import Broker, SerialLine
+from tests.broker import Broker
+from tests.hil.bench import SerialLine
 
 
 @pytest.fixture
@@ -30,7 +31,5 @@ def serial_line() -> Iterator[SerialLine]:
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
     """A running broker."""
-    broker = Broker(tmp_path)
-    broker.start()
-    yield broker
-    broker.kill()
+    with Broker(tmp_path) as broker:
+        yield broker

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import serial
 
-from tests.hil.bench import Broker, SerialLine
+from tests.broker import Broker
+from tests.hil.bench import SerialLine
 
 
 def test_a_frame_crosses_the_bus_with_the_kernels_stamp(can_channel: str) -> None:
@@ -54,7 +55,7 @@ def test_bytes_cross_a_serial_line_both_ways(serial_line: SerialLine) -> None:
 
 
 async def test_a_message_goes_round_through_the_broker(broker: Broker) -> None:
-    async with aiomqtt.Client(broker.host, broker.port) as client:
+    async with aiomqtt.Client("127.0.0.1", broker.port) as client:
         await client.subscribe("fusiond/bench/#", qos=1)
         await client.publish("fusiond/bench/nav", b"\x00payload", qos=1)
         message = await asyncio.wait_for(anext(aiter(client.messages)), timeout=10.0)
@@ -62,14 +63,14 @@ async def test_a_message_goes_round_through_the_broker(broker: Broker) -> None:
 
 
 async def test_the_broker_dies_and_returns_on_its_port(broker: Broker) -> None:
-    async with aiomqtt.Client(broker.host, broker.port):
+    async with aiomqtt.Client("127.0.0.1", broker.port):
         pass
     broker.kill()
     with pytest.raises(aiomqtt.MqttError):
-        async with aiomqtt.Client(broker.host, broker.port):
+        async with aiomqtt.Client("127.0.0.1", broker.port):
             pass
     broker.start()
-    async with aiomqtt.Client(broker.host, broker.port):
+    async with aiomqtt.Client("127.0.0.1", broker.port):
         pass
 
 
