@@ -3,7 +3,8 @@
 An aid whose instant has passed takes the filter back to the last checkpoint before it; it is
 applied at its own instant, and everything after it runs again. The state that results is, bit for
 bit, the one that would have come of arrival in order of validity, as long as the aid is younger
-than the oldest checkpoint. Aids of one instant are ordered by source, not by arrival.
+than the oldest checkpoint. Aids of one instant are ordered by source, not by arrival; a feedback
+that is due comes first.
 """
 
 from __future__ import annotations
@@ -32,11 +33,13 @@ MOST_WAITING = 4096
 
 @dataclass(slots=True)
 class Entry:
-    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart."""
+    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
+    `judged` that its innovation has been looked at: a rewind applies it again."""
 
     key: Key
     aid: Linearised
     outcome: Outcome | None = None
+    judged: bool = False
 
 
 @dataclass(slots=True)
@@ -109,7 +112,9 @@ class Timeline:
 
     def insert(self, aid: Linearised, serial: int = 0) -> Entry:
         """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
-        key = (aid.t_ns, aid.source, serial)
+        # What is due to be fed back is fed back before anything of the same instant is applied: the
+        # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
+        key = (aid.t_ns, "" if isinstance(aid, FeedBackAid) else aid.source, serial)
         entry = Entry(key, aid)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
