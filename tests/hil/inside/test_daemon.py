@@ -200,7 +200,7 @@ async def _restart_at_rest(
     await heard.online(b"online")
     status = await heard.until("status", lambda m: m["mode"] == "navigating")
     assert status["why"] == "heading from saved state"
-    print(f"restart: first status after {status['uptime_s']:.1f} s of the clock's start")
+    print(f"navigates {status['uptime_s']:.1f} s after the restart")
     await _check_against_truth(heard, vehicle)
 
 
