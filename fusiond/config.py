@@ -216,6 +216,15 @@ class Estimator(Section):
     invalid_sd_m: PositiveFloat = 5000.0
 
 
+class ConsistencyTest(Section):
+    """The verdict on a source's innovations; see `docs/consistency.md`."""
+
+    window: Annotated[int, Field(ge=20, le=10000)] = 100
+    """Epochs judged together. RDSS sources, asked once a minute, use half of it."""
+    alpha: Probability = 0.01
+    """Share of windows of a matched filter that are found wrong by chance."""
+
+
 class Scheduler(Section):
     rate_hz: Annotated[float, Field(ge=1.0, le=1000.0)] = 100.0
 
@@ -281,6 +290,7 @@ class Config(Section):
     constraints: Constraints = Constraints()
     alignment: Alignment = Alignment()
     estimator: Estimator = Estimator()
+    consistency: ConsistencyTest = ConsistencyTest()
     scheduler: Scheduler = Scheduler()
     clock: ClockOptions = ClockOptions()
     mqtt: Mqtt = Mqtt()

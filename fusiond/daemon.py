@@ -34,6 +34,7 @@ from fusiond.outputs.commands import (
 )
 from fusiond.outputs.messages import (
     Level,
+    consistency_message,
     event_message,
     health_message,
     nav_message,
@@ -63,6 +64,9 @@ FORGET_SPEED_M_S = 1.0
 # Words in an event's code that make it a warning or an error for whoever filters by level.
 WARNINGS = (
     "absent",
+    "optimistic",
+    "pessimistic",
+    "coloured",
     "lost",
     "silent",
     "silence",
@@ -230,6 +234,10 @@ class Daemon:
                 memory_mb=memory_mb,
             )
         )
+        reports = self.navigator.verdicts.reports()
+        if reports:
+            utc_ns = self.clock.utc_ns(t_ns)
+            self.mqtt.publish_consistency(consistency_message(utc_ns, reports))
 
     # ------------------------------------------------------------------ events and commands
 

@@ -26,6 +26,7 @@ from fusiond.estimators.kernels import compensate
 from fusiond.estimators.model import make_model, position_bias
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.intake import Intake
+from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.standstill import StandstillDetector, Window
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
@@ -37,6 +38,8 @@ from fusiond.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
 
+# Aids that the filter makes by itself.
+CONSTRAINTS = frozenset({"zero_velocity", "zero_rate", "non_holonomic"})
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
 
@@ -64,6 +67,12 @@ class Navigator:
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
         )
         self.estimator = KalmanEstimator(self.model, imu.gap_s)
+        self.verdicts = Verdicts(
+            config.consistency.window,
+            config.consistency.alpha,
+            CONSTRAINTS,
+            lambda source, verdict: self._event(f"verdict_{verdict}", f"innovations of {source}"),
+        )
         self.timeline = Timeline(
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
@@ -166,6 +175,7 @@ class Navigator:
             first = self.imu.index_after(start.t_ns) + self.imu.start
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             self.timeline.start()
+            self.verdicts.reset()
             self.started = start
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", f"heading from {start.how}")
@@ -245,6 +255,7 @@ class Navigator:
     def _outcome(self, entry: Entry) -> None:
         outcome = entry.outcome
         if outcome is not None and outcome.name == "fused":
+            self.verdicts.judge(entry, outcome)
             source, t_ns = entry.aid.source, entry.key[0]
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
             if isinstance(entry.aid, PositionAid | RdssPositionAid):

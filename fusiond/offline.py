@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,6 +98,9 @@ def process(
         "aligned": None if navigator.started is None else navigator.started.how,
         "mode": str(navigator.mode(navigator.imu.latest_ns)[0]),
         "reason": navigator.mode(navigator.imu.latest_ns)[1],
+        "consistency": {
+            name: asdict(report) for name, report in navigator.verdicts.reports().items()
+        },
         "rewinds": navigator.timeline.counters.rewinds,
     }
 

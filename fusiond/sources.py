@@ -157,6 +157,7 @@ class Sources:
                     fused=ended["fused"],
                     rejected=rejected,
                     fused_age_s=fused_age,
+                    verdict=navigator.verdicts.verdict(name),
                 )
                 continue
             counters = {k: int(v) for k, v in source.driver.counters.items() if v}
@@ -182,5 +183,6 @@ class Sources:
                 fused_age_s=fused_age,
                 latency_s=None if source.latency_s is None else round(source.latency_s, 4),
                 counters=counters,
+                verdict=navigator.verdicts.verdict(name),
             )
         return health

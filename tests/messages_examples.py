@@ -6,9 +6,11 @@ from math import radians
 from typing import Any
 
 from fusiond.clock import ClockStatus
+from fusiond.integrity.consistency import judge
 from fusiond.outputs.messages import (
     ReplyMessage,
     SourceHealth,
+    consistency_message,
     event_message,
     health_message,
     nav_message,
@@ -72,6 +74,7 @@ EXAMPLES: dict[str, Any] = {
                 fused_age_s=0.06,
                 latency_s=0.071,
                 counters={"checksum": 2, "sentences": 213_480},
+                verdict="consistent",
             ),
             "rdss": SourceHealth(
                 state="silent",
@@ -83,6 +86,7 @@ EXAMPLES: dict[str, Any] = {
                 fused_age_s=187.2,
                 latency_s=1.42,
                 counters={"no_beam": 12, "requests": 61},
+                verdict="coloured",
             ),
         },
         scheduler=SCHEDULER,
@@ -91,6 +95,17 @@ EXAMPLES: dict[str, Any] = {
         ),
         cpu_percent=17.3,
         memory_mb=141.8,
+    ),
+    "consistency": consistency_message(
+        UTC_NS,
+        {
+            "rdss": judge(
+                50,
+                100,
+                0.893,
+                (-0.4054, -0.0259, -0.0411, -0.0881, 0.1637, -0.1903, 0.0842, 0.1781),
+            )
+        },
     ),
     "event": event_message(
         UTC_NS,

@@ -48,11 +48,14 @@ def gate_threshold(probability: float, degrees: int) -> float:
 
 
 class Outcome(NamedTuple):
-    """How an aid ended: its name, and the innovation that led to it (NIS and dimension)."""
+    """How an aid ended: its name, and the innovation that led to it (NIS, dimension, and L^-1 nu
+    with
+    S = L L^T)."""
 
     name: str
     nis: float = float("nan")
     degrees: int = 0
+    whitened: tuple[float, ...] = ()
 
 
 class Snapshot(NamedTuple):
@@ -142,15 +145,16 @@ class KalmanEstimator:
         degrees = z.shape[0]
         state_arrays = self.nav, self.xi, self._cov, self._dx
         threshold = gate_threshold(aid.gate, degrees)
-        nis = fuse(*state_arrays, z, h, r, threshold, self._holding)
+        y = np.zeros(degrees)
+        nis = fuse(*state_arrays, z, h, r, threshold, self._holding, y)
         if nis <= threshold:
-            return Outcome("fused", nis, degrees)
+            return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
         if not inflate:
             return Outcome("gated", nis, degrees)
         self._widen(z - h @ self._dx, h)
-        fuse(*state_arrays, z, h, r, math.inf, self._holding)
+        fuse(*state_arrays, z, h, r, math.inf, self._holding, y)
         return Outcome("fused", nis, degrees)
 
     def hold(self) -> None:

@@ -347,9 +347,11 @@ def propagate(
     return i, now
 
 
-@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])")
-def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array) -> float:
-    """nu^T S^-1 nu for z (m,), h (m, n), r (m,) variances; S = H P H^T + diag(r).
+@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])")
+def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: Array) -> float:
+    """nu^T S^-1 nu for z (m,), h (m, n), r (m,) variances; S = H P H^T + diag(r) = L L^T.
+
+    `y` (m,) is left as the whitened innovation L^-1 z.
 
     Computed row by row with a covariance that shrinks as the update's would: the same number
     without forming S^-1 (Bierman, section V.2), but on a copy.
@@ -373,7 +375,6 @@ def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array) -> f
         s[a, a] += r[a]
     # Cholesky s = L L^T and forward substitution L y = z, y^T y is the answer.
     total = 0.0
-    y = np.empty(m)
     for a in range(m):
         for b in range(a + 1):
             value = s[a, b]
@@ -442,7 +443,9 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
     nav[HEIGHT] += d[8]
 
 
-@compiled("f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1)")
+@compiled(
+    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1, f8[::1])"
+)
 def fuse(
     nav: Array,
     xi: Array,
@@ -453,11 +456,13 @@ def fuse(
     r: Array,
     threshold: float,
     holding: bool,
+    y: Array,
 ) -> float:
     """Gate, update and feedback in one; the normalised innovation squared.
 
     Nothing changes if it is above `threshold` or not finite. With `holding` the estimate `dx` (n,)
     is kept and added to instead of fed back; `z` is then the innovation before `dx` is taken off.
+    `y` (m,) is left as the whitened innovation.
     """
     n = dx.shape[0]
     innovation = z
@@ -466,7 +471,7 @@ def fuse(
         for a in range(z.shape[0]):
             for i in range(n):
                 innovation[a] -= h[a, i] * dx[i]
-    nis = normalised_innovation_squared(cov, innovation, h, r)
+    nis = normalised_innovation_squared(cov, innovation, h, r, y)
     if nis <= threshold:
         if not holding:
             dx[:] = 0.0

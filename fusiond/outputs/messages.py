@@ -17,6 +17,7 @@ from pydantic.json_schema import models_json_schema
 
 from drivers.base import State
 from fusiond.clock import ClockStatus
+from fusiond.integrity.consistency import Consistency, Verdict
 from fusiond.outputs.commands import COMMANDS
 from fusiond.scheduler import SchedulerStatus
 from fusiond.solution import Mode, Solution
@@ -91,6 +92,31 @@ class SourceHealth(BaseModel):
     fused_age_s: Number = Field(default=None, description="since the last one was fused")
     latency_s: Number = Field(default=None, description="from validity to arrival, the last one")
     counters: dict[str, Count] = Field(default_factory=dict, description="of the driver")
+    verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
+
+
+class SourceConsistency(BaseModel):
+    """The tests of one source's innovations (docs/consistency.md); figures are null with too
+    few."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    verdict: Verdict
+    k: Count = Field(description="innovations in the window")
+    alpha: Number = Field(description="overall level of the verdict")
+    nis_average: Number = Field(description="per degree of freedom; 1 is expected")
+    nis_low: Number = Field(description="95 % interval")
+    nis_high: Number = Field(description="95 % interval")
+    rho: tuple[Number, ...] = Field(description="autocorrelation at lags 1 to 8")
+    rho_high: Number = Field(description="95 % interval of one lag is +- this")
+    portmanteau: Number
+    portmanteau_limit: Number
+
+
+class ConsistencyMessage(Message):
+    """Can the filter's sigma be believed: one verdict a source."""
+
+    sources: dict[str, SourceConsistency]
 
 
 class HealthMessage(Message):
@@ -239,6 +265,32 @@ def health_message(
     )
 
 
+def consistency_message(
+    utc_ns: int | None, reports: Mapping[str, Consistency]
+) -> ConsistencyMessage:
+    """`consistency` from the monitors' reports."""
+    t_utc, t_ms = stamp(utc_ns)
+    return ConsistencyMessage(
+        t_utc=t_utc,
+        t_ms=t_ms,
+        sources={
+            name: SourceConsistency(
+                verdict=r.verdict,
+                k=r.k,
+                alpha=r.alpha,
+                nis_average=round(r.nis_average, 4),
+                nis_low=round(r.nis_interval[0], 4),
+                nis_high=round(r.nis_interval[1], 4),
+                rho=tuple(round(x, 4) for x in r.rho),
+                rho_high=round(r.rho_interval[1], 4),
+                portmanteau=round(r.portmanteau, 3),
+                portmanteau_limit=round(r.portmanteau_limit, 3),
+            )
+            for name, r in reports.items()
+        },
+    )
+
+
 def event_message(
     utc_ns: int | None, *, source: str, code: str, text: str, level: Level = "info"
 ) -> EventMessage:
@@ -262,9 +314,10 @@ class Topic:
 NAV = Topic("nav", NavMessage, 0, False)
 STATUS = Topic("status", StatusMessage, 1, True)
 HEALTH = Topic("health", HealthMessage, 0, True)
+CONSISTENCY = Topic("consistency", ConsistencyMessage, 0, True)
 EVENT = Topic("event", EventMessage, 1, False)
 REPLY = Topic("reply", ReplyMessage, 1, False)
-TOPICS = (NAV, STATUS, HEALTH, EVENT, REPLY)
+TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, EVENT, REPLY)
 
 
 def base_topic(vehicle: str) -> str:

@@ -28,11 +28,13 @@ from fusiond.outputs.commands import (
     parse,
 )
 from fusiond.outputs.messages import (
+    CONSISTENCY,
     EVENT,
     HEALTH,
     NAV,
     REPLY,
     STATUS,
+    ConsistencyMessage,
     EventMessage,
     HealthMessage,
     Message,
@@ -105,6 +107,9 @@ class MqttPublisher:
 
     def publish_health(self, message: HealthMessage) -> None:
         self._replace(HEALTH, message)
+
+    def publish_consistency(self, message: ConsistencyMessage) -> None:
+        self._replace(CONSISTENCY, message)
 
     def publish_status(self, message: StatusMessage) -> None:
         self.counters["mqtt_dropped"] += self._status_due
