@@ -53,6 +53,8 @@ from scipy.special import (
     ndtri,
 )
 
+from fusiond.navigation.compiled import compiled
+
 Array = NDArray[np.float64]
 Verdict = Literal["consistent", "optimistic", "pessimistic", "coloured", "too_few"]
 Interval = tuple[float, float]
@@ -288,6 +290,61 @@ def whiten(nu: Array, s: Array) -> Array:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(s), nu), dtype=float)
 
 
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[::1], f8, f8, f8[::1])")
+def _slide(
+    rows: Array,
+    figures: Array,
+    products: Array,
+    sums: Array,
+    now: int,
+    window: int,
+    row: Array,
+    nis: float,
+    energy: float,
+    rho: Array,
+) -> None:
+    """Put epoch `now` into the ring, keep the sums over the window, write rho (8,) by (8).
+
+    Rings of `window` + 8: `rows` (., m), `figures` (2, .) NIS and energy, `products` (., 8) with
+    the eight before; `sums` (10,) of the same.
+    """
+    size = figures.shape[1]
+    slot = now % size
+    rows[slot] = row
+    figures[0, slot], figures[1, slot] = nis, energy
+    if now < LAGS:
+        return
+    for lag in range(LAGS):
+        other = (now - lag - 1) % size
+        total = 0.0
+        for j in range(row.shape[0]):
+            total += rows[other, j] * row[j]
+        products[slot, lag] = total
+    k = min(now + 1 - LAGS, window)
+    if slot == size - 1:  # anew, so that rounding cannot pile up
+        sums[:] = 0.0
+        for back in range(k):
+            i = (now - back) % size
+            sums[0] += figures[0, i]
+            sums[1] += figures[1, i]
+            for lag in range(LAGS):
+                sums[2 + lag] += products[i, lag]
+    else:
+        leaving = now - window
+        old = leaving % size
+        gone = 1.0 if leaving >= LAGS else 0.0
+        sums[0] += nis - gone * figures[0, old]
+        sums[1] += energy - gone * figures[1, old]
+        for lag in range(LAGS):
+            sums[2 + lag] += products[slot, lag] - gone * products[old, lag]
+    # Energy of the window moved back by each lag: what comes in before it, what goes at its end.
+    moved = sums[1]
+    for lag in range(LAGS):
+        moved += figures[1, (now - k - lag) % size] - figures[1, (now - lag) % size]
+        scale = sums[1] * moved
+        rho[lag] = sums[2 + lag] / math.sqrt(scale) if scale > 0.0 else 0.0
+
+
 class ConsistencyMonitor:
     """Sliding window over the innovations of one kind of aid of one source.
 
@@ -311,8 +368,7 @@ class ConsistencyMonitor:
         """Forget the window and the verdict, as after a new alignment. Counters stay."""
         size = self.options.window + LAGS
         self._rows = np.zeros((size, self._m))
-        self._nis = np.zeros(size)
-        self._energy = np.zeros(size)
+        self._figures = np.zeros((2, size))
         self._products = np.zeros((size, LAGS))
         self._sums = np.zeros(2 + LAGS)
         self._count = 0
@@ -348,46 +404,29 @@ class ConsistencyMonitor:
             self.restarts += self._m > 0
             self._m = row.shape[0]
             self.reset()
-        self._slide(row, nis, energy)
-        self._test()
+        self._test(row, nis, energy)
 
-    def _slide(self, row: Array, nis: float, energy: float) -> None:
-        """Put epoch `now` into the ring and keep the sums over the window."""
-        now, size = self._count, len(self._nis)
-        slot = now % size
-        self._rows[slot], self._nis[slot], self._energy[slot] = row, nis, energy
+    def _test(self, row: Array, nis: float, energy: float) -> None:
+        """Take the epoch in; the window's verdict, and the verdict contradicted long enough."""
+        o = self.options
         self._count += 1
-        if now < LAGS:
-            return
-        self._products[slot] = self._rows.take(now - _LAG, axis=0, mode="wrap") @ row
-        if slot == size - 1:
-            window = (now - np.arange(self.k)) % size
-            self._sums[0] = self._nis[window].sum()
-            self._sums[1] = self._energy[window].sum()
-            self._sums[2:] = self._products[window].sum(axis=0)
-            return
-        self._sums += (nis, energy, *self._products[slot])
-        leaving = now - self.options.window
-        if leaving >= LAGS:
-            old = leaving % size
-            self._sums -= (self._nis[old], self._energy[old], *self._products[old])
-
-    def _test(self) -> None:
-        """The verdict of the window, and the verdict once it has been contradicted long enough."""
         k = self.k
+        _slide(
+            self._rows,
+            self._figures,
+            self._products,
+            self._sums,
+            self._count - 1,
+            o.window,
+            row,
+            nis,
+            energy,
+            self._rho,
+        )
         if k < FEWEST:
             return
-        last = self._count - 1
-        before = self._energy.take(last - k + 1 - _LAG, mode="wrap").cumsum()
-        newest = self._energy.take(last + 1 - _LAG, mode="wrap").cumsum()
-        scale = self._sums[1] * (self._sums[1] + before - newest)
-        positive = scale > 0.0  # all innovations zero: no correlation to speak of
-        self._rho = np.where(
-            positive, self._sums[2:] / np.sqrt(np.where(positive, scale, 1.0)), 0.0
-        )
         dof = k * self._m
-        self._average = self._sums[0] / dof
-        o = self.options
+        self._average = float(self._sums[0]) / dof
         limits = _limits(k, dof, o.alpha, o.gate, o.whitened)
         q = float(limits.weights @ (self._rho * self._rho))
         self.window_verdict = _verdict(self._average, q, limits)
