@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from fusiond.studies import STUDIES
 
 if TYPE_CHECKING:
     from fusiond.config import Config
@@ -220,6 +222,39 @@ def schema(
 
 
 @app.command()
+def study(
+    name: Annotated[str, typer.Argument(metavar="NAME", help=", ".join(STUDIES) + ".")],
+    runs: Annotated[
+        int | None, typer.Option(min=2, help="Monte Carlo runs; the study's own by default.")
+    ] = None,
+    json_path: JsonPath = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="F.png", help="Draw the result (needs matplotlib).")
+    ] = None,
+) -> None:
+    """Repeat a paper's experiment, or one that a default stands on."""
+    if name not in STUDIES:
+        raise typer.BadParameter(f"{name!r}: there are {', '.join(STUDIES)}")
+    from importlib import import_module  # noqa: PLC0415
+    from importlib.util import find_spec  # noqa: PLC0415
+
+    if plot is not None and find_spec("matplotlib") is None:
+        typer.echo("fusiond: --plot needs matplotlib: pip install fusiond[report]", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE)
+    module = import_module(STUDIES[name])
+    with _progress(name) as progress:
+        result = module.run(runs, progress=progress)
+    if json_path != "-":
+        from fusiond.studies.report import print_study  # noqa: PLC0415
+
+        print_study(module, result)
+    _write_json(result, json_path)
+    if plot is not None:
+        with _data_errors():
+            module.plot(result, plot)
+
+
+@app.command()
 def bench() -> None:
     """Time the kernels against one numpy product; prints JSON."""
     from fusiond.bench import bench as run_bench  # noqa: PLC0415
@@ -283,6 +318,20 @@ def _spinner(text: str) -> AbstractContextManager[object]:
     from rich.console import Console  # noqa: PLC0415
 
     return Console(stderr=True).status(text)
+
+
+@contextmanager
+def _progress(text: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A bar on a terminal, called with (done, total); nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import Progress  # noqa: PLC0415
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(text, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _plain(value: object) -> object:

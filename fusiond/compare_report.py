@@ -43,12 +43,13 @@ def print_report(report: Report, console: Console | None = None) -> None:
             ["mean NEES, position", f"{report['position_nees']:.2f}", "3"],
         ]
     console.print(heading, highlight=False, soft_wrap=True)
-    _print_table(console, ["error", "RMS", "95 %", "max", ""], errors)
+    print_table(console, ["error", "RMS", "95 %", "max", ""], errors)
     if shares:
-        _print_table(console, ["consistency", "found", "Gaussian"], shares)
+        print_table(console, ["consistency", "found", "Gaussian"], shares)
 
 
-def _print_table(console: Console, header: list[str], rows: list[list[str]]) -> None:
+def print_table(console: Console, header: list[str], rows: list[list[str]]) -> None:
+    """Rows of text under a header: a rich table on a terminal, aligned columns in a pipe."""
     if console.is_terminal:
         table = Table(*header)
         for row in rows:

@@ -397,6 +397,13 @@ class ConsistencyMonitor:
         row = white if self.options.whitened else nu
         with np.errstate(over="ignore"):
             nis, energy = float(white @ white), float(row @ row)
+        self._take(row, nis, energy)
+
+    def add_whitened(self, row: Array, nis: float) -> None:
+        """Take L^-1 nu (m,) whose square `nis` is known already: `add` without its checks."""
+        self._take(row, nis, nis)
+
+    def _take(self, row: Array, nis: float, energy: float) -> None:
         if not (math.isfinite(nis) and math.isfinite(energy)):
             self.rejected["not_finite"] += 1
             return

@@ -52,7 +52,7 @@ class Verdicts:
             options = ConsistencyOptions(window, self._alpha, gate=entry.aid.gate)
             monitor = self._monitors[source] = ConsistencyMonitor(options)
         before = monitor.verdict
-        monitor.add(np.array(outcome.whitened))
+        monitor.add_whitened(np.array(outcome.whitened), outcome.nis)
         if monitor.verdict != before:
             self._on_change(source, monitor.verdict)
 
