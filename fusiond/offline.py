@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from drivers.measurements import (
     UtcStamp,
     WheelSpeed,
 )
-from drivers.nmea_decoder import NmeaDecoder
+from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
 from fusiond.config import Config, GnssAiding
 from fusiond.csv_tables import Rejection, TableError, counts
 from fusiond.files import ImuTable, read_attitude, read_gnss, read_imu, read_rdss, read_wheel
@@ -34,6 +35,8 @@ from fusiond.solution_csv import STATUS, SolutionWriter
 
 Array = NDArray[np.float64]
 
+# A recording may be old; before selective availability ended there was no receiver worth replaying.
+EARLIEST_DATE = date(2000, 5, 1)
 SECONDS_OF_WEEK = 604800.0
 # Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
 # this spacing, and memory stays bounded.
@@ -62,12 +65,14 @@ def process(
     Raises `TableError` for a file that cannot be read as what it is said to be.
     """
     imu = read_imu(imu_path)
-    files: dict[str, Any] = {"imu": _account(len(imu.t_s), imu.rejected)}
+    rows_read = len(imu.t_s) + len(imu.rejected)
+    files: dict[str, Any] = {"imu": _account(rows_read, imu.rejected)}
     arrivals: list[_Arrival] = []
     withheld: dict[str, int] = {}
     for kind, path in aids:
         rows, rejected = _READERS[kind](path, imu)
-        files[kind] = _account(len(rows) + len(rejected), rejected)
+        name = kind if kind not in files else f"{kind}:{path.name}"
+        files[name] = _account(len(rows) + len(rejected), rejected)
         kept = rows
         if outages:
             kept = [row for row in rows if not _withheld(row.measurement, outages)]
@@ -327,7 +332,7 @@ def _read_wheel(path: Path, _: ImuTable) -> _Read:
 def _read_nmea(path: Path, imu: ImuTable) -> _Read:
     """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
     maps to: GPS second of week (below 604800) or POSIX seconds."""
-    decoder = NmeaDecoder("gnss")
+    decoder = NmeaDecoder("gnss", NmeaDecoding(earliest_date=EARLIEST_DATE))
     found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     rows = []

@@ -51,6 +51,7 @@ class Sources:
     def __init__(
         self, config: Config, clock: Clock, navigator: Navigator, on_event: EventSink
     ) -> None:
+        self._config = config
         self._clock = clock
         self._navigator = navigator
         self._on_event = on_event
@@ -124,11 +125,16 @@ class Sources:
         return all(s.driver.status.state == "running" for s in self.all.values())
 
     def height_hint(self, height_m: float, sd_m: float) -> None:
-        """Tell the terminals that can use it the height of the solution."""
-        for source in self.all.values():
+        """Tell the terminals that can use it the height of their antenna by the solution.
+
+        Of the lever arm only its upward part counts: tilt moves a roof antenna by centimetres.
+        """
+        for name, source in self.all.items():
             hint = getattr(source.driver, "height_hint", None)
             if hint is not None:
-                hint(height_m, sd_m)
+                section = self._config.aiding.get(name)
+                down = section.lever_arm_m[2] if section is not None else 0.0
+                hint(height_m - down, sd_m)
 
     def request_fix(self) -> list[str]:
         """Ask every terminal for a fix; what each said. Empty if there is no terminal."""

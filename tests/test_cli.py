@@ -152,7 +152,7 @@ def test_process_names_what_it_rejected(tmp_path: Path) -> None:
     aid, out = f"gnss={gnss}", tmp_path / "solution.csv"
     done = fusiond("process", "config/vehicle.toml", "--imu", imu, "--aid", aid, "--out", out)
     assert (done.returncode, done.stderr) == (0, "")
-    assert f"imu: {len(lines) - 3} rows, 2 rejected" in done.stdout.splitlines()
+    assert f"imu: {len(lines) - 1} rows, 2 rejected" in done.stdout.splitlines()
     assert "  line 11: time_repeated: " in done.stdout
     assert "  line 501: not_finite: accel_z_m_s2 = nan" in done.stdout
     assert out.read_text().startswith("t_s,lat_deg,")
