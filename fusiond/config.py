@@ -27,7 +27,7 @@ Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 class Section(BaseModel):
     """Base of every section: frozen, unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -53,19 +53,30 @@ class Imu(Section):
     """
 
     axes: Axes = ("+x", "+y", "+z")
+    """Sensor axes along body forward, right and down."""
     mounting_deg: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the nominal sensor frame against the body."""
     time_offset_s: float = 0.0
+    """Added to the sensor's stamps; negative where they are late."""
     rate_hz: PositiveFloat = 100.0
     gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
+    """Angle random walk."""
     accel_noise_m_s_sqrt_h: PositiveFloat = 0.1
+    """Velocity random walk."""
     gyro_bias_instability_deg_h: PositiveFloat = 10.0
+    """One sigma of the drifting part of the bias."""
     accel_bias_instability_mg: PositiveFloat = 0.1
+    """One sigma of the drifting part of the bias."""
     bias_correlation_s: PositiveFloat = 3600.0
+    """Correlation time of that drift."""
     gyro_bias_initial_deg_h: PositiveFloat = 360.0
+    """One sigma of the bias at switch-on."""
     accel_bias_initial_mg: PositiveFloat = 10.0
+    """One sigma of the bias at switch-on."""
     gyro_scale_ppm: PositiveFloat = 2000.0
+    """One sigma of the scale factors' errors."""
     accel_scale_ppm: PositiveFloat = 2000.0
-    scale_correlation_s: PositiveFloat = 3600.0
+    """One sigma of the scale factors' errors."""
     gap_s: PositiveFloat = 0.5
     """A pause longer than this is a gap: the solution says so and the covariance grows for it."""
 
@@ -86,11 +97,15 @@ class GnssAiding(Aiding):
 
     kind: Literal["gnss"] = "gnss"
     use_velocity: bool = True
+    """Whether the receiver's velocity is an aid too."""
     range_error_m: PositiveFloat = 3.0
-    """Times DOP gives sigma where the receiver sends no GST; see `docs`."""
+    """Times DOP gives sigma where the receiver sends no GST; see `docs/gnss-nmea.md`."""
     velocity_sd_m_s: PositiveFloat = 0.1
+    """Where the receiver states none."""
     min_position_sd_m: PositiveFloat = 0.02
+    """No smaller sigma is believed."""
     min_velocity_sd_m_s: PositiveFloat = 0.02
+    """No smaller sigma is believed."""
     velocity_delay_s: NonNegativeFloat = 0.0
     """Age of the velocity at the fix's instant: half an epoch where the receiver averages over
     one."""
@@ -120,6 +135,7 @@ class RdssAiding(Aiding):
     bias_sd_m: NonNegativeFloat = 0.0
     """Error that successive fixes share, one sigma an axis; 0: none is estimated."""
     bias_correlation_s: PositiveFloat = 600.0
+    """Correlation time of that drift."""
 
 
 class AttitudeAiding(Aiding):
@@ -153,12 +169,20 @@ class ZeroVelocity(Section):
 
     enabled: bool = True
     window_s: PositiveFloat = 1.0
+    """Samples judged together, on a fixed grid of time."""
     gyro_sd_deg_s: PositiveFloat = 0.5
+    """Quiet below this standard deviation on every axis; twice what standing with the engine
+    on shows."""
     accel_sd_m_s2: PositiveFloat = 0.15
+    """The same for specific force."""
     max_rate_deg_s: PositiveFloat = 2.0
+    """Quiet below this mean rate."""
     max_speed_m_s: PositiveFloat = 0.5
+    """A quiet sensor means standstill only below this computed speed."""
     velocity_sd_m_s: PositiveFloat = 0.05
+    """One sigma of the velocity at rest."""
     rate_sd_deg_s: PositiveFloat = 0.1
+    """What the standing vehicle may turn."""
     interval_s: PositiveFloat = 0.5
 
 
@@ -187,18 +211,27 @@ class Alignment(Section):
     heading: tuple[
         Literal["saved", "config", "dual_antenna", "gyrocompass", "gnss_course"], ...
     ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course")
+    """Allowed sources of the first heading, in order of preference."""
     heading_deg: float | None = None
+    """For `config`: true heading at the start."""
     heading_sd_deg: PositiveFloat = 5.0
+    """One sigma of it."""
     position_deg_m: Vector | None = None
     """Latitude, longitude, height where the vehicle starts, if no aid will say it."""
     position_sd_m: PositiveFloat = 100.0
+    """One sigma of it."""
     levelling_s: PositiveFloat = 2.0
+    """Rest needed to level by gravity."""
     course_speed_m_s: PositiveFloat = 3.0
+    """Speed from which the GNSS course is taken for the heading."""
     course_sd_deg: PositiveFloat = 5.0
+    """One sigma of that (side slip, mounting)."""
     gyrocompass_s: PositiveFloat = 120.0
+    """Rest needed to gyrocompass."""
     gyrocompass_max_sd_deg: PositiveFloat = 5.0
     """Gyrocompassing is used only if bias and noise allow this heading sigma."""
     saved_max_age_s: PositiveFloat = 86400.0
+    """A saved state older than this is not used."""
 
     @model_validator(mode="after")
     def _heading_given(self) -> Alignment:
@@ -209,11 +242,15 @@ class Alignment(Section):
 
 class Estimator(Section):
     model: Literal["ins15", "ins21", "planar15"] = "ins21"
+    """Error state; see `docs/navigation.md`."""
     buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
     """History that late measurements may rewind into; at least 10 s."""
     checkpoint_s: PositiveFloat = 0.5
+    """Spacing of the points that a rewind starts from."""
     coast_after_s: PositiveFloat = 10.0
+    """Without a fused position for longer the mode is `coasting`."""
     invalid_sd_m: PositiveFloat = 5000.0
+    """Horizontal sigma beyond which the mode is `invalid`."""
 
 
 class ConsistencyTest(Section):
