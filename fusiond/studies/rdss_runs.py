@@ -253,8 +253,8 @@ class Navigation:
             self.innovations[entry.key[0]] = entry.outcome.whitened
 
     def advance(self, t_s: float) -> None:
-        """IMU samples up to `t_s` arrive."""
-        end = round(t_s * 1e9) // self._period_ns
+        """IMU samples up to `t_s` arrive, as far as there are any."""
+        end = min(round(t_s * 1e9) // self._period_ns, len(self._samples))
         if end > self._given:
             times = np.arange(self._given + 1, end + 1, dtype=np.int64) * self._period_ns
             self.imu.append(times, self._samples[self._given : end])
