@@ -16,11 +16,11 @@ from scipy.stats import binomtest, chi2
 from fusiond.integrity.consistency import (
     FEWEST,
     LAGS,
-    ConsistencyMonitor,
     ConsistencyOptions,
     judge,
     whiten,
 )
+from fusiond.integrity.monitor import ConsistencyMonitor
 from fusiond.studies import consistency as study
 from fusiond.studies.level_axis import Aided, Fault, innovations, town_drive
 

@@ -34,7 +34,6 @@ variance it is 1/(K m), in between for others. Unwhitened, 1/K is kept: never to
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -52,8 +51,6 @@ from scipy.special import (
     gammaincinv,
     ndtri,
 )
-
-from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
 Verdict = Literal["consistent", "optimistic", "pessimistic", "coloured", "too_few"]
@@ -140,7 +137,7 @@ class Consistency:
 
 
 _UNKNOWN = (math.nan, math.nan)
-_TOO_FEW = Consistency(
+TOO_FEW = Consistency(
     verdict="too_few",
     window_verdict="too_few",
     k=0,
@@ -160,7 +157,7 @@ _TOO_FEW = Consistency(
 )
 
 
-class _Limits(NamedTuple):
+class Limits(NamedTuple):
     """What depends on K, m, alpha and gate only. `scale` of the average's gamma law."""
 
     shape: float
@@ -173,8 +170,13 @@ class _Limits(NamedTuple):
     portmanteau: float
 
 
+NO_LIMITS = Limits(
+    math.nan, math.nan, _UNKNOWN, _UNKNOWN, np.zeros(LAGS), _UNKNOWN, _UNKNOWN, math.nan
+)
+
+
 @lru_cache(maxsize=2048)
-def _limits(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> _Limits:
+def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Limits:
     shape, scale = _average_law(k, dof, gate)
     level = 1.0 - math.sqrt(1.0 - alpha)
     n = dof if whitened else k
@@ -187,7 +189,7 @@ def _limits(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> _Lim
             scale * float(gammainccinv(shape, outside / 2.0)),
         )
 
-    return _Limits(
+    return Limits(
         shape,
         scale,
         between(1.0 - INTERVAL_LEVEL),
@@ -216,7 +218,7 @@ def _detectable(
     k: int, dof: int, alpha: float, gate: float, whitened: bool
 ) -> tuple[Interval, float]:
     """NIS ratios and a single lag's rho that are noticed with POWER."""
-    limits = _limits(k, dof, alpha, gate, whitened)
+    limits = limits_of(k, dof, alpha, gate, whitened)
     low, high = limits.nis_limits
     ratio = (
         low / (limits.scale * float(gammaincinv(limits.shape, POWER))),
@@ -244,8 +246,8 @@ def judge(
     if len(rho) != LAGS or not 1 <= k <= dof:
         raise ValueError(f"K = {k}, {dof} degrees of freedom, {len(rho)} lags; needs {LAGS} lags")
     if k < FEWEST:
-        return replace(_TOO_FEW, k=k, dof=dof, alpha=alpha)
-    limits = _limits(k, dof, alpha, gate, whitened)
+        return replace(TOO_FEW, k=k, dof=dof, alpha=alpha)
+    limits = limits_of(k, dof, alpha, gate, whitened)
     ratio, single = _detectable(k, dof, alpha, gate, whitened)
     values = np.asarray(rho, dtype=float)
     q = float(limits.weights @ (values * values))
@@ -254,7 +256,7 @@ def judge(
         float(gammaincc(limits.shape, average / limits.scale)),
     )
     d, nu = limits.freedom
-    verdict = _verdict(average, q, limits)
+    verdict = verdict_of(average, q, limits)
     return Consistency(
         verdict=verdict,
         window_verdict=verdict,
@@ -275,7 +277,7 @@ def judge(
     )
 
 
-def _verdict(average: float, q: float, limits: _Limits) -> Verdict:
+def verdict_of(average: float, q: float, limits: Limits) -> Verdict:
     """The average goes first: a covariance that is too small is worse than colour."""
     low, high = limits.nis_limits
     if average > high:
@@ -288,164 +290,3 @@ def _verdict(average: float, q: float, limits: _Limits) -> Verdict:
 def whiten(nu: Array, s: Array) -> Array:
     """L^-1 nu (m,) with S = L L^T (m, m). Raises LinAlgError when S is not positive definite."""
     return np.asarray(np.linalg.solve(np.linalg.cholesky(s), nu), dtype=float)
-
-
-@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[::1], f8, f8, f8[::1])")
-def _slide(
-    rows: Array,
-    figures: Array,
-    products: Array,
-    sums: Array,
-    now: int,
-    window: int,
-    row: Array,
-    nis: float,
-    energy: float,
-    rho: Array,
-) -> None:
-    """Put epoch `now` into the ring, keep the sums over the window, write rho (8,) by (8).
-
-    Rings of `window` + 8: `rows` (., m), `figures` (2, .) NIS and energy, `products` (., 8) with
-    the eight before; `sums` (10,) of the same.
-    """
-    size = figures.shape[1]
-    slot = now % size
-    rows[slot] = row
-    figures[0, slot], figures[1, slot] = nis, energy
-    if now < LAGS:
-        return
-    for lag in range(LAGS):
-        other = (now - lag - 1) % size
-        total = 0.0
-        for j in range(row.shape[0]):
-            total += rows[other, j] * row[j]
-        products[slot, lag] = total
-    k = min(now + 1 - LAGS, window)
-    if slot == size - 1:  # anew, so that rounding cannot pile up
-        sums[:] = 0.0
-        for back in range(k):
-            i = (now - back) % size
-            sums[0] += figures[0, i]
-            sums[1] += figures[1, i]
-            for lag in range(LAGS):
-                sums[2 + lag] += products[i, lag]
-    else:
-        leaving = now - window
-        old = leaving % size
-        gone = 1.0 if leaving >= LAGS else 0.0
-        sums[0] += nis - gone * figures[0, old]
-        sums[1] += energy - gone * figures[1, old]
-        for lag in range(LAGS):
-            sums[2 + lag] += products[slot, lag] - gone * products[old, lag]
-    # Energy of the window moved back by each lag: what comes in before it, what goes at its end.
-    moved = sums[1]
-    for lag in range(LAGS):
-        moved += figures[1, (now - k - lag) % size] - figures[1, (now - lag) % size]
-        scale = sums[1] * moved
-        rho[lag] = sums[2 + lag] / math.sqrt(scale) if scale > 0.0 else 0.0
-
-
-class ConsistencyMonitor:
-    """Sliding window over the innovations of one kind of aid of one source.
-
-    Give it what the filter fused, in order. A changed dimension m starts over. `verdict` changes
-    once the window's has differed from it for half a window of epochs in a row: neighbouring
-    windows share their innovations, so a chance excess lasts, but seldom that long. Memory and
-    work are bounded: K + 8 rows; O(m) an epoch, and once in K + 8 epochs the sums are formed anew,
-    so that rounding cannot pile up.
-    """
-
-    def __init__(self, options: ConsistencyOptions | None = None) -> None:
-        self.options = options or ConsistencyOptions()
-        self.rejected: Counter[str] = Counter()
-        """Innovations not taken: `not_finite`, `not_positive_definite`."""
-        self.restarts = 0
-        """Windows started over because m changed."""
-        self._m = 0
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the window and the verdict, as after a new alignment. Counters stay."""
-        size = self.options.window + LAGS
-        self._rows = np.zeros((size, self._m))
-        self._figures = np.zeros((2, size))
-        self._products = np.zeros((size, LAGS))
-        self._sums = np.zeros(2 + LAGS)
-        self._count = 0
-        self._average, self._rho = math.nan, np.full(LAGS, math.nan)
-        self.verdict: Verdict = "too_few"
-        self.window_verdict: Verdict = "too_few"
-        self._contradicted = 0
-
-    @property
-    def k(self) -> int:
-        """Epochs in the window."""
-        return max(0, min(self._count - LAGS, self.options.window))
-
-    def add(self, nu: Array, s: Array | None = None) -> None:
-        """Take an innovation (m,): whitened, or as it is together with its covariance `s` (m, m).
-
-        Raises ValueError when the paper's form is asked for and `s` is missing.
-        """
-        if s is None and not self.options.whitened:
-            raise ValueError("unwhitened autocorrelation needs the innovation and its covariance")
-        try:
-            white = nu if s is None else whiten(nu, s)
-        except np.linalg.LinAlgError:
-            self.rejected["not_positive_definite"] += 1
-            return
-        row = white if self.options.whitened else nu
-        with np.errstate(over="ignore"):
-            nis, energy = float(white @ white), float(row @ row)
-        self._take(row, nis, energy)
-
-    def add_whitened(self, row: Array, nis: float) -> None:
-        """Take L^-1 nu (m,) whose square `nis` is known already: `add` without its checks."""
-        self._take(row, nis, nis)
-
-    def _take(self, row: Array, nis: float, energy: float) -> None:
-        if not (math.isfinite(nis) and math.isfinite(energy)):
-            self.rejected["not_finite"] += 1
-            return
-        if row.shape[0] != self._m:
-            self.restarts += self._m > 0
-            self._m = row.shape[0]
-            self.reset()
-        self._test(row, nis, energy)
-
-    def _test(self, row: Array, nis: float, energy: float) -> None:
-        """Take the epoch in; the window's verdict, and the verdict contradicted long enough."""
-        o = self.options
-        self._count += 1
-        k = self.k
-        _slide(
-            self._rows,
-            self._figures,
-            self._products,
-            self._sums,
-            self._count - 1,
-            o.window,
-            row,
-            nis,
-            energy,
-            self._rho,
-        )
-        if k < FEWEST:
-            return
-        dof = k * self._m
-        self._average = float(self._sums[0]) / dof
-        limits = _limits(k, dof, o.alpha, o.gate, o.whitened)
-        q = float(limits.weights @ (self._rho * self._rho))
-        self.window_verdict = _verdict(self._average, q, limits)
-        self._contradicted = self._contradicted + 1 if self.window_verdict != self.verdict else 0
-        if self._contradicted >= k // 2:
-            self.verdict, self._contradicted = self.window_verdict, 0
-
-    def report(self) -> Consistency:
-        """The figures of the window and the verdict; changes nothing."""
-        o, k = self.options, self.k
-        if k < FEWEST:
-            return replace(_TOO_FEW, k=k, dof=k * self._m, alpha=o.alpha)
-        average, rho = float(self._average), self._rho.tolist()
-        found = judge(k, k * self._m, average, rho, alpha=o.alpha, gate=o.gate, whitened=o.whitened)
-        return replace(found, verdict=self.verdict)

@@ -12,10 +12,10 @@ from fusiond.estimators.kalman import Outcome
 from fusiond.integrity.consistency import (
     FEWEST,
     Consistency,
-    ConsistencyMonitor,
     ConsistencyOptions,
     Verdict,
 )
+from fusiond.integrity.monitor import ConsistencyMonitor
 from fusiond.timeline import Entry
 
 

@@ -1,0 +1,199 @@
+"""The consistency tests online: one source's innovations in a sliding window."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.integrity.consistency import (
+    FEWEST,
+    LAGS,
+    NO_LIMITS,
+    TOO_FEW,
+    Consistency,
+    ConsistencyOptions,
+    Verdict,
+    judge,
+    limits_of,
+    verdict_of,
+    whiten,
+)
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+
+
+@compiled(
+    "f8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[::1], f8, f8, f8[::1], f8[::1])"
+)
+def _slide(
+    rows: Array,
+    figures: Array,
+    products: Array,
+    sums: Array,
+    now: int,
+    window: int,
+    row: Array,
+    nis: float,
+    energy: float,
+    weights: Array,
+    rho: Array,
+) -> float:
+    """Put epoch `now` into the ring, keep the sums over the window, write rho (8,) by (8).
+
+    Returns Q = sum of `weights` (8,) rho^2.
+
+    Rings of `window` + 8: `rows` (., m), `figures` (2, .) NIS and energy, `products` (., 8) with
+    the eight before; `sums` (10,) of the same.
+    """
+    size = figures.shape[1]
+    slot = now % size
+    rows[slot] = row
+    figures[0, slot], figures[1, slot] = nis, energy
+    if now < LAGS:
+        return 0.0
+    for lag in range(LAGS):
+        other = (now - lag - 1) % size
+        total = 0.0
+        for j in range(row.shape[0]):
+            total += rows[other, j] * row[j]
+        products[slot, lag] = total
+    k = min(now + 1 - LAGS, window)
+    if slot == size - 1:  # anew, so that rounding cannot pile up
+        sums[:] = 0.0
+        for back in range(k):
+            i = (now - back) % size
+            sums[0] += figures[0, i]
+            sums[1] += figures[1, i]
+            for lag in range(LAGS):
+                sums[2 + lag] += products[i, lag]
+    else:
+        leaving = now - window
+        old = leaving % size
+        gone = 1.0 if leaving >= LAGS else 0.0
+        sums[0] += nis - gone * figures[0, old]
+        sums[1] += energy - gone * figures[1, old]
+        for lag in range(LAGS):
+            sums[2 + lag] += products[slot, lag] - gone * products[old, lag]
+    # Energy of the window moved back by each lag: what comes in before it, what goes at its end.
+    moved = sums[1]
+    q = 0.0
+    for lag in range(LAGS):
+        moved += figures[1, (now - k - lag) % size] - figures[1, (now - lag) % size]
+        scale = sums[1] * moved
+        rho[lag] = sums[2 + lag] / math.sqrt(scale) if scale > 0.0 else 0.0
+        q += weights[lag] * rho[lag] * rho[lag]
+    return q
+
+
+class ConsistencyMonitor:
+    """Sliding window over the innovations of one kind of aid of one source.
+
+    Give it what the filter fused, in order. A changed dimension m starts over. `verdict` changes
+    once the window's has differed from it for half a window of epochs in a row: neighbouring
+    windows share their innovations, so a chance excess lasts, but seldom that long. Memory and
+    work are bounded: K + 8 rows; O(m) an epoch, and once in K + 8 epochs the sums are formed anew,
+    so that rounding cannot pile up.
+    """
+
+    def __init__(self, options: ConsistencyOptions | None = None) -> None:
+        self.options = options or ConsistencyOptions()
+        self.rejected: Counter[str] = Counter()
+        """Innovations not taken: `not_finite`, `not_positive_definite`."""
+        self.restarts = 0
+        """Windows started over because m changed."""
+        self._m = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the window and the verdict, as after a new alignment. Counters stay."""
+        size = self.options.window + LAGS
+        self._rows = np.zeros((size, self._m))
+        self._figures = np.zeros((2, size))
+        self._products = np.zeros((size, LAGS))
+        self._sums = np.zeros(2 + LAGS)
+        self._count = 0
+        self._average, self._rho = math.nan, np.full(LAGS, math.nan)
+        self.verdict: Verdict = "too_few"
+        self.window_verdict: Verdict = "too_few"
+        self._contradicted = 0
+        self._limits_k, self._limits = 0, NO_LIMITS
+
+    @property
+    def k(self) -> int:
+        """Epochs in the window."""
+        return max(0, min(self._count - LAGS, self.options.window))
+
+    def add(self, nu: Array, s: Array | None = None) -> None:
+        """Take an innovation (m,): whitened, or as it is together with its covariance `s` (m, m).
+
+        Raises ValueError when the paper's form is asked for and `s` is missing.
+        """
+        if s is None and not self.options.whitened:
+            raise ValueError("unwhitened autocorrelation needs the innovation and its covariance")
+        try:
+            white = nu if s is None else whiten(nu, s)
+        except np.linalg.LinAlgError:
+            self.rejected["not_positive_definite"] += 1
+            return
+        row = white if self.options.whitened else nu
+        with np.errstate(over="ignore"):
+            nis, energy = float(white @ white), float(row @ row)
+        self._take(row, nis, energy)
+
+    def add_whitened(self, row: Array, nis: float) -> None:
+        """Take L^-1 nu (m,) whose square `nis` is known already: `add` without its checks."""
+        self._take(row, nis, nis)
+
+    def _take(self, row: Array, nis: float, energy: float) -> None:
+        if not (math.isfinite(nis) and math.isfinite(energy)):
+            self.rejected["not_finite"] += 1
+            return
+        if row.shape[0] != self._m:
+            self.restarts += self._m > 0
+            self._m = row.shape[0]
+            self.reset()
+        self._test(row, nis, energy)
+
+    def _test(self, row: Array, nis: float, energy: float) -> None:
+        """Take the epoch in; the window's verdict, and the verdict contradicted long enough."""
+        o = self.options
+        self._count += 1
+        k = self.k
+        if k != self._limits_k and k >= FEWEST:
+            self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
+            self._limits_k = k
+        q = _slide(
+            self._rows,
+            self._figures,
+            self._products,
+            self._sums,
+            self._count - 1,
+            o.window,
+            row,
+            nis,
+            energy,
+            self._limits.weights,
+            self._rho,
+        )
+        if k < FEWEST:
+            return
+        dof = k * self._m
+        self._average = float(self._sums[0]) / dof
+        self.window_verdict = verdict_of(self._average, q, self._limits)
+        self._contradicted = self._contradicted + 1 if self.window_verdict != self.verdict else 0
+        if self._contradicted >= k // 2:
+            self.verdict, self._contradicted = self.window_verdict, 0
+
+    def report(self) -> Consistency:
+        """The figures of the window and the verdict; changes nothing."""
+        o, k = self.options, self.k
+        if k < FEWEST:
+            return replace(TOO_FEW, k=k, dof=k * self._m, alpha=o.alpha)
+        average, rho = float(self._average), self._rho.tolist()
+        found = judge(k, k * self._m, average, rho, alpha=o.alpha, gate=o.gate, whitened=o.whitened)
+        return replace(found, verdict=self.verdict)
