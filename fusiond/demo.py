@@ -69,7 +69,7 @@ def demo(duration_s: float, headless: bool) -> dict[str, Any]:
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
     full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run
     are correlated, so 0.5 to 5 is common). All three are None where nothing was navigated. `fused`
-    counts measurements by source, `rejected` by source and reason. Raises `DemoError` if something
+    and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if something
     is not installed.
     """
     if not CONFIG.is_file():
@@ -226,8 +226,10 @@ class _Run:
             **self._score.against(self._vehicle),
             "mqtt_published": daemon.mqtt.counters["mqtt_published"],
             "mqtt_dropped": daemon.mqtt.counters["mqtt_dropped"],
-            "fused": {name: source.fused for name, source in health.items()},
-            "rejected": {name: source.rejected for name, source in health.items()},
+            "fused": sum(s.fused for n, s in health.items() if n != "imu"),
+            "rejected": sum(sum(s.rejected.values()) for s in health.values()),
+            "fused_by_source": {name: source.fused for name, source in health.items()},
+            "rejected_by_source": {name: source.rejected for name, source in health.items()},
         }
 
 

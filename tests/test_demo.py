@@ -40,6 +40,8 @@ KEYS = [
     "mqtt_dropped",
     "fused",
     "rejected",
+    "fused_by_source",
+    "rejected_by_source",
 ]
 
 
@@ -56,8 +58,9 @@ def test_navigates_on_all_sources_and_ends_with_the_summary(command: list[str]) 
     summary = json.loads(done.stdout.splitlines()[-1])
     assert list(summary) == KEYS
     assert summary["ticks"] > 500
-    assert summary["fused"]["imu"] > 500
-    assert summary["fused"]["gnss"] > 0
+    assert summary["fused_by_source"]["imu"] > 500
+    assert summary["fused_by_source"]["gnss"] > 0
+    assert summary["fused"] > 0
     assert 0.0 < summary["horizontal_rms_m"] < 10.0
     assert 0.0 < summary["yaw_rms_deg"] < 10.0
     assert summary["nees"] > 0.0
