@@ -69,8 +69,8 @@ def demo(duration_s: float, headless: bool) -> dict[str, Any]:
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
     full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run
     are correlated, so 0.5 to 5 is common). All three are None where nothing was navigated. `fused`
-    and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if something
-    is not installed.
+    and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if
+    something is not installed.
     """
     if not CONFIG.is_file():
         raise DemoError(f"{CONFIG} is not there: run the demo from a checkout (make demo)")

@@ -40,9 +40,9 @@ from fusiond.config import (
 )
 from fusiond.settings import DEG
 
-# What a fix moved forward by the computed velocity is wrong by: a velocity error of 2 m/s over a
-# delay of 1.5 s, which lasts as long as the velocity error of an inertial unit between turns.
-COMPENSATION_SD_M, COMPENSATION_TAU_S = 3.0, 60.0
+# What a fix moved forward by the computed velocity is wrong by: an acceleration of 2.5 m/s^2 over a
+# delay of 1.5 s, which lasts as long as a manoeuvre. The velocity's own error is in the Jacobian.
+COMPENSATION_SD_M, COMPENSATION_TAU_S = 3.0, 5.0
 
 S = TypeVar("S", bound=Aiding)
 

@@ -43,7 +43,8 @@ from drivers.rdss.terminal import Terminal
 from fusiond.simulation.can_imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss_receiver import GnssOptions, GnssReceiver, latitude, longitude
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.rdss_terminal import RdssOptions, RdssTerminal
+from fusiond.simulation.rdss_centre import RdssOptions
+from fusiond.simulation.rdss_terminal import RdssTerminal
 from fusiond.simulation.trajectories import drive
 
 UTC_START = datetime(2026, 11, 20, 23, 59, 30, 123456, tzinfo=UTC)
@@ -229,6 +230,17 @@ def test_terminal_answers_reads(truth: Truth, family: Family) -> None:
     assert host.terminal.next_s == math.inf
 
 
+@pytest.mark.parametrize(("family", "hour"), [("4.0", 8), ("2.1", 0)])
+def test_clock_of_a_terminal_in_beijing_time(truth: Truth, family: Family, hour: int) -> None:
+    """SJXX prints the zone of the fixes, BDZDA always UTC as NMEA 0183 ZDA does."""
+    host = Host(truth, family, zone_h=8)
+    host.ask(TimeRequest(), 30.0)
+    (clock,) = _messages(host.listen(60.0))
+    assert isinstance(clock, DeviceClock)
+    assert (clock.day, int(clock.time_of_day_s // 3600)) == (21, hour)
+    assert clock.zone_h == (None if family == "4.0" else -8)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("zone_h", [0, 8])
 def test_fix_is_the_position_at_the_burst(truth: Truth, family: Family, zone_h: int) -> None:
@@ -268,6 +280,45 @@ def test_service_frequency_is_kept(truth: Truth, family: Family) -> None:
     assert feedback[1].wait_s == 37.0
     assert sum(isinstance(m, Fix) for m in messages) == 2
     assert host.terminal.counters["refused_frequency"] == 1
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_refused_by_chance(truth: Truth, family: Family) -> None:
+    """Whoever waits as he is told to is not refused for it twice, nor counted as too early."""
+    host = Host(truth, family, service_frequency_s=4, refuse_probability=0.4)
+    t, feedback = 1.0, []
+    while t < 280.0:
+        host.ask(PositionRequest(), t)
+        last = [m for m in _messages(host.listen(t + 0.1)) if isinstance(m, Feedback)][-1]
+        feedback.append(last)
+        t += last.wait_s or 4.0
+    no_beam = Outcome.NOT_LOCKED if family == "4.0" else Outcome.NOT_SENT
+    refused = {o: sum(f.outcome is o for f in feedback) for o in (Outcome.FREQUENCY, no_beam)}
+    share = np.array(list(refused.values())) / len(feedback)
+    assert share == pytest.approx(0.2, abs=3.0 * math.sqrt(0.2 * 0.8 / len(feedback)))
+    assert {f.wait_s for f in feedback} == {None, 1.0, 2.0, 3.0, 4.0}
+    counters = host.terminal.counters
+    assert counters["too_early"] == 0
+    assert counters["fixes"] == len(feedback) - sum(refused.values())
+    host.ask(PositionRequest(), t + 0.5)
+    host.ask(PositionRequest(), t + 0.6)
+    assert counters["too_early"] >= 1
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_end_of_a_suppression_is_said(truth: Truth, family: Family) -> None:
+    host = Host(truth, family)
+    host.terminal.suppressed = True
+    host.terminal.lift(20.0)
+    ((when, notice),) = host.listen(100.0)
+    assert when == pytest.approx(20.05)
+    assert isinstance(notice, Feedback)
+    if family == "4.0":
+        assert notice.outcome is Outcome.SILENCE_OR_LIFTED
+    else:
+        assert (notice.outcome, notice.inhibited) == (Outcome.OK, False)
+    host.ask(PositionRequest(), 21.0)
+    assert any(isinstance(m, Fix) for m in _messages(host.listen(100.0)))
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusiond.integrity.consistency import LAGS, ConsistencyMonitor, ConsistencyOptions
+from fusiond.integrity.consistency import LAGS, ConsistencyOptions
+from fusiond.integrity.monitor import ConsistencyMonitor
 from fusiond.studies import STUDIES, rdss_correlated, rdss_dynamic, rdss_static
 from fusiond.studies.rdss import judged_windows, nees_interval, plot, tables
 from fusiond.studies.rdss_runs import RDSS_ALONE, monte_carlo, simulate

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fusiond.fixed_decimal import MAX_CELL, format_rows
 from fusiond.simulation.gnss_receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.rdss_terminal import RdssCentre
+from fusiond.simulation.rdss_centre import RdssCentre
 from fusiond.simulation.scenarios import Scenario, random_streams
 
 Array = NDArray[np.float64]

@@ -6,8 +6,7 @@ that the vehicle had when the terminal's burst left the antenna, with the time o
 instant. What may go wrong is in `RdssOptions` (probabilities) and in the terminal's public
 attributes, which may be changed at any time.
 
-Source: the public interface documents as in `drivers.rdss`; delays and accuracy classes from the
-BeiDou RDSS literature (two geostationary hops up and down, 20 m and 100 m classes).
+Source: the public interface documents as in `drivers.rdss`.
 """
 
 from __future__ import annotations
@@ -16,10 +15,8 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import count
-from typing import Literal
 
 import numpy as np
 
@@ -30,7 +27,6 @@ from drivers.rdss.messages import (
     Decoder,
     DeviceClock,
     EncodeError,
-    Family,
     Feedback,
     Fix,
     HeightMode,
@@ -50,7 +46,8 @@ from drivers.rdss.messages import (
     Unknown,
     VersionRequest,
 )
-from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.rdss_centre import RdssCentre, RdssOptions
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FOREIGN_USER = 242407
@@ -60,111 +57,13 @@ LOW_BATTERY_PERCENT = 10.0
 _LOCKED = (0, 3, 4, 0, 2, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class RdssOptions:
-    """The terminal, its card and the errors of the centre's answers; one sigma, each axis."""
-
-    family: Family = "4.0"
-    user: int = 242286
-    service_frequency_s: int = 10
-    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    precision_class_m: Literal[20, 100] = 20
-    error_sd_m: float | None = None
-    """Horizontal error; None: as large as the class."""
-    error_correlation_s: float = 0.0
-    """Correlation time of the error between fixes; 0: independent."""
-    height_sd_m: float = 10.0
-    """Error of the centre's terrain model, used when the request gives no height."""
-    height_anomaly_m: float = -14.0
-    response_s: float = 0.05
-    """From the request's last byte to the burst: the instant the fix is for."""
-    delay_s: tuple[float, float] = (0.6, 5.0)
-    """Least and greatest time from the burst to the fix on the serial line."""
-    mean_delay_s: float = 1.5
-    """Mean of the delay, which is exponential above its least value."""
-    reply_s: float = 0.05
-    """From a command to its answer or feedback."""
-    zone_h: int = 0
-    """Zone of the time of day printed: 0 (UTC) or 8."""
-    fraction_s: float = 0.01
-    """Unit of the fraction byte of family 4.0: 0.01 or 0.1."""
-    bds3_feedback: bool = False
-    """BDFKI in the BDS-3 form (family 2.1)."""
-    drop_probability: float = 0.0
-    multi_value_probability: float = 0.0
-    foreign_probability: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class SimulatedFix:
-    """A fix on its way: instants in s of the trajectory; position in degrees and metres."""
-
-    t_s: float
-    t_arrival_s: float
-    lat_deg: float
-    lon_deg: float
-    height_m: float
-    precision_class_m: Literal[20, 100]
-    multi_value: bool
-
-
-class RdssCentre:
-    """The centre's side of a fix: the true position at the burst, its error, its delay."""
-
-    def __init__(self, truth: Truth, options: RdssOptions, rng: np.random.Generator) -> None:
-        self._truth = truth
-        self._options = options
-        self._rng = rng
-        self._error = np.zeros(2)
-        self._last_s = -math.inf
-
-    def fix(self, burst_s: float, given_height_m: float | None) -> SimulatedFix:
-        """The fix for a burst at `burst_s`."""
-        o, rng = self._options, self._rng
-        sd = float(o.precision_class_m) if o.error_sd_m is None else o.error_sd_m
-        age = burst_s - self._last_s
-        kept = math.exp(-age / o.error_correlation_s) if o.error_correlation_s > 0 else 0.0
-        self._error = kept * self._error + (
-            sd * math.sqrt(1.0 - kept * kept) * rng.standard_normal(2)
-        )
-        self._last_s = burst_s
-        multi_value = bool(rng.random() < o.multi_value_probability)
-        height_error = float(rng.standard_normal()) * o.height_sd_m
-        least, greatest = o.delay_s
-        delay = least + float(rng.exponential(max(o.mean_delay_s - least, 0.0)))
-        state = self._truth.at(np.array([burst_s]), o.lever_arm_m)
-        north, east = (float(x) for x in self._error)
-        if multi_value:  # the other of the two solutions: far off, as an ambiguous fix may be
-            north -= 3000.0
-        offset = metres_to_geodetic(
-            state.position[:, 0], state.position[:, 2], np.array([[north, east, 0.0]])
-        )
-        lat, lon, height = (float(x) for x in (state.position + offset)[0])
-        return SimulatedFix(
-            t_s=burst_s,
-            t_arrival_s=burst_s + min(delay, greatest),
-            lat_deg=math.degrees(lat),
-            lon_deg=math.degrees(lon),
-            height_m=height + height_error if given_height_m is None else given_height_m,
-            precision_class_m=o.precision_class_m,
-            multi_value=multi_value,
-        )
-
-    def dropped(self) -> bool:
-        """Whether this request is lost on the way."""
-        return bool(self._rng.random() < self._options.drop_probability)
-
-    def foreign(self) -> bool:
-        """Whether somebody else's fix comes along with this one."""
-        return bool(self._rng.random() < self._options.foreign_probability)
-
-
 class RdssTerminal:
     """The terminal. Times are seconds of the trajectory; `utc_start_ns` is UTC at its 0.
 
     `beam_levels`, `battery_percent`, `suppressed`, `silent` and `utc_start_ns` may be set from
-    outside. Counters: the name of every request class, `fixes`, `foreign`, `dropped`, `unsayable`
-    (the family has no such message), `refused_<outcome>`.
+    outside; `lift` ends a suppression or a silence as a terminal does, with a notice. Counters: the
+    name of every request class, `fixes`, `foreign`, `dropped`, `unsayable` (the family has no such
+    message), `refused_<outcome>`, `too_early` (transmissions asked for within the card's spacing).
     """
 
     def __init__(
@@ -212,6 +111,20 @@ class RdssTerminal:
         while self._queue and self._queue[0][0] <= t_s:
             said += heapq.heappop(self._queue)[2]
         return said
+
+    def lift(self, t_s: float) -> None:
+        """Suppression and silence end at `t_s`; the feedback that says so, unasked for.
+
+        Family 4.0: flag 8, as the one vendor has it that documents a notice. Family 2.1: inhibit 0.
+        """
+        self.suppressed = self.silent = False
+        binary = self.options.family == "4.0"
+        notice = Feedback(
+            Outcome.SILENCE_OR_LIFTED if binary else Outcome.OK,
+            command="DWSQ" if binary else "DWA",
+            user=self.options.user,
+        )
+        self._say(t_s + self.options.reply_s, notice)
 
     def _say(self, due_s: float, message: Reply | Unknown) -> None:
         try:
@@ -279,7 +192,7 @@ class RdssTerminal:
     def _say_time(self, t_s: float) -> None:
         o = self.options
         due = t_s + o.reply_s
-        local = self._local(due)
+        local = self._local(due, o.zone_h if o.family == "4.0" else 0)
         midnight = local.replace(hour=0, minute=0, second=0, microsecond=0)
         clock = DeviceClock(
             local.year,
@@ -292,9 +205,9 @@ class RdssTerminal:
         )
         self._say(due, clock)
 
-    def _local(self, t_s: float) -> datetime:
-        """The time that the terminal prints, to 10 ms."""
-        hundredths = round((self.utc_start_ns + t_s * 1e9) / 1e7) + self.options.zone_h * 360_000
+    def _local(self, t_s: float, zone_h: int) -> datetime:
+        """The time in a zone, to 10 ms."""
+        hundredths = round((self.utc_start_ns + t_s * 1e9) / 1e7) + zone_h * 360_000
         return _EPOCH + timedelta(milliseconds=10 * hundredths)
 
     def _refusal(self, t_s: float) -> tuple[Outcome, float | None] | None:
@@ -306,11 +219,20 @@ class RdssTerminal:
             return Outcome.SUPPRESSED, None
         if self.battery_percent < LOW_BATTERY_PERCENT:
             return Outcome.LOW_BATTERY, None
+        no_beam = Outcome.NOT_LOCKED if binary else Outcome.NOT_SENT
         if max(self.beam_levels) < USABLE_BEAM_LEVEL:
-            return (Outcome.NOT_LOCKED if binary else Outcome.NOT_SENT), None
-        wait = self._last_burst_s + self.options.service_frequency_s - t_s
+            return no_beam, None
+        spacing = self.options.service_frequency_s
+        wait = self._last_burst_s + spacing - t_s
         if wait > 0.0:
+            self.counters["too_early"] += 1
             return Outcome.FREQUENCY, float(math.ceil(wait))
+        match self._centre.refused():
+            case "no_beam":
+                return no_beam, None
+            case "other_host":
+                self._last_burst_s = self._centre.other_burst_s(t_s)
+                return Outcome.FREQUENCY, float(round(self._last_burst_s + spacing - t_s))
         return None
 
     def _transmit(self, command_4_0: str, command_2_1: str, t_s: float) -> bool:
@@ -322,7 +244,7 @@ class RdssTerminal:
             self._last_burst_s = t_s
         else:
             self.counters[f"refused_{outcome}"] += 1
-        local = self._local(t_s)
+        local = self._local(t_s, o.zone_h)
         printed = local.hour * 3600 + local.minute * 60 + local.second
         feedback = Feedback(
             outcome,
@@ -343,7 +265,7 @@ class RdssTerminal:
             return
         given = request.height_m if request.height_mode is HeightMode.GIVEN else None
         fix = self._centre.fix(t_s + o.response_s, given)
-        local = self._local(fix.t_s)
+        local = self._local(fix.t_s, o.zone_h)
         seconds = local.hour * 3600 + local.minute * 60 + local.second
         fraction = local.microsecond * 1e-6
         message = Fix(

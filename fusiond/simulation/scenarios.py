@@ -10,7 +10,7 @@ import numpy as np
 from fusiond.config import Config, GnssAiding, Imu, RdssAiding
 from fusiond.simulation.gnss_receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.rdss_terminal import RdssOptions
+from fusiond.simulation.rdss_centre import RdssOptions
 from fusiond.simulation.sensor_errors import ImuOutput, Vibration, imu_output
 from fusiond.simulation.trajectories import Path, drive, flight, static
 

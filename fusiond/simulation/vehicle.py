@@ -5,7 +5,8 @@
 
 Everything random is drawn before the start; while it runs, the vehicle only looks up, formats and
 writes. Instant 0 of the trajectory is `start_ns` of the host's monotonic clock. Commands on
-standard input, a line each: `unplug NAME`, `plug NAME` (imu, gnss, rdss), `quit`.
+standard input, a line each: `unplug NAME`, `plug NAME` (imu, gnss, rdss); `suppress`, `silence`,
+`lift` for the RDSS terminal; `quit`. Each is answered; the last line is the counters, as JSON.
 """
 
 from __future__ import annotations
@@ -177,6 +178,10 @@ class SimulatedVehicle:
         elif device in self._lines:
             self._lines[device].unplug()
 
+    def lift(self) -> None:
+        """The terminal's suppression or silence ends, and it says so."""
+        self.terminal.lift(self._now_s())
+
     # ------------------------------------------------------------------ real time
 
     async def run(self) -> None:
@@ -257,6 +262,15 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--rdss-link", type=Path)
     parser.add_argument("--rdss-family", choices=("4.0", "2.1"), default="4.0")
     parser.add_argument("--service-frequency", type=int, default=10, help="of the RDSS card, s")
+    parser.add_argument(
+        "--rdss-delay", type=float, nargs=2, metavar=("LEAST", "GREATEST"), help="uniform, s"
+    )
+    parser.add_argument(
+        "--rdss-refuse", type=float, default=0.0, metavar="P", help="no beam, or a stated wait"
+    )
+    parser.add_argument(
+        "--rdss-drop", type=float, default=0.0, metavar="P", help="accepted, but no fix comes"
+    )
     parser.add_argument("--truth", type=Path, help="write truth.csv here")
     parser.add_argument(
         "--start-file", type=Path, help="write start_monotonic_ns and start_utc_ns here (JSON)"
@@ -272,6 +286,15 @@ def _watch_commands(vehicle: SimulatedVehicle, main: asyncio.Task[None]) -> None
         match line.split():
             case ["quit"]:
                 main.cancel()
+            case ["suppress"]:
+                vehicle.terminal.suppressed = True
+                print("suppressed", flush=True)
+            case ["silence"]:
+                vehicle.terminal.silent = True
+                print("silenced", flush=True)
+            case ["lift"]:
+                vehicle.lift()
+                print("lifted", flush=True)
             case [("plug" | "unplug") as verb, ("imu" | "gnss" | "rdss") as device]:
                 try:
                     vehicle.plug(device) if verb == "plug" else vehicle.unplug(device)
@@ -294,8 +317,14 @@ async def _main(args: argparse.Namespace) -> None:
     if args.rest is not None:
         scenario = replace(scenario, path=partial(drive, rest_s=args.rest))
     rdss = replace(
-        scenario.rdss, family=args.rdss_family, service_frequency_s=args.service_frequency
+        scenario.rdss,
+        family=args.rdss_family,
+        service_frequency_s=args.service_frequency,
+        refuse_probability=args.rdss_refuse,
+        drop_probability=args.rdss_drop,
     )
+    if args.rdss_delay is not None:
+        rdss = replace(rdss, delay_s=tuple(args.rdss_delay), mean_delay_s=None)
     vehicle = SimulatedVehicle(
         replace(scenario, rdss=rdss),
         seed=args.seed,
@@ -321,7 +350,8 @@ async def _main(args: argparse.Namespace) -> None:
         print("ready", flush=True)
     with contextlib.suppress(asyncio.CancelledError):
         await task
-    print(json.dumps(dict(vehicle.counters)), flush=True)
+    terminal = {f"terminal_{name}": n for name, n in vehicle.terminal.counters.items()}
+    print(json.dumps({**vehicle.counters, **terminal}), flush=True)
 
 
 if __name__ == "__main__":

@@ -215,17 +215,27 @@ class VehicleProcess:
         async with asyncio.timeout(PATIENCE_S):
             return (await self._process.stdout.readline()).decode().strip()
 
-    async def _command(self, verb: str, device: str) -> None:
+    async def command(self, line: str, answer: str) -> None:
+        """Say a line; the vehicle must give this answer."""
+        self._say(line)
+        assert await self._line() == answer
+
+    def _say(self, line: str) -> None:
         assert self._process is not None
         assert self._process.stdin is not None
-        self._process.stdin.write(f"{verb} {device}\n".encode())
-        assert await self._line() == f"{verb}ged {device}"
+        self._process.stdin.write(f"{line}\n".encode())
 
     async def plug(self, device: str) -> None:
-        await self._command("plug", device)
+        await self.command(f"plug {device}", f"plugged {device}")
 
     async def unplug(self, device: str) -> None:
-        await self._command("unplug", device)
+        await self.command(f"unplug {device}", f"unplugged {device}")
+
+    async def finish(self) -> dict[str, int]:
+        """End it as its user would; its counters."""
+        self._say("quit")
+        counters: dict[str, int] = json.loads(await self._line())
+        return counters
 
     def t_s(self, utc_ms: float) -> float:
         """Time of the trajectory at a POSIX instant in ms."""
