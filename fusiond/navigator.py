@@ -22,8 +22,8 @@ from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aligner import Aligner, AlignmentOptions
 from fusiond.config import Config
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.kernels import compensate
 from fusiond.estimators.model import make_model, position_bias
+from fusiond.estimators.propagation import compensate
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.intake import Intake
 from fusiond.integrity.verdicts import Verdicts

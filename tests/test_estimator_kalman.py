@@ -17,8 +17,8 @@ from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.position import PositionAid
 from fusiond.config import Imu
 from fusiond.estimators.kalman import KalmanEstimator, gate_threshold
-from fusiond.estimators.kernels import GAP_FORCE_M_S2, GAP_RATE_RAD_S
 from fusiond.estimators.model import Model
+from fusiond.estimators.propagation import GAP_FORCE_M_S2, GAP_RATE_RAD_S
 from fusiond.navigation.error_model import dense_transition
 from tests import runs
 

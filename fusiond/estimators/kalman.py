@@ -20,15 +20,9 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from fusiond.aiding.base import Linearised, NotApplicable, State
-from fusiond.estimators.kernels import (
-    SCRATCH_SIZE,
-    feed_back,
-    fuse,
-    propagate,
-    sensor_estimates,
-    sigmas,
-)
 from fusiond.estimators.model import Model
+from fusiond.estimators.propagation import SCRATCH_SIZE, propagate, sensor_estimates, sigmas
+from fusiond.estimators.update import feed_back, fuse
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.error_model import STRIDE
 from fusiond.navigation.rotation import dcm_from_quaternion
