@@ -19,7 +19,7 @@ import serial
 
 from drivers.can_signals import CanImuDecoder
 from drivers.measurements import DeviceStamp, ImuSample
-from drivers.rdss import binary_4_0
+from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.messages import Fix, Identity, IdentityRequest, PositionRequest
 from fusiond.files import read_truth
 from fusiond.simulation.can_imu import SIM_IMU
@@ -166,6 +166,9 @@ async def test_the_vehicle_as_a_process(tmp_path: Path) -> None:
             assert abs(start["start_monotonic_ns"] - time.monotonic_ns()) < 60e9
             assert len(read_truth(tmp_path / "truth.csv").t_s) == 601
             assert (tmp_path / "gnss").is_symlink()
+            with serial.Serial(str(tmp_path / "rdss"), 115200, timeout=20.0) as port:
+                port.write(text_2_1.encode(IdentityRequest()))
+                assert port.read(6) == b"$BDICI"
             process.stdin.write(b"unplug gnss\n")
             assert await process.stdout.readline() == b"unplugged gnss\n"
             assert not (tmp_path / "gnss").is_symlink()
@@ -173,8 +176,12 @@ async def test_the_vehicle_as_a_process(tmp_path: Path) -> None:
             assert await process.stdout.readline() == b"plugged gnss\n"
             assert await process.stdout.readline() == b"unknown command: what\n"
             assert (tmp_path / "gnss").is_symlink()
-            process.stdin.write(b"quit\n")
-            json.loads(await process.stdout.readline())
+            process.stdin.write(b"suppress\nsilence\nlift\nquit\n")
+            said = [await process.stdout.readline() for _ in range(4)]
+            assert said[:3] == [b"suppressed\n", b"silenced\n", b"lifted\n"]
+            counters = json.loads(said[3])
+            assert counters["imu_frames"] > 0
+            assert counters["terminal_IdentityRequest"] == 1
             assert await process.wait() == 0
             assert not (tmp_path / "rdss").is_symlink()
     finally:
