@@ -268,9 +268,12 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure = Figure(figsize=(9.0, 3.6 * len(cases)), layout="constrained")
     for axes, case in zip(figure.subplots(len(cases), squeeze=False)[:, 0], cases, strict=True):
         series = case["series"]
-        for name, values in series["horizontal_rms_m"].items():
-            style = "--" if name == "optimal_prediction" else "-"
-            axes.plot(series["t_s"], values, style, label=name.replace("_", " "), linewidth=1.2)
+        for number, (name, values) in enumerate(series["horizontal_rms_m"].items()):
+            width = 4.0 if number == 0 else 1.2  # others may lie on the first
+            label = name.replace("_", " ")
+            axes.plot(
+                series["t_s"], values, linewidth=width, alpha=0.4 + 0.6 * (number > 0), label=label
+            )
         axes.set_yscale("log")
         axes.set_xlabel("s")
         axes.set_ylabel("horizontal RMS, m")
