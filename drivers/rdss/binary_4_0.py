@@ -6,8 +6,8 @@
           10  n  payload
         10+n  1  XOR of everything before
 
-There is no terminator and `$` may occur inside a payload, so every failure advances one byte and
-looks again. Numbers with a sign are sign and magnitude. Public copies of the interface agree on
+There is no terminator and `$` may occur inside a payload. Numbers with a sign are sign and
+magnitude. Public copies of the interface agree on
 the above; where they disagree (sign bits of H and xi, the wait of FKXX flag 4, the fraction of T)
 the reading is tolerant and says so at its place.
 """
@@ -15,19 +15,19 @@ the reading is tolerant and says so at its place.
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from collections.abc import Callable
 
 from drivers.rdss.binary_4_0_encode import (
     FLAGS,
+    HEADER,
     LENGTHS,
     MAX_LENGTH,
     MAX_USER,
     OVERHEAD,
-    checksum,
     encode,
     frame,
 )
+from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import (
     CARD_FAULTS,
     HARDWARE_FAULTS,
@@ -49,6 +49,7 @@ from drivers.rdss.messages import (
     StopRequest,
     Subordinates,
     Text,
+    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,
@@ -122,7 +123,7 @@ def _position_request(user: int, p: bytes) -> Message:
     )
 
 
-def _text_kind(payload: bytes, code: bool) -> str:
+def _text_kind(payload: bytes, code: bool) -> TextEncoding:
     if not code:
         return "chinese"
     return "mixed" if payload.startswith(b"\xa4") else "code"
@@ -140,7 +141,7 @@ def _text_request(user: int, p: bytes) -> Message:
         user=user,
         receiver=int.from_bytes(p[1:4], "big"),
         payload=text,
-        encoding=_text_kind(text, bool(p[0] & 2)),  # type: ignore[arg-type]
+        encoding=_text_kind(text, bool(p[0] & 2)),
         acknowledge=bool(p[6]),
     )
 
@@ -152,7 +153,7 @@ def _text(user: int, p: bytes) -> Message:
         user=user,
         sender=int.from_bytes(p[1:4], "big"),
         payload=text,
-        encoding=_text_kind(text, bool(p[0] & 0x20)),  # type: ignore[arg-type]
+        encoding=_text_kind(text, bool(p[0] & 0x20)),
         minute_of_day=_time(p[4], p[5], 0) // 60,
         crc_ok=p[-1] == 0,
     )
@@ -272,7 +273,7 @@ _DECODE: dict[str, Callable[[int, bytes], Message]] = {
 # --------------------------------------------------------------------------- framing
 
 
-class Decoder:
+class Decoder(FrameDecoder):
     """Bytes in, messages out, both directions. Buffers at most one frame.
 
     Counters: `frames`, `unknown` (well-formed, not read here), `bad_checksum`, `bad_length`,
@@ -280,61 +281,10 @@ class Decoder:
     `abandoned` (frame whose rest never came), `garbage_bytes`.
     """
 
-    def __init__(self, counters: Counter[str] | None = None) -> None:
-        self.counters: Counter[str] = Counter() if counters is None else counters
-        self._buffer = bytearray()
-        self._awaited = 0
-
-    @property
-    def awaited_bytes(self) -> int:
-        return self._awaited
-
-    def feed(self, data: bytes) -> list[Message]:
-        self._buffer += data
-        return self._scan(0)
-
-    def expire(self) -> list[Message]:
-        if not self._buffer:
-            return []
-        self.counters["abandoned"] += 1
-        return self._scan(1)
-
-    def _scan(self, at: int) -> list[Message]:
-        messages: list[Message] = []
-        buffer, counters = self._buffer, self.counters
-        counters["garbage_bytes"] += at
-        self._awaited = 0
-        while True:
-            start = buffer.find(b"$", at)
-            if start < 0:
-                start = len(buffer)
-            counters["garbage_bytes"] += start - at
-            at = start
-            header = bytes(buffer[at : at + 7])
-            if len(header) < 7:
-                self._awaited = 7 if header else 0
-                break
-            length, fault = self._length(header)
-            if not fault and len(buffer) - at < length:
-                self._awaited = length
-                break
-            if not fault:
-                whole = bytes(buffer[at : at + length])
-                message = self._read(whole)
-                if message is not None:
-                    messages.append(message)
-                    at += length
-                    continue
-            else:
-                counters[fault] += 1
-            counters["garbage_bytes"] += 1
-            at += 1
-        del buffer[:at]
-        return messages
-
-    @staticmethod
-    def _length(header: bytes) -> tuple[int, str]:
-        """Length that a header claims, and the name of its fault if it is none."""
+    def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
+        header = bytes(buffer[at : at + HEADER])
+        if len(header) < HEADER:
+            return HEADER, ""
         letters = header[1:5]
         if not (letters.isalpha() and letters.isupper()):
             return 0, "bad_name"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import struct
-from functools import reduce
-from operator import xor
 
+from drivers.rdss.framing import checksum
 from drivers.rdss.messages import (
     CARD_FAULTS,
     FORBIDDEN,
@@ -32,8 +31,11 @@ from drivers.rdss.messages import (
     TimeRequest,
     Unknown,
     VersionRequest,
+    split_time,
 )
 
+HEADER = 7
+"""Bytes that tell the length: name 5, length 2."""
 OVERHEAD = 11
 """Bytes around the payload: name 5, length 2, address 3, XOR 1."""
 MAX_LENGTH = 240
@@ -61,11 +63,6 @@ LENGTHS = {
 MAX_USER = 0x1FFFFF
 MAX_ORDINARY_HEIGHT_M = 16300
 MAX_ORDINARY_ANTENNA_M = 400.0
-
-
-def checksum(data: bytes | bytearray | memoryview) -> int:
-    """XOR of all bytes; over a whole frame it is 0."""
-    return reduce(xor, data, 0)
 
 
 def frame(name: str, user: int, payload: bytes) -> bytes:
@@ -112,10 +109,7 @@ def _angle_bytes(angle_deg: float) -> bytes:
 
 
 def _time_bytes(time_of_day_s: float) -> bytes:
-    whole = int(time_of_day_s)
-    hour = min(whole // 3600, 23)
-    minute = min((whole - hour * 3600) // 60, 59)
-    return bytes((hour, minute, whole - hour * 3600 - minute * 60))
+    return bytes(split_time(int(time_of_day_s)))
 
 
 def _encode_position_request(m: PositionRequest) -> bytes:

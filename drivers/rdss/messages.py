@@ -343,6 +343,13 @@ def ascii_name(raw: bytes) -> str:
     return raw.decode("ascii")
 
 
+def split_time(whole_s: int) -> tuple[int, int, int]:
+    """Second of the day to hour, minute, second; 86400, a leap second, is 23, 59, 60."""
+    hour = min(whole_s // 3600, 23)
+    minute = min((whole_s - hour * 3600) // 60, 59)
+    return hour, minute, whole_s - hour * 3600 - minute * 60
+
+
 def check_range(name: str, value: float, low: float, high: float) -> None:
     """FieldError unless low <= value <= high (NaN fails)."""
     if not low <= value <= high:

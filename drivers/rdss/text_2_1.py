@@ -3,15 +3,14 @@
     $ talker(2) formatter(3) , fields * XOR of what stands between $ and *, two hex digits, CR LF
 
 Talker CC speaks to the terminal, BD from it. The same port may carry ordinary GNSS sentences (any
-talker): they pass as `Unknown`. A raw Chinese text may hold bytes of 0x80 and more. Every failure
-advances one byte and looks for the next `$`.
+talker): they pass as `Unknown`. A raw Chinese text may hold bytes of 0x80 and more.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 
+from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import (
     ZTI_FAULTS,
     BeamPower,
@@ -44,7 +43,6 @@ from drivers.rdss.text_2_1_encode import (
     KINDS,
     MAX_SENTENCE,
     REASONS,
-    checksum,
     encode,
     sentence,
 )
@@ -309,7 +307,7 @@ _DECODE: dict[str, Callable[[Fields], Message | None]] = {
 # --------------------------------------------------------------------------- framing
 
 
-class Decoder:
+class Decoder(FrameDecoder):
     """Bytes in, messages out, both directions. Buffers at most one sentence.
 
     Counters: `frames`, `unknown` (well-formed, not read here), `bad_checksum`, `bad_length` (no
@@ -317,63 +315,22 @@ class Decoder:
     frame), `abandoned` (sentence whose rest never came), `garbage_bytes`.
     """
 
-    def __init__(self, counters: Counter[str] | None = None) -> None:
-        self.counters: Counter[str] = Counter() if counters is None else counters
-        self._buffer = bytearray()
-        self._awaited = 0
+    BETWEEN = b"\r\n"
 
-    @property
-    def awaited_bytes(self) -> int:
-        return self._awaited
+    def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
+        """A sentence ends with its first control character, that one included."""
+        fault = _header_fault(bytes(buffer[at + 1 : at + _HEADER]))
+        if fault:
+            return 0, fault
+        limit = at + MAX_SENTENCE
+        for i in range(at, min(limit, len(buffer))):
+            if buffer[i] < 0x20:
+                return i + 1 - at, ""
+        return (0, "bad_length") if len(buffer) >= limit else (MAX_SENTENCE, "")
 
-    def feed(self, data: bytes) -> list[Message]:
-        self._buffer += data
-        return self._scan(0)
-
-    def expire(self) -> list[Message]:
-        if not self._buffer:
-            return []
-        self.counters["abandoned"] += 1
-        return self._scan(1)
-
-    def _scan(self, at: int) -> list[Message]:
-        messages: list[Message] = []
-        buffer, counters = self._buffer, self.counters
-        counters["garbage_bytes"] += at
-        self._awaited = 0
-        while True:
-            start = buffer.find(b"$", at)
-            if start < 0:
-                start = len(buffer)
-            counters["garbage_bytes"] += sum(b not in b"\r\n" for b in buffer[at:start])
-            at = start
-            end = next(
-                (i for i in range(at, min(at + MAX_SENTENCE, len(buffer))) if buffer[i] < 0x20), -1
-            )
-            header = bytes(buffer[at + 1 : at + _HEADER])
-            fault = _header_fault(header)
-            if not fault and end < 0:
-                if len(buffer) - at < MAX_SENTENCE:
-                    self._awaited = MAX_SENTENCE if buffer[at:] else 0
-                    break
-                fault = "bad_length"
-            if not fault:
-                message = self._read(bytes(buffer[at + 1 : end + 1]))
-                if message is not None:
-                    messages.append(message)
-                    at = end + 1
-                    continue
-            else:
-                counters[fault] += 1
-            counters["garbage_bytes"] += 1
-            at += 1
-        del buffer[:at]
-        return messages
-
-    def _read(self, line: bytes) -> Message | None:
-        """What stands between `$` and the first control character, that one included."""
-        body, star, digits = line[:-1].rpartition(b"*")
-        if not line.endswith((b"\r", b"\n")) or not star or len(digits) != 2:
+    def _read(self, whole: bytes) -> Message | None:
+        body, star, digits = whole[1:-1].rpartition(b"*")
+        if not whole.endswith((b"\r", b"\n")) or not star or len(digits) != 2:
             self.counters["bad_length"] += 1
             return None
         if digits.upper() != b"%02X" % checksum(body):

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import xor
 from typing import Literal
 
+from drivers.rdss.framing import checksum
 from drivers.rdss.messages import (
     FORBIDDEN,
     ZTI_FAULTS,
@@ -29,15 +28,11 @@ from drivers.rdss.messages import (
     TextRequest,
     TimeRequest,
     Unknown,
+    split_time,
 )
 
 MAX_SENTENCE = 512
 """Longest sentence believed: 420 hex digits of text (1680 bits) and its header, rounded up."""
-
-
-def checksum(body: bytes) -> int:
-    """XOR of the bytes between `$` and `*`."""
-    return reduce(xor, body, 0)
 
 
 def sentence(name: str, fields: bytes) -> bytes:
@@ -81,9 +76,7 @@ def _print_time(time_of_day_s: float, decimals: int) -> str:
     """hhmmss.ss, never rounded into a 60th second that is not there."""
     scale: int = 10**decimals
     whole, part = divmod(int(time_of_day_s * scale + 1e-6), scale)
-    hour = min(whole // 3600, 23)
-    minute = min((whole - hour * 3600) // 60, 59)
-    text = f"{hour:02d}{minute:02d}{whole - hour * 3600 - minute * 60:02d}"
+    text = "{:02d}{:02d}{:02d}".format(*split_time(whole))
     return f"{text}.{part:0{decimals}d}" if decimals else text
 
 

@@ -1,0 +1,91 @@
+"""What both wire families share: how frames are found in a stream, and their checksum.
+
+A frame begins with `$`, which may also occur inside one, so every failure advances one byte and
+looks for the next `$`: a good frame is found whatever stands before it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from functools import reduce
+from operator import xor
+from typing import ClassVar
+
+from drivers.rdss.messages import Message
+
+
+def checksum(data: bytes | bytearray | memoryview) -> int:
+    """XOR of all bytes."""
+    return reduce(xor, data, 0)
+
+
+class FrameDecoder(ABC):
+    """Bytes in, messages out, both directions. Buffers at most one frame.
+
+    Counters: `abandoned` (frame whose rest never came), `garbage_bytes`, and the faults that a
+    family names.
+    """
+
+    BETWEEN: ClassVar[bytes] = b""
+    """Bytes that may stand between frames and are no garbage."""
+
+    def __init__(self, counters: Counter[str] | None = None) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._buffer = bytearray()
+        self._awaited = 0
+
+    @property
+    def awaited_bytes(self) -> int:
+        return self._awaited
+
+    def feed(self, data: bytes) -> list[Message]:
+        self._buffer += data
+        return self._scan(0)
+
+    def expire(self) -> list[Message]:
+        if not self._buffer:
+            return []
+        self.counters["abandoned"] += 1
+        return self._scan(1)
+
+    def _scan(self, at: int) -> list[Message]:
+        messages: list[Message] = []
+        buffer, counters = self._buffer, self.counters
+        counters["garbage_bytes"] += at
+        self._awaited = 0
+        while True:
+            start = buffer.find(b"$", at)
+            if start < 0:
+                start = len(buffer)
+            counters["garbage_bytes"] += len(buffer[at:start].translate(None, self.BETWEEN))
+            at = start
+            if at == len(buffer):
+                break
+            length, fault = self._extent(buffer, at)
+            if fault:
+                counters[fault] += 1
+            elif len(buffer) - at < length:
+                self._awaited = length
+                break
+            else:
+                message = self._read(bytes(buffer[at : at + length]))
+                if message is not None:
+                    messages.append(message)
+                    at += length
+                    continue
+            counters["garbage_bytes"] += 1
+            at += 1
+        del buffer[:at]
+        return messages
+
+    @abstractmethod
+    def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
+        """Length of the frame whose `$` stands at `at`, and the name of its fault or "".
+
+        While the length cannot be told, the greatest that it takes to tell it.
+        """
+
+    @abstractmethod
+    def _read(self, whole: bytes) -> Message | None:
+        """The message of a frame as long as it claims; None, and counted, if it is damaged."""
