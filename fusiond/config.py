@@ -132,8 +132,9 @@ class RdssAiding(Aiding):
     """The fix's height aids the height channel with this sigma; null: it does not. Without any
     other
     height an inertial height runs away."""
-    bias_sd_m: NonNegativeFloat = 0.0
-    """Error that successive fixes share, one sigma an axis; 0: none is estimated."""
+    bias_sd_m: NonNegativeFloat = 15.0
+    """Error that successive fixes share (height model, satellite positions), one sigma an axis; 0:
+    none is estimated. See `docs/rdss-strategies.md` for why not 0."""
     bias_correlation_s: PositiveFloat = 600.0
     """Correlation time of that drift."""
 
