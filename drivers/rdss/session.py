@@ -1,0 +1,94 @@
+"""What the request cycle knows of the terminal on the line, and the moves between its states.
+
+`replies` changes it by what the terminal says, `terminal` by what is due.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from drivers.rdss.cycle import GIVE_UP_NS, HOLD_NS, IN_FLIGHT, OFFLINE, State, TerminalOptions
+from drivers.rdss.messages import Family, Identity
+from drivers.rdss.permit import Pace, TransmitPermit
+from drivers.rdss.probe import Probe
+
+
+class Session:
+    """State, deadline of the state, and what was read. Instants are monotonic ns.
+
+    `levels` and `levels_ns`: beam levels and when they were read, `beam_reads` how often they were
+    asked for since. `answerable`: the last request may still bring a fix. `timeouts`: requests in a
+    row without one. Spacing (`pace`), suppression and silence (`permit`) outlive the line.
+    """
+
+    def __init__(self, options: TerminalOptions, counters: Counter[str]) -> None:
+        self.options = options
+        self.counters = counters
+        self.state = State.CLOSED
+        self.deadline_ns: int | None = None
+        self.heard_ns = 0
+        self.family: Family | None = None
+        self.identity: Identity | None = None
+        self.probe = Probe(options.bauds, options.families)
+        self.next_poll_ns = 0
+        self.levels: tuple[int, ...] = ()
+        self.levels_ns: int | None = None
+        self.beam_reads = 0
+        self.answerable = False
+        self.timeouts = 0
+        self.pace = Pace(options.request_interval_s)
+        self.permit = TransmitPermit(options.suppression_hold_s)
+        self.hold_why, self.hold_until_ns = "", 0
+
+    @property
+    def answered(self) -> bool:
+        """A terminal with a known family is on the line."""
+        return self.state not in OFFLINE
+
+    @property
+    def beams(self) -> str:
+        """The beams in words."""
+        return f"strongest level {max(self.levels)}" if self.levels else "beam levels unknown"
+
+    @property
+    def blocked_until_ns(self) -> int | None:
+        """When HOLDING or SUPPRESSED ends by itself; None in any other state."""
+        match self.state:
+            case State.HOLDING:
+                return self.hold_until_ns
+            case State.SUPPRESSED:
+                return self.permit.suppressed_until_ns
+            case _:
+                return None
+
+    # ------------------------------------------------------------------ moves
+
+    def enter(self, state: State, deadline_ns: int | None) -> None:
+        """Be in `state`, with something to do at `deadline_ns`."""
+        self.state = state
+        self.deadline_ns = deadline_ns
+
+    def search(self, t_ns: int) -> None:
+        """Look who is there."""
+        self.probe.restart()
+        self.enter(State.PROBING, t_ns)
+
+    def proceed(self, t_ns: int) -> None:
+        """Card known, nothing in flight: on to the next request, or to why there is none."""
+        if self.permit.silent:
+            self.enter(State.SILENT, t_ns)
+        elif not self.permit.granted:
+            self.enter(State.SUPPRESSED, t_ns)
+        else:
+            self.beam_reads = 0
+            self.enter(State.CHECKING, t_ns)
+
+    def hold(self, t_ns: int, why: str) -> None:
+        """No request for a while."""
+        self.hold_why, self.hold_until_ns = why, t_ns + HOLD_NS
+        self.enter(State.HOLDING, t_ns)
+
+    def abandon(self) -> None:
+        """Stop waiting for the request in flight; the next keeps clear of its late answer."""
+        if self.state in IN_FLIGHT and self.pace.requested_ns is not None:
+            self.pace.not_before(self.pace.requested_ns + GIVE_UP_NS)
