@@ -5,8 +5,7 @@ descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descrip
 `udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn. A bus
 without one (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
 
-Error frames: Linux `include/uapi/linux/can/error.h`. Frame layout: `struct can_frame` and
-`struct canfd_frame` of `include/uapi/linux/can.h`.
+Frame layout: `struct can_frame` and `struct canfd_frame` of Linux `include/uapi/linux/can.h`.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from typing import Literal, NamedTuple, TypedDict
 import can
 
 from drivers.base import Backoff, Now, monotonic_ns
+from drivers.can_errors import ControllerState, controller_state, error_names
 
 FRAMES_PER_WAKEUP = 64
 """Most frames handled in one turn of the loop: 2 ms of work, 15 ms of a full 500 kbit/s bus."""
@@ -37,25 +37,8 @@ LONGEST_WAIT_S = 1.0
 """Longest wait between attempts to open: trying costs three system calls, so try often."""
 
 Interface = Literal["socketcan", "virtual", "udp_multicast"]
-ControllerState = Literal["active", "warning", "passive", "bus_off"]
 
 EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 0x8000_0000, 0x4000_0000, 0x2000_0000
-ERROR_CLASSES = {
-    0x001: "tx_timeout",
-    0x002: "lost_arbitration",
-    0x004: "controller",
-    0x008: "protocol",
-    0x010: "transceiver",
-    0x020: "no_acknowledge",
-    0x040: "bus_off",
-    0x080: "bus_error",
-    0x100: "restarted",
-    0x200: "error_counters",
-}
-"""CAN_ERR_* classes of the identifier of an error frame; counted as `error_<name>`."""
-_CONTROLLER, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100
-_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40  # CAN_ERR_CRTL_*, data[1]
-
 _FRAME = struct.Struct("=IB3x")
 _TIMESPEC = struct.Struct("@ll")
 _CANFD_MTU = 72
@@ -85,22 +68,6 @@ class CanFrame(NamedTuple):
     realtime_ns: int | None = None
     remote: bool = False
     error: bool = False
-
-
-def controller_state(error_classes: int, data: bytes) -> ControllerState | None:
-    """The state of the controller that an error frame tells of; None if of something else."""
-    if error_classes & _BUS_OFF:
-        return "bus_off"
-    if error_classes & _RESTARTED:
-        return "active"
-    if error_classes & _CONTROLLER and len(data) > 1:
-        if data[1] & _PASSIVE:
-            return "passive"
-        if data[1] & _WARNING:
-            return "warning"
-        if data[1] & _ACTIVE:
-            return "active"
-    return None
 
 
 class _BusFaultError(Exception):
@@ -320,11 +287,8 @@ class CanBus:
         """Sort one frame: data to `on_frame`, error frames into the controller's state."""
         if frame.error:
             self.counters["error_frames"] += 1
-            for bit, name in ERROR_CLASSES.items():
-                if frame.can_id & bit:
-                    self.counters[f"error_{name}"] += 1
-            if frame.can_id & _CONTROLLER and len(frame.data) > 1 and frame.data[1] & _OVERFLOW:
-                self.counters["error_overflow"] += 1
+            for name in error_names(frame.can_id, frame.data):
+                self.counters[f"error_{name}"] += 1
             self._controller_is(controller_state(frame.can_id, frame.data))
             return
         if frame.remote:

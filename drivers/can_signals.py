@@ -18,7 +18,7 @@ from drivers.base import (
     PermanentDriverError,
     monotonic_ns,
 )
-from drivers.can_bus import CanBus, CanFilter, CanFrame, ControllerState, Interface
+from drivers.can_bus import CanBus, CanFilter, CanFrame, Interface
 from drivers.can_dbc import (
     FORCE_UNITS,
     RATE_UNITS,
@@ -31,6 +31,7 @@ from drivers.can_dbc import (
     plan_counter,
     plan_time,
 )
+from drivers.can_errors import ControllerState
 from drivers.can_pairing import Group, Pairing
 from drivers.measurements import (
     ArrivalStamp,

@@ -18,7 +18,8 @@ import can
 import pytest
 
 from drivers import can_bus
-from drivers.can_bus import CanBus, CanFrame, controller_state
+from drivers.can_bus import CanBus, CanFrame
+from drivers.can_errors import controller_state
 from drivers.can_signals import CanImuDriver, CanImuOptions
 from drivers.measurements import DeviceEvent, DeviceStamp, ImuSample, KernelStamp, Measurement
 
