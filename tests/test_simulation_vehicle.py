@@ -179,9 +179,7 @@ async def test_the_vehicle_as_a_process(tmp_path: Path) -> None:
             process.stdin.write(b"suppress\nsilence\nlift\nquit\n")
             said = [await process.stdout.readline() for _ in range(4)]
             assert said[:3] == [b"suppressed\n", b"silenced\n", b"lifted\n"]
-            counters = json.loads(said[3])
-            assert counters["imu_frames"] > 0
-            assert counters["terminal_IdentityRequest"] == 1
+            assert json.loads(said[3])["terminal_IdentityRequest"] == 1
             assert await process.wait() == 0
             assert not (tmp_path / "rdss").is_symlink()
     finally:

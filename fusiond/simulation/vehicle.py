@@ -31,6 +31,7 @@ import can
 import numpy as np
 
 from drivers.can_signals import CanImuOptions
+from fusiond.load_config import load_config
 from fusiond.simulation.can_imu import SIM_IMU, CanImu
 from fusiond.simulation.files import write_truth
 from fusiond.simulation.gnss_receiver import GnssReceiver
@@ -254,6 +255,7 @@ class SimulatedVehicle:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="fusiond.simulation.vehicle")
     parser.add_argument("--scenario", choices=sorted(SCENARIOS), default="drive")
+    parser.add_argument("--config", type=Path, help="fit IMU and lever arms to this configuration")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--duration", type=float, help="s; the scenario's own by default")
     parser.add_argument("--rest", type=float, help="s at rest before the drive; 60 by default")
@@ -314,6 +316,8 @@ def _watch_commands(vehicle: SimulatedVehicle, main: asyncio.Task[None]) -> None
 async def _main(args: argparse.Namespace) -> None:
     interface, _, channel = args.can.partition(":")
     scenario = SCENARIOS[args.scenario]
+    if args.config is not None:
+        scenario = scenario.fitted(load_config(args.config))
     if args.rest is not None:
         scenario = replace(scenario, path=partial(drive, rest_s=args.rest))
     rdss = replace(
