@@ -50,6 +50,13 @@ class DriverStatus:
     detail: str = ""
 
 
+def state_event(source: str, t_ns: int, port: str, status: DriverStatus) -> DeviceEvent:
+    """`device_absent`, `device_silent` or `device_running`: what a driver on a serial line says
+    when its state has changed."""
+    text = f"{port}: {status.detail or status.state}"
+    return DeviceEvent(source, t_ns, f"device_{status.state}", text)
+
+
 class Driver(Protocol):
     """A device's driver. `counters` holds every received, refused and damaged item by name."""
 

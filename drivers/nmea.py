@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, PositiveFloat
 
-from drivers.base import DriverStatus, Emit, Now, State, monotonic_ns
-from drivers.measurements import DeviceEvent, Measurement, TimeReport
+from drivers.base import DriverStatus, Emit, Now, State, monotonic_ns, state_event
+from drivers.measurements import Measurement, TimeReport
 from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
 from drivers.serial_line import SerialLine
 
@@ -128,8 +128,7 @@ class NmeaDriver:
         changed = state != self.status.state
         self.status.state, self.status.detail = state, detail
         if changed:
-            text = f"{self._options.port}: {detail}" if detail else f"{self._options.port}: {state}"
-            self._emit(DeviceEvent(self.name, self._now_ns(), f"device_{state}", text))
+            self._emit(state_event(self.name, self._now_ns(), self._options.port, self.status))
 
     def _running_detail(self) -> str:
         if self._now_ns() - self._useful_ns < self._options.timeout_s * 1e9:

@@ -57,6 +57,7 @@ class PtyTerminal:
         self._rate = rate
         self.heard: list[Message] = []
         self.before = b""
+        self.mute = False
         asyncio.get_running_loop().add_reader(self.master, self._read)
 
     def close(self) -> None:
@@ -69,7 +70,7 @@ class PtyTerminal:
 
     def _read(self) -> None:
         data = os.read(self.master, 4096)
-        if termios.tcgetattr(self.master)[4] != self._rate:
+        if self.mute or termios.tcgetattr(self.master)[4] != self._rate:
             return
         for message in self._decoder.feed(data):
             self.heard.append(message)
@@ -96,9 +97,11 @@ async def until(condition: Callable[[], Any], seconds: float = 20.0) -> None:
 
 
 @asynccontextmanager
-async def running(options: dict[str, Any]) -> AsyncIterator[tuple[RdssDriver, list[Any]]]:
+async def running(
+    options: dict[str, Any], now_ns: Callable[[], int] = time.monotonic_ns
+) -> AsyncIterator[tuple[RdssDriver, list[Any]]]:
     said: list[Any] = []
-    driver = RdssDriver("rdss", RdssOptions(**options), said.append, time.monotonic_ns)
+    driver = RdssDriver("rdss", RdssOptions(**options), said.append, now_ns)
     task = asyncio.create_task(driver.run())
     try:
         yield driver, said
@@ -111,6 +114,10 @@ async def running(options: dict[str, Any]) -> AsyncIterator[tuple[RdssDriver, li
 
 def of(kind: type, said: list[Any]) -> list[Any]:
     return [item for item in said if isinstance(item, kind)]
+
+
+def states_said(said: list[Any]) -> list[str]:
+    return [e.code for e in of(DeviceEvent, said) if e.code.startswith("device_")]
 
 
 @pytest.mark.parametrize(("family", "rate"), [("4.0", termios.B19200), ("2.1", termios.B115200)])
@@ -186,6 +193,54 @@ async def test_absent_port_is_said_and_picked_up_and_lost_and_found(tmp_path: Pa
         port.symlink_to(again.port)
         await until(lambda: driver.status.state == "running")
         again.close()
+    assert states_said(said)[:4] == [
+        "device_absent",
+        "device_running",
+        "device_absent",
+        "device_running",
+    ]
+    first = next(e for e in of(DeviceEvent, said) if e.code == "device_absent")
+    assert str(port) in first.text
+    assert "No such file" in first.text
+
+
+class LeapingClock:
+    """The monotonic clock, and what a test adds to it so as not to wait."""
+
+    added_s = 0
+
+    def __call__(self) -> int:
+        return time.monotonic_ns() + self.added_s * 1_000_000_000
+
+
+async def test_a_terminal_that_falls_silent_is_said_and_picked_up() -> None:
+    terminal, clock = PtyTerminal("4.0"), LeapingClock()
+    options = {"port": terminal.port, "family": "4.0", "baud": 115200}
+    async with running(options, clock) as (driver, said):
+
+        def reached(state: str, leap_s: int) -> bool:
+            clock.added_s += leap_s * (driver.status.state != state)
+            return driver.status.state == state
+
+        await until(lambda: driver.status.state == "running")
+        terminal.mute = True
+        await until(lambda: reached("silent", 31))
+        terminal.mute = False
+        await until(lambda: reached("running", 3))
+    assert states_said(said) == ["device_running", "device_silent", "device_running"]
+    terminal.close()
+
+
+async def test_a_port_on_which_nobody_answers_is_silent() -> None:
+    terminal, clock = PtyTerminal("4.0"), LeapingClock()
+    terminal.mute = True
+    async with running({"port": terminal.port, "baud": 115200}, clock) as (driver, said):
+        await until(lambda: driver.counters["probes"] == 1)
+        assert driver.status.state == "starting"
+        clock.added_s += 3
+        await until(lambda: driver.status.state == "silent")
+    assert states_said(said) == ["device_silent"]
+    terminal.close()
 
 
 async def test_a_frame_that_never_ends_does_not_hide_the_next() -> None:

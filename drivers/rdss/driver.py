@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat
 
-from drivers.base import DriverOptions, DriverStatus, Emit, Now, State
+from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
 from drivers.measurements import DelayedFix, DeviceEvent, TimeOfDayStamp, TimeReport
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_ANTENNA_M, MAX_ORDINARY_HEIGHT_M
@@ -141,6 +141,7 @@ class RdssDriver:
         t_ns = self._now_ns()
         self._perform(self._terminal.closed(t_ns), t_ns)
         self._notify(t_ns, "rdss_closed", why)
+        self._wake.set()
 
     def _on_bytes(self, data: bytes, t_ns: int) -> None:
         for family, decoder in tuple(self._decoders.items()):
@@ -175,16 +176,19 @@ class RdssDriver:
                 continue
 
     def _say_status(self) -> None:
-        """`silent` once every baud rate has been probed in vain."""
+        """`silent` once every baud rate has been probed in vain, or nobody answers any more."""
         state: State = "starting"
         if not self._line.is_open:
             state = "absent" if self._line.detail else "starting"
         elif self._terminal.answered:
             state = "running"
-        elif self._terminal.unanswered_round:
+        elif self._terminal.unanswered_round or self.status.state in ("running", "silent"):
             state = "silent"
+        changed = state != self.status.state
         self.status.state = state
         self.status.detail = self._terminal.detail if self._line.is_open else self._line.detail
+        if changed and state != "starting":
+            self._emit(state_event(self.name, self._now_ns(), self._line.port, self.status))
 
     def _give_up_frames(self, t_ns: int) -> None:
         self._overdue_ns = None
