@@ -8,15 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.cycle import (
-    SECOND,
-    Action,
-    FixReady,
-    Notice,
-    Send,
-    SetBaud,
-    TerminalOptions,
-)
+from drivers.rdss.cycle import SECOND, Action, FixReady, Notice, Send, SetBaud, TerminalOptions
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,

@@ -7,13 +7,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.messages import (
-    Fix,
-)
-from tests.rdss_frames import (
-    FRAMES,
-    MODULES,
-)
+from drivers.rdss.messages import Fix
+from tests.rdss_frames import FRAMES, MODULES
 
 fixes = st.builds(
     Fix,

@@ -7,9 +7,7 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.rdss.cycle import (
-    State,
-)
+from drivers.rdss.cycle import State
 from drivers.rdss.messages import (
     BeamPower,
     Family,

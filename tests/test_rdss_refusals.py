@@ -6,9 +6,7 @@ import itertools
 
 import pytest
 
-from drivers.rdss.cycle import (
-    State,
-)
+from drivers.rdss.cycle import State
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,

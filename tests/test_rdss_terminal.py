@@ -7,11 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.rdss.cycle import (
-    SECOND,
-    State,
-    TerminalOptions,
-)
+from drivers.rdss.cycle import SECOND, State, TerminalOptions
 from drivers.rdss.fraction import FractionReader
 from drivers.rdss.messages import (
     BeamPowerRequest,
