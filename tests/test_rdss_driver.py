@@ -218,15 +218,20 @@ async def test_a_terminal_that_falls_silent_is_said_and_picked_up() -> None:
     options = {"port": terminal.port, "family": "4.0", "baud": 115200}
     async with running(options, clock) as (driver, said):
 
-        def reached(state: str, leap_s: int) -> bool:
-            clock.added_s += leap_s * (driver.status.state != state)
-            return driver.status.state == state
+        def state() -> str:
+            return driver.status.state
+
+        def left(before: str, leap_s: int) -> bool:
+            clock.added_s += leap_s * (state() == before)
+            return state() != before
 
         await until(lambda: driver.status.state == "running")
         terminal.mute = True
-        await until(lambda: reached("silent", 31))
+        await until(lambda: left("running", 31))
+        assert state() == "silent", "at once, not after a round of probes"
         terminal.mute = False
-        await until(lambda: reached("running", 3))
+        await until(lambda: left("silent", 3))
+        assert state() == "running"
     assert states_said(said) == ["device_running", "device_silent", "device_running"]
     terminal.close()
 
