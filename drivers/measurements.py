@@ -117,7 +117,8 @@ class DelayedFix:
     """A BeiDou RDSS fix: the terminal's position at the instant its request left the antenna.
 
     `precision_class_m` is the class the centre states (20 or 100 m). `height_m` is what went into
-    the solution, not an independent measurement. `multi_value` says two solutions were possible.
+    the solution, not an independent measurement. `multi_value` says two solutions were possible,
+    `height_given` that the height was ours: the request gave it, and it says nothing new.
     """
 
     source: str
@@ -128,6 +129,7 @@ class DelayedFix:
     height_m: float
     precision_class_m: float
     multi_value: bool = False
+    height_given: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,9 +129,8 @@ class RdssAiding(Aiding):
     height_sd_m: PositiveFloat = 10.0
     """Of the height that the centre solves with."""
     fix_height_sd_m: PositiveFloat | None = 30.0
-    """The fix's height aids the height channel with this sigma; null: it does not. Without any
-    other
-    height an inertial height runs away."""
+    """The fix's height aids with this sigma, unless the request gave it (then it says nothing new).
+    Without any height an inertial height runs away."""
     bias_sd_m: NonNegativeFloat = 15.0
     """Error that successive fixes share (height model, satellite positions), one sigma an axis; 0:
     none is estimated. See `docs/rdss-strategies.md` for why not 0."""

@@ -219,7 +219,7 @@ class Intake:
         ]
         if holds:
             aids.append(FeedBackAid(f"{m.source}_feedback", arrival_ns, gate))
-        if o.fix_height_sd_m is not None:
+        if o.fix_height_sd_m is not None and not m.height_given:
             sd = o.fix_height_sd_m * o.sigma_scale
             aids.append(HeightAid(f"{m.source}_height", when_ns, gate, m.height_m, sd))
         return aids

@@ -389,3 +389,17 @@ def test_a_long_wait_for_alignment_does_not_grow() -> None:
     total = sum(c.total() for c in navigator.timeline.counters.outcomes.values())
     # A fix and a velocity, five instants of the constraint (and the very first), two of standstill.
     assert total + navigator.timeline.waiting == 600 * (2 + 5 + 2) + 1
+
+
+def test_a_height_that_we_gave_does_not_come_back_as_a_measurement() -> None:
+    navigator, _ = _started()
+    now = navigator.imu.latest_ns
+    lat, lon, up = runs.ORIGIN
+    fix = DelayedFix("rdss", now, MonotonicStamp(now), lat, lon, up, 20.0)
+    assert navigator.add(replace(fix, height_given=True), now, seen_ns=now) == "accepted"
+    navigator.advance()
+    assert set(_outcomes(navigator)) & {"rdss", "rdss_height"} == {"rdss"}
+    later = now - 1_000_000
+    assert navigator.add(fix, later, seen_ns=now) == "accepted"
+    navigator.advance()
+    assert set(_outcomes(navigator)) & {"rdss", "rdss_height"} == {"rdss", "rdss_height"}

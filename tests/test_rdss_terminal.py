@@ -142,11 +142,13 @@ def test_height_given_from_solution_config_or_terrain() -> None:
     ship = Bench(TerminalOptions(bauds=(115200,), families=("4.0",), height_m=17.0))
     ship.run(5)
     assert ship.requests[0][1] == PositionRequest(USER, HeightMode.GIVEN, height_m=17.0)
+    assert [ready.height_given for _, ready in ship.fixes] == [True]
     own = TerminalOptions(bauds=(115200,), families=("4.0",), use_solution_height=False)
     terrain = Bench(own)
     terrain.cycle.height_hint(438.0, 1.0, terrain.t_ns)
     terrain.run(5)
     assert terrain.requests[0][1].height_mode is HeightMode.NONE
+    assert [ready.height_given for _, ready in terrain.fixes] == [False]
 
 
 # --------------------------------------------------------------------------- which fixes

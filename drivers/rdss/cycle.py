@@ -80,12 +80,13 @@ class SetBaud:
 @dataclass(frozen=True, slots=True)
 class FixReady:
     """An own fix: its time of day (s, zone unknown), the bound of what the fraction leaves open
-    (s), and when its request was written."""
+    (s), when its request was written, and whether that gave a height."""
 
     fix: Fix
     time_of_day_s: float
     uncertainty_s: float
     requested_ns: int
+    height_given: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -256,6 +256,7 @@ class RdssDriver:
             fix.height_m,
             float(fix.precision_class_m),
             fix.multi_value,
+            ready.height_given,
         )
 
     def _report_time(self, clock: DeviceClock, t_ns: int) -> None:

@@ -252,4 +252,12 @@ class Replies:
             time_of_day += part
             if uncertainty >= 0.5:
                 session.counters["bad_fraction"] += 1
-        actions.append(FixReady(fix, time_of_day, uncertainty, session.pace.requested_ns))
+        actions.append(
+            FixReady(
+                fix,
+                time_of_day,
+                uncertainty,
+                session.pace.requested_ns,
+                session.height_given,
+            )
+        )

@@ -17,7 +17,8 @@ class Session:
     """State, deadline of the state, and what was read. Instants are monotonic ns.
 
     `levels` and `levels_ns`: beam levels and when they were read, `beam_reads` how often they were
-    asked for since. `answerable`: the last request may still bring a fix. `timeouts`: requests in a
+    asked for since. `answerable`: the last request may still bring a fix; `height_given`: it
+    gave a height. `timeouts`: requests in a
     row without one. Spacing (`pace`), suppression and silence (`permit`) outlive the line.
     """
 
@@ -35,6 +36,7 @@ class Session:
         self.levels_ns: int | None = None
         self.beam_reads = 0
         self.answerable = False
+        self.height_given = False
         self.timeouts = 0
         self.pace = Pace(options.request_interval_s)
         self.permit = TransmitPermit(options.suppression_hold_s)

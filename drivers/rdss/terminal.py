@@ -43,6 +43,7 @@ from drivers.rdss.messages import (
     BeamPowerRequest,
     EncodeError,
     Family,
+    HeightMode,
     Identity,
     IdentityRequest,
     Message,
@@ -294,7 +295,8 @@ class Terminal:
             session.search(t_ns)
             return
         try:
-            data = ENCODE[session.family](self._height.request(session.identity.user, t_ns))
+            request = self._height.request(session.identity.user, t_ns)
+            data = ENCODE[session.family](request)
         except EncodeError as error:
             session.hold(t_ns, str(error))
             return
@@ -302,6 +304,7 @@ class Terminal:
         self.counters["requested"] += 1
         session.pace.written(t_ns)
         session.answerable = True
+        session.height_given = request.height_mode is HeightMode.GIVEN
         session.enter(State.AWAIT_FEEDBACK, t_ns + FEEDBACK_NS)
 
 
