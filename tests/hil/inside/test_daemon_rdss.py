@@ -181,6 +181,7 @@ async def test_a_drive_on_rdss_alone_ends_within_its_sigma(tmp_path: Path, famil
                 await vehicle.start()
                 await _meet_refusals(heard, family)
                 await _lose_the_radio(heard, vehicle, family)
+                await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= FEWEST_FUSED)
                 await _end_within_sigma(heard, vehicle)
                 terminal = await vehicle.finish()
                 await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
