@@ -74,10 +74,11 @@ class Intake:
                 return self._rdss(m, t_ns, sd_time_s, seen_ns)
             case Attitude():
                 o = self._section(m.source, AttitudeAiding)
-                sd = tuple(s * o.sigma_scale for s in m.sd_rpy_rad)
+                roll, pitch, yaw = (s * o.sigma_scale for s in m.sd_rpy_rad)
+                sd = (roll, pitch, yaw)
                 if not all(s > 0.0 or math.isnan(a) for s, a in zip(sd, m.rpy_rad, strict=True)):
                     return "no_sigma"
-                return [AttitudeAid(m.source, t_ns, o.gate_probability, m.rpy_rad, sd)]  # type: ignore[arg-type]
+                return [AttitudeAid(m.source, t_ns, o.gate_probability, m.rpy_rad, sd)]
             case Heading():
                 h = self._section(m.source, HeadingAiding)
                 sd_rad = (m.sd_rad or h.sd_deg * DEG) * h.sigma_scale

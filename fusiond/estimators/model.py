@@ -157,14 +157,6 @@ class Model:
         """Slots of the parameters of one column (constant and Markov gyro drift share one)."""
         return [int(i) for i in np.flatnonzero(self.column_of == column)]
 
-    def describe(self) -> list[tuple[str, str, float, float, float, float]]:
-        """A row a state: name, unit, initial sigma, white density^0.5, Markov sigma, tau (s)."""
-        return [
-            (f"{b.name}.{s}", b.unit, b.initial, math.sqrt(b.white), b.steady, b.tau_s)
-            for b in self.blocks
-            for s in b.states
-        ]
-
 
 def _navigation_blocks(noise: ImuNoise, planar: bool) -> list[Block]:
     n_e_d, n_e = ("n", "e", "d"), ("n", "e")
