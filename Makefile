@@ -40,6 +40,8 @@ lint: $(STAMP) ## ruff and mypy
 	$(BIN)/mypy
 
 unit: $(STAMP) test-packages ## unit and property tests, on every core
+	@echo "compiling the kernels once, before the tests share them"
+	$(BIN)/python -c 'import fusiond.daemon, fusiond.offline, fusiond.simulation.vehicle'
 	$(BIN)/pytest -n auto --ignore tests/test_hil.py $(ARGS)
 
 hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
