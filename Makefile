@@ -63,7 +63,7 @@ load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
 	$(COMPILE) --all-extras $(ARGS) --output-file requirements-dev.lock pyproject.toml
 	cp requirements-dev.lock requirements.lock
-	$(COMPILE) --extra demo --output-file requirements.lock pyproject.toml
+	$(COMPILE) --extra demo --extra raw --output-file requirements.lock pyproject.toml
 
 clean: ## remove what the other targets made
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,141 @@
+"""What a GNSS receiver's raw stream says: observations, broadcast ephemerides, ionosphere models.
+
+Angles are rad, times s, lengths m; every field is in the unit that the orbit equations take, and
+semicircles, scale factors and week rollovers end in the decoders. Systems are the letters of
+RINEX: G GPS, E Galileo, C BeiDou (others are counted and left out). Signals are RINEX 3
+observation codes without their type: "1C" GPS L1 C/A, "2I" BeiDou B1I, "6I" B3I, "1P" B1C pilot,
+"5P" B2a pilot.
+
+A system's own time: GPS and Galileo weeks count from 1980-01-06 (Galileo's are given in GPS
+weeks, 1024 more than its own count) and agree to nanoseconds; BeiDou's count from 2006-01-01 and
+BDT = GPST - 14 s. `Ephemeris` keeps the system's own time, `RawGnssEpoch` is in GPS time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from drivers.measurements import Stamp
+
+System = Literal["G", "E", "C"]
+SYSTEMS: tuple[System, ...] = ("G", "E", "C")
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+
+CARRIER_HZ: dict[tuple[System, str], float] = {
+    ("G", "1"): 1_575_420_000.0,
+    ("G", "2"): 1_227_600_000.0,
+    ("G", "5"): 1_176_450_000.0,
+    ("E", "1"): 1_575_420_000.0,
+    ("E", "5"): 1_176_450_000.0,
+    ("E", "7"): 1_207_140_000.0,
+    ("E", "8"): 1_191_795_000.0,
+    ("E", "6"): 1_278_750_000.0,
+    ("C", "2"): 1_561_098_000.0,
+    ("C", "1"): 1_575_420_000.0,
+    ("C", "5"): 1_176_450_000.0,
+    ("C", "7"): 1_207_140_000.0,
+    ("C", "8"): 1_191_795_000.0,
+    ("C", "6"): 1_268_520_000.0,
+}
+"""Carrier by system and RINEX band (the first character of a signal): RINEX 3.05, table A23."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawSignal:
+    """One signal of one satellite. Range rate is positive while the distance grows.
+
+    `sd_*` are what the receiver states, None where it does not; `cno_db_hz` likewise.
+    """
+
+    system: System
+    prn: int
+    signal: str
+    pseudorange_m: float
+    range_rate_m_s: float | None = None
+    carrier_cycles: float | None = None
+    cno_db_hz: float | None = None
+    sd_pseudorange_m: float | None = None
+    sd_range_rate_m_s: float | None = None
+
+    @property
+    def satellite(self) -> str:
+        """Such as "C21"."""
+        return f"{self.system}{self.prn:02d}"
+
+
+@dataclass(frozen=True, slots=True)
+class RawGnssEpoch:
+    """All signals of one instant of the receiver's clock, which is GPS time `week`, `tow_s`.
+
+    `stamp` is the same instant in UTC where the receiver knows the leap seconds.
+    """
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    week: int
+    tow_s: float
+    signals: tuple[RawSignal, ...]
+    clock_reset: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Ephemeris:
+    """Broadcast Keplerian ephemeris of one satellite (IS-GPS-200, BDS-SIS-ICD, Galileo OS SIS ICD).
+
+    `week` with `toe_s` and `toc_s` in the system's own time. `group_delay_s`: GPS (TGD,),
+    BeiDou (TGD1, TGD2), Galileo (BGD E5a/E1, BGD E5b/E1). `message`: "lnav", "d1", "d2", "inav",
+    "fnav". `healthy` is what the satellite says of itself.
+    """
+
+    source: str
+    t_seen_ns: int
+    system: System
+    prn: int
+    message: str
+    week: int
+    toe_s: float
+    toc_s: float
+    sqrt_a: float
+    eccentricity: float
+    inclination: float
+    ascending_node: float
+    perigee: float
+    mean_anomaly: float
+    mean_motion_correction: float
+    inclination_rate: float
+    ascending_node_rate: float
+    cuc: float
+    cus: float
+    crc: float
+    crs: float
+    cic: float
+    cis: float
+    clock_bias_s: float
+    clock_drift: float
+    clock_drift_rate: float
+    group_delay_s: tuple[float, ...]
+    issue: int
+    accuracy_m: float | None
+    healthy: bool
+
+    @property
+    def satellite(self) -> str:
+        """Such as "C21"."""
+        return f"{self.system}{self.prn:02d}"
+
+
+@dataclass(frozen=True, slots=True)
+class Klobuchar:
+    """Ionosphere coefficients as broadcast: `alpha` s / semicircle^i, `beta` s / semicircle^i."""
+
+    source: str
+    t_seen_ns: int
+    system: System
+    alpha: tuple[float, float, float, float]
+    beta: tuple[float, float, float, float]
+
+
+RawEvent = RawGnssEpoch | Ephemeris | Klobuchar
