@@ -255,6 +255,27 @@ def study(
 
 
 @app.command()
+def model(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Such as ins21.")],
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="CONFIG", help="Whose IMU and aids; the defaults if none."),
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Print an error-state model: states, units, noise and initial sigma."""
+    from fusiond.estimators.model import MODELS  # noqa: PLC0415
+    from fusiond.model_report import model_report, print_model  # noqa: PLC0415
+
+    if name not in MODELS:
+        raise typer.BadParameter(f"{name!r}: there are {', '.join(MODELS)}")
+    report = model_report(name, None if config is None else _load(config))
+    if json_path != "-":
+        print_model(report)
+    _write_json(report, json_path)
+
+
+@app.command()
 def bench() -> None:
     """Time the kernels against one numpy product; prints JSON."""
     from fusiond.bench import bench as run_bench  # noqa: PLC0415

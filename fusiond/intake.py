@@ -26,7 +26,7 @@ from fusiond.aiding.body_velocity import WheelSpeedAid
 from fusiond.aiding.height import HeightAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
-from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
+from fusiond.aiding.rdss_position import BIAS_BLOCK, FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import (
     Aiding,
@@ -38,6 +38,7 @@ from fusiond.config import (
     RdssAiding,
     WheelAiding,
 )
+from fusiond.estimators.model import Block, position_bias
 from fusiond.settings import DEG
 
 # What a fix moved forward by the computed velocity is wrong by: an acceleration of 2.5 m/s^2 over a
@@ -100,19 +101,19 @@ class Intake:
             case _:
                 return "not_an_aid"
 
-    def position_bias(self) -> tuple[float, float] | None:
-        """Sigma (m) and correlation time (s) of the error that RDSS fixes share; None: not
-        modelled.
+    def extra_blocks(self) -> list[Block]:
+        """The states that the configured aids need beside the model's own.
 
-        Position compensation needs it for what the moved fix is wrong by.
+        RDSS fixes share an error; position compensation needs the same block for what the moved fix
+        is wrong by.
         """
         for o in self._aiding.values():
             if isinstance(o, RdssAiding):
                 if o.bias_sd_m > 0.0:
-                    return o.bias_sd_m, o.bias_correlation_s
+                    return [position_bias(BIAS_BLOCK, o.bias_sd_m, o.bias_correlation_s)]
                 if o.strategy == "position_compensation":
-                    return COMPENSATION_SD_M, COMPENSATION_TAU_S
-        return None
+                    return [position_bias(BIAS_BLOCK, COMPENSATION_SD_M, COMPENSATION_TAU_S)]
+        return []
 
     def _section(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""

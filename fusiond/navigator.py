@@ -17,13 +17,12 @@ from drivers.measurements import Measurement
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
+from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aligner import Aligner, AlignmentOptions
 from fusiond.config import Config
-from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.model import make_model, position_bias
 from fusiond.estimators.propagation import compensate
+from fusiond.filters import estimator_of, model_of
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.intake import Intake
 from fusiond.integrity.verdicts import Verdicts
@@ -60,13 +59,11 @@ class Navigator:
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding)
-        bias = self._intake.position_bias()
-        extra = [] if bias is None else [position_bias(BIAS_BLOCK, *bias)]
-        self.model = make_model(e.model, self._noise, *extra)
+        self.model = model_of(config, *self._intake.extra_blocks())
         self.imu = ImuBuffer(
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
         )
-        self.estimator = KalmanEstimator(self.model, imu.gap_s)
+        self.estimator = estimator_of(config, self.model)
         self.verdicts = Verdicts(
             config.consistency.window,
             config.consistency.alpha,

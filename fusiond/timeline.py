@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
-from fusiond.estimators.kalman import KalmanEstimator, Outcome, Snapshot
+from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.imu_buffer import ImuBuffer
 
 Key = tuple[int, str, int]
@@ -66,7 +66,7 @@ class Timeline:
 
     def __init__(
         self,
-        estimator: KalmanEstimator,
+        estimator: Estimator,
         imu: ImuBuffer,
         keep_s: float,
         checkpoint_s: float,

@@ -75,7 +75,8 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         ("imu = 3", "imu = 3: expected a section"),
         (
             '[estimator]\nmodel = "ins12"',
-            "estimator.model = \"ins12\": did you mean 'ins21'? allowed: ins15, ins21, planar15",
+            "estimator.model = \"ins12\": did you mean 'ins23'?"
+            " allowed: ins15, ins17, ins21, ins23, planar10, planar15",
         ),
         (
             '[mqtt]\ncommands = ["reset"]',

@@ -16,7 +16,8 @@ from fusiond.aiding.attitude import HeadingAid
 from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.position import PositionAid
 from fusiond.config import Imu
-from fusiond.estimators.kalman import KalmanEstimator, gate_threshold
+from fusiond.estimators.base import gate_threshold
+from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model
 from fusiond.estimators.propagation import GAP_FORCE_M_S2, GAP_RATE_RAD_S
 from fusiond.navigation.error_model import dense_transition

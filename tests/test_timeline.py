@@ -19,7 +19,8 @@ from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Imu
-from fusiond.estimators.kalman import KalmanEstimator, Outcome
+from fusiond.estimators.base import Outcome
+from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.timeline import RECOVERY_COUNT, RECOVERY_NS, Entry, Timeline

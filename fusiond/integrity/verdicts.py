@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fusiond.aiding.rdss_position import RdssPositionAid
-from fusiond.estimators.kalman import Outcome
+from fusiond.estimators.base import Outcome
 from fusiond.integrity.consistency import (
     FEWEST,
     Consistency,

@@ -26,6 +26,8 @@ Source: Shin, Accuracy Improvement of Low Cost INS/GPS for Land Applications (20
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +52,9 @@ PHI, DV, DR, CORE_SIZE = 0, 3, 6, 9
 RATE_ERROR, FORCE_ERROR, RATE_SCALE, FORCE_SCALE, COLUMN_END = 9, 12, 15, 18, 21
 
 COEFFICIENTS = 58
-# Row widths of the arrays that `apply` works on: whole vectors of 8 doubles. The first holds a
-# covariance of up to STRIDE states, the second the nine navigation errors.
-STRIDE = 24
+# Row widths of the arrays that `apply` works on: whole vectors of 8 doubles. A covariance has rows
+# of the first of WIDTHS that holds its states; CORE_STRIDE holds the nine navigation errors.
+WIDTHS = (24, 32)
 CORE_STRIDE = 16
 
 
@@ -112,7 +114,8 @@ def coefficients(nav: Array, step: Array, h: float, c: Array) -> None:
         c[30 + j], c[40 + j], c[49 + j] = x, y, z
 
 
-def _apply_for(width: int):  # type: ignore[no-untyped-def]
+@cache
+def apply_for(width: int) -> Callable[[Array, Array, Array, Array], None]:
     """`apply` for rows of `width` doubles: a constant, so that the loop becomes vector code."""
 
     @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])", forceinline=True)
@@ -149,8 +152,7 @@ def _apply_for(width: int):  # type: ignore[no-untyped-def]
     return apply
 
 
-apply_to_state = _apply_for(STRIDE)
-apply_to_core = _apply_for(CORE_STRIDE)
+apply_to_core = apply_for(CORE_STRIDE)
 
 
 def dense_transition(nav: Array, step: Array, h: float) -> Array:
@@ -160,9 +162,9 @@ def dense_transition(nav: Array, step: Array, h: float) -> Array:
     """
     c = np.zeros(COEFFICIENTS)
     coefficients(nav, step, h, c)
-    unit = np.eye(CORE_SIZE + 6, STRIDE)
-    out = np.zeros(CORE_SIZE * STRIDE)
-    apply_to_state(unit[:CORE_SIZE].ravel(), unit[CORE_SIZE:].ravel(), c, out)
-    sensor_and_core = out.reshape(CORE_SIZE, STRIDE)[:, : CORE_SIZE + 6]
+    unit = np.eye(CORE_SIZE + 6, CORE_STRIDE)
+    out = np.zeros(CORE_SIZE * CORE_STRIDE)
+    apply_to_core(unit[:CORE_SIZE].ravel(), unit[CORE_SIZE:].ravel(), c, out)
+    sensor_and_core = out.reshape(CORE_SIZE, CORE_STRIDE)[:, : CORE_SIZE + 6]
     scale = sensor_and_core[:, CORE_SIZE:] * step[3:9]
     return np.hstack([sensor_and_core, scale])

@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.aiding.base import NotApplicable
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
-from fusiond.aiding.rdss_position import BIAS_BLOCK
 from fusiond.config import Imu, RdssAiding
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.model import Model, make_model, position_bias
+from fusiond.estimators.model import Model, make_model
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.intake import Intake
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -232,8 +231,7 @@ class Navigation:
 
     def __init__(self, case: Case, filter_: Filter, samples: Array, error: Array) -> None:
         self._intake = Intake({"rdss": _aiding(filter_)})
-        bias = self._intake.position_bias() if filter_.strategy else None
-        extra = [] if bias is None else [position_bias(BIAS_BLOCK, *bias)]
+        extra = self._intake.extra_blocks() if filter_.strategy else []
         self.model = make_model("planar15", imu_noise(case.imu), *extra)
         self.estimator = KalmanEstimator(self.model, case.imu.gap_s)
         self.innovations: dict[int, tuple[float, ...]] = {}

@@ -1,0 +1,258 @@
+r"""What every estimator is, and what all share: an error-state filter in a closed loop.
+
+One navigation state is propagated through the IMU's samples. Beside it run the statistics of its
+error: one covariance and one error estimate for each filter that the estimator keeps (`covs`,
+`dxs`; filter 0 is what is published). An estimate of the error is taken out of the navigation state
+(`feed_back`); parameters keep their estimates in `xi`.
+
+Gate: with S = H P H^T + R, nu^T S^-1 nu is chi-square with m degrees of freedom while filter and
+measurement agree; beyond the quantile of the aid's gate probability the measurement is left out.
+
+Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from fusiond.aiding.base import Linearised, State
+from fusiond.estimators.model import Model
+from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
+from fusiond.estimators.update import feed_back
+from fusiond.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
+
+Array = NDArray[np.float64]
+
+# One sigma (rad) added to the attitude when a filter that rejects everything is opened again: what
+# a bad alignment on the move can be wrong by.
+DOUBTED_ATTITUDE_RAD = math.radians(3.0)
+
+
+@lru_cache(maxsize=256)
+def gate_threshold(probability: float, degrees: int) -> float:
+    """Chi-square quantile for a gate probability."""
+    return float(chdtri(degrees, 1.0 - probability))
+
+
+class Outcome(NamedTuple):
+    """How an aid ended: its name, and the innovation that led to it (NIS, dimension, and L^-1 nu
+    with S = L L^T)."""
+
+    name: str
+    nis: float = float("nan")
+    degrees: int = 0
+    whitened: tuple[float, ...] = ()
+
+
+class Snapshot(NamedTuple):
+    """All that a later restore needs; `extra` is the estimator's own."""
+
+    t_ns: int
+    sample: int
+    nav: Array
+    xi: Array
+    covs: Array
+    dxs: Array
+    step: Array
+    holding: bool
+    extra: object
+
+
+class Estimator(Protocol):
+    """What timeline, navigator and studies know of an estimator: nothing of how it works.
+
+    State at `t_ns` (ns) after samples of the buffer up to, not including, `sample` (absolute).
+    """
+
+    model: Model
+    t_ns: int
+    sample: int
+    nav: Array
+    xi: Array
+
+    @property
+    def covariance(self) -> Array:
+        """P (n, n) of the published error state."""
+
+    @property
+    def sensor_errors(self) -> Array:
+        """Estimates (12,): rate bias (rad/s), force bias (m/s^2), rate and force scale (1)."""
+
+    @property
+    def isolated(self) -> dict[str, str]:
+        """Sources that a fault detection keeps out of the solution, and why."""
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+
+    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+
+    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
+        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes."""
+
+    def hold(self) -> None:
+        """From now on estimate without feedback: errors are carried along with the state."""
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+
+    def sigmas(self) -> Array:
+        """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
+
+    def snapshot(self) -> Snapshot:
+        """A copy of everything."""
+
+    def restore(self, s: Snapshot) -> None:
+        """Back to a snapshot, bit for bit."""
+
+
+class ErrorStateFilter:
+    """What the estimators share: the state, its propagation, feedback and snapshots.
+
+    `shares` (k,): filter i gets its process noise and its initial covariance divided by shares[i].
+    """
+
+    def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
+        self.model = model
+        self.gap_ns = round(gap_s * 1e9)
+        self.t_ns = 0
+        self.sample = 0
+        self.nav: Array = np.zeros(NAV_SIZE)
+        self.xi: Array = np.zeros(model.size)
+        self.step: Array = np.zeros(STEP_SIZE)
+        count, width = len(shares), model.width
+        self._covs: Array = np.zeros((count, width, width))
+        self._dxs: Array = np.zeros((count, model.size))
+        self._shares: Array = np.array(shares)
+        self._phi: Array = np.zeros((0, 0))
+        self._holding = False
+        self._carrying = False
+        self._scratch: Array = np.zeros(scratch_size(width))
+        self._kernel = propagate_for(width)
+
+    @property
+    def covariance(self) -> Array:
+        """P (n, n) of the published error state, a view."""
+        return self._covs[0, : self.model.size, : self.model.size]
+
+    @property
+    def isolated(self) -> dict[str, str]:
+        """Sources that a fault detection keeps out of the solution, and why."""
+        return {}
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+        self.t_ns, self.sample = t_ns, sample
+        self.nav[:], self.xi[:] = nav, xi
+        p = covariance.copy()
+        p[~self.model.active] = 0.0
+        p[:, ~self.model.active] = 0.0
+        n = self.model.size
+        self._covs[:] = 0.0
+        self._covs[:, :n, :n] = p / self._shares[:, None, None]
+        self._dxs[:], self._holding = 0.0, False
+        self.step[:] = 0.0
+        self.step[STEP_DCM:] = dcm_from_quaternion(self.nav[Q0:]).ravel()
+
+    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+        model = self.model
+        first, self.t_ns = self._kernel(
+            self.nav,
+            self.xi,
+            self._covs,
+            self._dxs,
+            self._shares,
+            self._phi,
+            self.step,
+            self._scratch,
+            model.hold_height,
+            model.active,
+            model.sensor_terms,
+            model.rate_terms,
+            model.noise,
+            imu.times,
+            imu.samples,
+            self.sample - imu.start,
+            imu.end,
+            self.t_ns,
+            target_ns,
+            self.gap_ns,
+            record,
+            imu.nav,
+            imu.sigmas,
+            self._holding or self._carrying,
+        )
+        self.sample = first + imu.start
+
+    @property
+    def state(self) -> State:
+        """What an aid may look at."""
+        return State(self.nav, self.xi, self.step, self.model)
+
+    @property
+    def sensor_errors(self) -> Array:
+        """Estimates (12,): rate bias (rad/s), force bias (m/s^2), rate and force scale (1)."""
+        estimate = np.empty(12)
+        slot, kind = self.model.sensor_terms
+        sensor_estimates(self.xi, slot, kind, estimate)
+        return estimate
+
+    def sigmas(self) -> Array:
+        """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
+        out = np.empty(9)
+        sigmas(self._covs[0], self.step, out)
+        return out
+
+    def _feed_back(self, dx: Array) -> None:
+        """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
+        feed_back(self.nav, self.xi, dx)
+
+    def _widen(self, cov: Array, z: Array, h: Array) -> None:
+        """Add the innovation's own square to the states that it measures directly, and doubt the
+        attitude: a filter that was this wrong about position was wrong about more."""
+        for slot in range(3):
+            cov[slot, slot] += DOUBTED_ATTITUDE_RAD**2
+        for row, value in zip(h, z, strict=True):
+            # Position or velocity before the attitude that turns a lever arm.
+            group = next(g for g in (slice(3, 9), slice(0, 3), slice(0, len(row))) if row[g].any())
+            slot = group.start + int(np.argmax(np.abs(row[group])))
+            if self.model.active[slot]:
+                cov[slot, slot] += value * value
+
+    def snapshot(self) -> Snapshot:
+        """A copy of everything."""
+        return Snapshot(
+            self.t_ns,
+            self.sample,
+            self.nav.copy(),
+            self.xi.copy(),
+            self._covs.copy(),
+            self._dxs.copy(),
+            self.step.copy(),
+            self._holding,
+            self._own_snapshot(),
+        )
+
+    def restore(self, s: Snapshot) -> None:
+        """Back to a snapshot, bit for bit."""
+        self.t_ns, self.sample = s.t_ns, s.sample
+        self.nav[:], self.xi[:], self._covs[:], self.step[:] = s.nav, s.xi, s.covs, s.step
+        self._dxs[:], self._holding = s.dxs, s.holding
+        self._own_restore(s.extra)
+
+    def _own_snapshot(self) -> object:
+        """What a kind of estimator keeps beside the shared state; never changed afterwards."""
+        return None
+
+    def _own_restore(self, extra: object) -> None:
+        """Back to what `_own_snapshot` gave."""
