@@ -1,0 +1,123 @@
+r"""Compiled kernel: update with many rows of which some may be wrong (pseudoranges).
+
+Each row is judged twice, both times against a chi-square quantile with one degree of freedom:
+
+    before   nu^2 / (h P h^T + r)                      its own gate, whatever the others say
+    after    v^2 / (r - h P+ h^T),  v = z - h dx+      the residual test of the update
+
+The residual's variance follows from v = (I - H K) nu; its square over that variance is the
+statistic of leaving the row out (Teunissen, Testing Theory, 2006, section 4.4: the w-test). While
+the largest fails, that row goes and the update is made anew from the rest. The order of the rows
+does not matter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+Codes = NDArray[np.int64]
+
+# What became of a row.
+KEPT, GATED, RESIDUAL = 0, 1, 2
+# A residual whose variance is this small a part of r tells nothing: the row alone determines a
+# state.
+_DETERMINED = 1e-6
+
+
+@compiled(
+    "f8(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, i8[::1], f8[::1], f8[:, ::1],"
+    "f8[::1])"
+)
+def screened_update(
+    cov: Array,
+    dx: Array,
+    z: Array,
+    h: Array,
+    r: Array,
+    threshold: float,
+    codes: Codes,
+    y: Array,
+    cov_out: Array,
+    dx_out: Array,
+) -> float:
+    """Fold the rows z = h dx + noise (variances r) that pass into `cov_out` and `dx_out`.
+
+    cov and cov_out (w, w), dx and dx_out (n,), z, r, y (m,), h (m, n). `codes` (m,) says what
+    became of each row; rows not KEPT at the call are left out from the start. y[a] is left as the
+    whitened innovation of a kept row, 0 otherwise. Returns the sum of their squares, nu^T S^-1 nu.
+    """
+    m, n = h.shape
+    columns = np.empty((m, n), dtype=np.int64)
+    counts = np.zeros(m, dtype=np.int64)
+    for a in range(m):
+        for i in range(n):
+            if h[a, i] != 0.0:
+                columns[a, counts[a]] = i
+                counts[a] += 1
+    for a in range(m):
+        innovation, s = z[a], r[a]
+        for p in range(counts[a]):
+            i = columns[a, p]
+            innovation -= h[a, i] * dx[i]
+            for q in range(counts[a]):
+                s += h[a, i] * cov[i, columns[a, q]] * h[a, columns[a, q]]
+        if codes[a] == KEPT and not innovation * innovation <= threshold * s:
+            codes[a] = GATED
+    u, k = np.empty(n), np.empty(n)
+    while True:
+        cov_out[:] = cov
+        dx_out[:] = dx
+        nis = 0.0
+        for a in range(m):
+            y[a] = 0.0
+            if codes[a] != KEPT:
+                continue
+            u[:] = 0.0
+            innovation = z[a]
+            for p in range(counts[a]):
+                i = columns[a, p]
+                c = h[a, i]
+                innovation -= c * dx_out[i]
+                for j in range(n):
+                    u[j] += c * cov_out[i, j]
+            s = r[a]
+            for p in range(counts[a]):
+                s += h[a, columns[a, p]] * u[columns[a, p]]
+            y[a] = innovation / np.sqrt(s)
+            nis += y[a] * y[a]
+            hk = 0.0
+            for i in range(n):
+                k[i] = u[i] / s
+                dx_out[i] += k[i] * innovation
+            for p in range(counts[a]):
+                hk += h[a, columns[a, p]] * k[columns[a, p]]
+            # Joseph form of one row, as in fusiond.estimators.update.
+            c = r[a] - (1.0 - hk) * s
+            for i in range(n):
+                ck = c * k[i]
+                for j in range(n):
+                    cov_out[i, j] += ck * k[j] - k[i] * u[j]
+            for i in range(n):
+                for j in range(i):
+                    mean = 0.5 * (cov_out[i, j] + cov_out[j, i])
+                    cov_out[i, j] = mean
+                    cov_out[j, i] = mean
+        worst, greatest = -1, threshold
+        for a in range(m):
+            if codes[a] != KEPT:
+                continue
+            residual, variance = z[a], r[a]
+            for p in range(counts[a]):
+                i = columns[a, p]
+                residual -= h[a, i] * dx_out[i]
+                for q in range(counts[a]):
+                    variance -= h[a, i] * cov_out[i, columns[a, q]] * h[a, columns[a, q]]
+            if variance > _DETERMINED * r[a] and residual * residual > greatest * variance:
+                worst, greatest = a, residual * residual / variance
+        if worst < 0:
+            return nis
+        codes[worst] = RESIDUAL
