@@ -1,10 +1,10 @@
-"""NMEA 0183 sentences out of a byte stream that may also carry UBX and RTCM 3 frames: no I/O.
+"""NMEA 0183 sentences, UBX and RTCM 3 frames out of one byte stream: no I/O.
 
     sentence    $ address , fields * hh          hh = XOR of what stands between $ and *
     UBX         B5 62 class id length16 payload ck_a ck_b     8-bit Fletcher from class on
     RTCM 3      D3 000000 length10 payload crc24q             from D3 on
 
-Binary frames are skipped whole, so that a `$` inside one starts nothing. A frame whose check fails,
+Binary frames are taken whole, so that a `$` inside one starts nothing. A frame whose check fails,
 or inside which a whole sentence verifies, was none: scanning goes on one byte behind its first.
 Sources: NMEA 0183 4.11 section 5.3; u-blox ZED-F9P interface description section 3; RTCM 10403.3
 section 4.
@@ -75,33 +75,50 @@ def is_rdss_sentence(sentence: Sentence) -> bool:
     return sentence.formatter in _RDSS
 
 
-class NmeaSplitter:
-    """Bytes in, verified sentences out, whatever the splits.
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A verified binary frame, `raw` from its first sync byte to its last check byte."""
+
+    kind: Literal["ubx", "rtcm"]
+    raw: bytes
+
+
+Item = Sentence | Frame
+
+
+class StreamSplitter:
+    """Bytes in, verified sentences and binary frames out, whatever the splits.
 
     Counts in `counters`: `sentences`, `ubx_frames`, `rtcm_frames`; refused `checksum_bad`,
     `checksum_missing`, `sentence_too_long`, `inner_dollar`, `not_text`, `address_bad`,
-    `ubx_damaged`, `rtcm_damaged`; and `garbage_bytes`, all that belonged to nothing.
+    `ubx_damaged`, `rtcm_damaged`, `frame_cut` (the stream ended inside it); and `garbage_bytes`,
+    all that belonged to nothing.
     """
 
     def __init__(self, counters: Counter[str] | None = None) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self._buffer = bytearray()
 
-    def feed(self, data: bytes) -> list[Sentence]:
-        """The sentences that `data` completes, in order."""
-        sentences: list[Sentence] = []
+    @property
+    def waiting(self) -> int:
+        """Bytes kept until more come."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> list[Item]:
+        """The sentences and frames that `data` completes, in order."""
+        items: list[Item] = []
         for start in range(0, len(data), SLICE):
             self._buffer += data[start : start + SLICE]
-            self._scan(sentences, final=False)
-        return sentences
+            self._scan(items, final=False)
+        return items
 
-    def finish(self) -> list[Sentence]:
+    def finish(self) -> list[Item]:
         """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
-        sentences: list[Sentence] = []
-        self._scan(sentences, final=True)
-        return sentences
+        items: list[Item] = []
+        self._scan(items, final=True)
+        return items
 
-    def _scan(self, sentences: list[Sentence], *, final: bool) -> None:
+    def _scan(self, items: list[Item], *, final: bool) -> None:
         buffer, at = self._buffer, 0
         while True:
             start = _START.search(buffer, at)
@@ -112,16 +129,18 @@ class NmeaSplitter:
             self._garbage(buffer[at : start.start()])
             at = start.start()
             if buffer[at] == 0x24:
-                used = self._sentence(at, sentences)
+                used = self._sentence(at, items)
             elif buffer[at] == 0xB5:
-                used = self._binary(at, _ubx_length(buffer, at), "ubx")
+                used = self._binary(at, _ubx_length(buffer, at), "ubx", items)
             else:
-                used = self._binary(at, _rtcm_length(buffer, at), "rtcm")
+                used = self._binary(at, _rtcm_length(buffer, at), "rtcm", items)
             if used is None:
                 if not final:
                     break
                 used = 1
                 self.counters["garbage_bytes"] += 1
+                if buffer[at] != 0x24:
+                    self.counters["frame_cut"] += 1
             at += used
         del buffer[:at]
 
@@ -133,7 +152,7 @@ class NmeaSplitter:
         self.counters["garbage_bytes"] += length
         return length
 
-    def _sentence(self, at: int, sentences: list[Sentence]) -> int | None:
+    def _sentence(self, at: int, items: list[Item]) -> int | None:
         """Bytes used by the sentence that starts at `at`, good or not; None: more are needed."""
         buffer = self._buffer
         stop = _NOT_BODY.search(buffer, at + 1, at + MAX_SENTENCE - 2)
@@ -146,11 +165,11 @@ class NmeaSplitter:
         if byte == 0x2A:
             if len(buffer) < end + 3:
                 return None
-            return self._verify(at, end, sentences)
+            return self._verify(at, end, items)
         why = {0x24: "inner_dollar", 0x0D: "checksum_missing", 0x0A: "checksum_missing"}
         return self._refuse(why.get(byte, "not_text"), end - at)
 
-    def _verify(self, at: int, star: int, sentences: list[Sentence]) -> int:
+    def _verify(self, at: int, star: int, items: list[Item]) -> int:
         raw = bytes(self._buffer[at : star + 3])
         if not _verifies(raw):
             # The two bytes behind the star may be the start of something else.
@@ -159,10 +178,12 @@ class NmeaSplitter:
         if not _ADDRESS.match(address):
             return self._refuse("address_bad", len(raw))
         self.counters["sentences"] += 1
-        sentences.append(Sentence(address, tuple(fields), raw))
+        items.append(Sentence(address, tuple(fields), raw))
         return len(raw)
 
-    def _binary(self, at: int, length: int | None, kind: Literal["ubx", "rtcm"]) -> int | None:
+    def _binary(
+        self, at: int, length: int | None, kind: Literal["ubx", "rtcm"], items: list[Item]
+    ) -> int | None:
         """As `_sentence`, for a frame of `length` (0: no such header; None: not known yet)."""
         if length is None:
             return None
@@ -180,7 +201,29 @@ class NmeaSplitter:
         if not (_ubx_verifies(frame) if kind == "ubx" else crc24q(frame) == 0):
             return self._refuse(f"{kind}_damaged", 1)
         self.counters[f"{kind}_frames"] += 1
+        items.append(Frame(kind, frame))
         return length
+
+
+class NmeaSplitter:
+    """`StreamSplitter` for whoever wants the sentences only."""
+
+    def __init__(self, counters: Counter[str] | None = None) -> None:
+        self._stream = StreamSplitter(counters)
+        self.counters = self._stream.counters
+
+    @property
+    def waiting(self) -> int:
+        """Bytes kept until more come."""
+        return self._stream.waiting
+
+    def feed(self, data: bytes) -> list[Sentence]:
+        """The sentences that `data` completes, in order."""
+        return [item for item in self._stream.feed(data) if isinstance(item, Sentence)]
+
+    def finish(self) -> list[Sentence]:
+        """As `StreamSplitter.finish`."""
+        return [item for item in self._stream.finish() if isinstance(item, Sentence)]
 
 
 def _verifies(raw: bytes) -> bool:

@@ -130,11 +130,11 @@ def test_endless_streams_stay_bounded() -> None:
         splitter = NmeaSplitter()
         for start in range(0, len(endless), 1000):
             splitter.feed(endless[start : start + 1000])
-            assert len(splitter._buffer) <= MAX_SENTENCE
+            assert splitter.waiting <= MAX_SENTENCE
     splitter = NmeaSplitter()
     for _ in range(40):
         splitter.feed(b"\xb5\x62\x02\x15\x00\x20" * 200)
-        assert len(splitter._buffer) <= MAX_UBX_PAYLOAD + 8
+        assert splitter.waiting <= MAX_UBX_PAYLOAD + 8
     assert [s.raw for s in splitter.feed(HDT)] == [HDT.rstrip()]
 
 

@@ -1,0 +1,100 @@
+"""Bit strings of broadcast messages and the scaled numbers in them, by table.
+
+    value = n * 2^exponent            n: `length` bits from bit `at`, most significant first,
+                                      two's complement where signed; angles times PI
+
+A table names each number once: where it starts, how long it is, and what its last bit weighs. Bits
+count from 0, in a string from which parity and headers were taken out, so that a number which the
+message splits over two words or pages stands in one piece.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+PI = 3.1415926535898
+"""The value that IS-GPS-200 (20.3.3.4.3), BDS-SIS-ICD-B1I and the Galileo OS SIS ICD prescribe."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bits:
+    """`length` bits in the integer `value`; bit 0 is the most significant one."""
+
+    value: int
+    length: int
+
+    def unsigned(self, at: int, length: int) -> int:
+        """`length` bits from bit `at`."""
+        return self.value >> (self.length - at - length) & ((1 << length) - 1)
+
+    def signed(self, at: int, length: int) -> int:
+        """The same as two's complement."""
+        n = self.unsigned(at, length)
+        return n - (1 << length) if n >> (length - 1) else n
+
+    def cut(self, start: int, end: int) -> Bits:
+        """The bits from `start` to before `end`."""
+        return Bits(self.unsigned(start, end - start), end - start)
+
+    @classmethod
+    def join(cls, *parts: Bits) -> Bits:
+        """One string out of several."""
+        value = length = 0
+        for part in parts:
+            value = value << part.length | part.value
+            length += part.length
+        return cls(value, length)
+
+    @classmethod
+    def of_bytes(cls, data: bytes) -> Bits:
+        return cls(int.from_bytes(data, "big"), 8 * len(data))
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A number of a message: see the module."""
+
+    at: int
+    length: int
+    signed: bool = False
+    exponent: int = 0
+    factor: float = 1.0
+
+    def read(self, bits: Bits) -> float:
+        n = (
+            bits.signed(self.at, self.length)
+            if self.signed
+            else bits.unsigned(self.at, self.length)
+        )
+        return n * 2.0**self.exponent * self.factor
+
+
+def u(at: int, length: int, exponent: int = 0, factor: float = 1.0) -> Number:
+    """Unsigned."""
+    return Number(at, length, False, exponent, factor)
+
+
+def s(at: int, length: int, exponent: int = 0, factor: float = 1.0) -> Number:
+    """Signed."""
+    return Number(at, length, True, exponent, factor)
+
+
+def angle(at: int, length: int, exponent: int) -> Number:
+    """Signed, sent in semicircles (or semicircles per second), read in rad."""
+    return Number(at, length, True, exponent, PI)
+
+
+Table = dict[str, Number]
+
+
+def read(bits: Bits, table: Table) -> dict[str, Any]:
+    """The numbers of `table` by name, as floats."""
+    return {name: number.read(bits) for name, number in table.items()}
+
+
+def klobuchar_table(at: int) -> tuple[Table, Table]:
+    """Alpha and beta of GPS and BeiDou, eight bits each, one behind the other from bit `at`."""
+    alpha = {f"{i}": s(at + 8 * i, 8, e) for i, e in enumerate((-30, -27, -24, -24))}
+    beta = {f"{i}": s(at + 32 + 8 * i, 8, e) for i, e in enumerate((11, 14, 16, 16))}
+    return alpha, beta

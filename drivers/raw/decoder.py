@@ -1,0 +1,215 @@
+"""Bytes of a receiver's raw output in, observations and ephemerides out: no I/O, no clock.
+
+Every verified frame ends in exactly one of these counters:
+
+    UBX     rawx, rawx_unreadable, time_unset; sfrbx_unreadable, one name per subframe; ubx_not_used
+    RTCM 3  msm, week_unknown, rtcm_ephemerides, ..._not_used, rtcm_unreadable, and the refusals of
+            an ephemeris
+
+A subframe's name is `subframes_lnav`, `_d1`, `_d2` or `_inav` where it was used, a message that is
+not decoded (`fnav_not_used`), or the reason of its refusal (`parity_bad`). See `docs/gnss-raw.md`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from datetime import date
+from typing import Protocol
+
+from drivers.measurements import UtcStamp
+from drivers.nmea_decoder import BUILD_DATE
+from drivers.nmea_framing import Frame, StreamSplitter
+from drivers.raw.beidou_words import GEO
+from drivers.raw.d1 import D1Decoder
+from drivers.raw.d2 import D2Decoder
+from drivers.raw.inav import InavDecoder
+from drivers.raw.lnav import PREAMBLE, LnavDecoder
+from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch
+from drivers.raw.rtcm import RtcmDecoder
+from drivers.raw.subframes import Decoded, RefusedError, Subframe
+from drivers.raw.ubx import (
+    MAX_PRN,
+    OTHER_SYSTEMS,
+    RAWX,
+    SFRBX,
+    SYSTEM_BY_ID,
+    Sfrbx,
+    parse_rawx,
+    parse_sfrbx,
+)
+from drivers.raw.weeks import FIRST_RAWX_WEEK, LEAP_SECONDS, WeekReference, utc_ns
+
+
+class MessageDecoder(Protocol):
+    """Of one satellite, one message."""
+
+    def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded: ...
+
+
+_DECODERS: dict[str, Callable[[], MessageDecoder]] = {
+    "lnav": LnavDecoder,
+    "d1": D1Decoder,
+    "d2": D2Decoder,
+    "inav": InavDecoder,
+}
+_BEIDOU_D1, _BEIDOU_D2 = frozenset({0, 2, 4}), frozenset({1, 3, 10})
+_GALILEO_INAV, _GALILEO_FNAV = frozenset({0, 1, 5}), frozenset({3, 4})
+
+
+class RawDecoder:
+    """`feed` bytes, get events; `flush` at the end of the file.
+
+    `earliest` resolves a 10-bit GPS week where the stream gives no fuller one; set it back to read
+    an old RTCM log. With `rtcm` off, RTCM 3 frames are counted as `rtcm_not_used`; with it on, the
+    first one needs pyrtcm: PermanentDriverError where it is not installed.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        counters: Counter[str] | None = None,
+        *,
+        earliest: date = BUILD_DATE,
+        rtcm: bool = True,
+    ) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self.leap_seconds: int | None = None
+        """GPS time minus UTC as the receiver last said that it knows it."""
+        self._source = source
+        self._splitter = StreamSplitter(self.counters)
+        self._weeks = WeekReference(earliest)
+        self._rtcm = RtcmDecoder(source, self._weeks, self.counters) if rtcm else None
+        self._messages: dict[tuple[str, int, int], MessageDecoder] = {}
+        self._ionosphere: dict[str, Klobuchar] = {}
+
+    def feed(self, data: bytes, t_seen_ns: int) -> list[RawEvent]:
+        """The events that `data`, seen at `t_seen_ns`, completes. Sentences are left out."""
+        found: list[RawEvent] = []
+        for item in self._splitter.feed(data):
+            if isinstance(item, Frame):
+                found += self.take(item, t_seen_ns)
+        return found
+
+    def flush(self) -> list[RawEvent]:
+        """The stream ended, or broke: everything that can still be had from what came."""
+        found: list[RawEvent] = []
+        for item in self._splitter.finish():
+            if isinstance(item, Frame):
+                found += self.take(item, 0)
+        return found + self.flush_epoch()
+
+    def flush_epoch(self) -> list[RawEvent]:
+        """No more of an epoch of MSM will come."""
+        return [] if self._rtcm is None else self._rtcm.flush()
+
+    def note_utc(self, utc: int) -> None:
+        """UTC (POSIX ns) from another source, to be believed: it dates MSM epochs."""
+        self._weeks.note_utc(utc, self.leap_seconds or LEAP_SECONDS)
+
+    def take(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
+        """What a frame that `StreamSplitter` verified completes."""
+        if frame.kind == "rtcm":
+            if self._rtcm is not None:
+                return self._rtcm.take(frame.raw, t_seen_ns)
+            self.counters["rtcm_not_used"] += 1
+            return []
+        kind, payload = frame.raw[2:4], frame.raw[6:-2]
+        if kind == RAWX:
+            return self._observe(payload, t_seen_ns)
+        if kind == SFRBX:
+            subframe = parse_sfrbx(payload)
+            if subframe is None:
+                self.counters["sfrbx_unreadable"] += 1
+                return []
+            return self._broadcast(subframe, t_seen_ns)
+        self.counters["ubx_not_used"] += 1
+        return []
+
+    def _observe(self, payload: bytes, t_seen_ns: int) -> list[RawEvent]:
+        epoch = parse_rawx(payload, self.counters)
+        if epoch is None:
+            self.counters["rawx_unreadable"] += 1
+            return []
+        if epoch.week < FIRST_RAWX_WEEK:
+            self.counters["time_unset"] += 1
+            return []
+        self.counters["rawx"] += 1
+        self.counters["epochs_raw"] += 1
+        self.counters["clock_reset"] += epoch.clock_reset
+        self.leap_seconds = leap = epoch.leap_seconds
+        if leap is None:
+            self.counters["leap_seconds_assumed"] += 1
+            leap = LEAP_SECONDS
+        elif self._rtcm is not None:
+            self._rtcm.leap_seconds = leap
+        self._weeks.note(epoch.week, epoch.tow_s)
+        stamp = UtcStamp(utc_ns(epoch.week, epoch.tow_s, leap))
+        return [
+            RawGnssEpoch(
+                self._source,
+                t_seen_ns,
+                stamp,
+                epoch.week,
+                epoch.tow_s,
+                epoch.signals,
+                epoch.clock_reset,
+            )
+        ]
+
+    def _broadcast(self, sfrbx: Sfrbx, t_seen_ns: int) -> list[RawEvent]:
+        message = message_of(sfrbx)
+        system = SYSTEM_BY_ID.get(sfrbx.gnss_id)
+        if system is None or message not in _DECODERS:
+            self.counters[message] += 1
+            return []
+        if not 1 <= sfrbx.prn <= MAX_PRN[system]:
+            self.counters["satellite_unknown"] += 1
+            return []
+        key = (message, sfrbx.prn, sfrbx.signal_id)
+        decoder = self._messages.get(key)
+        if decoder is None:
+            decoder = self._messages[key] = _DECODERS[message]()
+        subframe = Subframe(
+            self._source, t_seen_ns, system, sfrbx.prn, sfrbx.signal_id, sfrbx.words
+        )
+        try:
+            decoded = decoder.take(subframe, self._weeks)
+        except RefusedError as refused:
+            self.counters[str(refused)] += 1
+            return []
+        self.counters[f"subframes_{message}"] += 1
+        return [event for event in decoded if self._is_news(event)]
+
+    def _is_news(self, event: Ephemeris | Klobuchar) -> bool:
+        """Every whole ephemeris counts, for its health and age; an ionosphere once."""
+        if isinstance(event, Ephemeris):
+            self.counters["ephemerides"] += 1
+            return True
+        last = self._ionosphere.get(event.system)
+        if last is not None and (last.alpha, last.beta) == (event.alpha, event.beta):
+            return False
+        self._ionosphere[event.system] = event
+        self.counters["ionospheres"] += 1
+        return True
+
+
+def message_of(sfrbx: Sfrbx) -> str:
+    """The message in a SFRBX: a key of the decoders, or the counter of what is not decoded.
+
+    Receivers before generation 9 leave sigId 0; the satellite or the words then tell.
+    """
+    signal = sfrbx.signal_id
+    if sfrbx.gnss_id == 0:
+        # CNAV starts with its preamble in the top byte, LNAV two bits later.
+        cnav = signal != 0 or (bool(sfrbx.words) and sfrbx.words[0] >> 24 == PREAMBLE)
+        return "gps_cnav_not_used" if cnav else "lnav"
+    if sfrbx.gnss_id == 2:
+        if signal in _GALILEO_INAV:
+            return "inav"
+        return "fnav_not_used" if signal in _GALILEO_FNAV else "galileo_cnav_not_used"
+    if sfrbx.gnss_id == 3:
+        if signal in _BEIDOU_D2 or (signal in _BEIDOU_D1 and sfrbx.prn in GEO):
+            return "d2"
+        return "d1" if signal in _BEIDOU_D1 else "bcnav_not_used"
+    return f"{OTHER_SYSTEMS.get(sfrbx.gnss_id, 'unknown_system')}_not_used"

@@ -1,0 +1,319 @@
+"""RTCM 3: MSM4 to MSM7 of GPS, Galileo and BeiDou, and the ephemerides 1019, 1042, 1045, 1046.
+
+    pseudorange  c/1000 * (DF397 + DF398 + DF400)     DF405 in place of DF400 in MSM6 and 7; ms
+    carrier      f/1000 * (DF397 + DF398 + DF401)     DF406 in MSM6 and 7; cycles
+    rate         DF399 + DF404                        MSM5 and 7; m/s, positive while it grows
+    epoch        DF004, DF248: GPS time; DF427: BeiDou time, 14 s behind it; ms of week
+    angles       semicircles, times PI
+
+The messages of one epoch, one a system, become one `RawGnssEpoch`: it ends with the message whose
+multiple-message bit (DF393) is off, whatever its system, or with the next epoch. The week is not
+sent; it is the one that puts the epoch nearest to the last instant known in full. pyrtcm takes the
+payloads apart; it is imported with the first of them. Source: RTCM 10403.3, sections 3.5.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from drivers.base import PermanentDriverError
+from drivers.measurements import UtcStamp
+from drivers.raw.beidou_words import GEO
+from drivers.raw.bits import PI, Bits
+from drivers.raw.messages import (
+    CARRIER_HZ,
+    SPEED_OF_LIGHT_M_S,
+    Ephemeris,
+    RawEvent,
+    RawGnssEpoch,
+    RawSignal,
+    System,
+)
+from drivers.raw.subframes import RefusedError, check_orbit, sisa_m, ura_m
+from drivers.raw.ubx import MAX_PRN, PSEUDORANGE_M
+from drivers.raw.weeks import BDT_BEHIND_GPS_S, LEAP_SECONDS, WEEK_S, WeekReference, utc_ns
+
+MSM_SYSTEMS: dict[int, System] = {107: "G", 109: "E", 112: "C"}
+"""By the message number without its last digit, which is the kind of MSM."""
+MSM_KINDS = frozenset({4, 5, 6, 7})
+OTHER_MSM = {
+    108: "glonass_not_used",
+    110: "sbas_not_used",
+    111: "qzss_not_used",
+    113: "navic_not_used",
+}
+EPHEMERIDES: dict[int, System] = {1019: "G", 1042: "C", 1045: "E", 1046: "E"}
+
+_MS_M = SPEED_OF_LIGHT_M_S / 1000.0
+_NO_RANGE_MS = 255
+_NO_RATE_M_S = -8192
+_EPOCH_FIELD: dict[System, str] = {"G": "DF004", "E": "DF248", "C": "DF427"}
+
+# What a field that says "not valid" reads as: its most negative number.
+_NO_FINE_RANGE_MS = {"DF400": -(2.0**-10), "DF405": -(2.0**-10)}
+_NO_FINE_CARRIER_MS = {"DF401": -(2.0**-8), "DF406": -(2.0**-8)}
+_NO_FINE_RATE_M_S = -1.6384
+
+# Fields of the ephemerides: GPS, BeiDou, Galileo.
+_NAMES = (
+    ("inclination_rate", "DF079", "DF491", "DF292"),
+    ("toc_s", "DF081", "DF493", "DF293"),
+    ("clock_drift_rate", "DF082", "DF494", "DF294"),
+    ("clock_drift", "DF083", "DF495", "DF295"),
+    ("clock_bias_s", "DF084", "DF496", "DF296"),
+    ("crs", "DF086", "DF498", "DF297"),
+    ("mean_motion_correction", "DF087", "DF499", "DF298"),
+    ("mean_anomaly", "DF088", "DF500", "DF299"),
+    ("cuc", "DF089", "DF501", "DF300"),
+    ("eccentricity", "DF090", "DF502", "DF301"),
+    ("cus", "DF091", "DF503", "DF302"),
+    ("sqrt_a", "DF092", "DF504", "DF303"),
+    ("toe_s", "DF093", "DF505", "DF304"),
+    ("cic", "DF094", "DF506", "DF305"),
+    ("ascending_node", "DF095", "DF507", "DF306"),
+    ("cis", "DF096", "DF508", "DF307"),
+    ("inclination", "DF097", "DF509", "DF308"),
+    ("crc", "DF098", "DF510", "DF309"),
+    ("perigee", "DF099", "DF511", "DF310"),
+    ("ascending_node_rate", "DF100", "DF512", "DF311"),
+)
+_COLUMN: dict[System, int] = {"G": 1, "C": 2, "E": 3}
+_ANGLES = frozenset(
+    {
+        "inclination_rate",
+        "mean_motion_correction",
+        "mean_anomaly",
+        "ascending_node",
+        "inclination",
+        "perigee",
+        "ascending_node_rate",
+    }
+)
+
+Parse = Callable[[bytes], Any]
+
+
+def load_pyrtcm() -> Parse:
+    """The parser of a frame. PermanentDriverError when pyrtcm is not installed."""
+    try:
+        pyrtcm = importlib.import_module("pyrtcm")
+    except ImportError as error:
+        raise PermanentDriverError(
+            "RTCM 3 needs the package pyrtcm: install fusiond[raw], or set rtcm = false"
+        ) from error
+    parse: Parse = pyrtcm.RTCMReader.parse
+    return parse
+
+
+class RtcmDecoder:
+    """Verified frames in, events out. Counts every frame by one name, and refused signals."""
+
+    def __init__(self, source: str, weeks: WeekReference, counters: Counter[str]) -> None:
+        self.leap_seconds: int | None = None
+        """What another message of the stream said."""
+        self._source = source
+        self._weeks = weeks
+        self._counters = counters
+        self._parse: Parse | None = None
+        self._epoch: tuple[int, float] | None = None
+        self._signals: dict[tuple[str, int, str], RawSignal] = {}
+        self._t_seen_ns = 0
+
+    def take(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
+        """What this frame completes."""
+        bits = Bits.of_bytes(frame[3:-3])
+        number = bits.unsigned(0, 12) if bits.length >= 12 else 0
+        group, kind = divmod(number, 10)
+        msm = 1 <= kind <= 7 and (group in MSM_SYSTEMS or group in OTHER_MSM)
+        if msm and bits.length < 55:
+            self._counters["rtcm_unreadable"] += 1
+            return []
+        if not msm and number not in EPHEMERIDES:
+            self._counters["rtcm_not_used"] += 1
+            return []
+        found: list[RawEvent] = []
+        if not msm or (group in MSM_SYSTEMS and kind in MSM_KINDS):
+            message = self._message(frame)
+            if message is None:
+                self._counters["rtcm_unreadable"] += 1
+            elif msm:
+                self._observe(MSM_SYSTEMS[group], message, t_seen_ns, found)
+            else:
+                self._ephemeris(number, message, t_seen_ns, found)
+        elif group in MSM_SYSTEMS:
+            self._counters["msm_kind_not_used"] += 1
+        else:
+            self._counters[OTHER_MSM[group]] += 1
+        if msm and not bits.unsigned(54, 1):  # DF393: this was the last message of the epoch
+            found += self.flush()
+        return found
+
+    def flush(self) -> list[RawEvent]:
+        """The epoch that is open, when there is one."""
+        epoch, signals = self._epoch, tuple(self._signals.values())
+        self._epoch = None
+        self._signals.clear()
+        if epoch is None:
+            return []
+        week, tow_s = epoch
+        leap = self.leap_seconds
+        if leap is None:
+            self._counters["leap_seconds_assumed"] += 1
+            leap = LEAP_SECONDS
+        self._counters["epochs_raw"] += 1
+        stamp = UtcStamp(utc_ns(week, tow_s, leap))
+        return [RawGnssEpoch(self._source, self._t_seen_ns, stamp, week, tow_s, signals)]
+
+    def _message(self, frame: bytes) -> Any | None:
+        """pyrtcm's view of the frame; None when it cannot read it, whatever it raises."""
+        if self._parse is None:
+            self._parse = load_pyrtcm()
+        try:
+            return self._parse(frame)
+        except Exception:  # it indexes what a damaged or newer message does not have
+            return None
+
+    # ----------------------------------------------------------------- observations
+
+    def _observe(self, system: System, message: Any, t_seen_ns: int, found: list[RawEvent]) -> None:
+        tow_s = getattr(message, _EPOCH_FIELD[system]) * 1e-3
+        if system == "C":
+            tow_s = (tow_s + BDT_BEHIND_GPS_S) % WEEK_S
+        if not 0.0 <= tow_s < WEEK_S:
+            self._counters["rtcm_unreadable"] += 1
+            return
+        week = self._weeks.week_of_tow(tow_s)
+        if week is None:
+            self._counters["week_unknown"] += 1
+            return
+        self._counters["msm"] += 1
+        if self._epoch is not None and self._epoch != (week, tow_s):
+            found += self.flush()
+        self._epoch, self._t_seen_ns = (week, tow_s), t_seen_ns
+        self._weeks.note_tow(week, tow_s)
+        for signal in _signals(system, message, self._counters):
+            key = (signal.system, signal.prn, signal.signal)
+            if key in self._signals:
+                self._counters["signal_repeated"] += 1
+                continue
+            self._signals[key] = signal
+
+    # ----------------------------------------------------------------- ephemerides
+
+    def _ephemeris(self, number: int, message: Any, t_seen_ns: int, found: list[RawEvent]) -> None:
+        system = EPHEMERIDES[number]
+        try:
+            ephemeris = self._build(system, number, message, t_seen_ns)
+            check_orbit(ephemeris)
+        except RefusedError as refused:
+            self._counters[str(refused)] += 1
+        except (AttributeError, TypeError, ValueError):
+            self._counters["rtcm_unreadable"] += 1
+        else:
+            self._counters["rtcm_ephemerides"] += 1
+            found.append(ephemeris)
+
+    def _build(self, system: System, number: int, message: Any, t_seen_ns: int) -> Ephemeris:
+        def value(name: str) -> Any:
+            return getattr(message, name)
+
+        numbers: dict[str, Any] = {}
+        for row in _NAMES:
+            scale = PI if row[0] in _ANGLES else 1.0
+            numbers[row[0]] = float(value(row[_COLUMN[system]])) * scale
+        toe_s = numbers["toe_s"]
+        prn = int(value({"G": "DF009", "C": "DF488", "E": "DF252"}[system]))
+        if not 1 <= prn <= MAX_PRN[system]:
+            raise RefusedError("satellite_unknown")
+        rest: dict[str, Any]
+        if system == "G":
+            if value("DF085") & 0xFF != value("DF071"):
+                raise RefusedError("ephemeris_mixed")
+            rest = {
+                "message": "lnav",
+                "week": self._weeks.gps_week(value("DF076"), toe_s),
+                "group_delay_s": (value("DF101"),),
+                "issue": value("DF071"),
+                "accuracy_m": ura_m(value("DF077")),
+                "healthy": value("DF102") == 0,
+            }
+        elif system == "C":
+            if numbers["toc_s"] != toe_s:
+                raise RefusedError("ephemeris_mixed")
+            rest = {
+                "message": "d2" if prn in GEO else "d1",
+                "week": self._weeks.bdt_week(value("DF489"), toe_s),
+                "group_delay_s": (value("DF513") * 1e-9, value("DF514") * 1e-9),
+                "issue": value("DF492"),
+                "accuracy_m": ura_m(value("DF490")),
+                "healthy": value("DF515") == 0,
+            }
+        else:
+            rest = {
+                "week": self._weeks.galileo_week(value("DF289"), toe_s),
+                "issue": value("DF290"),
+            }
+            if number == 1045:
+                rest |= {
+                    "message": "fnav",
+                    "group_delay_s": (value("DF312"),),
+                    "accuracy_m": sisa_m(value("DF291")),
+                    "healthy": value("DF314") == 0 and value("DF315") == 0,
+                }
+            else:
+                rest |= {
+                    "message": "inav",
+                    "group_delay_s": (value("DF312"), value("DF313")),
+                    "accuracy_m": sisa_m(value("DF286")),
+                    "healthy": value("DF287") == 0 and value("DF288") == 0,
+                }
+        return Ephemeris(self._source, t_seen_ns, system, prn, **rest, **numbers)
+
+
+def _signals(system: System, message: Any, counters: Counter[str]) -> list[RawSignal]:
+    """The cells of an MSM that are good; the others counted."""
+    satellites = {
+        getattr(message, f"PRN_{i:02d}"): (
+            getattr(message, f"DF397_{i:02d}"),
+            getattr(message, f"DF398_{i:02d}"),
+            getattr(message, f"DF399_{i:02d}", _NO_RATE_M_S),
+        )
+        for i in range(1, message.NSat + 1)
+    }
+    fine = "DF405" if hasattr(message, "DF405_01") else "DF400"
+    phase = "DF406" if fine == "DF405" else "DF401"
+    strength = "DF408" if fine == "DF405" else "DF403"
+    found: list[RawSignal] = []
+    for i in range(1, message.NCell + 1):
+        counters[f"measured_{system}"] += 1
+        name, code = getattr(message, f"CELLPRN_{i:02d}"), getattr(message, f"CELLSIG_{i:02d}")
+        carrier_hz = CARRIER_HZ.get((system, code[:1]))
+        if carrier_hz is None or len(code) != 2:
+            counters["signal_unknown"] += 1
+            continue
+        if not (name.isdigit() and 1 <= int(name) <= MAX_PRN[system]):
+            counters["prn_unknown"] += 1
+            continue
+        whole, part, rough_rate = satellites[name]
+        rest = getattr(message, f"{fine}_{i:02d}")
+        if whole == _NO_RANGE_MS or rest <= _NO_FINE_RANGE_MS[fine]:
+            counters["pseudorange_invalid"] += 1
+            continue
+        pseudorange_m = (whole + part + rest) * _MS_M
+        if not PSEUDORANGE_M[0] <= pseudorange_m <= PSEUDORANGE_M[1]:
+            counters["pseudorange_implausible"] += 1
+            continue
+        turn = getattr(message, f"{phase}_{i:02d}")
+        carrier = None
+        if turn > _NO_FINE_CARRIER_MS[phase]:
+            carrier = (whole + part + turn) * carrier_hz * 1e-3
+        fine_rate = getattr(message, f"DF404_{i:02d}", _NO_FINE_RATE_M_S)
+        rate = None
+        if rough_rate != _NO_RATE_M_S and fine_rate > _NO_FINE_RATE_M_S + 1e-9:
+            rate = rough_rate + fine_rate
+        cno = getattr(message, f"{strength}_{i:02d}") or None
+        found.append(RawSignal(system, int(name), code, pseudorange_m, rate, carrier, cno))
+    return found

@@ -1,0 +1,116 @@
+"""Subframes of one satellite gathered until they make an ephemeris: what every message shares.
+
+A decoder of a message takes one verified block (a subframe, page or word) at a time and returns
+what it completes. What it refuses it names by raising `RefusedError`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.raw.messages import Ephemeris, Klobuchar, System
+from drivers.raw.weeks import HALF_WEEK_S, WeekReference
+
+MAX_ECCENTRICITY = 0.5
+"""What the 32 bits of IS-GPS-200 table 20-III are said to hold at most (0.03); GPS and Galileo
+reserve the rest, Galileo's E14 and E18 have 0.17."""
+SQRT_A_M = (4000.0, 7000.0)
+"""Orbit radius 16,000 to 49,000 km: MEO is above 25,500 km, GEO and IGSO at 42,164 km."""
+
+
+class RefusedError(Exception):
+    """A block that cannot be used; the message is the counter's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subframe:
+    """What UBX-RXM-SFRBX carries: the words of one block of one signal of one satellite."""
+
+    source: str
+    t_seen_ns: int
+    system: System
+    prn: int
+    signal_id: int
+    words: tuple[int, ...]
+
+
+@dataclass(slots=True)
+class Parts:
+    """Blocks by number that belong together by `key`; another key starts anew."""
+
+    key: Any = None
+    found: dict[int, Any] = field(default_factory=dict)
+
+    def add(self, key: Any, number: int, block: Any) -> bool:
+        """Keep `block`; whether it made earlier ones of another key useless."""
+        mixed = bool(self.found) and key != self.key
+        if mixed:
+            self.found.clear()
+        self.key = key
+        self.found[number] = block
+        return mixed
+
+    def clear(self) -> None:
+        self.found.clear()
+
+
+Decoded = list[Ephemeris | Klobuchar]
+Decode = Callable[[Subframe, WeekReference], Decoded]
+
+
+def ephemeris(subframe: Subframe, message: str, numbers: dict[str, Any], **rest: Any) -> Ephemeris:
+    """The `Ephemeris` of `subframe`'s satellite. RefusedError when no orbit can be so."""
+    found = Ephemeris(
+        source=subframe.source,
+        t_seen_ns=subframe.t_seen_ns,
+        system=subframe.system,
+        prn=subframe.prn,
+        message=message,
+        **numbers,
+        **rest,
+    )
+    check_orbit(found)
+    return found
+
+
+def check_orbit(found: Ephemeris) -> None:
+    """RefusedError unless the orbit is one of a navigation satellite."""
+    lowest, highest = SQRT_A_M
+    if not (lowest <= found.sqrt_a <= highest and 0.0 <= found.eccentricity <= MAX_ECCENTRICITY):
+        raise RefusedError("ephemeris_implausible")
+    if not math.isfinite(found.mean_anomaly + found.clock_bias_s + found.toe_s):
+        raise RefusedError("ephemeris_implausible")
+
+
+def week_of_toe(week: int, tow_s: float, toe_s: float) -> int:
+    """The week of `toe_s` when `week` and `tow_s` are those of the transmission: toe is never
+    half a week away."""
+    if toe_s - tow_s > HALF_WEEK_S:
+        return week - 1
+    if toe_s - tow_s < -HALF_WEEK_S:
+        return week + 1
+    return week
+
+
+def ura_m(index: int) -> float | None:
+    """Sigma of GPS (IS-GPS-200, 20.3.3.3.1.3) and BeiDou (BDS-SIS-ICD-B1I 5.2.4.5) by index:
+    2^(1+N/2) m to N = 6, then 2^(N-2) m; None for 15, no prediction."""
+    if index >= 15:
+        return None
+    return 2.0 ** (1.0 + index / 2.0) if index <= 6 else 2.0 ** (index - 2)
+
+
+def sisa_m(index: int) -> float | None:
+    """Sigma of Galileo by index (OS SIS ICD 5.1.12, table 90): None where none is predicted."""
+    for first, last, base_m, step_m in (
+        (0, 49, 0.0, 0.01),
+        (50, 74, 0.5, 0.02),
+        (75, 99, 1.0, 0.04),
+        (100, 125, 2.0, 0.16),
+    ):
+        if first <= index <= last:
+            return base_m + (index - first) * step_m
+    return None

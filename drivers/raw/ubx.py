@@ -1,0 +1,174 @@
+"""UBX-RXM-RAWX and UBX-RXM-SFRBX, little endian, out of verified frames.
+
+    RAWX   rcvTow R8 s, week U2, leapS I1, numMeas U1, recStat X1, 3 bytes; then numMeas times
+           prMes R8 m, cpMes R8 cycles, doMes R4 Hz, gnssId, svId, sigId, freqId U1, locktime U2 ms,
+           cno U1 dB-Hz, prStdev, cpStdev, doStdev X1, trkStat X1, 1 byte
+    SFRBX  gnssId, svId, sigId, freqId, numWords, chn, version U1, 1 byte; then numWords U4
+    sigma  0.01 * 2^n m of the pseudorange, 0.002 * 2^n Hz of the Doppler (n: low four bits)
+    rate   -doMes * c / f: a positive Doppler approaches
+
+Source: u-blox F9 HPG interface description, UBX-RXM-RAWX and UBX-RXM-SFRBX.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from dataclasses import dataclass
+
+from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S, RawSignal, System
+
+RAWX = b"\x02\x15"
+SFRBX = b"\x02\x13"
+
+PSEUDORANGE_M = (1.5e7, 5.0e7)
+"""A GPS satellite overhead is 20,200 km away, an IGSO one at the horizon 42,000 km; the rest is
+room for a receiver clock of 17 ms."""
+MAX_PRN: dict[System, int] = {"G": 32, "E": 36, "C": 63}
+SYSTEM_BY_ID: dict[int, System] = {0: "G", 2: "E", 3: "C"}
+OTHER_SYSTEMS = {1: "sbas", 5: "qzss", 6: "glonass", 7: "navic"}
+
+SIGNALS: dict[tuple[int, int], str] = {
+    (0, 0): "1C",
+    (0, 3): "2L",
+    (0, 4): "2S",
+    (0, 6): "5I",
+    (0, 7): "5Q",
+    (2, 0): "1C",
+    (2, 1): "1B",
+    (2, 3): "5I",
+    (2, 4): "5Q",
+    (2, 5): "7I",
+    (2, 6): "7Q",
+    (2, 8): "6B",
+    (2, 9): "6C",
+    (3, 0): "2I",
+    (3, 1): "2I",
+    (3, 2): "7I",
+    (3, 3): "7I",
+    (3, 4): "6I",
+    (3, 10): "6I",
+    (3, 5): "1P",
+    (3, 6): "1D",
+    (3, 7): "5P",
+    (3, 8): "5D",
+}
+"""RINEX signal by gnssId and sigId."""
+
+_HEADER = struct.Struct("<dHbBB3x")
+_MEASUREMENT = struct.Struct("<ddfBBBxHBBxBBx")
+_SUBFRAME = struct.Struct("<BBBxBxBx")
+
+_LEAP_KNOWN, _CLOCK_RESET = 1, 2
+_RANGE_VALID, _CARRIER_VALID = 1, 2
+
+# Per signal what one measurement needs: system, RINEX code, metres per second and hertz.
+_BY_SIGNAL = {
+    (gnss, sig): (
+        SYSTEM_BY_ID[gnss],
+        code,
+        SPEED_OF_LIGHT_M_S / CARRIER_HZ[SYSTEM_BY_ID[gnss], code[0]],
+    )
+    for (gnss, sig), code in SIGNALS.items()
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Rawx:
+    """An epoch as the receiver states it. `leap_seconds` is None while it does not know them."""
+
+    tow_s: float
+    week: int
+    leap_seconds: int | None
+    clock_reset: bool
+    signals: tuple[RawSignal, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sfrbx:
+    gnss_id: int
+    prn: int
+    signal_id: int
+    words: tuple[int, ...]
+
+
+def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
+    """The epoch; None where the length does not fit or the time is no number.
+
+    Every measurement is counted as `measured_G`, `measured_E`, `measured_C`, or with the name of
+    another system, and again where one of the three is refused: `signal_unknown`, `prn_unknown`,
+    `pseudorange_invalid`, `not_finite`, `pseudorange_implausible`, `signal_repeated`.
+    """
+    if len(payload) < _HEADER.size:
+        return None
+    tow_s, week, leap, count, status = _HEADER.unpack_from(payload)
+    if len(payload) != _HEADER.size + count * _MEASUREMENT.size or not 0.0 <= tow_s < 604_801.0:
+        return None
+    signals: dict[tuple[str, int, str], RawSignal] = {}
+    for measurement in _MEASUREMENT.iter_unpack(payload[_HEADER.size :]):
+        signal = _signal(measurement, counters)
+        if signal is None:
+            continue
+        key = (signal.system, signal.prn, signal.signal)
+        if key in signals:
+            counters["signal_repeated"] += 1
+            continue
+        signals[key] = signal
+    return Rawx(
+        tow_s,
+        week,
+        leap if status & _LEAP_KNOWN else None,
+        bool(status & _CLOCK_RESET),
+        tuple(signals.values()),
+    )
+
+
+def _signal(
+    measurement: tuple[float, float, float, int, int, int, int, int, int, int, int],
+    counters: Counter[str],
+) -> RawSignal | None:
+    pseudorange, carrier, doppler, gnss, prn, sig, _, cno, sd_range, sd_doppler, track = measurement
+    system = SYSTEM_BY_ID.get(gnss)
+    if system is None:
+        counters[f"measured_{OTHER_SYSTEMS.get(gnss, 'unknown_system')}"] += 1
+        return None
+    counters[f"measured_{system}"] += 1
+    known = _BY_SIGNAL.get((gnss, sig))
+    if known is None:
+        counters["signal_unknown"] += 1
+        return None
+    if not 1 <= prn <= MAX_PRN[system]:
+        counters["prn_unknown"] += 1
+        return None
+    if not track & _RANGE_VALID:
+        counters["pseudorange_invalid"] += 1
+        return None
+    if not (math.isfinite(pseudorange) and math.isfinite(doppler) and math.isfinite(carrier)):
+        counters["not_finite"] += 1
+        return None
+    if not PSEUDORANGE_M[0] <= pseudorange <= PSEUDORANGE_M[1]:
+        counters["pseudorange_implausible"] += 1
+        return None
+    _, code, wavelength = known
+    return RawSignal(
+        system,
+        prn,
+        code,
+        pseudorange,
+        -doppler * wavelength,
+        carrier if track & _CARRIER_VALID else None,
+        float(cno) if cno else None,
+        0.01 * (1 << (sd_range & 0xF)),
+        0.002 * (1 << (sd_doppler & 0xF)) * wavelength,
+    )
+
+
+def parse_sfrbx(payload: bytes) -> Sfrbx | None:
+    """The words of a subframe; None where the length does not fit."""
+    if len(payload) < _SUBFRAME.size:
+        return None
+    gnss, prn, sig, count, _version = _SUBFRAME.unpack_from(payload)
+    if len(payload) != _SUBFRAME.size + 4 * count:
+        return None
+    return Sfrbx(gnss, prn, sig, struct.unpack_from(f"<{count}I", payload, _SUBFRAME.size))
