@@ -17,8 +17,12 @@ from typing import ClassVar, Literal, Protocol
 from pydantic import BaseModel, ConfigDict
 
 from drivers.measurements import DeviceEvent, Measurement
+from drivers.raw.messages import RawEvent
 
-Emit = Callable[[Measurement | DeviceEvent], None]
+Emitted = Measurement | RawEvent | DeviceEvent
+"""All that a driver may hand over. `Ephemeris` and `Klobuchar` have no stamp: they say themselves
+what they are valid for."""
+Emit = Callable[[Emitted], None]
 Now = Callable[[], int]
 
 State = Literal["starting", "absent", "silent", "running", "failed"]

@@ -101,6 +101,13 @@ class NmeaDecoder:
             self._take(sentence, t_seen_ns, found)
         return found
 
+    def take(self, sentence: Sentence, t_seen_ns: int) -> list[Measurement]:
+        """As `feed`, for a sentence that somebody else has verified."""
+        found: list[Measurement] = []
+        self._t_seen_ns = t_seen_ns
+        self._take(sentence, t_seen_ns, found)
+        return found
+
     def silence(self) -> list[Measurement]:
         """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
         found: list[Measurement] = []

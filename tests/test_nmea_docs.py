@@ -21,6 +21,7 @@ CODE = "".join(
         "nmea_epochs.py",
         "nmea_framing.py",
         "nmea_time.py",
+        "receiver.py",
         "serial_line.py",
     )
 )

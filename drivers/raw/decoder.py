@@ -99,6 +99,11 @@ class RawDecoder:
                 found += self.take(item, 0)
         return found + self.flush_epoch()
 
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `flush_epoch` would end an epoch of MSM."""
+        return self._rtcm is not None and self._rtcm.epoch_open
+
     def flush_epoch(self) -> list[RawEvent]:
         """No more of an epoch of MSM will come."""
         return [] if self._rtcm is None else self._rtcm.flush()

@@ -122,6 +122,11 @@ class RtcmDecoder:
         self._signals: dict[tuple[str, int, str], RawSignal] = {}
         self._t_seen_ns = 0
 
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `flush` would end an epoch."""
+        return self._epoch is not None
+
     def take(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
         """What this frame completes."""
         bits = Bits.of_bytes(frame[3:-3])

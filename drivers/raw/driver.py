@@ -1,0 +1,187 @@
+"""A GNSS receiver's serial line with raw observations and NMEA mixed: see `docs/gnss-raw.md`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import ClassVar
+
+from drivers.base import Emit, Now, monotonic_ns
+from drivers.measurements import Measurement, PositionFix, TimeReport, UtcStamp
+from drivers.nmea import REFUSALS, NmeaOptions
+from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
+from drivers.nmea_framing import Item, Sentence, StreamSplitter
+from drivers.nmea_time import TimeTrust
+from drivers.raw.decoder import RawDecoder
+from drivers.raw.messages import RawEvent, RawGnssEpoch
+from drivers.raw.rtcm import load_pyrtcm
+from drivers.receiver import ReceiverDriver
+
+Found = Measurement | RawEvent
+
+
+class GnssOptions(NmeaOptions):
+    """Options of a `driver = "gnss"` source: those of `nmea`, and which of the stream to use."""
+
+    use_nmea_fix: bool = True
+    """Hand over the receiver's own fixes too. They are made of the same pseudoranges: fuse one of
+    the two. Headings and times are handed over in any case."""
+    use_raw: bool = True
+    """Hand over observations, ephemerides and ionosphere models."""
+    rtcm: bool = True
+    """Decode RTCM 3, which needs the package pyrtcm (extra `raw`)."""
+
+
+class GnssDecoder:
+    """One stream, two decoders: sentences go to the one, frames to the other."""
+
+    def __init__(
+        self,
+        source: str,
+        decoding: NmeaDecoding,
+        counters: Counter[str] | None = None,
+        *,
+        use_nmea_fix: bool = True,
+        use_raw: bool = True,
+        rtcm: bool = True,
+    ) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._source = source
+        self._use_nmea_fix = use_nmea_fix
+        self._splitter = StreamSplitter(self.counters)
+        self._nmea = NmeaDecoder(source, decoding, self.counters)
+        self._raw = (
+            RawDecoder(source, self.counters, earliest=decoding.earliest_date, rtcm=rtcm)
+            if use_raw
+            else None
+        )
+        self._trust = TimeTrust()
+        self._nmea_told_time = False
+        self._t_seen_ns = 0
+
+    @property
+    def refusal(self) -> str:
+        """Why the last NMEA epoch gave no fix, by counter name."""
+        return self._nmea.refusal
+
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `silence` would close an epoch."""
+        return self._nmea.epoch_open or (self._raw is not None and self._raw.epoch_open)
+
+    def feed(self, data: bytes, t_seen_ns: int) -> list[Found]:
+        """What `data`, seen at `t_seen_ns`, completes."""
+        self._t_seen_ns = t_seen_ns
+        found: list[Found] = []
+        for item in self._splitter.feed(data):
+            self._take(item, found)
+        return found
+
+    def silence(self) -> list[Found]:
+        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        found: list[Found] = []
+        self._take_nmea(self._nmea.silence(), found)
+        if self._raw is not None:
+            self._take_raw(self._raw.flush_epoch(), found)
+        return found
+
+    def flush(self) -> list[Found]:
+        """The stream ended, or broke: everything that can still be had from what came."""
+        found: list[Found] = []
+        for item in self._splitter.finish():
+            self._take(item, found)
+        self._take_nmea(self._nmea.flush(), found)
+        if self._raw is not None:
+            self._take_raw(self._raw.flush_epoch(), found)
+        return found
+
+    def _take(self, item: Item, found: list[Found]) -> None:
+        if isinstance(item, Sentence):
+            self._take_nmea(self._nmea.take(item, self._t_seen_ns), found)
+        elif self._raw is not None:
+            self._take_raw(self._raw.take(item, self._t_seen_ns), found)
+
+    def _take_nmea(self, measurements: list[Measurement], found: list[Found]) -> None:
+        for measurement in measurements:
+            if isinstance(measurement, TimeReport):
+                self._nmea_told_time = True
+                if measurement.trusted and self._raw is not None:
+                    self._raw.note_utc(measurement.utc_ns)
+            if isinstance(measurement, PositionFix) and not self._use_nmea_fix:
+                continue
+            found.append(measurement)
+
+    def _take_raw(self, events: list[RawEvent], found: list[Found]) -> None:
+        for event in events:
+            if isinstance(event, RawGnssEpoch):
+                self._report_time(event, found)
+            found.append(event)
+
+    def _report_time(self, epoch: RawGnssEpoch, found: list[Found]) -> None:
+        """UTC of an epoch of RXM-RAWX, where the receiver knows the leap seconds and no RMC or
+        ZDA says it."""
+        assert self._raw is not None
+        known = self._raw.leap_seconds is not None
+        if self._nmea_told_time or not known or not isinstance(epoch.stamp, UtcStamp):
+            return
+        utc_ns = epoch.stamp.utc_ns
+        trusted = self._trust.report(utc_ns, epoch.t_seen_ns, valid=True)
+        if trusted is not None:
+            found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))
+
+
+class GnssDriver(ReceiverDriver):
+    """Reads the line, hands over raw observations and what the NMEA driver does.
+
+    PermanentDriverError when RTCM 3 is to be decoded and pyrtcm is not installed.
+    """
+
+    Options: ClassVar[type[GnssOptions]] = GnssOptions
+    alive_by = ("sentences", "ubx_frames", "rtcm_frames")
+
+    def __init__(
+        self, name: str, options: GnssOptions, emit: Emit, now_ns: Now = monotonic_ns
+    ) -> None:
+        if options.use_raw and options.rtcm:
+            load_pyrtcm()
+        self._options = options
+        super().__init__(name, options.port, options.baud, options.timeout_s, emit, now_ns)
+
+    def _make_decoder(self) -> GnssDecoder:
+        options = self._options
+        self._gnss = GnssDecoder(
+            self.name,
+            options,
+            self.counters,
+            use_nmea_fix=options.use_nmea_fix,
+            use_raw=options.use_raw,
+            rtcm=options.rtcm,
+        )
+        return self._gnss
+
+    def _running_detail(self) -> str:
+        useless = super()._running_detail()
+        counters = self.counters
+        if useless or not counters["epochs_raw"]:
+            return useless
+        if not (counters["ephemerides"] or counters["rtcm_ephemerides"]):
+            return "no ephemeris yet: are UBX-RXM-SFRBX, or RTCM 1019, 1042, 1046, switched on?"
+        return ""
+
+    def _useless_detail(self) -> str:
+        counters = self.counters
+        if self._options.use_raw:
+            if counters["week_unknown"]:
+                return "RTCM epochs without a week: switch on RTCM 1019 or 1042, or NMEA RMC"
+            if counters["time_unset"]:
+                return "the receiver has observations, but no time yet"
+            if not counters["epochs_raw"] and not self._gnss.refusal:
+                return "no observations arrive: switch on UBX-RXM-RAWX, or RTCM MSM4 or MSM7"
+        if self._options.use_nmea_fix and counters["epochs"]:
+            return REFUSALS.get(self._gnss.refusal, "epochs arrive, but none has a position")
+        return "neither observations nor epochs of NMEA arrive"
+
+    def _unintelligible_detail(self) -> str:
+        return (
+            f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies at {self._baud} baud:"
+            " is that the receiver's rate?"
+        )

@@ -1,0 +1,162 @@
+"""What the drivers `nmea` and `gnss` share: one receiver on one serial line, read and judged.
+
+A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
+silent, and says in `status` whether the device is there and intelligible.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import Sequence
+from typing import Protocol
+
+from drivers.base import DriverStatus, Emit, Now, State, state_event
+from drivers.measurements import Measurement, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent
+from drivers.serial_line import SerialLine
+
+SILENCE_S = 0.05
+"""A pause that ends an epoch: receivers send an epoch's sentences in one burst."""
+STATUS_INTERVAL_S = 0.25
+
+_LIFE_SIGNS = ("bytes_in", "sentences", "ubx_frames", "rtcm_frames")
+
+
+class ReceiverDecoder(Protocol):
+    """Bytes in, measurements out."""
+
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `silence` would close an epoch."""
+
+    def feed(self, data: bytes, t_seen_ns: int) -> Sequence[Measurement | RawEvent]: ...
+
+    def silence(self) -> Sequence[Measurement | RawEvent]: ...
+
+    def flush(self) -> Sequence[Measurement | RawEvent]: ...
+
+
+class ReceiverDriver:
+    """Reads the line. Who derives from it gives the decoder and the words of `status.detail`."""
+
+    alive_by: tuple[str, ...] = ("sentences",)
+    """Counters of which one must grow for the device to be `running`."""
+
+    def __init__(
+        self, name: str, port: str, baud: int, timeout_s: float, emit: Emit, now_ns: Now
+    ) -> None:
+        self.name = name
+        self.status = DriverStatus()
+        self._port = port
+        self._baud = baud
+        self._timeout_s = timeout_s
+        self._emit = emit
+        self._now_ns = now_ns
+        self._line = SerialLine(port, baud, now_ns)
+        self.counters: Counter[str] = self._line.counters
+        self._decoder = self._make_decoder()
+        self._silence: asyncio.TimerHandle | None = None
+        self._alive_ns = now_ns()
+        """When the line opened or something on it last verified."""
+        self._window: dict[str, int] = {}
+        """Counters at that instant: what came since and was not understood."""
+        self._useful_ns = self._alive_ns
+        """When the line opened or a measurement was last handed over."""
+
+    def _make_decoder(self) -> ReceiverDecoder:
+        """The decoder, which counts in `self.counters`."""
+        raise NotImplementedError
+
+    def _useless_detail(self) -> str:
+        """Why what arrives has brought no measurement for the time-out."""
+        raise NotImplementedError
+
+    def _unintelligible_detail(self) -> str:
+        """Why the bytes that arrive are not what this driver reads."""
+        raise NotImplementedError
+
+    async def run(self) -> None:
+        """Serve the receiver until cancelled."""
+        watch = asyncio.create_task(self._watch())
+        try:
+            await self._line.run(self._on_bytes, self._on_open, self._on_close)
+        finally:
+            watch.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await watch
+
+    def _on_open(self) -> None:
+        self._mark_alive()
+        self._useful_ns = self._alive_ns
+        self.status.state, self.status.detail = "starting", "open, nothing verified yet"
+
+    def _on_close(self, why: str) -> None:
+        self._stop_timer()
+        self._hand_over(self._decoder.flush())
+
+    def _on_bytes(self, data: bytes, t_seen_ns: int) -> None:
+        self._stop_timer()
+        before = self._signs_of_life()
+        self._hand_over(self._decoder.feed(data, t_seen_ns))
+        if self._signs_of_life() > before:
+            self._mark_alive()
+            self._set_state("running", self._running_detail())
+        if self._decoder.epoch_open:
+            loop = asyncio.get_running_loop()
+            self._silence = loop.call_later(SILENCE_S, self._on_silence)
+
+    def _on_silence(self) -> None:
+        self._silence = None
+        self._hand_over(self._decoder.silence())
+
+    def _stop_timer(self) -> None:
+        if self._silence is not None:
+            self._silence.cancel()
+            self._silence = None
+
+    def _hand_over(self, found: Sequence[Measurement | RawEvent]) -> None:
+        for measurement in found:
+            if not isinstance(measurement, TimeReport | Ephemeris | Klobuchar):
+                self._useful_ns = measurement.t_seen_ns
+            self._emit(measurement)
+
+    # ----------------------------------------------------------------- status
+
+    async def _watch(self) -> None:
+        while True:
+            await asyncio.sleep(STATUS_INTERVAL_S)
+            if not self._line.is_open:
+                self._set_state("absent", self._line.detail)
+            elif self._now_ns() - self._alive_ns > self._timeout_s * 1e9:
+                self._set_state("silent", self._silent_detail())
+            elif self.status.state == "running":
+                self._set_state("running", self._running_detail())
+
+    def _signs_of_life(self) -> int:
+        return sum(self.counters[name] for name in self.alive_by)
+
+    def _mark_alive(self) -> None:
+        self._alive_ns = self._now_ns()
+        self._window = {name: self.counters[name] for name in _LIFE_SIGNS}
+
+    def _set_state(self, state: State, detail: str) -> None:
+        changed = state != self.status.state
+        self.status.state, self.status.detail = state, detail
+        if changed:
+            self._emit(state_event(self.name, self._now_ns(), self._port, self.status))
+
+    def _since_alive(self, name: str) -> int:
+        """What a counter of bytes, sentences or frames grew by since the device last made sense."""
+        return self.counters[name] - self._window.get(name, 0)
+
+    def _running_detail(self) -> str:
+        if self._now_ns() - self._useful_ns < self._timeout_s * 1e9:
+            return ""
+        return self._useless_detail()
+
+    def _silent_detail(self) -> str:
+        if not self._since_alive("bytes_in"):
+            return f"no bytes for {self._timeout_s:g} s"
+        return self._unintelligible_detail()
