@@ -1,0 +1,1 @@
+"""Satellites: orbits, clocks, atmosphere and the range equations. No I/O, no configuration."""

@@ -1,0 +1,221 @@
+r"""Satellite position, velocity and clock from a broadcast Keplerian ephemeris.
+
+    A = sqrtA^2,  n = sqrt(GM / A^3) + dn,  M = M0 + n tk,  M = E - e sin E
+    phi = atan2(sqrt(1 - e^2) sin E, cos E - e) + omega
+    u = phi + cus sin 2phi + cuc cos 2phi
+    r = A (1 - e cos E) + crs sin 2phi + crc cos 2phi
+    i = i0 + idot tk + cis sin 2phi + cic cos 2phi
+    MEO, IGSO:  Omega = Omega0 + (Omegadot - we) tk - we toe
+                s = Rz(-Omega) Rx(-i) [r cos u, r sin u, 0]
+    BeiDou GEO: Omega = Omega0 + Omegadot tk - we toe,  s as above, then Rz(we tk) Rx(-5 deg) s
+    dt = a0 + a1 (t - toc) + a2 (t - toc)^2 + F e sqrtA sin E,   F = -2 sqrt(GM) / c^2
+
+tk = t - toe, t the system time of transmission; R(x) are rotations of the axes. Velocity and clock
+drift are the derivatives of these lines by t; Edot = n / (1 - e cos E) carries them all. Angles rad,
+lengths m, times s; ECEF is the frame of the instant of transmission (WGS 84, GTRF and BDCS agree to
+centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv); the
+relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
+
+BeiDou's time is 14 s behind GPS time. It is settled here and nowhere else: `Orbits` is asked in GPS
+time, and toe and toc are moved to GPS time when they come in; `we toe` keeps the system's own toe.
+
+Source: IS-GPS-200N 20.3.3.3.3.1, 20.3.3.4.3 and table 20-IV; BDS-SIS-ICD-B1I-3.0 5.2.4.9 and
+5.2.4.12 (GEO rotation); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.raw.messages import SPEED_OF_LIGHT_M_S, Ephemeris, System
+from fusiond.navigation.compiled import compiled
+
+Array = npt.NDArray[np.float64]
+
+WEEK_S = 604800.0
+BDT_BEHIND_GPS_S = 14.0
+BDT_WEEK_0_IN_GPS_WEEKS = 1356
+"""2006-01-01, where BeiDou's weeks start."""
+
+GEO_TILT_RAD = math.radians(-5.0)
+
+
+class Constants(NamedTuple):
+    """`gm` m^3/s^2, `earth_rate` rad/s, `relativity` F in s/sqrt(m)."""
+
+    gm: float
+    earth_rate: float
+    relativity: float
+
+
+CONSTANTS: dict[System, Constants] = {
+    "G": Constants(3.986005e14, 7.2921151467e-5, -4.442807633e-10),
+    "E": Constants(3.986004418e14, 7.2921151467e-5, -4.442807309e-10),
+    "C": Constants(
+        3.986004418e14, 7.2921150e-5, -2.0 * math.sqrt(3.986004418e14) / SPEED_OF_LIGHT_M_S**2
+    ),
+}
+"""Each ICD's own: an ephemeris fits its orbit only with the constants it was made with."""
+
+
+def is_beidou_geo(system: System, prn: int) -> bool:
+    """Whether the orbit is given in the tilted frame: C01 to C05 and C59 to C63."""
+    return system == "C" and (prn <= 5 or 59 <= prn <= 63)
+
+
+def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
+    """GPS week and second of week of a system's own week and second; seconds may pass the week."""
+    if system == "C":
+        return week + BDT_WEEK_0_IN_GPS_WEEKS, seconds + BDT_BEHIND_GPS_S
+    return week, seconds
+
+
+# Columns of the elements' array.
+_COLUMNS = 29
+(
+    _WEEK, _TOE, _TOC, _GM, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _I0, _NODE, _PERIGEE, _M0,
+    _DN, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC, _CIS, _A0, _A1, _A2,
+    _COS_TILT, _SIN_TILT, _TOC_WEEK,
+) = range(_COLUMNS)  # fmt: skip
+
+
+@compiled("void(f8[:, ::1], f8, f8[::1], b1, f8[:, ::1])")
+def satellite_states(
+    elements: Array, week: float, tow: Array, by_satellite_clock: bool, out: Array
+) -> None:
+    """Write (n, 8): position m, velocity m/s, clock offset s and drift s/s.
+
+    `elements` (n, 29) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
+    satellite's own clock has it if `by_satellite_clock`.
+    """
+    for k in range(elements.shape[0]):
+        q = elements[k]
+        since_toc = (week - q[_TOC_WEEK]) * WEEK_S + (tow[k] - q[_TOC])
+        tk = (week - q[_WEEK]) * WEEK_S + (tow[k] - q[_TOE])
+        if by_satellite_clock:
+            step = q[_A0] + (q[_A1] + q[_A2] * since_toc) * since_toc
+            for _ in range(2):
+                dt = since_toc - step
+                step = q[_A0] + (q[_A1] + q[_A2] * dt) * dt
+            since_toc -= step
+            tk -= step
+        sqrt_a = q[_SQRT_A]
+        ecc = q[_E]
+        axis = sqrt_a * sqrt_a
+        n = math.sqrt(q[_GM] / axis) / axis + q[_DN]
+        mean = q[_M0] + n * tk
+        anomaly = mean + ecc * math.sin(mean)
+        for _ in range(12):  # Newton, quadratic: two or three steps at e = 0.02
+            change = (anomaly - ecc * math.sin(anomaly) - mean) / (1.0 - ecc * math.cos(anomaly))
+            anomaly -= change
+            if abs(change) < 1e-14:
+                break
+        sin_e, cos_e = math.sin(anomaly), math.cos(anomaly)
+        nearness = 1.0 - ecc * cos_e
+        anomaly_rate = n / nearness
+        root = math.sqrt(1.0 - ecc * ecc)
+        phi = math.atan2(root * sin_e, cos_e - ecc) + q[_PERIGEE]
+        phi_rate = root * anomaly_rate / nearness
+        s2, c2 = math.sin(2.0 * phi), math.cos(2.0 * phi)
+        u = phi + q[_CUS] * s2 + q[_CUC] * c2
+        u_rate = phi_rate * (1.0 + 2.0 * (q[_CUS] * c2 - q[_CUC] * s2))
+        r = axis * nearness + q[_CRS] * s2 + q[_CRC] * c2
+        r_rate = axis * ecc * sin_e * anomaly_rate + 2.0 * phi_rate * (q[_CRS] * c2 - q[_CRC] * s2)
+        inc = q[_I0] + q[_I_RATE] * tk + q[_CIS] * s2 + q[_CIC] * c2
+        inc_rate = q[_I_RATE] + 2.0 * phi_rate * (q[_CIS] * c2 - q[_CIC] * s2)
+        we = q[_RATE]
+        geo = q[_GEO] > 0.0
+        node_rate = q[_NODE_RATE] if geo else q[_NODE_RATE] - we
+        node = q[_NODE] + node_rate * tk - we * q[_OWN_TOE]
+        su, cu = math.sin(u), math.cos(u)
+        si, ci = math.sin(inc), math.cos(inc)
+        so, co = math.sin(node), math.cos(node)
+        px, py = r * cu, r * su
+        px_rate = r_rate * cu - py * u_rate
+        py_rate = r_rate * su + px * u_rate
+        level, level_rate = py * ci, py_rate * ci - py * si * inc_rate
+        x = px * co - level * so
+        y = px * so + level * co
+        z = py * si
+        vx = px_rate * co - level_rate * so - y * node_rate
+        vy = px_rate * so + level_rate * co + x * node_rate
+        vz = py_rate * si + level * inc_rate
+        if geo:
+            ct, st = q[_COS_TILT], q[_SIN_TILT]
+            y, z = y * ct + z * st, z * ct - y * st
+            vy, vz = vy * ct + vz * st, vz * ct - vy * st
+            turn = we * tk
+            cz, sz = math.cos(turn), math.sin(turn)
+            x, y = x * cz + y * sz, y * cz - x * sz
+            vx, vy = vx * cz + vy * sz + we * y, vy * cz - vx * sz - we * x
+        out[k, 0], out[k, 1], out[k, 2] = x, y, z
+        out[k, 3], out[k, 4], out[k, 5] = vx, vy, vz
+        relativity = q[_F] * ecc * sqrt_a
+        out[k, 6] = q[_A0] + (q[_A1] + q[_A2] * since_toc) * since_toc + relativity * sin_e
+        out[k, 7] = q[_A1] + 2.0 * q[_A2] * since_toc + relativity * cos_e * anomaly_rate
+
+
+def elements_row(ephemeris: Ephemeris) -> Array:
+    """One ephemeris as the row (29,) that `satellite_states` takes."""
+    e = ephemeris
+    constants = CONSTANTS[e.system]
+    week, toe = gps_time(e.system, e.week, e.toe_s)
+    _, toc = gps_time(e.system, e.week, e.toc_s)
+    # toc lies in the week nearest to toe: the two differ by hours, unless the week turned between
+    toc_week = week + round((toe - toc) / WEEK_S)
+    values = (
+        week, toe, toc, *constants, is_beidou_geo(e.system, e.prn), e.toe_s, e.sqrt_a,
+        e.eccentricity, e.inclination, e.ascending_node, e.perigee, e.mean_anomaly,
+        e.mean_motion_correction, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
+        e.crs, e.cic, e.cis, e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
+        math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week,
+    )  # fmt: skip
+    return np.array(values, float)
+
+
+class SatelliteStates(NamedTuple):
+    """`position` (n, 3) m and `velocity` (n, 3) m/s in ECEF, `clock_s` (n,), `clock_drift` (n,)."""
+
+    position: Array
+    velocity: Array
+    clock_s: Array
+    clock_drift: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Orbits:
+    """Ephemerides of n satellites, stacked once: `elements` (n, 29)."""
+
+    elements: Array
+
+    @classmethod
+    def of(cls, ephemerides: Sequence[Ephemeris]) -> Orbits:
+        """Stack ephemerides in their order."""
+        rows = [elements_row(e) for e in ephemerides]
+        return cls(np.array(rows).reshape(len(rows), _COLUMNS))
+
+    def at(self, week: int, tow_s: float | Array) -> SatelliteStates:
+        """States at a GPS time of transmission: week and seconds, () or (n,)."""
+        return self._states(week, tow_s, False)
+
+    def sent(self, week: int, tow_s: float, pseudorange_m: Array) -> SatelliteStates:
+        """States at the transmission of what came in at `tow_s` of the receiver's clock.
+
+        Receiver time minus pseudorange / c is the satellite's own time of transmission, whatever
+        the receiver's clock error is: no iteration over the flight time.
+        """
+        return self._states(week, tow_s - pseudorange_m / SPEED_OF_LIGHT_M_S, True)
+
+    def _states(self, week: int, tow_s: float | Array, by_clock: bool) -> SatelliteStates:
+        n = len(self.elements)
+        out = np.empty((n, 8))
+        tow = np.empty(n)
+        tow[:] = tow_s
+        satellite_states(self.elements, float(week), tow, by_clock, out)
+        return SatelliteStates(out[:, :3], out[:, 3:6], out[:, 6], out[:, 7])
