@@ -1,0 +1,81 @@
+r"""What a signal's hardware in the satellite adds to the clock that the ephemeris states.
+
+    pseudorange + c (dt - d) = range + ...        d in s, in terms of the broadcast group delays
+
+GPS (clock refers to L1/L2 P, ionosphere-free):
+    L1: d = TGD,  L2: d = (f1/f2)^2 TGD,  L5: d = TGD, and 3 m more of sigma
+Galileo (clock of I/NAV refers to E1/E5b, of F/NAV to E1/E5a, each ionosphere-free):
+    E1:  I/NAV d = BGDb,  F/NAV d = BGDa
+    E5b: I/NAV d = (f1/f5b)^2 BGDb
+    E5a: F/NAV d = (f1/f5a)^2 BGDa;  I/NAV d = BGDb + ((f1/f5a)^2 - 1) BGDa
+BeiDou (clock refers to B3I):
+    B3I: d = 0,  B1I: d = TGD1,  B2I: d = TGD2
+
+Without a broadcast delay, so refused by name: BeiDou B1C and B2a (B-CNAV only), Galileo E5 as a
+whole and E6.
+
+E5a with an I/NAV clock: both clocks serve E1, so dt_F - BGDa = dt_I - BGDb there, and dt_F follows.
+L5: the inter-signal correction is in CNAV only. IS-GPS-705J 20.3.3.3.1.2.1 has it within
++-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
+
+Source: IS-GPS-200N 20.3.3.3.3.2; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0 5.2.4.10,
+BDS-SIS-ICD-B3I-1.0 5.2.4.10 (B3I takes none).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from drivers.raw.messages import CARRIER_HZ, Ephemeris
+
+GPS_L5_SIGMA_M = 3.0
+
+
+class GroupDelay(NamedTuple):
+    """`delay_s` to take off the clock offset; `sigma_m` what stays unknown of it."""
+
+    delay_s: float
+    sigma_m: float = 0.0
+
+
+_L1_L2 = (CARRIER_HZ["G", "1"] / CARRIER_HZ["G", "2"]) ** 2
+_E1_E5A = (CARRIER_HZ["E", "1"] / CARRIER_HZ["E", "5"]) ** 2
+_E1_E5B = (CARRIER_HZ["E", "1"] / CARRIER_HZ["E", "7"]) ** 2
+
+
+def group_delay(ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
+    """Delay of a signal (RINEX code such as "1C") by its satellite's ephemeris; None if unknown."""
+    band, delays = signal[0], ephemeris.group_delay_s
+    if ephemeris.system == "G":
+        return _gps(band, delays)
+    if ephemeris.system == "E":
+        return _galileo(band, delays, ephemeris.message)
+    return _beidou(band, signal, delays)
+
+
+def _gps(band: str, delays: tuple[float, ...]) -> GroupDelay | None:
+    if not delays:
+        return None
+    scale = {"1": (1.0, 0.0), "2": (_L1_L2, 0.0), "5": (1.0, GPS_L5_SIGMA_M)}.get(band)
+    return None if scale is None else GroupDelay(scale[0] * delays[0], scale[1])
+
+
+def _galileo(band: str, delays: tuple[float, ...], message: str) -> GroupDelay | None:
+    """`delays` (BGD E1/E5a, BGD E1/E5b); F/NAV has the first only."""
+    if message == "fnav":
+        scale = {"1": 1.0, "5": _E1_E5A}.get(band)
+        return GroupDelay(scale * delays[0]) if scale is not None and delays else None
+    if len(delays) < 2:
+        return None
+    a, b = delays[:2]
+    delay = {"1": b, "7": _E1_E5B * b, "5": b + (_E1_E5A - 1.0) * a}.get(band)
+    return None if delay is None else GroupDelay(delay)
+
+
+def _beidou(band: str, signal: str, delays: tuple[float, ...]) -> GroupDelay | None:
+    if band == "6":
+        return GroupDelay(0.0)
+    at = {"2": 0, "7": 1}.get(band)
+    if at is None or (band == "7" and signal[1] not in "IQX") or at >= len(delays):
+        return None
+    return GroupDelay(delays[at])

@@ -1,0 +1,171 @@
+r"""Range and range rate equations of one epoch, for all satellites at once.
+
+    rho = |s - r|,  l = (s - r) / rho,   s = Rz(we tau) s_t,  tau = rho / c,  v = Rz(we tau) v_t
+    P + c (dt - d) - T - I = rho + b_system + noise
+    D (1 + l . v_i / c) + c ddt = l . (v - v_r) + d + noise,    v_i = v + we x s
+
+s_t, v_t satellite position and velocity at transmission, turned into the ECEF frame of the instant
+of reception; r, v_r the receiver's; P pseudorange, D pseudorange rate (m, m/s; positive while the
+distance grows); dt, ddt the satellite's clock offset and drift, d the signal's group delay; T, I
+troposphere and ionosphere (m); b the receiver's clock offset (m), d its drift (m/s). The factor at
+D: transmission time runs 1 - rhodot/c as fast as reception time, up to 2 mm/s.
+
+r is taken at the time that the receiver's clock shows: with a clock 1 ms off and 30 m/s it is 3 cm.
+
+Variances: see `fusiond.gnss.ranges`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.raw.messages import SPEED_OF_LIGHT_M_S
+from fusiond.gnss.atmosphere import (
+    klobuchar_beidou,
+    klobuchar_gps,
+    mapping,
+    mapping_coefficients,
+    slant,
+    zenith_delays,
+)
+from fusiond.gnss.ecef import to_geodetic
+from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states
+from fusiond.navigation.compiled import compiled
+
+Array = npt.NDArray[np.float64]
+
+EARTH_RATE_RAD_S = 7.2921151467e-5
+LOWEST_RADIUS_M = 6.3e6
+"""A receiver nearer to the earth's centre is a starting value: no elevation, no atmosphere."""
+
+# What the plan says of each row.
+SIGNAL_COLUMNS = 4
+GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE = range(SIGNAL_COLUMNS)
+NO_MODEL, GPS_MODEL, BEIDOU_MODEL = 0.0, 1.0, 2.0
+# What the receiver says of each row; NaN where it does not.
+MEASURED_COLUMNS = 5
+PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = range(MEASURED_COLUMNS)
+# Results.
+ROW_COLUMNS = 19
+(
+    X, Y, Z, VX, VY, VZ, LX, LY, LZ, RANGE, ELEVATION, AZIMUTH, CORRECTED, CORRECTED_RATE,
+    VARIANCE, RATE_VARIANCE, TROPOSPHERE, IONOSPHERE, COMMON,
+) = range(ROW_COLUMNS)  # fmt: skip
+# Noise.
+NOISE_VALUES = 8
+(
+    CODE_ZENITH, CODE_CNO, CNO_REFERENCE, TROPO_ZENITH, IONO_SHARE, IONO_UNMODELLED, IONO_LOCAL,
+    RATE_ZENITH,
+) = range(NOISE_VALUES)  # fmt: skip
+
+
+@compiled(
+    "void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])"
+)
+def range_rows(
+    elements: Array,
+    signals: Array,
+    measured: Array,
+    ionosphere: Array,
+    week: float,
+    tow: float,
+    receiver: Array,
+    noise: Array,
+    out: Array,
+) -> None:
+    """Write (n, 19) rows for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock.
+
+    `elements` (n, 29), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
+    BeiDou's coefficients; `noise` (8,).
+    """
+    n = elements.shape[0]
+    sent = np.empty(n)
+    for k in range(n):
+        sent[k] = tow - measured[k, PSEUDORANGE] / SPEED_OF_LIGHT_M_S
+    states = np.empty((n, 8))
+    satellite_states(elements, week, sent, True, states)
+    rx, ry, rz = receiver[0], receiver[1], receiver[2]
+    on_earth = rx * rx + ry * ry + rz * rz > LOWEST_RADIUS_M * LOWEST_RADIUS_M
+    lat, lon, height = 0.0, 0.0, 0.0
+    dry, wet = 0.0, 0.0
+    q = np.empty(7)
+    if on_earth:
+        lat, lon, height = to_geodetic(rx, ry, rz)
+        dry, wet = zenith_delays(lat, height)
+        mapping_coefficients(lat, height, week * 7.0 + tow / 86400.0, q)
+    sp, cp, sl, cl = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
+    for k in range(n):
+        xt, yt, z = states[k, 0], states[k, 1], states[k, 2]
+        x, y = xt, yt
+        c, s = 1.0, 0.0
+        distance = 0.0
+        for _ in range(3):  # each step a factor of 3e-6 closer
+            dx, dy, dz = x - rx, y - ry, z - rz
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+            angle = EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S
+            c, s = math.cos(angle), math.sin(angle)
+            x, y = c * xt + s * yt, c * yt - s * xt
+        dx, dy, dz = x - rx, y - ry, z - rz
+        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+        vx = c * states[k, 3] + s * states[k, 4]
+        vy = c * states[k, 4] - s * states[k, 3]
+        vz = states[k, 5]
+        lx, ly, lz = dx / distance, dy / distance, dz / distance
+        elevation, azimuth = 0.5 * math.pi, 0.0
+        tropo, iono = 0.0, 0.0
+        iono_sigma = 0.0
+        if on_earth:
+            east = -sl * lx + cl * ly
+            north = -sp * cl * lx - sp * sl * ly + cp * lz
+            up = cp * cl * lx + cp * sl * ly + sp * lz
+            elevation = math.asin(min(max(up, -1.0), 1.0))
+            azimuth = math.atan2(east, north) % (2.0 * math.pi)
+            dry_map, wet_map = mapping(elevation, q)
+            tropo = dry * dry_map + wet * wet_map
+            model = signals[k, IONO_MODEL]
+            if model == GPS_MODEL:
+                iono = klobuchar_gps(ionosphere[0], tow, lat, lon, elevation, azimuth)
+            elif model == BEIDOU_MODEL:
+                bdt = tow - BDT_BEHIND_GPS_S
+                iono = klobuchar_beidou(ionosphere[1], bdt, lat, lon, elevation, azimuth)
+            iono *= signals[k, IONO_SCALE]
+            iono_sigma = noise[IONO_SHARE] * iono
+            if model == NO_MODEL:
+                iono_sigma = noise[IONO_UNMODELLED] * slant(elevation) * signals[k, IONO_SCALE]
+        out[k, X], out[k, Y], out[k, Z] = x, y, z
+        out[k, VX], out[k, VY], out[k, VZ] = vx, vy, vz
+        out[k, LX], out[k, LY], out[k, LZ] = lx, ly, lz
+        out[k, RANGE] = distance
+        out[k, ELEVATION], out[k, AZIMUTH] = elevation, azimuth
+        out[k, TROPOSPHERE], out[k, IONOSPHERE], out[k, COMMON] = tropo, iono, iono_sigma
+        clock = SPEED_OF_LIGHT_M_S * states[k, 6] - signals[k, GROUP_DELAY_M]
+        out[k, CORRECTED] = measured[k, PSEUDORANGE] + clock - tropo - iono
+        inertial = (
+            lx * (vx - EARTH_RATE_RAD_S * y) + ly * (vy + EARTH_RATE_RAD_S * x) + lz * vz
+        ) / SPEED_OF_LIGHT_M_S
+        drift = SPEED_OF_LIGHT_M_S * states[k, 7]
+        out[k, CORRECTED_RATE] = measured[k, RATE] * (1.0 + inertial) + drift
+        thin = slant(elevation)
+        code = noise[CODE_ZENITH] * thin
+        cno = measured[k, CNO]
+        weak = 0.0 if math.isnan(cno) else 10.0 ** (0.1 * (noise[CNO_REFERENCE] - cno))
+        stated = measured[k, SD_PSEUDORANGE]
+        if math.isnan(stated):
+            stated = 0.0
+        out[k, VARIANCE] = (
+            code * code
+            + noise[CODE_CNO] * noise[CODE_CNO] * weak
+            + stated * stated
+            + (noise[TROPO_ZENITH] * thin) ** 2
+            + (noise[IONO_LOCAL] * iono_sigma) ** 2
+            + signals[k, FIXED_VARIANCE]
+        )
+        stated = measured[k, SD_RATE]
+        if math.isnan(stated):
+            stated = 0.0
+        out[k, RATE_VARIANCE] = (
+            noise[RATE_ZENITH] * noise[RATE_ZENITH] * thin * thin + stated * stated
+        )

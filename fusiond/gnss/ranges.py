@@ -1,0 +1,347 @@
+r"""Corrected pseudoranges and rates of an epoch: which signals serve, and how good each row is.
+
+    sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2
+                     + (0.12 m)^2 + (0.2 s_I)^2 + s_sis^2 + s_d^2
+    sigma^2(rate)  = (r m)^2 + s_rx^2
+    common to all ranges: s_I n,  n ~ N(0, 1),  s_I half the modelled delay, or 5 m m without model
+
+m = 1.001 / sqrt(0.002001 + sin^2 E) grows as 1 / sin E; a multipath at the zenith and b thermal
+noise at 45 dB-Hz (m), s_rx what the receiver states, 0.12 m the troposphere left, s_sis orbit and
+clock, s_d the group delay left; r (m/s). Where a receiver states nothing, C/N0 or s_rx is left out.
+
+The ionosphere that is left is not noise: the model is too strong or too weak for the whole sky and
+for hours. So it has a column of its own, `ionosphere_sigma_m`, to be used as one more unknown with
+unit variance (as `fusiond.gnss.single_point` does), or as a state of a filter; a fifth of it stands
+for what differs from satellite to satellite.
+
+One signal of each satellite serves: the first of `PREFERRED` that is there. Nothing is combined: the ionosphere-free pair makes noise
+and multipath 2.6 to 3 times as large.
+
+Refusals, by satellite: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (of none of
+its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.raw.messages import (
+    CARRIER_HZ,
+    SPEED_OF_LIGHT_M_S,
+    SYSTEMS,
+    Ephemeris,
+    RawGnssEpoch,
+    RawSignal,
+    System,
+)
+from fusiond.gnss import range_kernel as rk
+from fusiond.gnss.group_delay import group_delay
+from fusiond.gnss.orbit import WEEK_S, Orbits
+from fusiond.gnss.store import EphemerisStore
+
+Array = npt.NDArray[np.float64]
+
+PREFERRED: dict[System, tuple[str, ...]] = {
+    "G": ("1C", "1W", "1P", "2W", "2L", "2S", "2X", "5Q", "5I", "5X"),
+    "E": ("1C", "1B", "1X", "7Q", "7I", "7X", "5Q", "5I", "5X"),
+    "C": ("2I", "2X", "6I", "6X", "7I", "7X"),
+}
+"""Signals that have a broadcast group delay, best known first."""
+
+SIGNAL_IN_SPACE_M: dict[System, float] = {"G": 0.7, "E": 0.7, "C": 1.5}
+"""Orbit and clock, global RMS: Montenbruck, Steigenberger, Hauschild, GPS Solutions 19 (2015),
+321-333, for GPS and BeiDou. Galileo's 1.6 m there were its first four satellites: GPS's
+is taken."""
+
+GPS_IONO_HZ = CARRIER_HZ["G", "1"]
+BEIDOU_IONO_HZ = CARRIER_HZ["C", "2"]
+PLAN_HOLDS_S = 10.0
+"""Ephemerides are chosen anew after this: it is what one may be used beyond its limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class RangeNoise:
+    """One sigma of the terms above.
+
+    `multipath_m`: RTCA DO-229D J.2.4 has 0.13 + 0.53 exp(-E / 10 deg) m on an aircraft; a vehicle
+    stands between walls. `thermal_m`: code tracking of a 1 Hz loop at 45 dB-Hz (Groves 9.3.3).
+    With both and the receiver's own sigma the residuals of a walk with a hand-held antenna in the
+    open have 0.19 of the expected mean square: conservative, as errors there last for minutes.
+    `rate_m_s`: oscillator and walking antenna; 0.02 m/s are the signal's own at 45 dB-Hz.
+    `ionosphere_share`: a Klobuchar model takes out at least half (IS-GPS-200N 20.3.3.5.2.5);
+    without one 5 m at the zenith, an afternoon of an active sun at middle latitudes.
+    """
+
+    multipath_m: float = 0.5
+    thermal_m: float = 0.3
+    troposphere_m: float = 0.12
+    ionosphere_share: float = 0.5
+    ionosphere_unmodelled_m: float = 5.0
+    ionosphere_local: float = 0.2
+    rate_m_s: float = 0.05
+
+    def array(self) -> Array:
+        """As `range_kernel.range_rows` takes it."""
+        return np.array(
+            (
+                self.multipath_m,
+                self.thermal_m,
+                45.0,
+                self.troposphere_m,
+                self.ionosphere_share,
+                self.ionosphere_unmodelled_m,
+                self.ionosphere_local,
+                self.rate_m_s,
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RangeOptions:
+    """Masks and choices. `systems`: which to use."""
+
+    systems: tuple[System, ...] = SYSTEMS
+    elevation_mask_rad: float = np.radians(10.0)
+    cno_mask_db_hz: float = 28.0
+    preferred: dict[System, tuple[str, ...]] = field(default_factory=lambda: PREFERRED)
+    noise: RangeNoise = RangeNoise()
+    signal_in_space_m: dict[System, float] = field(default_factory=lambda: SIGNAL_IN_SPACE_M)
+
+
+class Rows(NamedTuple):
+    """What serves of an epoch, n rows; ECEF is the frame of the instant of reception.
+
+    `pseudorange_m` and `rate_m_s` (n,) corrected, so that range + clock offset of the receiver and
+    its rate are left (NaN where no rate was measured); `position` and `velocity` (n, 3) of the
+    satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
+    that was assumed; `system` (n,) indices into `SYSTEMS`; `measured_at` (n,) into the epoch's signals;
+    `variance` and `rate_variance` (n,)
+    of what is independent, `ionosphere_sigma_m` (n,) of what is common; `troposphere_m` and
+    `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
+    """
+
+    satellites: tuple[str, ...]
+    signals: tuple[str, ...]
+    system: npt.NDArray[np.intp]
+    measured_at: npt.NDArray[np.intp]
+    pseudorange_m: Array
+    rate_m_s: Array
+    position: Array
+    velocity: Array
+    line_of_sight: Array
+    range_m: Array
+    elevation_rad: Array
+    azimuth_rad: Array
+    variance: Array
+    rate_variance: Array
+    troposphere_m: Array
+    ionosphere_m: Array
+    ionosphere_sigma_m: Array
+    refused: tuple[tuple[str, str], ...]
+
+    def without(self, satellites: Collection[str]) -> Rows:
+        """The same without some satellites."""
+        keep = np.array([s not in satellites for s in self.satellites], bool)
+        changed: dict[str, Any] = {n: getattr(self, n)[keep] for n in self._fields[2:-1]}
+        for name in ("satellites", "signals"):
+            changed[name] = tuple(v for v, k in zip(getattr(self, name), keep, strict=True) if k)
+        return self._replace(**changed)
+
+
+class _Plan(NamedTuple):
+    """Which signals serve, as long as the same ones come and no ephemeris changes."""
+
+    keys: list[tuple[System, int, str]]
+    version: int
+    gps_s: float
+    measured_at: npt.NDArray[np.intp]
+    satellites: tuple[str, ...]
+    signals: tuple[str, ...]
+    system: npt.NDArray[np.intp]
+    orbits: Orbits
+    fixed: Array
+    ionosphere: Array
+    refused: tuple[tuple[str, str], ...]
+
+
+class Picked(NamedTuple):
+    """An epoch's signals that serve, (n, 5) as measured: all that does not need the receiver."""
+
+    plan: _Plan
+    week: int
+    tow_s: float
+    measured: Array
+
+
+class RangeModel:
+    """Turns epochs into rows with the ephemerides of a store."""
+
+    def __init__(self, store: EphemerisStore, options: RangeOptions | None = None) -> None:
+        self.store = store
+        self.options = options or RangeOptions()
+        self._noise = self.options.noise.array()
+        self._plan: _Plan | None = None
+
+    def rows(self, epoch: RawGnssEpoch, receiver: Array) -> Rows:
+        """Rows for a receiver at about (3,) ECEF m; 100 m off moves a correction by 1 cm.
+
+        A receiver nearer to the earth's centre than its surface is a first guess: elevations are
+        then 90 deg and the atmosphere is left out.
+        """
+        return self.evaluate(self.pick(epoch), receiver)
+
+    def pick(self, epoch: RawGnssEpoch) -> Picked:
+        """Choose the signals that serve."""
+        keys = [(s.system, s.prn, s.signal) for s in epoch.signals]
+        now = epoch.week * WEEK_S + epoch.tow_s
+        plan = self._plan
+        if (
+            plan is None
+            or plan.version != self.store.version
+            or abs(now - plan.gps_s) > PLAN_HOLDS_S
+            or plan.keys != keys
+        ):
+            self._plan = plan = self._make_plan(epoch, keys, now)
+        signals = epoch.signals
+        values = [
+            (
+                s.pseudorange_m,
+                s.range_rate_m_s,
+                s.cno_db_hz,
+                s.sd_pseudorange_m,
+                s.sd_range_rate_m_s,
+            )
+            for s in map(signals.__getitem__, plan.measured_at.tolist())
+        ]
+        measured = np.array(values, float).reshape(len(values), rk.MEASURED_COLUMNS)
+        return Picked(plan, epoch.week, epoch.tow_s, measured)
+
+    def evaluate(self, picked: Picked, receiver: Array) -> Rows:
+        """Rows of picked signals for a receiver at (3,) ECEF m."""
+        plan = picked.plan
+        out = np.empty((len(plan.measured_at), rk.ROW_COLUMNS))
+        rk.range_rows(
+            plan.orbits.elements,
+            plan.fixed,
+            picked.measured,
+            plan.ionosphere,
+            float(picked.week),
+            picked.tow_s,
+            np.ascontiguousarray(receiver, float),
+            self._noise,
+            out,
+        )
+        satellites, signals, system, index = (
+            plan.satellites,
+            plan.signals,
+            plan.system,
+            plan.measured_at,
+        )
+        refused = plan.refused
+        weak = picked.measured[:, rk.CNO] < self.options.cno_mask_db_hz
+        low = out[:, rk.ELEVATION] < self.options.elevation_mask_rad
+        if (drop := weak | low).any():
+            refused += tuple(
+                (satellites[k], "weak_signal" if weak[k] else "low_elevation")
+                for k in np.flatnonzero(drop)
+            )
+            keep = np.flatnonzero(~drop)
+            satellites = tuple(satellites[k] for k in keep)
+            signals = tuple(signals[k] for k in keep)
+            system, index, out = system[keep], index[keep], out[keep]
+        return Rows(
+            satellites,
+            signals,
+            system,
+            index,
+            out[:, rk.CORRECTED],
+            out[:, rk.CORRECTED_RATE],
+            out[:, rk.X : rk.VX],
+            out[:, rk.VX : rk.LX],
+            out[:, rk.LX : rk.RANGE],
+            out[:, rk.RANGE],
+            out[:, rk.ELEVATION],
+            out[:, rk.AZIMUTH],
+            out[:, rk.VARIANCE],
+            out[:, rk.RATE_VARIANCE],
+            out[:, rk.TROPOSPHERE],
+            out[:, rk.IONOSPHERE],
+            out[:, rk.COMMON],
+            refused,
+        )
+
+    def _make_plan(
+        self, epoch: RawGnssEpoch, keys: list[tuple[System, int, str]], now: float
+    ) -> _Plan:
+        by_satellite: dict[tuple[System, int], dict[str, int]] = {}
+        for k, s in enumerate(epoch.signals):
+            if s.system in self.options.systems:
+                by_satellite.setdefault((s.system, s.prn), {})[s.signal] = k
+        chosen: list[tuple[int, RawSignal, Ephemeris]] = []
+        fixed: list[tuple[float, float, float, float]] = []
+        refused: list[tuple[str, str]] = []
+        for found in by_satellite.values():
+            served = self._serve(epoch, found)
+            if isinstance(served, str):
+                refused.append((epoch.signals[next(iter(found.values()))].satellite, served))
+                continue
+            index, ephemeris, row = served
+            chosen.append((index, epoch.signals[index], ephemeris))
+            fixed.append(row)
+        return _Plan(
+            keys,
+            self.store.version,
+            now,
+            np.array([k for k, _, _ in chosen], np.intp),
+            tuple(s.satellite for _, s, _ in chosen),
+            tuple(s.signal for _, s, _ in chosen),
+            np.array([SYSTEMS.index(s.system) for _, s, _ in chosen], np.intp),
+            Orbits.of([e for _, _, e in chosen]),
+            np.array(fixed, float).reshape(len(fixed), rk.SIGNAL_COLUMNS),
+            self._ionosphere(),
+            tuple(refused),
+        )
+
+    def _serve(
+        self, epoch: RawGnssEpoch, found: dict[str, int]
+    ) -> tuple[int, Ephemeris, tuple[float, float, float, float]] | str:
+        """Of one satellite's signals the one that serves: index, ephemeris, row of the plan."""
+        first = epoch.signals[next(iter(found.values()))]
+        wanted = [found[name] for name in self.options.preferred[first.system] if name in found]
+        outcome = "no_group_delay"
+        for k in wanted or found.values():
+            s = epoch.signals[k]
+            e = self.store.select(s.system, s.prn, epoch.week, epoch.tow_s, s.signal[0])
+            if isinstance(e, str):
+                outcome = e
+                continue
+            delay = group_delay(e, s.signal)
+            if delay is None:
+                continue
+            model, scale = self._ionosphere_model(s)
+            variance = self.options.signal_in_space_m[s.system] ** 2 + delay.sigma_m**2
+            return k, e, (SPEED_OF_LIGHT_M_S * delay.delay_s, model, scale, variance)
+        return outcome
+
+    def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
+        """Model and scale to the signal's frequency: the system's own, else whichever came."""
+        have = self.store.ionosphere
+        carrier = CARRIER_HZ[signal.system, signal.signal[0]]
+        if "C" in have and (signal.system == "C" or "G" not in have):
+            return rk.BEIDOU_MODEL, (BEIDOU_IONO_HZ / carrier) ** 2
+        if "G" in have:
+            return rk.GPS_MODEL, (GPS_IONO_HZ / carrier) ** 2
+        return rk.NO_MODEL, (GPS_IONO_HZ / carrier) ** 2
+
+    def _ionosphere(self) -> Array:
+        out = np.zeros((2, 8))
+        if gps := self.store.ionosphere.get("G"):
+            out[0] = (*gps.alpha, *gps.beta)
+        if beidou := self.store.ionosphere.get("C"):
+            out[1] = (*beidou.alpha, *beidou.beta)
+        return out

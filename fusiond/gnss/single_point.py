@@ -1,0 +1,199 @@
+r"""Least-squares position, velocity and clocks from one epoch: no filter, no past.
+
+    y - rho(x) = H [dr, b, n] + noise,   H = [-l, clock columns, s_I],   n ~ N(0, 1)
+    dx = N^-1 H^T W (y - rho),   N = H^T W H + diag(0, .., 0, 1)
+
+l (n, 3) lines of sight, one clock offset per system that is there, W = 1 / sigma^2; s_I n is what
+the ionosphere's model leaves in the whole sky, known beforehand to its sigma. Iterated until the
+step is under 1 mm, from the earth's centre if nothing better is known. Velocity and drift the same
+way from the rates, with one drift. Residual test: the sum of squares over sigma^2, and n^2, against
+chi^2 with as many degrees of freedom as there are rows more than positions and clocks; while it
+fails, the row with the largest normalised residual
+
+    w_k = r_k / sqrt(S_kk),   S = W^-1 - H N^-1 H^T
+
+is taken out (`residual`), as long as one row more than unknowns is left.
+
+Dilution of precision, from Q = (H^T H)^-1 with position in north-east-down:
+
+    HDOP^2 = q_nn + q_ee,  VDOP^2 = q_dd,  PDOP^2 = HDOP^2 + VDOP^2
+    TDOP^2 = sum of the clocks' q,  GDOP^2 = PDOP^2 + TDOP^2
+
+With several clocks TDOP is that of all of them, so GDOP^2 stays the trace of Q.
+
+Source: Groves, 2nd edition, 9.4.1 (9.141), 9.4.3 (9.153) and 17.4.1; Baarda, A Testing Procedure
+for Use in Geodetic Networks (1968), whose level of 0.001 is kept.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import chdtri
+
+from drivers.raw.messages import SYSTEMS, RawGnssEpoch
+from fusiond.gnss.ecef import ned_axes, to_geodetic
+from fusiond.gnss.ranges import Picked, RangeModel, Rows
+
+Array = npt.NDArray[np.float64]
+
+FALSE_ALARM = 0.001
+MAX_ITERATIONS = 12
+STEP_M = 1e-3
+MAX_CONDITION = 1e5
+"""Of H: GDOP over about 1e4, where 1 m of range is 10 km."""
+
+
+class Dops(NamedTuple):
+    """Dilutions of precision, without unit."""
+
+    gdop: float
+    pdop: float
+    hdop: float
+    vdop: float
+    tdop: float
+
+
+class SinglePoint(NamedTuple):
+    """`position` (3,) ECEF m with `covariance` (3, 3) m^2; `clock_m` by system letter;
+    `ionosphere_sigmas` n; `velocity` (3,) ECEF m/s and `drift_m_s`, None without enough rates; `rows` those used with `residual_m`
+    (n,); `refused` pairs of satellite and reason; `statistic` of the residual test against `bound`
+    with `redundancy` degrees of freedom."""
+
+    position: Array
+    covariance: Array
+    clock_m: dict[str, float]
+    ionosphere_sigmas: float
+    velocity: Array | None
+    drift_m_s: float | None
+    dops: Dops
+    rows: Rows
+    residual_m: Array
+    refused: tuple[tuple[str, str], ...]
+    statistic: float
+    bound: float
+    redundancy: int
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the residual test passes; without redundancy there is nothing to test."""
+        return self.redundancy == 0 or self.statistic <= self.bound
+
+
+def design(line_of_sight: Array, system: npt.NDArray[np.intp]) -> tuple[Array, list[int]]:
+    """H (n, 3 + clocks) of positions and clocks, and the index of each clock's system."""
+    present = sorted(set(system.tolist()))
+    h = np.zeros((len(system), 3 + len(present)))
+    h[:, :3] = -line_of_sight
+    for j, s in enumerate(present):
+        h[:, 3 + j] = system == s
+    return h, present
+
+
+def dops(line_of_sight: Array, system: npt.NDArray[np.intp], receiver: Array) -> Dops | None:
+    """DOPs of lines of sight (n, 3) in ECEF with one clock per system; None if not observable."""
+    h, _ = design(line_of_sight, system)
+    lat, lon, _ = to_geodetic(float(receiver[0]), float(receiver[1]), float(receiver[2]))
+    h[:, :3] = h[:, :3] @ ned_axes(lat, lon)
+    if len(h) < h.shape[1] or np.linalg.cond(h) > MAX_CONDITION:
+        return None
+    q = np.diag(np.linalg.inv(h.T @ h))
+    return Dops(*np.sqrt([q.sum(), q[:3].sum(), q[:2].sum(), q[2], q[3:].sum()]).tolist())
+
+
+class _Fit(NamedTuple):
+    position: Array
+    clocks: Array
+    ionosphere: float
+    rows: Rows
+    h: Array
+    systems: list[int]
+    covariance: Array
+    residual: Array
+
+
+def single_point(
+    model: RangeModel, epoch: RawGnssEpoch, guess: Array | None = None
+) -> SinglePoint | str:
+    """Solve one epoch; `too_few`, `geometry` or `diverged` names why there is none.
+
+    `guess` (3,) ECEF m: where the receiver is about.
+    """
+    picked = model.pick(epoch)
+    position = np.zeros(3) if guess is None else np.array(guess, float)
+    out: list[str] = []
+    while True:
+        fit = _fit(model, picked, position, out)
+        if isinstance(fit, str):
+            return fit
+        position, rows = fit.position, fit.rows
+        n, m = len(fit.h), fit.h.shape[1] - 1
+        statistic = float(fit.residual**2 @ (1.0 / rows.variance)) + fit.ionosphere**2
+        bound = float(chdtri(n - m, FALSE_ALARM)) if n > m else 0.0
+        if n - m < 2 or statistic <= bound:
+            break
+        spread = rows.variance - np.einsum("ij,jk,ik->i", fit.h, fit.covariance, fit.h)
+        w = np.abs(fit.residual) / np.sqrt(np.maximum(spread, 1e-6 * rows.variance))
+        out.append(rows.satellites[int(np.argmax(w))])
+    quality = dops(rows.line_of_sight, rows.system, position)
+    if quality is None:
+        return "geometry"
+    velocity, drift = _velocity(rows)
+    return SinglePoint(
+        position,
+        fit.covariance[:3, :3],
+        {SYSTEMS[s]: float(c) for s, c in zip(fit.systems, fit.clocks, strict=True)},
+        fit.ionosphere,
+        velocity,
+        drift,
+        quality,
+        rows,
+        fit.residual,
+        rows.refused + tuple((s, "residual") for s in out),
+        statistic,
+        bound,
+        n - m,
+    )
+
+
+def _fit(model: RangeModel, picked: Picked, position: Array, out: list[str]) -> _Fit | str:
+    """Gauss-Newton from `position`, without the satellites in `out`."""
+    for _ in range(MAX_ITERATIONS):
+        rows = model.evaluate(picked, position)
+        if out:
+            rows = rows.without(out)
+        h, systems = design(rows.line_of_sight, rows.system)
+        n, m = h.shape
+        if n < m or m == 3:
+            return "too_few"
+        if np.linalg.cond(h) > MAX_CONDITION:
+            return "geometry"
+        weight = 1.0 / rows.variance
+        h = np.column_stack([h, rows.ionosphere_sigma_m])
+        normal = h.T @ (h * weight[:, None])
+        normal[m, m] += 1.0
+        covariance = np.linalg.inv(normal)
+        y = rows.pseudorange_m - rows.range_m
+        x = covariance @ (h.T @ (weight * y))
+        position = position + x[:3]
+        if np.abs(x[:3]).max() < STEP_M:
+            residual: Array = y - h @ x
+            return _Fit(position, x[3:m], float(x[m]), rows, h, systems, covariance, residual)
+    return "diverged"
+
+
+def _velocity(rows: Rows) -> tuple[Array | None, float | None]:
+    """Velocity (3,) ECEF m/s and drift m/s from the rows that have a rate."""
+    has = np.isfinite(rows.rate_m_s)
+    if has.sum() < 4:
+        return None, None
+    los = rows.line_of_sight[has]
+    h = np.column_stack([-los, np.ones(len(los))])
+    if np.linalg.cond(h) > MAX_CONDITION:
+        return None, None
+    y = rows.rate_m_s[has] - np.einsum("ij,ij->i", los, rows.velocity[has])
+    weight = 1.0 / rows.rate_variance[has]
+    x = np.linalg.solve(h.T @ (h * weight[:, None]), h.T @ (weight * y))
+    return x[:3], float(x[3])

@@ -1,0 +1,91 @@
+"""Broadcast ephemerides by satellite: which one holds now, or why none does.
+
+    |t - toe| <= limit        t, toe in GPS time
+
+The closest toe is taken. A satellite keeps its last issues, so at a changeover a late measurement
+still meets the older one. Health is what the satellite said last, whatever issue is used.
+
+Outcomes: `no_ephemeris`, `unhealthy`, `stale_ephemeris`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from drivers.raw.messages import Ephemeris, Klobuchar, System
+from fusiond.gnss.orbit import WEEK_S, gps_time
+
+MAX_AGE_S: dict[System, float] = {"G": 7200.0, "E": 14400.0, "C": 7200.0}
+"""GPS: fit interval of 4 h centred on toe (IS-GPS-200N 20.3.4.4 and table 20-XI). Galileo: 4 h
+(Galileo OS SDD 1.3, 2.4.1: validity of the navigation data). BeiDou: a new set each hour, for the
+hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4.9; toe on the hour), and one hour more for a set that
+was not received whole."""
+KEPT_ISSUES = 4
+"""By message: the present issue, the next, and what measurements out of a queue may need."""
+
+Missing = Literal["no_ephemeris", "unhealthy", "stale_ephemeris"]
+
+_MESSAGES: dict[tuple[System, str], tuple[str, ...]] = {("E", "5"): ("fnav", "inav")}
+_OTHERS: dict[System, tuple[str, ...]] = {"G": ("lnav",), "E": ("inav", "fnav"), "C": ("d1", "d2")}
+
+
+class EphemerisStore:
+    """What has been received. `version` rises with every change."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[System, int, str], list[Ephemeris]] = {}
+        self.ionosphere: dict[System, Klobuchar] = {}
+        self.version = 0
+
+    def __len__(self) -> int:
+        """Satellites of which an ephemeris is held."""
+        return len({key[:2] for key in self._kept})
+
+    def add(self, message: Ephemeris | Klobuchar) -> None:
+        """Take in what a decoder completed; the same again changes only when it was seen."""
+        if isinstance(message, Klobuchar):
+            old = self.ionosphere.get(message.system)
+            if old is None or (old.alpha, old.beta) != (message.alpha, message.beta):
+                self.version += 1
+            self.ionosphere[message.system] = message
+            return
+        key = (message.system, message.prn, message.message)
+        kept = self._kept.setdefault(key, [])
+        same = [e for e in kept if (e.week, e.toe_s) == (message.week, message.toe_s)]
+        for e in same:
+            kept.remove(e)
+        kept.append(message)
+        del kept[:-KEPT_ISSUES]
+        if not (same and _differs_only_in_time(same[-1], message)):
+            self.version += 1
+
+    def select(
+        self, system: System, prn: int, week: int, tow_s: float, band: str = ""
+    ) -> Ephemeris | Missing:
+        """The ephemeris for a GPS time, or why there is none.
+
+        `band` (first character of a signal): Galileo's clock for E5a is that of F/NAV.
+        """
+        outcome: Missing = "no_ephemeris"
+        for message in _MESSAGES.get((system, band), _OTHERS[system]):
+            kept = self._kept.get((system, prn, message))
+            if not kept:
+                continue
+            if not kept[-1].healthy:
+                return "unhealthy"
+            best = min(kept, key=lambda e: abs(seconds_from_toe(e, week, tow_s)))
+            if abs(seconds_from_toe(best, week, tow_s)) <= MAX_AGE_S[system]:
+                return best if best.healthy else "unhealthy"
+            outcome = "stale_ephemeris"
+        return outcome
+
+
+def seconds_from_toe(ephemeris: Ephemeris, week: int, tow_s: float) -> float:
+    """t - toe in s for a GPS time."""
+    toe_week, toe = gps_time(ephemeris.system, ephemeris.week, ephemeris.toe_s)
+    return (week - toe_week) * WEEK_S + (tow_s - toe)
+
+
+def _differs_only_in_time(a: Ephemeris, b: Ephemeris) -> bool:
+    names = [n for n in Ephemeris.__slots__ if n not in {"t_seen_ns", "source"}]
+    return all(getattr(a, n) == getattr(b, n) for n in names)
