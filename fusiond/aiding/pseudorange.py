@@ -1,0 +1,258 @@
+r"""Ranges and range rates to satellites: raw GNSS, and the slant ranges of a double-star system.
+
+With a = C l the lever arm and b = C (w x l) its velocity in NED axes, s and s' the satellite's
+ECEF position and velocity, u the unit vector from the antenna to it, c_k and d the clock's offset
+and drift as a range:
+
+    rho^ = |s - p^ - a| + c_k^,     rate^ = u . (s' - v^ - b) + d^
+    z_rho  = rho^ - rho   = -u . dr + (a x u) . phi - dc_k + v
+    z_rate = rate^ - rate = -u . dv + (b x u + g x a) . phi + (C^T u x l) . e - dd
+             + (g + turn) . dr + v
+    g = -(I - u u^T)(s' - v - b) / |s - p - a|
+
+`turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
+transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
+term in the rate either, for u . (w_ie x u) = 0. All else (satellite clock, group delay, atmosphere)
+has been taken off. Left out: the change of the flight time in the rate, under 3 mm/s, and the
+Earth's own rate times the lever. dc_k and dd are true minus estimated, as all parameters.
+
+A double-star system's two path lengths L1 = 2 rho_1, L2 = rho_1 + rho_2 (fusiond.aiding.
+rdss_geometry) are two ranges without a clock: rho_1 = L1 / 2 and rho_2 = L2 - L1 / 2 have
+independent errors.
+
+Source: Groves, 2nd ed., eq. 14.114 to 14.128 and 9.165.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.estimators.model import CLOCK_DRIFT, CLOCK_OFFSET
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
+from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
+from fusiond.navigation.rotation import dcm_elements
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, STEP_RATE_B, VN
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+NO_CLOCK = -1
+"""In place of a clock offset: the range knows no receiver clock."""
+
+
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1],"
+    "i8[::1], i8, f8, f8, f8, f8[::1], f8[:, ::1])"
+)
+def _rows(
+    nav: Array,
+    xi: Array,
+    step: Array,
+    column_of: Indices,
+    active: NDArray[np.bool_],
+    position: Array,
+    velocity: Array,
+    ranges: Array,
+    rates: Array,
+    offset_slot: Indices,
+    drift_slot: int,
+    l0: float,
+    l1: float,
+    l2: float,
+    z: Array,
+    h: Array,
+) -> None:
+    """Write z (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates."""
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
+    a0 = c00 * l0 + c01 * l1 + c02 * l2
+    a1 = c10 * l0 + c11 * l1 + c12 * l2
+    a2 = c20 * l0 + c21 * l1 + c22 * l2
+    w0, w1, w2 = step[STEP_RATE_B], step[STEP_RATE_B + 1], step[STEP_RATE_B + 2]
+    t0, t1, t2 = w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0
+    b0 = c00 * t0 + c01 * t1 + c02 * t2
+    b1 = c10 * t0 + c11 * t1 + c12 * t2
+    b2 = c20 * t0 + c21 * t1 + c22 * t2
+    v0, v1, v2 = nav[VN] + b0, nav[VN + 1] + b1, nav[VN + 2] + b2
+    sl, cl = math.sin(nav[LAT]), math.cos(nav[LAT])
+    so, co = math.sin(nav[LON]), math.cos(nav[LON])
+    root = math.sqrt(1.0 - ECCENTRICITY_SQUARED * sl * sl)
+    transverse, height = SEMI_MAJOR_M / root, nav[HEIGHT]
+    radius_n = transverse + height
+    radius_m = transverse * (1.0 - ECCENTRICITY_SQUARED) / (root * root) + height
+    x, y = radius_n * cl * co, radius_n * cl * so
+    zed = (transverse * (1.0 - ECCENTRICITY_SQUARED) + height) * sl
+
+    row = 0
+    for kind in range(2):
+        for i in range(ranges.shape[0]):
+            if not math.isfinite(ranges[i] if kind == 0 else rates[i]):
+                continue
+            # From the antenna to the satellite, north, east, down.
+            e0, e1, e2 = position[i, 0] - x, position[i, 1] - y, position[i, 2] - zed
+            m0 = -sl * co * e0 - sl * so * e1 + cl * e2 - a0
+            m1 = -so * e0 + co * e1 - a1
+            m2 = -cl * co * e0 - cl * so * e1 - sl * e2 - a2
+            distance = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+            u0, u1, u2 = m0 / distance, m1 / distance, m2 / distance
+            g = h[row]
+            if kind == 0:
+                z[row] = distance - ranges[i]
+                g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
+                g[6], g[7], g[8] = -u0, -u1, -u2
+                if offset_slot[i] >= 0:
+                    z[row] += xi[offset_slot[i]]
+                    g[offset_slot[i]] = -1.0
+            else:
+                e0, e1, e2 = velocity[i, 0], velocity[i, 1], velocity[i, 2]
+                q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
+                q1 = -so * e0 + co * e1 - v1
+                q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
+                along = u0 * q0 + u1 * q1 + u2 * q2
+                z[row] = along - rates[i]
+                k0 = (along * u0 - q0) / distance
+                k1 = (along * u1 - q1) / distance
+                k2 = (along * u2 - q2) / distance
+                g[0] = b1 * u2 - b2 * u1 + k1 * a2 - k2 * a1
+                g[1] = b2 * u0 - b0 * u2 + k2 * a0 - k0 * a2
+                g[2] = b0 * u1 - b1 * u0 + k0 * a1 - k1 * a0
+                g[3], g[4], g[5] = -u0, -u1, -u2
+                # The axes turn by [dr_e, -dr_n R_N / R_M, -dr_e tan(lat)] / R_N.
+                p0, p1, p2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
+                g[6] = k0 + p1 / radius_m
+                g[7] = k1 + (p2 * sl / cl - p0) / radius_n
+                g[8] = k2
+                # C^T u x l, by axis.
+                n0 = c00 * u0 + c10 * u1 + c20 * u2
+                n1 = c01 * u0 + c11 * u1 + c21 * u2
+                n2 = c02 * u0 + c12 * u1 + c22 * u2
+                for slot in range(CORE_SIZE, column_of.shape[0]):
+                    axis = column_of[slot] - RATE_ERROR
+                    if axis == 0:
+                        g[slot] = n1 * l2 - n2 * l1
+                    elif axis == 1:
+                        g[slot] = n2 * l0 - n0 * l2
+                    elif axis == 2:
+                        g[slot] = n0 * l1 - n1 * l0
+                if drift_slot >= 0:
+                    z[row] += xi[drift_slot]
+                    g[drift_slot] = -1.0
+            for j in range(CORE_SIZE):
+                if not active[j]:
+                    g[j] = 0.0
+            row += 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PseudorangeAid(Aid):
+    """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
+
+    `position`, `velocity` (n, 3): ECEF at transmission, turned to the axes at reception (m, m/s).
+    `ranges` (m), `rates` (m/s; positive: going away), their variances (m^2, (m/s)^2), each (n,);
+    NaN is not measured. `clock` (n,): which of the states of the model's block `clock_offset` each
+    range has, or NO_CLOCK; a rate of a satellite with NO_CLOCK has no drift either. `lever` (m,
+    body axes) of the antenna. Rows: the finite ranges in order, then the finite rates (`labels`).
+
+    ValueError for shapes that do not fit, a variance that is not positive where there is a value,
+    or a satellite with a clock beside one without where rates are given.
+    """
+
+    satellites: tuple[str, ...]
+    position: Array
+    velocity: Array
+    ranges: Array
+    rates: Array
+    range_variance: Array
+    rate_variance: Array
+    clock: Indices
+    lever: Vector3 = (0.0, 0.0, 0.0)
+    _r: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.satellites)
+        for name, shape in (("position", (n, 3)), ("velocity", (n, 3)), ("ranges", (n,))):
+            _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), shape)
+        for name in ("rates", "range_variance", "rate_variance"):
+            _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), (n,))
+        _keep(self, "clock", np.ascontiguousarray(self.clock, dtype=np.int64), (n,))
+        rates = np.isfinite(self.rates)
+        r = np.concatenate(
+            [self.range_variance[np.isfinite(self.ranges)], self.rate_variance[rates]]
+        )
+        if not bool(np.all((r > 0.0) & np.isfinite(r))):
+            raise ValueError("variances must be positive and finite")
+        if len({bool(c < 0) for c in self.clock[rates]}) > 1:
+            raise ValueError("rates of satellites with and without a clock in one epoch")
+        object.__setattr__(self, "_r", r)
+
+    @property
+    def labels(self) -> list[tuple[str, str]]:
+        """Satellite and `range` or `rate` of each row."""
+        return [
+            (name, what)
+            for what, values in (("range", self.ranges), ("rate", self.rates))
+            for name, value in zip(self.satellites, values, strict=True)
+            if math.isfinite(value)
+        ]
+
+    def only(self, keep: Sequence[bool] | NDArray[np.bool_]) -> PseudorangeAid:
+        """The epoch with the satellites marked in `keep` (n,) alone."""
+        mask = np.asarray(keep, dtype=bool)
+        return PseudorangeAid(
+            self.source,
+            self.t_ns,
+            self.gate,
+            tuple(s for s, k in zip(self.satellites, mask, strict=True) if k),
+            self.position[mask],
+            self.velocity[mask],
+            self.ranges[mask],
+            self.rates[mask],
+            self.range_variance[mask],
+            self.rate_variance[mask],
+            self.clock[mask],
+            self.lever,
+        )
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        model = state.model
+        if not self._r.size:
+            return NotApplicable("no_satellites")
+        offsets = np.array(model.slots_of(CLOCK_OFFSET) or [-1])
+        drifts = model.slots_of(CLOCK_DRIFT)
+        greatest = int(self.clock.max())
+        if greatest >= len(offsets) or (greatest >= 0 and not drifts):
+            return NotApplicable("no_clock_state")
+        slots = np.where(self.clock >= 0, offsets[self.clock], NO_CLOCK)
+        rows = self._r.size
+        z, h = np.empty(rows), np.zeros((rows, model.size))
+        _rows(
+            state.nav,
+            state.xi,
+            state.step,
+            model.column_of,
+            model.active,
+            self.position,
+            self.velocity,
+            self.ranges,
+            self.rates,
+            slots,
+            drifts[0] if greatest >= 0 else NO_CLOCK,
+            *self.lever,
+            z,
+            h,
+        )
+        return Innovation(z, h, self._r)
+
+
+def _keep(
+    aid: PseudorangeAid, name: str, value: NDArray[np.generic], shape: tuple[int, ...]
+) -> None:
+    if value.shape != shape:
+        raise ValueError(f"{name} has shape {value.shape}, not {shape}")
+    object.__setattr__(aid, name, value)
