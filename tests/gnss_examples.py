@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.raw.messages import Ephemeris, System
+from drivers.measurements import ArrivalStamp
+from drivers.raw.messages import (
+    CARRIER_HZ,
+    SPEED_OF_LIGHT_M_S,
+    Ephemeris,
+    RawGnssEpoch,
+    RawSignal,
+    System,
+)
 from fusiond.gnss.orbit import gps_time
 
 rtk = pytest.importorskip("pyrtklib", reason="pyrtklib, the oracle, has wheels for x86-64 only")
@@ -115,3 +123,47 @@ def oracle_state(e: Ephemeris, week: int, tow_s: float) -> tuple[Any, float]:
     position, clock, variance = vector(0, 0, 0), vector(0), vector(0)
     rtk.eph2pos(oracle_time(week, tow_s), oracle_ephemeris(e), position, clock, variance)
     return np.array([position[i] for i in range(3)]), clock[0]
+
+
+def oracle_pseudorange(
+    e: Ephemeris,
+    week: int,
+    tow_s: float,
+    receiver: Any,
+    signal: str,
+    group_delay_s: float,
+    clock_m: float,
+    ionosphere: tuple[float, ...] = (),
+) -> float:
+    """Pseudorange that RTKLIB's parts make; without `ionosphere` (GPS's eight) in vacuo.
+
+    `tow_s` true time of reception; the receiver's clock, and so what it says of the epoch, is ahead
+    by `clock_m` / c.
+    """
+    at = vector(*receiver)
+    place, azel, sight = vector(0, 0, 0), vector(0, 0), vector(0, 0, 0)
+    rtk.ecef2pos(at, place)
+    flight, distance, clock = 0.07, 0.0, 0.0
+    for _ in range(6):
+        position, clock = oracle_state(e, week, tow_s - flight)
+        distance = rtk.geodist(vector(*position), at, sight)
+        flight = distance / SPEED_OF_LIGHT_M_S
+    rtk.satazel(place, sight, azel)
+    range_m = distance - SPEED_OF_LIGHT_M_S * (clock - group_delay_s) + clock_m
+    if not ionosphere:
+        return float(range_m)
+    now = oracle_time(week, tow_s)
+    zenith = vector(0.0, math.pi / 2)
+    dry = rtk.tropmodel(now, place, zenith, 0.0)
+    wet = rtk.tropmodel(now, place, zenith, 0.7) - dry
+    wet_map = vector(0)
+    dry_map = rtk.tropmapf(now, place, azel, wet_map)
+    carrier = CARRIER_HZ[e.system, signal[0]]
+    layer = rtk.ionmodel(now, vector(*ionosphere), place, azel)
+    layer *= (CARRIER_HZ["G", "1"] / carrier) ** 2
+    return float(range_m + dry * dry_map + wet * wet_map[0] + layer)
+
+
+def signals_epoch(week: int, tow_s: float, signals: list[RawSignal]) -> RawGnssEpoch:
+    """An epoch of some signals."""
+    return RawGnssEpoch("made", 0, ArrivalStamp(), week, tow_s, tuple(signals))

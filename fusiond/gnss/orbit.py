@@ -19,8 +19,8 @@ relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
 BeiDou's time is 14 s behind GPS time. It is settled here and nowhere else: `Orbits` is asked in GPS
 time, and toe and toc are moved to GPS time when they come in; `we toe` keeps the system's own toe.
 
-Source: IS-GPS-200N 20.3.3.3.3.1, 20.3.3.4.3 and table 20-IV; BDS-SIS-ICD-B1I-3.0 5.2.4.9 and
-5.2.4.12 (GEO rotation); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4.
+Source: IS-GPS-200N 20.3.3.3.3.1, 20.3.3.4.3 and table 20-IV; BDS-SIS-ICD-B1I-3.0 5.2.4
+(ephemeris parameters, with the rotation for GEO); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ for hours. So it has a column of its own, `ionosphere_sigma_m`, to be used as on
 unit variance (as `fusiond.gnss.single_point` does), or as a state of a filter; a fifth of it stands
 for what differs from satellite to satellite.
 
-One signal of each satellite serves: the first of `PREFERRED` that is there. Nothing is combined: the ionosphere-free pair makes noise
-and multipath 2.6 to 3 times as large.
+One signal of each satellite serves: the first of `PREFERRED` that is there. Nothing is combined:
+the ionosphere-free pair makes noise and multipath 2.6 to 3 times as large.
 
 Refusals, by satellite: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (of none of
 its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
@@ -119,10 +119,10 @@ class Rows(NamedTuple):
     `pseudorange_m` and `rate_m_s` (n,) corrected, so that range + clock offset of the receiver and
     its rate are left (NaN where no rate was measured); `position` and `velocity` (n, 3) of the
     satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
-    that was assumed; `system` (n,) indices into `SYSTEMS`; `measured_at` (n,) into the epoch's signals;
-    `variance` and `rate_variance` (n,)
-    of what is independent, `ionosphere_sigma_m` (n,) of what is common; `troposphere_m` and
-    `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
+    that was assumed; `system` (n,) indices into `SYSTEMS`; `measured_at` (n,) into the epoch's
+    signals; `variance` and `rate_variance` (n,) of what is independent, `ionosphere_sigma_m` (n,)
+    of what is common; `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs of
+    satellite and reason.
     """
 
     satellites: tuple[str, ...]

@@ -21,7 +21,7 @@ Dilution of precision, from Q = (H^T H)^-1 with position in north-east-down:
 
 With several clocks TDOP is that of all of them, so GDOP^2 stays the trace of Q.
 
-Source: Groves, 2nd edition, 9.4.1 (9.141), 9.4.3 (9.153) and 17.4.1; Baarda, A Testing Procedure
+Source: Groves, 2nd edition, 9.4.1 and 9.4.3, residual test 17.4; Baarda, A Testing Procedure
 for Use in Geodetic Networks (1968), whose level of 0.001 is kept.
 """
 
@@ -58,9 +58,9 @@ class Dops(NamedTuple):
 
 class SinglePoint(NamedTuple):
     """`position` (3,) ECEF m with `covariance` (3, 3) m^2; `clock_m` by system letter;
-    `ionosphere_sigmas` n; `velocity` (3,) ECEF m/s and `drift_m_s`, None without enough rates; `rows` those used with `residual_m`
-    (n,); `refused` pairs of satellite and reason; `statistic` of the residual test against `bound`
-    with `redundancy` degrees of freedom."""
+    `ionosphere_sigmas` n; `velocity` (3,) ECEF m/s and `drift_m_s`, None without enough rates;
+    `rows` those used with `residual_m` (n,); `refused` pairs of satellite and reason;
+    `statistic` of the residual test against `bound` with `redundancy` degrees of freedom."""
 
     position: Array
     covariance: Array
@@ -172,9 +172,9 @@ def _fit(model: RangeModel, picked: Picked, position: Array, out: list[str]) -> 
             return "geometry"
         weight = 1.0 / rows.variance
         h = np.column_stack([h, rows.ionosphere_sigma_m])
-        normal = h.T @ (h * weight[:, None])
+        normal: Array = h.T @ (h * weight[:, None])
         normal[m, m] += 1.0
-        covariance = np.linalg.inv(normal)
+        covariance = np.asarray(np.linalg.inv(normal), np.float64)
         y = rows.pseudorange_m - rows.range_m
         x = covariance @ (h.T @ (weight * y))
         position = position + x[:3]

@@ -17,8 +17,8 @@ from fusiond.gnss.orbit import WEEK_S, gps_time
 
 MAX_AGE_S: dict[System, float] = {"G": 7200.0, "E": 14400.0, "C": 7200.0}
 """GPS: fit interval of 4 h centred on toe (IS-GPS-200N 20.3.4.4 and table 20-XI). Galileo: 4 h
-(Galileo OS SDD 1.3, 2.4.1: validity of the navigation data). BeiDou: a new set each hour, for the
-hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4.9; toe on the hour), and one hour more for a set that
+(Galileo OS SDD: longest time a set of navigation data is valid). BeiDou: a new set each hour, for
+the hour from toe on (BDS-SIS-ICD-B1I-3.0 5.2.4; toe on the hour), and one hour more for a set that
 was not received whole."""
 KEPT_ISSUES = 4
 """By message: the present issue, the next, and what measurements out of a queue may need."""
