@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +65,11 @@ class NotApplicable(NamedTuple):
 class Aid:
     """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
-    `gate` is the probability with which a consistent innovation passes.
+    `gate` is the probability with which a consistent innovation passes. The rows of a `screened` aid
+    are gated one by one, and a bad one goes alone (fusiond.estimators.screening).
     """
+
+    screened: ClassVar[bool] = False
 
     source: str
     t_ns: int
@@ -76,6 +79,8 @@ class Aid:
 class Linearised(Protocol):
     """An aid that can say its innovation."""
 
+    @property
+    def screened(self) -> bool: ...
     @property
     def source(self) -> str: ...
     @property

@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from fusiond.aiding.base import Linearised, State
-from fusiond.estimators.model import Model
+from fusiond.aiding.base import Innovation, Linearised, State
+from fusiond.estimators.model import CLOCK_OFFSET, Model
 from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
+from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
@@ -42,14 +43,21 @@ def gate_threshold(probability: float, degrees: int) -> float:
     return float(chdtri(degrees, 1.0 - probability))
 
 
+# Ranges that must fail together before a jump of the receiver's clock is a better explanation than
+# as many bad satellites.
+FEWEST_JUMPING = 3
+
+
 class Outcome(NamedTuple):
     """How an aid ended: its name, and the innovation that led to it (NIS, dimension, and L^-1 nu
-    with S = L L^T)."""
+    with S = L L^T). `rows`: of a screened aid, what became of each row
+    (fusiond.estimators.screening); `whitened` is then 0 where a row was left out."""
 
     name: str
     nis: float = float("nan")
     degrees: int = 0
     whitened: tuple[float, ...] = ()
+    rows: tuple[int, ...] = ()
 
 
 class Snapshot(NamedTuple):
@@ -64,6 +72,16 @@ class Snapshot(NamedTuple):
     step: Array
     holding: bool
     extra: object
+
+
+class Screened(NamedTuple):
+    """An update by rows: `codes` (m,), whitened `y` (m,), nu^T S^-1 nu, and P and dx after it."""
+
+    codes: Codes
+    y: Array
+    nis: float
+    cov: Array
+    dx: Array
 
 
 class Estimator(Protocol):
@@ -216,6 +234,31 @@ class ErrorStateFilter:
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
         feed_back(self.nav, self.xi, dx)
+
+    def _screen(self, aid: Linearised, rows: Innovation, cov: Array, dx: Array) -> Screened:
+        """Update by rows of a screened aid, without touching `cov` and `dx`.
+
+        A receiver that sets its clock moves all ranges at once: where it says so, or where the
+        better half of the ranges fails while the rates pass, the clock offset starts anew, in `cov`
+        too, and the rows are judged again.
+        """
+        z, h, r = rows
+        threshold = gate_threshold(aid.gate, 1)
+        offsets = self.model.slots_of(CLOCK_OFFSET)
+        ranges = h[:, offsets].any(axis=1)
+        renew = bool(offsets) and bool(getattr(aid, "clock_reset", False))
+        while True:
+            if renew:
+                cov[offsets] = 0.0
+                cov[:, offsets] = 0.0
+                cov[offsets, offsets] = self.model.initial[offsets] ** 2
+            codes, y = np.zeros(z.shape[0], dtype=np.int64), np.zeros(z.shape[0])
+            cov_out, dx_out = np.empty_like(cov), np.empty_like(dx)
+            nis = screened_update(cov, dx, z, h, r, threshold, codes, y, cov_out, dx_out)
+            lost = int((codes[ranges] != KEPT).sum())
+            if renew or not offsets or lost < FEWEST_JUMPING or 2 * lost <= int(ranges.sum()):
+                return Screened(codes, y, nis, cov_out, dx_out)
+            renew = True
 
     def _widen(self, cov: Array, z: Array, h: Array) -> None:
         """Add the innovation's own square to the states that it measures directly, and doubt the

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse
 
 Array = NDArray[np.float64]
@@ -28,9 +29,11 @@ class KalmanEstimator(ErrorStateFilter):
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
+        cov, dx = self._covs[0], self._dxs[0]
+        if aid.screened:
+            return self._update_by_rows(aid, innovation, inflate)
         z, h, r = innovation
         degrees = z.shape[0]
-        cov, dx = self._covs[0], self._dxs[0]
         threshold = gate_threshold(aid.gate, degrees)
         y = np.zeros(degrees)
         nis = fuse(self.nav, self.xi, cov, dx, z, h, r, threshold, self._holding, y)
@@ -43,6 +46,25 @@ class KalmanEstimator(ErrorStateFilter):
         self._widen(cov, z - h @ dx, h)
         fuse(self.nav, self.xi, cov, dx, z, h, r, math.inf, self._holding, y)
         return Outcome("fused", nis, degrees)
+
+    def _update_by_rows(self, aid: Linearised, rows: Innovation, inflate: bool) -> Outcome:
+        """Rows that pass are folded in; none, or with `inflate` as many as a wider P lets."""
+        cov, dx = self._covs[0], self._dxs[0]
+        s = self._screen(aid, rows, cov, dx)
+        kept = s.codes == KEPT
+        if inflate and 2 * int(kept.sum()) < len(kept):
+            self._widen(cov, rows.z - rows.h @ dx, rows.h)
+            s = self._screen(aid, rows, cov, dx)
+            kept = s.codes == KEPT
+        codes = tuple(s.codes.tolist())
+        if not kept.any():
+            return Outcome("gated", s.nis, 0, (), codes)
+        cov[:] = s.cov
+        dx[:] = s.dx
+        if not self._holding:
+            self._feed_back(dx)
+            dx[:] = 0.0
+        return Outcome("fused", s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
