@@ -134,13 +134,37 @@ class DelayedFix:
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Roll, pitch, yaw (rad, NED to body, 3-2-1) with one sigma; a NaN component is not given."""
+    """Roll, pitch, yaw (rad, NED to body, 3-2-1) with one sigma; a NaN angle is not given.
+
+    A star tracker's attitude is of the same kind, against north-east-down. The sigma of an angle
+    that is given is NaN where the device does not say it.
+    """
 
     source: str
     t_seen_ns: int
     stamp: Stamp
     rpy_rad: Vector3
     sd_rpy_rad: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Bearing:
+    """Direction from the antenna to a known point (SAR image match), in *sensor* axes.
+
+    Sensor axes are nominally those of the body: x forward, y right, z down. `azimuth_rad` runs from
+    x towards y, `elevation_rad` is positive upwards (against z) from the x-y plane. `sd_rad` is one
+    sigma of the two, None where the device does not say. `target` names the point; `point` is its
+    latitude, longitude (rad) and ellipsoidal height (m), None where the configuration holds it.
+    """
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    azimuth_rad: float
+    elevation_rad: float
+    sd_rad: tuple[float, float] | None
+    target: str
+    point: Vector3 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +215,15 @@ class TimeReport:
 
 
 Measurement = (
-    ImuSample | PositionFix | DelayedFix | Attitude | Heading | Height | WheelSpeed | TimeReport
+    ImuSample
+    | PositionFix
+    | DelayedFix
+    | Attitude
+    | Bearing
+    | Heading
+    | Height
+    | WheelSpeed
+    | TimeReport
 )
 
 

@@ -1,15 +1,30 @@
-r"""Attitude (roll, pitch, yaw) and heading.
+r"""Attitude (roll, pitch, yaw), also of a star tracker, and heading.
 
 Attitude: the rotation from measured to computed attitude is -phi, in navigation axes:
 
     z = rotation vector of C^ C_y^T = -phi + v,   cov(v) = J diag(sd^2) J^T
 
 J's columns are the axes about which roll, pitch and yaw turn: C e_x, [-sin yaw, cos yaw, 0], e_z.
-Its noise is whitened, so that the rows are uncorrelated. Heading alone:
+Its noise is whitened, so that the rows are uncorrelated.
+
+A star tracker is bolted on a little askew: its axes are the body's turned by the small rotation
+vector m (rad, body axes), so it measures the attitude C exp[m x]. With m^ the estimate and
+d = m - m^ what is left of it,
+
+    z = rotation vector of C^ exp[m^ x] C_y^T = -phi - C d + v
+
+m is a block of the model where there is one, else nothing. Attitude and misalignment add in z:
+other aids must tell them apart (position and velocity over accelerations, a bearing). A star
+tracker really measures against the stars; its attitude against north-east-down, which papers 001
+and others take ("SST attitude minus INS"), needs time and position. What a position error dr does
+to it, dr / R, is 0.03 arcsec a metre and is left out.
+
+A timing error of sigma s_t turns the body by w s_t, w the rate against north-east-down, which adds
+the squares of its roll, pitch and yaw to the variances. Heading alone:
 
     z = yaw^ - yaw,   d yaw = -[tan(pitch) cos yaw, tan(pitch) sin yaw, 1] phi
 
-Source: Groves, 2nd ed., section 16.1; Euler kinematics, eq. 2.57.
+Source: Groves, 2nd ed., section 16.1; Euler kinematics, eq. 2.57; paper 001 (star tracker).
 """
 
 from __future__ import annotations
@@ -19,7 +34,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, misaligned_axes
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
     rotation_vector_from_dcm,
@@ -31,22 +46,29 @@ from fusiond.navigation.rotation import (
 STEEPEST_PITCH_RAD = math.radians(80.0)
 # One sigma (rad) for an angle that was not measured: half a turn.
 UNKNOWN_SD_RAD = math.pi
+STAR_BLOCK = "star_misalignment"
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeAid(Aid):
-    """Roll, pitch, yaw (rad, NED to body) with `sd`; NaN is not measured."""
+    """Roll, pitch, yaw (rad, NED to body) with `sd`; NaN is not measured.
+
+    `block` names the model's block of the sensor's misalignment; a model without it has none.
+    """
 
     rpy: Vector3
     sd: Vector3
+    sd_time_s: float = 0.0
+    block: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        computed = rpy_from_dcm(state.dcm)
+        dcm, slots = misaligned_axes(state, self.block)
+        computed = rpy_from_dcm(dcm)
         given = [not math.isnan(a) for a in self.rpy]
         rpy = [y if g else c for y, c, g in zip(self.rpy, computed, given, strict=True)]
         sd = [s if g else UNKNOWN_SD_RAD for s, g in zip(self.sd, given, strict=True)]
         measured = dcm_from_rpy(*rpy)
-        z = rotation_vector_from_dcm(state.dcm @ measured.T)
+        z = rotation_vector_from_dcm(dcm @ measured.T)
         yaw = rpy[2]
         axes = np.column_stack(
             [measured[:, 0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
@@ -57,7 +79,10 @@ class AttitudeAid(Aid):
             return NotApplicable("too_steep")
         h = np.zeros((3, state.model.size))
         h[:, 0:3] = -whiten
-        return Innovation(whiten @ z, h, np.square(sd))
+        if slots:
+            h[:, slots] = -whiten @ dcm
+        turned = whiten @ (state.dcm @ state.rate_b) * self.sd_time_s
+        return Innovation(whiten @ z, h, np.square(sd) + np.square(turned))
 
 
 @dataclass(frozen=True, slots=True)

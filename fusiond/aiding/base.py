@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.model import Model
-from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import Q0, VE, VN
 
 Array = NDArray[np.float64]
@@ -96,3 +96,17 @@ def rate_columns(h: Array, rows: slice, model: Model, per_rate: Array) -> None:
     for axis in range(3):
         for slot in model.parameters(9 + axis):
             h[rows, slot] = per_rate[:, axis]
+
+
+def misaligned_axes(state: State, block: str) -> tuple[Array, list[int]]:
+    """C exp[m x] (3, 3), from the axes of a sensor to navigation axes, and the slots of m.
+
+    m (rad, body axes) turns the body's axes into the sensor's; it is the estimate of the block of
+    that name. C and no slots where the model has no such block.
+    """
+    slots = state.model.slots_of(block) if block else []
+    if not slots:
+        return state.dcm, slots
+    x, y, z = (float(state.xi[slot]) for slot in slots)
+    turn = dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z)))
+    return state.dcm @ turn, slots

@@ -1,0 +1,139 @@
+r"""Bearing: azimuth and elevation of a known point, as a radar (SAR) sees it from the vehicle.
+
+    d = C_ne (p - r) - C l                 from the antenna to the point, north-east-down (m)
+    u = exp[m x]^T C^T d                   the same in sensor axes
+    A = atan2(u_y, u_x),   E = atan2(-u_z, sqrt(u_x^2 + u_y^2))
+
+p and r point and vehicle, Earth-fixed (m); l the lever arm to the antenna, body axes; m the
+misalignment (rad, body axes) that turns the body's axes into the sensor's, a block of the model
+where there is one. Azimuth runs from the sensor's x to its y, elevation is positive upwards.
+
+With C^ = (I - [phi x]) C, position error dr and what is left of m, e = m - m^, computed minus true:
+
+    du = S^T ( -[d' x] phi + (-I + [d_0 x] T) dr ) - [u x] e,     S = C exp[m x]
+    dA = (-u_y du_x + u_x du_y) / rho^2,   dE = (u_z (u_x du_x + u_y du_y) / rho - rho du_z) / D^2
+
+d_0 = C_ne (p - r) and d' = d_0: the lever arm turns with the body. T dr is the turn of the
+north-east-down axes that goes with a displacement dr (1/R: 3 % of dr at 200 km). rho and D are the
+lengths of (u_x, u_y) and of u.
+
+A timing error of sigma s_t changes the angles by their rate times s_t, from du/dt = -w x u - S^T v.
+
+The angles are taken as linear in the errors. A displacement s across a distance rho bends them by
+(s / rho)^2, so a point nearer than `least_range_m` is `too_close`; beyond `STEEPEST_ELEVATION_RAD`
+azimuth loses its meaning: `too_steep`.
+
+Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checked numerically.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusiond.aiding.base import (
+    Aid,
+    Array,
+    Innovation,
+    NotApplicable,
+    State,
+    Vector3,
+    misaligned_axes,
+)
+from fusiond.estimators.model import SAR_MISALIGNMENT
+from fusiond.navigation.earth import (
+    ECCENTRICITY_SQUARED,
+    meridian_radius,
+    transverse_radius,
+)
+from fusiond.navigation.rotation import skew, wrap_angle
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
+
+SAR_BLOCK = SAR_MISALIGNMENT
+STEEPEST_ELEVATION_RAD = math.radians(80.0)
+"""As for heading: the azimuth's errors grow as 1 / cos(E), here almost sixfold."""
+
+
+def earth_fixed(lat_rad: float, lon_rad: float, height_m: float) -> Array:
+    """Earth-centred, Earth-fixed coordinates (3,) in m of a geodetic place (rad, rad, m)."""
+    n = transverse_radius(lat_rad)
+    across = (n + height_m) * math.cos(lat_rad)
+    return np.array(
+        [
+            across * math.cos(lon_rad),
+            across * math.sin(lon_rad),
+            (n * (1.0 - ECCENTRICITY_SQUARED) + height_m) * math.sin(lat_rad),
+        ]
+    )
+
+
+def line_of_sight(place: Vector3, point: Vector3) -> Array:
+    """From a place to a point, both lat, lon (rad), height (m): (3,) m, NED at the place."""
+    lat, lon, _ = place
+    sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
+    to_ned = np.array(
+        [
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [-sin_lon, cos_lon, 0.0],
+            [-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat],
+        ]
+    )
+    return np.asarray(to_ned @ (earth_fixed(*point) - earth_fixed(*place)), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class BearingAid(Aid):
+    """Azimuth and elevation (rad) with `sd` of `point` (lat, lon in rad, height in m).
+
+    `block` names the model's block of the sensor's misalignment; a model without it has none.
+    """
+
+    azimuth_rad: float
+    elevation_rad: float
+    sd: tuple[float, float]
+    point: Vector3
+    lever: Vector3
+    least_range_m: float
+    sd_time_s: float = 0.0
+    block: str = ""
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        nav = state.nav
+        lat, lon, height = float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT])
+        to_ned, slots = misaligned_axes(state, self.block)
+        sight = line_of_sight((lat, lon, height), self.point)
+        u = to_ned.T @ (sight - state.dcm @ np.array(self.lever))
+        x, y, z = (float(c) for c in u)
+        rho = math.hypot(x, y)
+        if abs(z) > rho * math.tan(STEEPEST_ELEVATION_RAD):
+            return NotApplicable("too_steep")
+        if rho < self.least_range_m:
+            return NotApplicable("too_close")
+        square = rho * rho + z * z
+        angles = np.array(
+            [
+                [-y / rho**2, x / rho**2, 0.0],
+                [z * x / (rho * square), z * y / (rho * square), -rho / square],
+            ]
+        )
+        n, m = 1.0 / (transverse_radius(lat) + height), 1.0 / (meridian_radius(lat) + height)
+        turn = np.array([[0.0, n, 0.0], [-m, 0.0, 0.0], [0.0, -math.tan(lat) * n, 0.0]])
+        in_ned = angles @ to_ned.T
+        h = np.zeros((2, state.model.size))
+        h[:, 0:3] = -in_ned @ skew(sight)
+        h[:, 6:9] = in_ned @ (skew(sight) @ turn - np.eye(3))
+        if slots:
+            h[:, slots] = -angles @ skew(u)
+        h[:, :9][:, ~state.model.active[:9]] = 0.0
+        innovation = np.array(
+            [
+                wrap_angle(math.atan2(y, x) - self.azimuth_rad),
+                math.atan2(-z, rho) - self.elevation_rad,
+            ]
+        )
+        # w in body axes turns u as well as in sensor axes, but for the misalignment: 1e-3 of it
+        rate = angles @ (-np.cross(state.rate_b, u)) - in_ned @ nav[VN : VN + 3]
+        r = np.square(self.sd) + np.square(rate * self.sd_time_s)
+        return Innovation(innovation, h, r)
