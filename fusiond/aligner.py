@@ -165,7 +165,9 @@ class Aligner:
                     self._position = aid
             elif isinstance(aid, HeadingAid):
                 self._heading = (aid.t_ns, aid.yaw_rad, aid.sd_rad)
-            elif isinstance(aid, AttitudeAid) and not math.isnan(aid.rpy[2]):
+            elif isinstance(aid, AttitudeAid) and not (aid.block or math.isnan(aid.rpy[2])):
+                # Of a sensor that is mounted askew the start would have the misalignment itself,
+                # and the filter would then find the two to agree.
                 self._heading = (aid.t_ns, aid.rpy[2], aid.sd[2])
             elif isinstance(aid, VelocityAid):
                 self._speed = math.hypot(*aid.v_ned[:2])

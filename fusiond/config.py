@@ -7,7 +7,7 @@ nothing else in the project converts them: `fusiond.settings` turns this into SI
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -21,6 +21,12 @@ from pydantic import (
 )
 
 Vector = tuple[float, float, float]
+Place = tuple[
+    Annotated[float, Field(ge=-90.0, le=90.0)],
+    Annotated[float, Field(ge=-180.0, le=180.0)],
+    Annotated[float, Field(ge=-1000.0, le=20000.0)],
+]
+"""Latitude, longitude (deg), ellipsoidal height (m) of a place on land."""
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
@@ -142,6 +148,41 @@ class AttitudeAiding(Aiding):
     kind: Literal["attitude"] = "attitude"
 
 
+class Misaligned(Aiding):
+    """An aid whose sensor is mounted a little askew: three small angles that the filter estimates.
+
+    The angles turn body axes into sensor axes; what is known of the mounting is taken out by the
+    device.
+    """
+
+    misalignment_sd_arcsec: NonNegativeFloat = 200.0
+    """One sigma of each angle before it is estimated; 0: none is estimated."""
+    misalignment_correlation_s: PositiveFloat | None = None
+    """Correlation time, where mount or airframe bend; without it the angles are constant."""
+
+
+class StarTrackerAiding(Misaligned):
+    """Attitude of a star tracker against north-east-down; see `docs/star-tracker-sar.md`."""
+
+    kind: Literal["star_tracker"] = "star_tracker"
+    sd_arcsec: PositiveFloat = 200.0
+    """One sigma of roll, pitch and yaw each, where the device states none. As in paper 001."""
+
+
+class SarAiding(Misaligned):
+    """Azimuth and elevation of known points in a radar's image; see `docs/star-tracker-sar.md`."""
+
+    kind: Literal["sar"] = "sar"
+    sd_arcsec: PositiveFloat = 100.0
+    """One sigma of azimuth and of elevation, where the device states none."""
+    min_range_m: PositiveFloat = 1000.0
+    """A nearer point is `too_close`: a position off by 16 m bends its angles by half the default
+    sigma."""
+    targets_deg_m: dict[str, Place] = Field(default_factory=dict)
+    """The known points by the number or name that the device gives: latitude, longitude (deg),
+    ellipsoidal height (m)."""
+
+
 class HeadingAiding(Aiding):
     kind: Literal["heading"] = "heading"
     sd_deg: PositiveFloat = 1.0
@@ -158,10 +199,19 @@ class WheelAiding(Aiding):
 
 
 AnyAiding = Annotated[
-    GnssAiding | RdssAiding | AttitudeAiding | HeadingAiding | HeightAiding | WheelAiding,
+    GnssAiding
+    | RdssAiding
+    | AttitudeAiding
+    | StarTrackerAiding
+    | SarAiding
+    | HeadingAiding
+    | HeightAiding
+    | WheelAiding,
     Field(discriminator="kind"),
 ]
-AIDING_KINDS = ("gnss", "rdss", "attitude", "heading", "height", "wheel")
+AIDING_KINDS = tuple(
+    section.model_fields["kind"].default for section in get_args(get_args(AnyAiding)[0])
+)
 
 
 class ZeroVelocity(Section):

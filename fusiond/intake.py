@@ -13,6 +13,7 @@ import numpy as np
 
 from drivers.measurements import (
     Attitude,
+    Bearing,
     DelayedFix,
     Heading,
     Height,
@@ -20,8 +21,9 @@ from drivers.measurements import (
     PositionFix,
     WheelSpeed,
 )
-from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid, HeadingAid
 from fusiond.aiding.base import Linearised, NotApplicable
+from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.aiding.body_velocity import WheelSpeedAid
 from fusiond.aiding.height import HeightAid
 from fusiond.aiding.position import PositionAid
@@ -35,11 +37,14 @@ from fusiond.config import (
     GnssAiding,
     HeadingAiding,
     HeightAiding,
+    Misaligned,
     RdssAiding,
+    SarAiding,
+    StarTrackerAiding,
     WheelAiding,
 )
-from fusiond.estimators.model import Block, position_bias
-from fusiond.settings import DEG
+from fusiond.estimators.model import Block, misalignment, position_bias
+from fusiond.settings import ARCSEC, DEG
 
 # What a fix moved forward by the computed velocity is wrong by: an acceleration of 2.5 m/s^2 over a
 # delay of 1.5 s, which lasts as long as a manoeuvre. The velocity's own error is in the Jacobian.
@@ -74,12 +79,9 @@ class Intake:
             case DelayedFix():
                 return self._rdss(m, t_ns, sd_time_s, seen_ns)
             case Attitude():
-                o = self._section(m.source, AttitudeAiding)
-                roll, pitch, yaw = (s * o.sigma_scale for s in m.sd_rpy_rad)
-                sd = (roll, pitch, yaw)
-                if not all(s > 0.0 or math.isnan(a) for s, a in zip(sd, m.rpy_rad, strict=True)):
-                    return "no_sigma"
-                return [AttitudeAid(m.source, t_ns, o.gate_probability, m.rpy_rad, sd)]
+                return self._attitude(m, t_ns, sd_time_s)
+            case Bearing():
+                return self._bearing(m, t_ns, sd_time_s)
             case Heading():
                 h = self._section(m.source, HeadingAiding)
                 sd_rad = (m.sd_rad or h.sd_deg * DEG) * h.sigma_scale
@@ -102,18 +104,26 @@ class Intake:
                 return "not_an_aid"
 
     def extra_blocks(self) -> list[Block]:
-        """The states that the configured aids need beside the model's own.
+        """What the aids need in the model beside its own blocks: errors that successive
+        measurements share.
 
-        RDSS fixes share an error; position compensation needs the same block for what the moved fix
-        is wrong by.
+        North and east of RDSS fixes (`BIAS_BLOCK`), which position compensation needs for what the
+        moved fix is wrong by; the misalignment of each star tracker and radar.
         """
-        for o in self._aiding.values():
-            if isinstance(o, RdssAiding):
-                if o.bias_sd_m > 0.0:
-                    return [position_bias(BIAS_BLOCK, o.bias_sd_m, o.bias_correlation_s)]
-                if o.strategy == "position_compensation":
-                    return [position_bias(BIAS_BLOCK, COMPENSATION_SD_M, COMPENSATION_TAU_S)]
-        return []
+        blocks: list[Block] = []
+        for name, o in self._aiding.items():
+            match o:
+                case RdssAiding() if BIAS_BLOCK not in {b.name for b in blocks}:
+                    if o.bias_sd_m > 0.0:
+                        bias = o.bias_sd_m, o.bias_correlation_s
+                        blocks.append(position_bias(BIAS_BLOCK, *bias))
+                    elif o.strategy == "position_compensation":
+                        bias = COMPENSATION_SD_M, COMPENSATION_TAU_S
+                        blocks.append(position_bias(BIAS_BLOCK, *bias))
+                case Misaligned() if o.misalignment_sd_arcsec > 0.0:
+                    sd, tau_s = o.misalignment_sd_arcsec * ARCSEC, o.misalignment_correlation_s
+                    blocks.append(misalignment(self._block(name, o), sd, tau_s or math.inf))
+        return blocks
 
     def _section(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""
@@ -124,6 +134,63 @@ class Intake:
             section = next((s for s in named if isinstance(s, kind)), None) or kind()
             self._sections[source, kind] = section
         return section
+
+    def _block(self, source: str, section: Misaligned) -> str:
+        """The block of a source's misalignment, named after its kind, or after the source where
+        that has a section of its own; empty where none is estimated."""
+        if section.misalignment_sd_arcsec == 0.0:
+            return ""
+        block = STAR_BLOCK if isinstance(section, StarTrackerAiding) else SAR_BLOCK
+        own = self._aiding.get(source) is section and source != section.kind
+        return f"{block}_{source}" if own else block
+
+    def _attitude(self, m: Attitude, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+        own = self._aiding.get(m.source)
+        tracker = isinstance(own, StarTrackerAiding) or (own is None and m.source == "star_tracker")
+        stated, block = m.sd_rpy_rad, ""
+        o: Aiding
+        if tracker:
+            o = star = self._section(m.source, StarTrackerAiding)
+            default = star.sd_arcsec * ARCSEC
+            r, p, y = (default if math.isnan(s) else s for s in stated)
+            stated, block = (r, p, y), self._block(m.source, star)
+        else:
+            o = self._section(m.source, AttitudeAiding)
+        roll, pitch, yaw = (s * o.sigma_scale for s in stated)
+        sd = (roll, pitch, yaw)
+        if not all(s > 0.0 or math.isnan(a) for s, a in zip(sd, m.rpy_rad, strict=True)):
+            return "no_sigma"
+        return [AttitudeAid(m.source, t_ns, o.gate_probability, m.rpy_rad, sd, sd_time_s, block)]
+
+    def _bearing(self, m: Bearing, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+        o = self._section(m.source, SarAiding)
+        if not (math.isfinite(m.azimuth_rad) and math.isfinite(m.elevation_rad)):
+            return "not_finite"
+        point = m.point
+        if point is None:
+            known = o.targets_deg_m.get(m.target)
+            if known is None:
+                return "unknown_target"
+            point = (known[0] * DEG, known[1] * DEG, known[2])
+        default = o.sd_arcsec * ARCSEC
+        azimuth, elevation = (s * o.sigma_scale for s in m.sd_rad or (default, default))
+        if not (azimuth > 0.0 and elevation > 0.0):
+            return "no_sigma"
+        return [
+            BearingAid(
+                m.source,
+                t_ns,
+                o.gate_probability,
+                m.azimuth_rad,
+                m.elevation_rad,
+                (azimuth, elevation),
+                point,
+                o.lever_arm_m,
+                o.min_range_m,
+                sd_time_s,
+                self._block(m.source, o),
+            )
+        ]
 
     def _gnss(self, m: PositionFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
         o = self._section(m.source, GnssAiding)

@@ -15,13 +15,25 @@ from typing import Any
 from pydantic import BaseModel
 
 from drivers.base import PermanentDriverError, monotonic_ns
-from fusiond.config import AnyAiding, Config, GnssAiding, RdssAiding
+from fusiond.config import (
+    AnyAiding,
+    Config,
+    GnssAiding,
+    RdssAiding,
+    SarAiding,
+    StarTrackerAiding,
+)
 from fusiond.config_mistakes import Location, did_you_mean, mistake, validate
 
 EXIT_CONFIG = 78
 """EX_CONFIG of sysexits.h; systemd's RestartPreventExitStatus knows it."""
 
-_DEFAULT_AIDING: dict[str, AnyAiding] = {"nmea": GnssAiding(), "rdss": RdssAiding()}
+_DEFAULT_AIDING: dict[str, AnyAiding] = {
+    "nmea": GnssAiding(),
+    "rdss": RdssAiding(),
+    "can_attitude": StarTrackerAiding(),
+    "can_bearing": SarAiding(),
+}
 
 
 class ConfigError(Exception):

@@ -19,6 +19,7 @@ from fusiond.navigation.standstill import QuietLimits
 DEG = math.pi / 180.0
 DEG_PER_HOUR = DEG / 3600.0
 PER_ROOT_HOUR = 1.0 / 60.0
+ARCSEC = DEG / 3600.0
 MILLI_G = 1e-3 * STANDARD_GRAVITY_M_S2
 
 

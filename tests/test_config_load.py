@@ -90,12 +90,12 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             '[aiding.roof]\nkind = "gns"',
             "aiding.roof.kind = \"gns\": did you mean 'gnss'? "
-            "allowed: attitude, gnss, heading, height, rdss, wheel",
+            "allowed: attitude, gnss, heading, height, rdss, sar, star_tracker, wheel",
         ),
         (
             "[aiding.roof]",
             "aiding.roof: lacks the key kind; "
-            "allowed: gnss, rdss, attitude, heading, height, wheel",
+            "allowed: gnss, rdss, attitude, star_tracker, sar, heading, height, wheel",
         ),
         ("[sources.rx]", "sources.rx.driver: missing; expected text in quotes"),
         (

@@ -15,6 +15,8 @@ SECTIONS = {
     "[aiding.gnss]": config.GnssAiding,
     "[aiding.rdss]": config.RdssAiding,
     "[aiding.attitude]": config.AttitudeAiding,
+    "[aiding.star_tracker]": config.StarTrackerAiding,
+    "[aiding.sar]": config.SarAiding,
     "[aiding.heading]": config.HeadingAiding,
     "[aiding.height]": config.HeightAiding,
     "[aiding.wheel]": config.WheelAiding,
