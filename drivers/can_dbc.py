@@ -45,6 +45,16 @@ FORCE_UNITS = {
 }
 MOST_RAD_S, MOST_M_S2 = 175.0, 10_000.0
 """Beyond any inertial sensor: 10,000 deg/s and 1,000 g; only a damaged float says more."""
+ANGLE_UNITS = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": math.pi / 180.0,
+    "°": math.pi / 180.0,
+    "mdeg": math.pi / 180e3,
+    "arcmin": math.pi / 10_800.0,
+    "arcsec": math.pi / 648e3,
+}
+NO_UNITS = {"": 1.0, "1": 1.0}
 TIME_UNITS = {"s": Fraction(1), "ms": Fraction(1, 1000), "us": Fraction(1, 10**6)} | {
     "µs": Fraction(1, 10**6),
     "ns": Fraction(1, 10**9),
@@ -60,7 +70,7 @@ class RefusedFrameError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One axis out of one signal: SI value = raw * scale + offset, believed within low..high."""
+    """One value out of one signal: SI value = raw * scale + offset, believed within low..high."""
 
     slot: int
     signal: str
@@ -81,7 +91,7 @@ class Stamp:
 
 @dataclass(slots=True)
 class Part:
-    """What one frame contributes: axis values by slot (0..2 gyro, 3..5 accelerometer), stamps."""
+    """What one frame contributes: values by slot (IMU: 0..2 gyro, 3..5 accelerometer), stamps."""
 
     values: list[tuple[int, float]]
     counter: int | None
@@ -180,21 +190,37 @@ def _unit(units: Mapping[str, Any], signal: Signal, override: str | None, what: 
 def plan_axis(
     slot: int, signal: Signal, negative: bool, units: Mapping[str, float], override: str | None
 ) -> Axis:
-    """The plan of one axis.
+    """The plan of one axis of an IMU, slots 0 to 2 gyro, 3 to 5 accelerometer."""
+    what, most = ("gyro", MOST_RAD_S) if slot < 3 else ("accel", MOST_M_S2)
+    factor = _unit(units, signal, override, what)
+    return plan_value(slot, signal, -factor if negative else factor, -most, most)
+
+
+def plan_value(slot: int, signal: Signal, factor: float, low: float, high: float) -> Axis:
+    """The plan of one value: physical value of the DBC times `factor`, believed within low..high.
 
     Minimum and maximum of the DBC are believed where they differ, widened by half a step for
     rounding.
     """
-    factor = float(_unit(units, signal, override, "gyro" if slot < 3 else "accel"))
-    signed = -factor if negative else factor
-    high = MOST_RAD_S if slot < 3 else MOST_M_S2
-    low = -high
     least, most = signal.minimum, signal.maximum
     if least is not None and most is not None and least < most:
         slack = 0.5 * abs(signal.scale)
-        ends = sorted(((least - slack) * signed, (most + slack) * signed))
+        ends = sorted(((least - slack) * factor, (most + slack) * factor))
         low, high = max(low, ends[0]), min(high, ends[1])
-    return Axis(slot, signal.name, signal.scale * signed, signal.offset * signed, low, high)
+    return Axis(slot, signal.name, signal.scale * factor, signal.offset * factor, low, high)
+
+
+def plan_angle(slot: int, signal: Signal, what: str, low: float, high: float) -> Axis:
+    """An angle within low..high (rad), in the unit that the DBC states."""
+    return plan_value(slot, signal, _unit(ANGLE_UNITS, signal, None, what), low, high)
+
+
+def plan_number(slot: int, signal: Signal, what: str) -> Axis:
+    """A whole number without unit: a flag, or what names something."""
+    if signal.is_float or float(signal.scale) != 1.0 or float(signal.offset) % 1.0:
+        raise PermanentDriverError(f"{what}: {signal.name} must be an integer, one a step")
+    factor = _unit(NO_UNITS, signal, None, what)
+    return plan_value(slot, signal, factor, -math.inf, math.inf)
 
 
 def plan_counter(signal: Signal) -> Stamp:

@@ -1,0 +1,169 @@
+r"""Star tracker and radar (SAR) of a simulated vehicle: attitudes and bearings with errors.
+
+    C_y = C_nb exp[m x],   roll, pitch, yaw of C_y, plus white noise            star tracker
+    u = exp[m x]^T C_nb^T (p - r),   azimuth atan2(u_y, u_x), elevation atan2(-u_z, |u_xy|), plus
+    white noise                                                                 radar
+
+m misalignment (rad, body axes): constant, or a first-order Gauss-Markov process, from its steady
+state; r the antenna, p a known point. The radar looks at the nearest point that is within its
+range and not too steep; where there is none it says nothing. Each keeps its latency exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
+from fusiond.settings import ARCSEC
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.sensor_errors import gauss_markov
+from fusiond.simulation.trajectories import dcm_from_rpy
+
+Array = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+
+LEAST_SIGHT_DEG = 75.0
+"""The radar does not look at points steeper than this, above or below."""
+
+
+@dataclass(frozen=True, slots=True)
+class StarTrackerOptions:
+    """One-sigma errors; `misalignment_correlation_s` None is a constant misalignment."""
+
+    rate_hz: float = 1.0
+    sd_arcsec: Vector3 = (200.0, 200.0, 200.0)
+    misalignment_sd_arcsec: float = 200.0
+    misalignment_correlation_s: float | None = None
+    latency_s: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class SarOptions:
+    """One-sigma errors of azimuth and elevation; the points by number: lat, lon (deg), height
+    (m)."""
+
+    targets_deg_m: Mapping[str, Vector3] = field(default_factory=dict)
+    rate_hz: float = 1.0
+    sd_arcsec: tuple[float, float] = (100.0, 100.0)
+    misalignment_sd_arcsec: float = 200.0
+    misalignment_correlation_s: float | None = None
+    lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
+    range_m: tuple[float, float] = (2_000.0, 80_000.0)
+    latency_s: float = 0.2
+
+
+def aid_streams(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Generators for star tracker and radar, independent of the other devices'."""
+    star, sar = (np.random.SeedSequence(seed, spawn_key=(100 + k,)) for k in range(2))
+    return np.random.default_rng(star), np.random.default_rng(sar)
+
+
+def _misalignment(o: StarTrackerOptions | SarOptions, n: int, rng: np.random.Generator) -> Array:
+    """(n, 3) rad at the epochs of a sensor."""
+    sd = o.misalignment_sd_arcsec * ARCSEC
+    if o.misalignment_correlation_s is None:
+        return np.tile(rng.standard_normal(3) * sd, (n, 1))
+    tau_s = o.misalignment_correlation_s
+    return gauss_markov(rng, (n, 3), step_s=1.0 / o.rate_hz, correlation_s=tau_s, sigma=sd)
+
+
+class StarTracker:
+    """Epochs over a whole trajectory, drawn at construction: `t_s`, `t_arrival_s` (n,), `rpy` (n,
+    3) in rad, and the `misalignment` (n, 3) that it had."""
+
+    def __init__(self, truth: Truth, options: StarTrackerOptions, rng: np.random.Generator) -> None:
+        o = self.options = options
+        n = int(truth.duration_s * o.rate_hz + 1e-9)
+        self.t_s = np.arange(1, n + 1) / o.rate_hz
+        self.t_arrival_s = self.t_s + o.latency_s
+        self.misalignment = _misalignment(o, n, rng)
+        body = dcm_from_rpy(truth.at(self.t_s).rpy)
+        turned = Rotation.from_matrix(body) * Rotation.from_rotvec(self.misalignment)
+        self.sd_rad = np.array(o.sd_arcsec) * ARCSEC
+        self.rpy = turned.as_euler("ZYX")[:, ::-1] + rng.standard_normal((n, 3)) * self.sd_rad
+
+    @property
+    def rows(self) -> Array:
+        """Rows of attitude.csv (n, 8)."""
+        rpy = np.degrees(self.rpy)
+        rpy[:, [0, 2]] = (rpy[:, [0, 2]] + 180.0) % 360.0 - 180.0
+        sd = np.tile(np.degrees(self.sd_rad), (len(rpy), 1))
+        return np.column_stack((self.t_s, self.t_arrival_s, rpy, sd))
+
+    def values(self, k: int) -> list[float]:
+        """Epoch `k` by the slots of `CanAttitudeDecoder`."""
+        return [*(float(a) for a in _wrapped(self.rpy[k])), *self.sd_rad.tolist(), 1.0]
+
+
+class SarRadar:
+    """Epochs over a whole trajectory, drawn at construction: `t_s`, `t_arrival_s` (n,), `angles`
+    (n, 2) azimuth and elevation in rad, `target` (n,), and the `misalignment` (n, 3)."""
+
+    def __init__(self, truth: Truth, options: SarOptions, rng: np.random.Generator) -> None:
+        o = self.options = options
+        n = int(truth.duration_s * o.rate_hz + 1e-9)
+        t_s = np.arange(1, n + 1) / o.rate_hz
+        states = truth.at(t_s, o.lever_arm_m)
+        misalignment = _misalignment(o, n, rng)
+        noise = rng.standard_normal((n, 2)) * np.array(o.sd_arcsec) * ARCSEC
+        names = sorted(o.targets_deg_m)
+        places = np.array([o.targets_deg_m[name] for name in names]).reshape(-1, 3)
+        points = _earth_fixed(np.radians(places[:, 0]), np.radians(places[:, 1]), places[:, 2])
+        here = _earth_fixed(*states.position.T)
+        # north-east-down axes as columns in Earth-fixed axes, then body, then the sensor's own
+        ned = Rotation.from_euler(
+            "ZY", np.column_stack((states.position[:, 1], -states.position[:, 0] - math.pi / 2.0))
+        )
+        body = ned * Rotation.from_matrix(dcm_from_rpy(states.rpy))
+        to_sensor = (body * Rotation.from_rotvec(misalignment)).inv()
+        distance = np.linalg.norm(points[None, :, :] - here[:, None, :], axis=2)
+        chosen = np.full(n, -1)
+        best = np.full(n, np.inf)
+        angles = np.zeros((n, 2))
+        for index, point in enumerate(points):
+            x, y, z = to_sensor.apply(point - here).T
+            elevation = np.arctan2(-z, np.hypot(x, y))
+            far = distance[:, index]
+            seen = (far >= o.range_m[0]) & (far <= o.range_m[1]) & (far < best)
+            seen &= np.abs(elevation) < math.radians(LEAST_SIGHT_DEG)
+            chosen[seen], best[seen] = index, far[seen]
+            angles[seen] = np.column_stack((np.arctan2(y, x), elevation))[seen]
+        ok = chosen >= 0
+        self.t_s = t_s[ok]
+        self.t_arrival_s = self.t_s + o.latency_s
+        self.misalignment = misalignment[ok]
+        self.sd_rad = np.array(o.sd_arcsec) * ARCSEC
+        self.angles = angles[ok] + noise[ok]
+        self.angles[:, 0] = _wrapped(self.angles[:, 0])
+        self.target = [names[i] for i in chosen[ok]]
+
+    @property
+    def rows(self) -> Array:
+        """Rows of bearing.csv (n, 9)."""
+        sd = np.tile(np.degrees(self.sd_rad), (len(self.t_s), 1))
+        points = [self.options.targets_deg_m[name] for name in self.target]
+        place = np.array(points, dtype=np.float64).reshape(-1, 3)
+        return np.column_stack((self.t_s, self.t_arrival_s, np.degrees(self.angles), sd, place))
+
+    def values(self, k: int) -> list[float]:
+        """Epoch `k` by the slots of `CanBearingDecoder`; the names of points must be numbers."""
+        azimuth, elevation = (float(a) for a in self.angles[k])
+        return [azimuth, elevation, *self.sd_rad.tolist(), float(self.target[k]), 1.0]
+
+
+def _wrapped(angles: Array) -> Array:
+    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi, dtype=np.float64)
+
+
+def _earth_fixed(lat: Array, lon: Array, height: Array) -> Array:
+    """Earth-fixed coordinates (n, 3) in m of geodetic places (n,), rad and m."""
+    n = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(lat) ** 2)
+    across = (n + height) * np.cos(lat)
+    polar = (n * (1.0 - ECCENTRICITY_SQUARED) + height) * np.sin(lat)
+    return np.column_stack((across * np.cos(lon), across * np.sin(lon), polar))
