@@ -26,7 +26,7 @@ EXIT_DATA = 65
 EXIT_UNAVAILABLE = 69
 EXIT_IO = 74
 EXIT_CONFIG = 78
-AID_KINDS = ("gnss", "rdss", "attitude", "wheel", "nmea")
+AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea")
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",

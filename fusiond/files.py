@@ -219,6 +219,51 @@ def _angle_without_sigma(angle: str, sd: str) -> Rule:
 
 
 @dataclass(frozen=True, slots=True)
+class BearingTable:
+    """Azimuth and elevation (rad, sensor axes) of known points and one sigma, (n, 2); `point`
+    latitude, longitude (rad), height (m), (n, 3). NaN sigma is not given."""
+
+    t_s: Floats
+    t_arrival_s: Floats
+    angles: Floats
+    sd: Floats
+    point: Floats
+    rejected: list[Rejection]
+
+
+_DIRECTION, _SD_DIRECTION = ("azimuth_deg", "elevation_deg"), ("sd_azimuth_deg", "sd_elevation_deg")
+_PLACES = {"target_lat_deg": _LAT, "target_lon_deg": _LON, "target_height_m": _HEIGHT}
+
+
+def read_bearing(path: Path | str) -> BearingTable:
+    """Read `bearing.csv`; a sigma of both angles or of neither. Raises `TableError`."""
+    columns = [
+        TIME,
+        _ARRIVAL,
+        Column("azimuth_deg", low=-360.0, high=360.0),
+        Column("elevation_deg", low=-90.0, high=90.0),
+        *_sigma(_SD_DIRECTION),
+        *(Column(name, low=c.low, high=c.high) for name, c in _PLACES.items()),
+    ]
+    one = Rule(
+        "missing",
+        "one of the two sigmas is not given",
+        lambda c: np.isnan(c[_SD_DIRECTION[0]]) != np.isnan(c[_SD_DIRECTION[1]]),
+    )
+    raw = read_table(path, columns, [_EARLY, one])
+    point = _stack(raw, tuple(_PLACES))
+    point[:, :2] = np.radians(point[:, :2])
+    return BearingTable(
+        raw.columns["t_s"],
+        raw.columns["t_arrival_s"],
+        np.radians(_stack(raw, _DIRECTION)),
+        np.radians(_stack(raw, _SD_DIRECTION)),
+        point,
+        raw.rejected,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class WheelTable:
     """Speed along the vehicle's forward axis and one sigma (m/s), (n,)."""
 

@@ -6,51 +6,31 @@ solution at each sample is what the daemon would have said then, before anything
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, replace
-from datetime import date
+from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import (
-    Attitude,
-    DelayedFix,
     Measurement,
     MonotonicStamp,
-    PositionFix,
-    UtcStamp,
-    WheelSpeed,
 )
-from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
+from fusiond.aid_files import READERS, Arrival, source_of
 from fusiond.config import Config, GnssAiding
-from fusiond.csv_tables import Rejection, TableError, counts
-from fusiond.files import ImuTable, read_attitude, read_gnss, read_imu, read_rdss, read_wheel
-from fusiond.gps_time import utc_ns_to_gps_week_seconds
+from fusiond.csv_tables import Rejection, counts
+from fusiond.files import ImuTable, read_imu
 from fusiond.navigator import Navigator
 from fusiond.solution_csv import STATUS, SolutionWriter
 
 Array = NDArray[np.float64]
 
-# A recording may be old; before selective availability ended there was no receiver worth replaying.
-EARLIEST_DATE = date(2000, 5, 1)
-SECONDS_OF_WEEK = 604800.0
 # Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
 # this spacing, and memory stays bounded.
 CHUNK = 512
 _SHOWN = 20
-
-
-class _Arrival(NamedTuple):
-    t_arrival_ns: int
-    measurement: Measurement
-
-
-def _ns(t_s: float) -> int:
-    return round(t_s * 1e9)
 
 
 def process(
@@ -67,10 +47,10 @@ def process(
     imu = read_imu(imu_path)
     rows_read = len(imu.t_s) + len(imu.rejected)
     files: dict[str, Any] = {"imu": _account(rows_read, imu.rejected)}
-    arrivals: list[_Arrival] = []
+    arrivals: list[Arrival] = []
     withheld: dict[str, int] = {}
     for kind, path in aids:
-        rows, rejected = _READERS[kind](path, imu)
+        rows, rejected = READERS[kind](path, imu, source_of(kind, config))
         name = kind if kind not in files else f"{kind}:{path.name}"
         files[name] = _account(len(rows) + len(rejected), rejected)
         kept = rows
@@ -126,7 +106,7 @@ def _withheld(m: Measurement, outages: Iterable[tuple[float, float]]) -> bool:
     return any(start <= t < start + length for start, length in outages)
 
 
-def _run(navigator: Navigator, imu: ImuTable, arrivals: list[_Arrival], out: Path | None) -> int:
+def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], out: Path | None) -> int:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
     samples = np.hstack([imu.gyro, imu.accel])
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
@@ -165,13 +145,13 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[_Arrival], out: Pat
     return recorder.rows
 
 
-def _give(navigator: Navigator, arrival: _Arrival) -> None:
+def _give(navigator: Navigator, arrival: Arrival) -> None:
     stamp = arrival.measurement.stamp  # type: ignore[union-attr]
     assert isinstance(stamp, MonotonicStamp)
     navigator.add(arrival.measurement, stamp.t_ns)
 
 
-def _is_late(arrival: _Arrival, config: Config) -> bool:
+def _is_late(arrival: Arrival, config: Config) -> bool:
     """Whether samples of its validity, or of an aid that it holds, come before it does."""
     m = arrival.measurement
     stamp = m.stamp  # type: ignore[union-attr]
@@ -228,131 +208,3 @@ def _rpy(q: Array) -> Array:
     pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
     yaw = np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z)
     return np.column_stack([roll, pitch, yaw])
-
-
-# --------------------------------------------------------------------------- aid files
-
-_Read = tuple[list[_Arrival], list[Rejection]]
-
-
-def _arrivals(
-    t_s: Array, t_arrival_s: Array, make: Callable[[int, int, int], Measurement]
-) -> list[_Arrival]:
-    valid = np.rint(t_s * 1e9).astype(np.int64)
-    arrival = np.where(np.isnan(t_arrival_s), valid, np.rint(t_arrival_s * 1e9))
-    instants = zip(valid.tolist(), arrival.astype(np.int64).tolist(), strict=True)
-    return [_Arrival(seen, make(i, t_ns, seen)) for i, (t_ns, seen) in enumerate(instants)]
-
-
-def _vector(row: list[float]) -> tuple[float, float, float] | None:
-    x, y, z = row
-    return None if math.isnan(x + y + z) else (x, y, z)
-
-
-def _horizontal(row: list[float]) -> tuple[float, float, float | None] | None:
-    x, y, z = row
-    if math.isnan(x + y):
-        return None
-    return x, y, None if math.isnan(z) else z
-
-
-def _or_none(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-def _read_gnss(path: Path, _: ImuTable) -> _Read:
-    table = read_gnss(path)
-    lat, lon, height = table.lat_rad.tolist(), table.lon_rad.tolist(), table.height_m.tolist()
-    quality = np.where(np.isnan(table.quality), 1, table.quality).astype(int).tolist()
-    sd, v, sd_v = table.sd_position.tolist(), table.v.tolist(), table.sd_v.tolist()
-
-    def fix(i: int, t_ns: int, seen: int) -> Measurement:
-        return PositionFix(
-            "gnss",
-            seen,
-            MonotonicStamp(t_ns),
-            lat[i],
-            lon[i],
-            _or_none(height[i]),
-            quality=quality[i],
-            sd_ned_m=_vector(sd[i]),
-            v_ned_m_s=_horizontal(v[i]),
-            sd_v_ned_m_s=_horizontal(sd_v[i]),
-        )
-
-    return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
-
-
-def _read_rdss(path: Path, _: ImuTable) -> _Read:
-    table = read_rdss(path)
-
-    def fix(i: int, t_ns: int, seen: int) -> Measurement:
-        return DelayedFix(
-            "rdss",
-            seen,
-            MonotonicStamp(t_ns),
-            float(table.lat_rad[i]),
-            float(table.lon_rad[i]),
-            float(table.height_m[i]),
-            float(table.precision_class_m[i]),
-            bool(table.multi_value[i]),
-        )
-
-    return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
-
-
-def _read_attitude(path: Path, _: ImuTable) -> _Read:
-    table = read_attitude(path)
-
-    def attitude(i: int, t_ns: int, seen: int) -> Measurement:
-        roll, pitch, yaw = (float(a) for a in table.rpy[i])
-        sd_roll, sd_pitch, sd_yaw = (float(a) for a in table.sd_rpy[i])
-        return Attitude(
-            "attitude", seen, MonotonicStamp(t_ns), (roll, pitch, yaw), (sd_roll, sd_pitch, sd_yaw)
-        )
-
-    return _arrivals(table.t_s, table.t_arrival_s, attitude), table.rejected
-
-
-def _read_wheel(path: Path, _: ImuTable) -> _Read:
-    table = read_wheel(path)
-
-    def speed(i: int, t_ns: int, seen: int) -> Measurement:
-        return WheelSpeed(
-            "wheel",
-            seen,
-            MonotonicStamp(t_ns),
-            float(table.speed_m_s[i]),
-            _or_none(float(table.sd_m_s[i])),
-        )
-
-    return _arrivals(table.t_s, table.t_arrival_s, speed), table.rejected
-
-
-def _read_nmea(path: Path, imu: ImuTable) -> _Read:
-    """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
-    maps to: GPS second of week (below 604800) or POSIX seconds."""
-    decoder = NmeaDecoder("gnss", NmeaDecoding(earliest_date=EARLIEST_DATE))
-    found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
-    of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
-    rows = []
-    for m in found:
-        if not isinstance(m, PositionFix) or not isinstance(m.stamp, UtcStamp):
-            continue
-        t_ns = m.stamp.utc_ns
-        if of_week:
-            t_ns = _ns(utc_ns_to_gps_week_seconds(t_ns))
-        rows.append(_Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
-    if found and not rows:
-        raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
-    refused = [Rejection(0, name, f"{count} times") for name, count in decoder.counters.items()]
-    return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
-
-
-_READERS: dict[str, Callable[[Path, ImuTable], _Read]] = {
-    "gnss": _read_gnss,
-    "rdss": _read_rdss,
-    "attitude": _read_attitude,
-    "wheel": _read_wheel,
-    "nmea": _read_nmea,
-}

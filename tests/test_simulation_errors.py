@@ -166,7 +166,13 @@ def test_files_are_what_the_readers_accept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "scenario"), [("vehicle", "drive"), ("vehicle", "static"), ("tactical", "flight")]
+    ("name", "scenario"),
+    [
+        ("vehicle", "drive"),
+        ("vehicle", "static"),
+        ("tactical", "flight"),
+        ("flight_sar", "flight-sar"),
+    ],
 )
 def test_scenarios_fit_the_shipped_configurations(name: str, scenario: str) -> None:
     path = Path(__file__).parents[1] / "config" / f"{name}.toml"

@@ -32,6 +32,32 @@ LEAST_SIGHT_DEG = 75.0
 """The radar does not look at points steeper than this, above or below."""
 
 
+FLIGHT_POINTS: Mapping[str, Vector3] = {
+    "1": (30.3931, 114.3256, 20.0),
+    "2": (30.3647, 114.7068, 30.0),
+    "3": (29.9016, 114.4850, 40.0),
+    "4": (29.4200, 114.8964, 50.0),
+    "5": (29.0677, 114.5760, 60.0),
+    "6": (28.7081, 114.0377, 70.0),
+    "7": (28.8418, 113.3305, 80.0),
+    "8": (28.2434, 113.5351, 20.0),
+    "9": (27.6641, 113.3410, 30.0),
+    "10": (27.0973, 113.4022, 40.0),
+    "11": (27.2651, 112.7425, 50.0),
+    "12": (26.9053, 112.2621, 60.0),
+    "13": (26.4872, 112.0043, 70.0),
+    "14": (26.0016, 112.4037, 80.0),
+    "15": (25.6492, 112.0930, 20.0),
+    "16": (25.2894, 111.5710, 30.0),
+    "17": (25.4232, 110.8850, 40.0),
+    "18": (24.8245, 111.0836, 50.0),
+    "19": (24.2450, 110.8951, 60.0),
+    "20": (23.6780, 110.9545, 70.0),
+}
+"""Known points along the flight of `fusiond.simulation.trajectories`, one each 200 s, 15 km to the
+right and to the left of the track in turn; as in `config/flight_sar.toml`."""
+
+
 @dataclass(frozen=True, slots=True)
 class StarTrackerOptions:
     """One-sigma errors; `misalignment_correlation_s` None is a constant misalignment."""
@@ -56,6 +82,24 @@ class SarOptions:
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     range_m: tuple[float, float] = (2_000.0, 80_000.0)
     latency_s: float = 0.2
+
+
+_TIMES = (("t_s", 6), ("t_arrival_s", 6))
+_RPY = ("roll", "pitch", "yaw")
+ATTITUDE_COLUMNS = (
+    *_TIMES,
+    *((f"{angle}_deg", 7) for angle in _RPY),
+    *((f"sd_{angle}_deg", 7) for angle in _RPY),
+)
+"""Columns of attitude.csv and their decimals."""
+BEARING_COLUMNS = (
+    *_TIMES,
+    *((f"{angle}_deg", 7) for angle in ("azimuth", "elevation", "sd_azimuth", "sd_elevation")),
+    ("target_lat_deg", 9),
+    ("target_lon_deg", 9),
+    ("target_height_m", 4),
+)
+"""Columns of bearing.csv and their decimals."""
 
 
 def aid_streams(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
@@ -167,3 +211,16 @@ def _earth_fixed(lat: Array, lon: Array, height: Array) -> Array:
     across = (n + height) * np.cos(lat)
     polar = (n * (1.0 - ECCENTRICITY_SQUARED) + height) * np.sin(lat)
     return np.column_stack((across * np.cos(lon), across * np.sin(lon), polar))
+
+
+def aid_tables(
+    truth: Truth, star: StarTrackerOptions | None, sar: SarOptions | None, seed: int
+) -> dict[str, tuple[tuple[tuple[str, int], ...], Array]]:
+    """Columns and rows of attitude.csv and bearing.csv, of what is on board."""
+    star_rng, sar_rng = aid_streams(seed)
+    tables = {}
+    if star is not None:
+        tables["attitude"] = (ATTITUDE_COLUMNS, StarTracker(truth, star, star_rng).rows)
+    if sar is not None:
+        tables["bearing"] = (BEARING_COLUMNS, SarRadar(truth, sar, sar_rng).rows)
+    return tables

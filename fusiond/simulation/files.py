@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.fixed_decimal import MAX_CELL, format_rows
+from fusiond.simulation.aid_sensors import aid_tables
 from fusiond.simulation.gnss_receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss_centre import RdssCentre
@@ -59,7 +60,8 @@ class Simulated:
 def simulate(
     scenario: Scenario, out_dir: Path, seed: int = 0, duration_s: float | None = None
 ) -> Simulated:
-    """Write imu.csv, gnss.csv, rdss.csv and truth.csv into `out_dir`, which is made if need be.
+    """Write imu.csv, gnss.csv, rdss.csv and truth.csv into `out_dir`, which is made if need be;
+    attitude.csv and bearing.csv where star tracker and radar are on board.
 
     The same scenario, seed and duration write the same bytes. `t_s` counts from the start of the
     trajectory. Raises OSError where the files cannot be written.
@@ -74,6 +76,7 @@ def simulate(
         "gnss": (_GNSS, _gnss_rows(GnssReceiver(truth, scenario.gnss, gnss_rng))),
         "rdss": (_RDSS, _rdss_rows(truth, scenario, rdss_rng)),
         "truth": (_TRUTH, truth_rows(truth)),
+        **aid_tables(truth, scenario.star_tracker, scenario.sar, seed),
     }
     files = {name: out_dir / f"{name}.csv" for name in tables}
     for name, (columns, rows) in tables.items():

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fusiond.config import Config, GnssAiding, Imu, RdssAiding
+from fusiond.config import Config, GnssAiding, Imu, RdssAiding, SarAiding
+from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
 from fusiond.simulation.gnss_receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss_centre import RdssOptions
@@ -48,6 +49,8 @@ class Scenario:
     vibration: Vibration = field(default_factory=Vibration)
     no_slip_m: tuple[float, float, float] = REAR_AXLE_M
     """From the IMU to the point that follows the path without side slip, body axes."""
+    star_tracker: StarTrackerOptions | None = None
+    sar: SarOptions | None = None
 
     def truth(self, duration_s: float | None = None) -> Truth:
         """The trajectory, sampled at the IMU's rate."""
@@ -64,31 +67,42 @@ class Scenario:
 
     def fitted(self, config: Config) -> Scenario:
         """This scenario with the IMU, the lever arms and the no-slip point of a configuration."""
-        gnss, rdss, no_slip = self.gnss, self.rdss, self.no_slip_m
+        gnss, rdss, no_slip, sar = self.gnss, self.rdss, self.no_slip_m, self.sar
         for aiding in config.aiding.values():
             match aiding:
                 case GnssAiding():
                     gnss = replace(gnss, lever_arm_m=aiding.lever_arm_m)
                 case RdssAiding():
                     rdss = replace(rdss, lever_arm_m=aiding.lever_arm_m)
+                case SarAiding() if sar is not None:
+                    points = aiding.targets_deg_m
+                    sar = replace(sar, lever_arm_m=aiding.lever_arm_m, targets_deg_m=points)
         if config.constraints.non_holonomic.enabled:
             no_slip = config.constraints.non_holonomic.lever_arm_m
-        return replace(self, imu=config.imu, gnss=gnss, rdss=rdss, no_slip_m=no_slip)
+        return replace(self, imu=config.imu, gnss=gnss, rdss=rdss, sar=sar, no_slip_m=no_slip)
 
 
-# Car and aircraft fit the shipped configurations `vehicle.toml` and `tactical.toml` unchanged.
+FLIGHT = Scenario(
+    "flight",
+    flight,
+    4000.0,
+    imu=AIRCRAFT_IMU,
+    rdss=RdssOptions(lever_arm_m=ANTENNA_M, service_frequency_s=60),
+    no_slip_m=(0.0, 0.0, 0.0),
+)
+# Car and aircraft fit the shipped configurations `vehicle.toml`, `tactical.toml` and
+# `flight_sar.toml` unchanged.
 SCENARIOS = {
     scenario.name: scenario
     for scenario in (
         Scenario("static", static, 600.0),
         Scenario("drive", drive, 1560.0),
-        Scenario(
-            "flight",
-            flight,
-            4000.0,
-            imu=AIRCRAFT_IMU,
-            rdss=RdssOptions(lever_arm_m=ANTENNA_M, service_frequency_s=60),
-            no_slip_m=(0.0, 0.0, 0.0),
+        FLIGHT,
+        replace(
+            FLIGHT,
+            name="flight-sar",
+            star_tracker=StarTrackerOptions(),
+            sar=SarOptions(FLIGHT_POINTS),
         ),
     )
 }

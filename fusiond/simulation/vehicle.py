@@ -5,8 +5,9 @@
 
 Everything random is drawn before the start; while it runs, the vehicle only looks up, formats and
 writes. Instant 0 of the trajectory is `start_ns` of the host's monotonic clock. Commands on
-standard input, a line each: `unplug NAME`, `plug NAME` (imu, gnss, rdss); `suppress`, `silence`,
-`lift` for the RDSS terminal; `quit`. Each is answered; the last line is the counters, as JSON.
+standard input, a line each: `unplug NAME`, `plug NAME` (imu, gnss, rdss, star_tracker, sar);
+`suppress`, `silence`, `lift` for the RDSS terminal; `quit`. Each is answered; the last line is the
+counters, as JSON.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ import numpy as np
 
 from drivers.can_signals import CanImuOptions
 from fusiond.load_config import load_config
+from fusiond.simulation.can_aids import CanAid, can_aids
 from fusiond.simulation.can_imu import SIM_IMU, CanImu
 from fusiond.simulation.files import write_truth
 from fusiond.simulation.gnss_receiver import GnssReceiver
@@ -40,7 +42,7 @@ from fusiond.simulation.rdss_terminal import RdssTerminal
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
 from fusiond.simulation.trajectories import drive
 
-Device = Literal["imu", "gnss", "rdss"]
+Device = Literal["imu", "gnss", "rdss", "star_tracker", "sar"]
 
 SERIAL_POLL_S = 0.01
 """How often the terminal's line is read: far below the 50 ms that its answers take."""
@@ -138,6 +140,9 @@ class SimulatedVehicle:
         self._encoder = CanImu(can_imu)
         self._can = (can_imu.interface, can_imu.channel)
         self._bus: can.BusABC | None = None
+        self.aids: dict[str, CanAid] = can_aids(
+            self.truth, scenario.star_tracker, scenario.sar, seed, self._can
+        )
         self._lines: dict[Device, PtyLine] = {}
         if gnss_link is not None:
             self._lines["gnss"] = PtyLine(gnss_link)
@@ -167,6 +172,8 @@ class SimulatedVehicle:
             if self._bus is None:
                 interface, channel = self._can
                 self._bus = can.Bus(interface=interface, channel=channel)
+        elif device in self.aids:
+            self.aids[device].plug()
         elif device in self._lines:
             self._lines[device].plug()
 
@@ -176,6 +183,8 @@ class SimulatedVehicle:
             if self._bus is not None:
                 self._bus.shutdown()
                 self._bus = None
+        elif device in self.aids:
+            self.aids[device].unplug()
         elif device in self._lines:
             self._lines[device].unplug()
 
@@ -203,7 +212,7 @@ class SimulatedVehicle:
 
     def _next_s(self, t_s: float) -> float:
         """When there is something to do again."""
-        due = [self.truth.duration_s, t_s + SERIAL_POLL_S]
+        due = [self.truth.duration_s, t_s + SERIAL_POLL_S, *(a.next_s for a in self.aids.values())]
         if self._next_imu < len(self.imu.gyro):
             due.append(float(self.truth.t_s[self._next_imu + 1]))
         if self._next_gnss < len(self.gnss):
@@ -218,6 +227,8 @@ class SimulatedVehicle:
                 break
             self._next_imu += 1
             self._send_sample(k)
+        for aid in self.aids.values():
+            aid.serve(t_s, self.counters)
         while self._next_gnss < len(self.gnss):
             k = self._next_gnss
             if self.gnss.t_arrival_s[k] > t_s:
@@ -297,7 +308,10 @@ def _watch_commands(vehicle: SimulatedVehicle, main: asyncio.Task[None]) -> None
             case ["lift"]:
                 vehicle.lift()
                 print("lifted", flush=True)
-            case [("plug" | "unplug") as verb, ("imu" | "gnss" | "rdss") as device]:
+            case [
+                ("plug" | "unplug") as verb,
+                ("imu" | "gnss" | "rdss" | "star_tracker" | "sar") as device,
+            ]:
                 try:
                     vehicle.plug(device) if verb == "plug" else vehicle.unplug(device)
                     print(f"{verb}ged {device}", flush=True)
