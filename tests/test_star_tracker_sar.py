@@ -188,6 +188,13 @@ async def test_the_daemon_fuses_both_off_the_bus(tmp_path: Path, entry_points: N
     assert (sd[model.slots_of(SAR_BLOCK)] < 200.0).all()
 
 
+def test_the_example_of_the_guide_is_valid(entry_points: None, tmp_path: Path) -> None:
+    guide = (ROOT / "docs" / "star-tracker-sar.md").read_text(encoding="utf-8")
+    path = tmp_path / "guide.toml"
+    path.write_text(guide.split("```toml\n")[1].split("```")[0])
+    assert set(load_config(path).sources) == {"star_tracker", "sar"}
+
+
 def test_a_point_that_the_configuration_lacks_is_named(entry_points: None, tmp_path: Path) -> None:
     """The shipped configuration loads with its drivers; what is missing in it is said."""
     assert load_config(ROOT / "config" / "flight_sar.toml").aiding["sar"].kind == "sar"
