@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.aiding.bearing import SAR_BLOCK, BearingAid, earth_fixed
+from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.config import Imu
 from fusiond.estimators.model import Model, make_model, misalignment
+from fusiond.gnss.ecef import to_ecef
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.settings import imu_noise
@@ -104,8 +105,8 @@ def _seen(nav: Array, point: tuple[float, float, float], turn: Rotation) -> tupl
     lat, lon = float(nav[0]), float(nav[1])
     to_earth = Rotation.from_euler("ZY", [lon, -lat - math.pi / 2.0])
     to_body = Rotation.from_quat(np.roll(nav[6:], -1)).inv()
-    here = earth_fixed(lat, lon, float(nav[2]))
-    sight = to_body.apply(to_earth.inv().apply(earth_fixed(*point) - here)) - LEVER
+    apart = np.subtract(to_ecef(*point), to_ecef(lat, lon, float(nav[2])))
+    sight = to_body.apply(to_earth.inv().apply(apart)) - LEVER
     x, y, z = turn.inv().apply(sight)
     return math.atan2(y, x), math.asin(-z / math.sqrt(x * x + y * y + z * z))
 

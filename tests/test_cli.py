@@ -69,7 +69,7 @@ def test_missing_configuration_exits_78(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "word"),
     [
-        ("--aid=gnns=a.csv", "gnss, rdss, attitude, wheel"),
+        ("--aid=gnns=a.csv", "gnss, rdss, attitude, bearing, wheel"),
         ("--aid=gnss", "KIND=FILE"),
         ("--outage=5", "START:LENGTH"),
         ("--outage=5:0", "LENGTH above 0"),

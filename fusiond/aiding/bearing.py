@@ -43,11 +43,8 @@ from fusiond.aiding.base import (
     misaligned_axes,
 )
 from fusiond.estimators.model import SAR_MISALIGNMENT
-from fusiond.navigation.earth import (
-    ECCENTRICITY_SQUARED,
-    meridian_radius,
-    transverse_radius,
-)
+from fusiond.gnss.ecef import ned_axes, to_ecef
+from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew, wrap_angle
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
 
@@ -56,31 +53,10 @@ STEEPEST_ELEVATION_RAD = math.radians(80.0)
 """As for heading: the azimuth's errors grow as 1 / cos(E), here almost sixfold."""
 
 
-def earth_fixed(lat_rad: float, lon_rad: float, height_m: float) -> Array:
-    """Earth-centred, Earth-fixed coordinates (3,) in m of a geodetic place (rad, rad, m)."""
-    n = transverse_radius(lat_rad)
-    across = (n + height_m) * math.cos(lat_rad)
-    return np.array(
-        [
-            across * math.cos(lon_rad),
-            across * math.sin(lon_rad),
-            (n * (1.0 - ECCENTRICITY_SQUARED) + height_m) * math.sin(lat_rad),
-        ]
-    )
-
-
 def line_of_sight(place: Vector3, point: Vector3) -> Array:
     """From a place to a point, both lat, lon (rad), height (m): (3,) m, NED at the place."""
-    lat, lon, _ = place
-    sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
-    to_ned = np.array(
-        [
-            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-            [-sin_lon, cos_lon, 0.0],
-            [-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat],
-        ]
-    )
-    return np.asarray(to_ned @ (earth_fixed(*point) - earth_fixed(*place)), dtype=np.float64)
+    apart = np.subtract(to_ecef(*point), to_ecef(*place))
+    return np.asarray(ned_axes(place[0], place[1]).T @ apart, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
