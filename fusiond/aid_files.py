@@ -23,7 +23,8 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
-from fusiond.config import Config, SarAiding, StarTrackerAiding
+from fusiond.config import Config
+from fusiond.config_aiding import SarAiding, StarTrackerAiding
 from fusiond.csv_tables import Rejection, TableError
 from fusiond.files import (
     ImuTable,

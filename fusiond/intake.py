@@ -30,7 +30,7 @@ from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
 from fusiond.aiding.rdss_position import BIAS_BLOCK, FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.config import (
+from fusiond.config_aiding import (
     Aiding,
     AnyAiding,
     AttitudeAiding,
@@ -38,12 +38,14 @@ from fusiond.config import (
     HeadingAiding,
     HeightAiding,
     Misaligned,
+    RawAiding,
     RdssAiding,
     SarAiding,
     StarTrackerAiding,
     WheelAiding,
 )
 from fusiond.estimators.model import Block, misalignment, position_bias
+from fusiond.raw_gnss import RawGnss, raw_blocks
 from fusiond.settings import ARCSEC, DEG
 
 # What a fix moved forward by the computed velocity is wrong by: an acceleration of 2.5 m/s^2 over a
@@ -75,6 +77,8 @@ class Intake:
         """The aids that `m`, valid at `t_ns`, stands for, or the name of the refusal."""
         match m:
             case PositionFix():
+                if isinstance(self._aiding.get(m.source), RawAiding):
+                    return "raw_is_used"
                 return self._gnss(m, t_ns, sd_time_s)
             case DelayedFix():
                 return self._rdss(m, t_ns, sd_time_s, seen_ns)
@@ -120,10 +124,17 @@ class Intake:
                     elif o.strategy == "position_compensation":
                         bias = COMPENSATION_SD_M, COMPENSATION_TAU_S
                         blocks.append(position_bias(BIAS_BLOCK, *bias))
+                case RawAiding():
+                    blocks += raw_blocks(o)
                 case Misaligned() if o.misalignment_sd_arcsec > 0.0:
                     sd, tau_s = o.misalignment_sd_arcsec * ARCSEC, o.misalignment_correlation_s
                     blocks.append(misalignment(self._block(name, o), sd, tau_s or math.inf))
         return blocks
+
+    def raw_receiver(self, source: str) -> RawGnss | None:
+        """What becomes of a source's raw data; None where its fixes are the aid, not they."""
+        section = self._aiding.get(source)
+        return RawGnss(source, section) if isinstance(section, RawAiding) else None
 
     def _section(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""

@@ -15,14 +15,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from drivers.base import PermanentDriverError, monotonic_ns
-from fusiond.config import (
-    AnyAiding,
-    Config,
-    GnssAiding,
-    RdssAiding,
-    SarAiding,
-    StarTrackerAiding,
-)
+from fusiond.config import Config
+from fusiond.config_aiding import AnyAiding, GnssAiding, RdssAiding, SarAiding, StarTrackerAiding
 from fusiond.config_mistakes import Location, did_you_mean, mistake, validate
 
 EXIT_CONFIG = 78

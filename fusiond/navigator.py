@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
+from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.pseudorange import PseudorangeAid
 from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aligner import Aligner, AlignmentOptions
@@ -29,6 +31,7 @@ from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.standstill import StandstillDetector, Window
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
+from fusiond.raw_gnss import RawGnss
 from fusiond.saved_state import SavedState
 from fusiond.settings import DEG, imu_noise, quiet_limits, sensor_to_body
 from fusiond.solution import Mode, Solution
@@ -59,6 +62,7 @@ class Navigator:
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding)
+        self.raw: dict[str, RawGnss] = {}
         self.model = model_of(config, *self._intake.extra_blocks())
         self.imu = ImuBuffer(
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
@@ -80,6 +84,10 @@ class Navigator:
         self._last_position_ns = 0
         self._last_slide_cell = -1
         self.started: Start | None = None
+        for name in config.aiding:
+            receiver = self._intake.raw_receiver(name)
+            if receiver is not None:
+                self.raw[name] = receiver
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -124,10 +132,19 @@ class Navigator:
             self._constrain(max(0, self.imu.end - taken))
         return taken
 
-    def add(self, m: Measurement, t_ns: int, sd_time_s: float = 0.0, seen_ns: int = 0) -> str:
+    def learn(self, message: Ephemeris | Klobuchar) -> None:
+        """What a satellite broadcasts, for the raw epochs of the same source."""
+        if message.source in self.raw:
+            self.raw[message.source].learn(message)
+
+    def add(
+        self, m: Measurement | RawGnssEpoch, t_ns: int, sd_time_s: float = 0.0, seen_ns: int = 0
+    ) -> str:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self._refuse(m.source, "from_future")
+        if isinstance(m, RawGnssEpoch):
+            return self._add_raw(m, t_ns)
         aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
@@ -135,6 +152,21 @@ class Navigator:
             self._aligner.aids(aids)
         for aid in aids:
             self.timeline.insert(aid)
+        return "accepted"
+
+    def _add_raw(self, epoch: RawGnssEpoch, t_ns: int) -> str:
+        receiver = self.raw.get(epoch.source)
+        if receiver is None:
+            return self._refuse(epoch.source, "raw_not_used")
+        place = None
+        if self.started is None:
+            self._aligner.aids(receiver.start_aids(epoch, t_ns))
+        else:
+            place = self.estimator.nav[:3]
+        aid = receiver.aid(epoch, t_ns, place)
+        if isinstance(aid, str):
+            return self._refuse(epoch.source, aid)
+        self.timeline.insert(aid)
         return "accepted"
 
     def reset(self, why: str) -> None:
@@ -255,8 +287,10 @@ class Navigator:
             self.verdicts.judge(entry, outcome)
             source, t_ns = entry.aid.source, entry.key[0]
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
-            if isinstance(entry.aid, PositionAid | RdssPositionAid):
+            if isinstance(entry.aid, PositionAid | RdssPositionAid | PseudorangeAid):
                 self._last_position_ns = max(t_ns, self._last_position_ns)
+        if isinstance(entry.aid, PseudorangeAid) and outcome is not None and outcome.rows:
+            self.raw[entry.aid.source].judged(entry.aid, outcome)
         if self._on_outcome is not None:
             self._on_outcome(entry)
 

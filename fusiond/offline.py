@@ -19,7 +19,8 @@ from drivers.measurements import (
     MonotonicStamp,
 )
 from fusiond.aid_files import READERS, Arrival, source_of
-from fusiond.config import Config, GnssAiding
+from fusiond.config import Config
+from fusiond.config_aiding import GnssAiding
 from fusiond.csv_tables import Rejection, counts
 from fusiond.files import ImuTable, read_imu
 from fusiond.navigator import Navigator

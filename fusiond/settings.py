@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.config import Imu, ZeroVelocity
-from fusiond.estimators.model import ImuNoise
+from fusiond.config_aiding import RawAiding
+from fusiond.estimators.model import ClockNoise, ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigation.standstill import QuietLimits
@@ -35,6 +36,13 @@ def imu_noise(imu: Imu) -> ImuNoise:
         bias_correlation_s=imu.bias_correlation_s,
         rate_scale=imu.gyro_scale_ppm * 1e-6,
         force_scale=imu.accel_scale_ppm * 1e-6,
+    )
+
+
+def clock_noise(raw: RawAiding) -> ClockNoise:
+    """The receiver clock's error model."""
+    return ClockNoise(
+        offset_white=raw.clock_phase_m_sqrt_s**2, drift_white=raw.clock_drift_m_s_sqrt_s**2
     )
 
 

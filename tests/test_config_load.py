@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.config import GnssAiding, RdssAiding
+from fusiond.config_aiding import GnssAiding, RdssAiding
 from fusiond.load_config import ConfigError, config_digest, driver_entry_points, load_config
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "config").glob("*.toml"))

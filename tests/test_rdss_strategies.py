@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
-from fusiond.config import RdssAiding
+from fusiond.config_aiding import RdssAiding
 from fusiond.intake import Intake
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import Leg, Path, follow

@@ -65,8 +65,8 @@ class NotApplicable(NamedTuple):
 class Aid:
     """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
-    `gate` is the probability with which a consistent innovation passes. The rows of a `screened` aid
-    are gated one by one, and a bad one goes alone (fusiond.estimators.screening).
+    `gate` is the probability with which a consistent innovation passes. The rows of a `screened`
+    aid are gated one by one, and a bad one goes alone (fusiond.estimators.screening).
     """
 
     screened: ClassVar[bool] = False

@@ -14,7 +14,9 @@ Two errors that many ranges share may be states of the model (blocks `RANGE_BIAS
 displacement t of the antenna, slowly changing, that stands for multipath and orbit errors that last
 for minutes, and the ionosphere that is left, n times each range's own `ionosphere`:
 
-    rho^ = |s - p^ - a - t^| + c_k^ + i n^,    z_rho += u . dt - i dn    (dt, dn true minus estimated)
+    rho^ = |s - p^ - a - t^| + c_k^ + i n^,    z_rho += u . dt - i dn
+
+with dt and dn true minus estimated.
 
 `turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
 transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
@@ -165,8 +167,9 @@ class PseudorangeAid(Aid):
     `ranges` (m), `rates` (m/s; positive: going away), their variances (m^2, (m/s)^2), each (n,);
     NaN is not measured. `clock` (n,): which of the states of the model's block `clock_offset` each
     range has, or NO_CLOCK; a rate of a satellite with NO_CLOCK has no drift either. `lever` (m,
-    body axes) of the antenna. `ionosphere` (n,): one sigma (m) of what the ionosphere leaves in each
-    range, common to all but for this factor. `clock_reset`: the receiver has set its clock. Rows: the finite ranges in order, then the finite rates (`labels`).
+    body axes) of the antenna. `ionosphere` (n,): one sigma (m) of what the ionosphere leaves in
+    each range, common to all but for this factor. `clock_reset`: the receiver has set its clock.
+    Rows: the finite ranges in order, then the finite rates (`labels`).
 
     ValueError for shapes that do not fit, a variance that is not positive where there is a value,
     or a satellite with a clock beside one without where rates are given.

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fusiond.config import Config, GnssAiding, Imu, RdssAiding, SarAiding
+from fusiond.config import Config, Imu
+from fusiond.config_aiding import GnssAiding, RdssAiding, SarAiding
 from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
 from fusiond.simulation.gnss_receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.aiding.base import NotApplicable
 from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
-from fusiond.config import Imu, RdssAiding
+from fusiond.config import Imu
+from fusiond.config_aiding import RdssAiding
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
 from fusiond.imu_buffer import ImuBuffer

@@ -1,0 +1,181 @@
+"""Sections `[aiding.NAME]`: how the filter uses what a source sends, in data sheets' units."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+)
+
+Vector = tuple[float, float, float]
+Place = tuple[
+    Annotated[float, Field(ge=-90.0, le=90.0)],
+    Annotated[float, Field(ge=-180.0, le=180.0)],
+    Annotated[float, Field(ge=-1000.0, le=20000.0)],
+]
+"""Latitude, longitude (deg), ellipsoidal height (m) of a place on land."""
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class Section(BaseModel):
+    """Base of every section: frozen, unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Aiding(Section):
+    """What every aid has: where it sits, how it is gated."""
+
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """Body axes (forward, right, down), from the IMU to the aid's reference point."""
+    gate_probability: Probability = 0.9999
+    """A consistent innovation fails the gate with one minus this probability."""
+    sigma_scale: PositiveFloat = 1.0
+    """Multiplies every sigma the device states, where experience says it is too optimistic."""
+
+
+class GnssAiding(Aiding):
+    """Position and velocity fixes of a GNSS receiver."""
+
+    kind: Literal["gnss"] = "gnss"
+    use_velocity: bool = True
+    """Whether the receiver's velocity is an aid too."""
+    range_error_m: PositiveFloat = 3.0
+    """Times DOP gives sigma where the receiver sends no GST; see `docs/gnss-nmea.md`."""
+    velocity_sd_m_s: PositiveFloat = 0.1
+    """Where the receiver states none."""
+    min_position_sd_m: PositiveFloat = 0.02
+    """No smaller sigma is believed."""
+    min_velocity_sd_m_s: PositiveFloat = 0.02
+    """No smaller sigma is believed."""
+    velocity_delay_s: NonNegativeFloat = 0.0
+    """Age of the velocity at the fix's instant: half an epoch where the receiver averages over
+    one."""
+    time_sd_s: NonNegativeFloat = 0.0
+    """Timing error of the fix against the IMU; times the speed it adds to sigma."""
+
+
+class RawAiding(Aiding):
+    """Pseudoranges and rates of a GNSS receiver, satellite by satellite; see `docs/gnss-raw.md`."""
+
+    kind: Literal["raw"] = "raw"
+    systems: tuple[Literal["G", "E", "C"], ...] = ("G", "E", "C")
+    """GPS, Galileo, BeiDou: which to use. Each has a clock offset of its own."""
+    elevation_mask_deg: Annotated[float, Field(ge=0.0, lt=90.0)] = 10.0
+    """Lower satellites are left out."""
+    cno_mask_db_hz: NonNegativeFloat = 28.0
+    """Weaker signals are left out."""
+    best_four: bool = False
+    """Use the four satellites of smallest GDOP alone (paper 002), not all in view."""
+    bias_sd_m: NonNegativeFloat = 1.5
+    """Displacement that the ranges share for minutes (multipath, orbits), one sigma an axis; 0:
+    none is estimated, and sigma shrinks as if errors were white."""
+    bias_correlation_s: PositiveFloat = 120.0
+    """Correlation time of that displacement."""
+    clock_phase_m_sqrt_s: PositiveFloat = 0.1
+    """Random walk of the receiver clock's offset; a temperature-compensated crystal's."""
+    clock_drift_m_s_sqrt_s: PositiveFloat = 0.2
+    """Random walk of its drift; likewise."""
+    start_velocity_sd_m_s: PositiveFloat = 0.2
+    """One sigma of the velocity from one epoch's rates, which alignment starts with."""
+
+
+class RdssAiding(Aiding):
+    """BeiDou RDSS fixes: late, horizontal, 20 or 100 m class."""
+
+    kind: Literal["rdss"] = "rdss"
+    strategy: Literal["rewind", "optimal_prediction", "position_compensation", "none"] = "rewind"
+    """What becomes of the delay; see `docs/rdss-strategies.md`. `rewind` is exact."""
+    noise: Literal["geometry", "class"] = "geometry"
+    """Covariance from the satellites' geometry with the terminal's class as its floor, or the class
+    alone on both axes."""
+    satellites_deg: tuple[float, float] = (80.0, 140.0)
+    """Longitudes of the two geostationary satellites, east positive."""
+    range_sd_m: PositiveFloat = 15.3
+    """Of a slant range after differential correction: 8 m satellite drift and 13 m ranging."""
+    height_sd_m: PositiveFloat = 10.0
+    """Of the height that the centre solves with."""
+    fix_height_sd_m: PositiveFloat | None = 30.0
+    """The fix's height aids with this sigma, unless the request gave it (then it says nothing new).
+    Without any height an inertial height runs away."""
+    bias_sd_m: NonNegativeFloat = 15.0
+    """Error that successive fixes share (height model, satellite positions), one sigma an axis; 0:
+    none is estimated. See `docs/rdss-strategies.md` for why not 0."""
+    bias_correlation_s: PositiveFloat = 600.0
+    """Correlation time of that drift."""
+
+
+class AttitudeAiding(Aiding):
+    kind: Literal["attitude"] = "attitude"
+
+
+class Misaligned(Aiding):
+    """An aid whose sensor is mounted a little askew: three small angles that the filter estimates.
+
+    The angles turn body axes into sensor axes; what is known of the mounting is taken out by the
+    device.
+    """
+
+    misalignment_sd_arcsec: NonNegativeFloat = 200.0
+    """One sigma of each angle before it is estimated; 0: none is estimated."""
+    misalignment_correlation_s: PositiveFloat | None = None
+    """Correlation time, where mount or airframe bend; without it the angles are constant."""
+
+
+class StarTrackerAiding(Misaligned):
+    """Attitude of a star tracker against north-east-down; see `docs/star-tracker-sar.md`."""
+
+    kind: Literal["star_tracker"] = "star_tracker"
+    sd_arcsec: PositiveFloat = 200.0
+    """One sigma of roll, pitch and yaw each, where the device states none. As in paper 001."""
+
+
+class SarAiding(Misaligned):
+    """Azimuth and elevation of known points in a radar's image; see `docs/star-tracker-sar.md`."""
+
+    kind: Literal["sar"] = "sar"
+    sd_arcsec: PositiveFloat = 100.0
+    """One sigma of azimuth and of elevation, where the device states none."""
+    min_range_m: PositiveFloat = 1000.0
+    """A nearer point is `too_close`: a position off by 16 m bends its angles by half the default
+    sigma."""
+    targets_deg_m: dict[str, Place] = Field(default_factory=dict)
+    """The known points by the number or name that the device gives: latitude, longitude (deg),
+    ellipsoidal height (m)."""
+
+
+class HeadingAiding(Aiding):
+    kind: Literal["heading"] = "heading"
+    sd_deg: PositiveFloat = 1.0
+
+
+class HeightAiding(Aiding):
+    kind: Literal["height"] = "height"
+    sd_m: PositiveFloat = 5.0
+
+
+class WheelAiding(Aiding):
+    kind: Literal["wheel"] = "wheel"
+    sd_m_s: PositiveFloat = 0.1
+
+
+AnyAiding = Annotated[
+    GnssAiding
+    | RawAiding
+    | RdssAiding
+    | AttitudeAiding
+    | StarTrackerAiding
+    | SarAiding
+    | HeadingAiding
+    | HeightAiding
+    | WheelAiding,
+    Field(discriminator="kind"),
+]
+AIDING_KINDS = tuple(
+    section.model_fields["kind"].default for section in get_args(get_args(AnyAiding)[0])
+)
