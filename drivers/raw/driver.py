@@ -18,6 +18,10 @@ from drivers.receiver import ReceiverDriver
 
 Found = Measurement | RawEvent
 
+NMEA_TIME_NS = 5_000_000_000
+"""RXM-RAWX tells the time when no RMC or ZDA has for this long: five epochs at 1 Hz. Its own is up
+to some milliseconds off, as the receiver's clock is."""
+
 
 class GnssOptions(NmeaOptions):
     """Options of a `driver = "gnss"` source: those of `nmea`, and which of the stream to use."""
@@ -55,7 +59,8 @@ class GnssDecoder:
             else None
         )
         self._trust = TimeTrust()
-        self._nmea_told_time = False
+        self._nmea_told_ns: int | None = None
+        """UTC of RMC or ZDA when last told, else of the first epoch of RXM-RAWX."""
         self._t_seen_ns = 0
 
     @property
@@ -103,7 +108,7 @@ class GnssDecoder:
     def _take_nmea(self, measurements: list[Measurement], found: list[Found]) -> None:
         for measurement in measurements:
             if isinstance(measurement, TimeReport):
-                self._nmea_told_time = True
+                self._nmea_told_ns = measurement.utc_ns
                 if measurement.trusted and self._raw is not None:
                     self._raw.note_utc(measurement.utc_ns)
             if isinstance(measurement, PositionFix) and not self._use_nmea_fix:
@@ -117,13 +122,16 @@ class GnssDecoder:
             found.append(event)
 
     def _report_time(self, epoch: RawGnssEpoch, found: list[Found]) -> None:
-        """UTC of an epoch of RXM-RAWX, where the receiver knows the leap seconds and no RMC or
-        ZDA says it."""
-        assert self._raw is not None
-        known = self._raw.leap_seconds is not None
-        if self._nmea_told_time or not known or not isinstance(epoch.stamp, UtcStamp):
+        """UTC of RXM-RAWX, where the receiver knows the leap seconds and no RMC or ZDA comes."""
+        if self._raw is None or self._raw.leap_seconds is None:
+            return
+        if not isinstance(epoch.stamp, UtcStamp):
             return
         utc_ns = epoch.stamp.utc_ns
+        if self._nmea_told_ns is None:
+            self._nmea_told_ns = utc_ns
+        if abs(utc_ns - self._nmea_told_ns) < NMEA_TIME_NS:
+            return
         trusted = self._trust.report(utc_ns, epoch.t_seen_ns, valid=True)
         if trusted is not None:
             found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))

@@ -6,10 +6,12 @@
     epoch        DF004, DF248: GPS time; DF427: BeiDou time, 14 s behind it; ms of week
     angles       semicircles, times PI
 
-The messages of one epoch, one a system, become one `RawGnssEpoch`: it ends with the message whose
-multiple-message bit (DF393) is off, whatever its system, or with the next epoch. The week is not
-sent; it is the one that puts the epoch nearest to the last instant known in full. pyrtcm takes the
-payloads apart; it is imported with the first of them. Source: RTCM 10403.3, sections 3.5.
+The messages of one epoch become one `RawGnssEpoch`: it ends with the message whose multiple-message
+bit (DF393) is off, whatever its system, or with the next epoch. Where a system sends several kinds
+of MSM the highest counts, and never two at once: they need not be of the same receiver clock (in a
+public log MSM6 and MSM7 are 108 km apart). The week is not sent; it is the one that puts the epoch
+nearest to the last instant known in full. pyrtcm takes the payloads apart; it is imported with the
+first of them. Source: RTCM 10403.3, section 3.5.
 """
 
 from __future__ import annotations
@@ -120,6 +122,7 @@ class RtcmDecoder:
         self._parse: Parse | None = None
         self._epoch: tuple[int, float] | None = None
         self._signals: dict[tuple[str, int, str], RawSignal] = {}
+        self._kinds: dict[System, int] = {}
         self._t_seen_ns = 0
 
     @property
@@ -145,7 +148,7 @@ class RtcmDecoder:
             if message is None:
                 self._counters["rtcm_unreadable"] += 1
             elif msm:
-                self._observe(MSM_SYSTEMS[group], message, t_seen_ns, found)
+                self._observe(MSM_SYSTEMS[group], kind, message, t_seen_ns, found)
             else:
                 self._ephemeris(number, message, t_seen_ns, found)
         elif group in MSM_SYSTEMS:
@@ -161,6 +164,7 @@ class RtcmDecoder:
         epoch, signals = self._epoch, tuple(self._signals.values())
         self._epoch = None
         self._signals.clear()
+        self._kinds.clear()
         if epoch is None:
             return []
         week, tow_s = epoch
@@ -183,7 +187,9 @@ class RtcmDecoder:
 
     # ----------------------------------------------------------------- observations
 
-    def _observe(self, system: System, message: Any, t_seen_ns: int, found: list[RawEvent]) -> None:
+    def _observe(
+        self, system: System, kind: int, message: Any, t_seen_ns: int, found: list[RawEvent]
+    ) -> None:
         tow_s = getattr(message, _EPOCH_FIELD[system]) * 1e-3
         if system == "C":
             tow_s = (tow_s + BDT_BEHIND_GPS_S) % WEEK_S
@@ -194,9 +200,19 @@ class RtcmDecoder:
         if week is None:
             self._counters["week_unknown"] += 1
             return
-        self._counters["msm"] += 1
         if self._epoch is not None and self._epoch != (week, tow_s):
             found += self.flush()
+        known = self._kinds.get(system, kind)
+        if kind < known:
+            self._counters["msm_superseded"] += 1
+            return
+        if kind > known:
+            old = [key for key in self._signals if key[0] == system]
+            self._counters["signal_superseded"] += len(old)
+            for key in old:
+                del self._signals[key]
+        self._kinds[system] = kind
+        self._counters["msm"] += 1
         self._epoch, self._t_seen_ns = (week, tow_s), t_seen_ns
         self._weeks.note_tow(week, tow_s)
         for signal in _signals(system, message, self._counters):
