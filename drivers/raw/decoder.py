@@ -78,6 +78,7 @@ class RawDecoder:
         """GPS time minus UTC as the receiver last said that it knows it."""
         self._source = source
         self._splitter = StreamSplitter(self.counters)
+        self._t_seen_ns = 0
         self._weeks = WeekReference(earliest)
         self._rtcm = RtcmDecoder(source, self._weeks, self.counters) if rtcm else None
         self._messages: dict[tuple[str, int, int], MessageDecoder] = {}
@@ -86,6 +87,7 @@ class RawDecoder:
     def feed(self, data: bytes, t_seen_ns: int) -> list[RawEvent]:
         """The events that `data`, seen at `t_seen_ns`, completes. Sentences are left out."""
         found: list[RawEvent] = []
+        self._t_seen_ns = t_seen_ns
         for item in self._splitter.feed(data):
             if isinstance(item, Frame):
                 found += self.take(item, t_seen_ns)
@@ -96,7 +98,7 @@ class RawDecoder:
         found: list[RawEvent] = []
         for item in self._splitter.finish():
             if isinstance(item, Frame):
-                found += self.take(item, 0)
+                found += self.take(item, self._t_seen_ns)
         return found + self.flush_epoch()
 
     @property
