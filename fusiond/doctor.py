@@ -16,8 +16,9 @@ import aiomqtt
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Driver
-from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
+from drivers.base import Driver, Emitted
+from drivers.measurements import DeviceEvent, ImuSample, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar
 from fusiond.clock import Clock
 from fusiond.config import Config
 from fusiond.doctor_devices import device_name, open_findings
@@ -75,7 +76,7 @@ class Heard:
         self.imu: deque[tuple[float, ...]] = deque(maxlen=KEPT)
         self.events: list[str] = []
 
-    def _emit(self, item: Measurement | DeviceEvent) -> None:
+    def _emit(self, item: Emitted) -> None:
         if isinstance(item, DeviceEvent):
             self.events.append(f"{item.code}: {item.text}")
             return
@@ -85,6 +86,8 @@ class Heard:
         if isinstance(item, TimeReport):
             self._clock.report(item)
             return
+        if isinstance(item, Ephemeris | Klobuchar):
+            return  # they have no instant
         instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
         kind.age_s.append((item.t_seen_ns - instant.t_valid_ns) * 1e-9)
         if isinstance(item, ImuSample):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import struct
 from typing import Any
 
@@ -92,6 +93,86 @@ def inav_words(data: int, alert: int = 0) -> list[int]:
     crc = crc24q((even << 82 | odd).to_bytes(25, "big"))
     page = (even << 14) << 128 | (odd << 24 | crc) << 22
     return [page >> (224 - 32 * i) & 0xFFFFFFFF for i in range(8)]
+
+
+SQRT_A, ECCENTRICITY = 5153 << 19, 123_456_789
+"""5153 m^1/2 in 2^-19 and 0.0144 in 2^-33, as every message sends them."""
+
+
+def lnav(seed: int, issue: int = 77) -> list[list[int]]:
+    """Subframes 1, 2 and 3 of random bits and one issue, as words."""
+    rng, frames = random.Random(seed), []
+    for number in (1, 2, 3):
+        bits = put(rng.getrandbits(240), 240, 0, 8, 0x8B)
+        bits = put(bits, 240, 24, 17, 57_600 + number)  # the next subframe's start over 6 s
+        bits = put(bits, 240, 43, 3, number)
+        bits = put(bits, 240, {1: 168, 2: 48, 3: 216}[number], 8, issue)
+        if number == 1:
+            bits = put(bits, 240, 48, 10, 2450 % 1024)
+        if number == 2:
+            bits = put(bits, 240, 136, 32, ECCENTRICITY)
+            bits = put(bits, 240, 184, 32, SQRT_A)
+            bits = put(bits, 240, 216, 16, 21_600 + seed)  # near the transmission, in 16 s
+        frames.append(lnav_words(bits))
+    return frames
+
+
+def beidou_header(bits: int, number: int, sow: int) -> int:
+    for at, length, field in ((0, 11, 0b11100010010), (15, 3, number), (18, 20, sow)):
+        bits = put(bits, 224, at, length, field)
+    return bits
+
+
+def d1(seed: int, sow: int = 345_600, toe: int = 43_200) -> list[list[int]]:
+    """Subframes 1, 2 and 3 of random bits; `toe` in 8 s."""
+    rng, frames = random.Random(seed), []
+    for number in (1, 2, 3):
+        bits = beidou_header(rng.getrandbits(224), number, sow + 6 * (number - 1))
+        if number == 1:
+            bits = put(put(bits, 224, 48, 13, 1094), 224, 61, 17, toe)
+        elif number == 2:
+            bits = put(put(bits, 224, 104, 32, ECCENTRICITY), 224, 190, 32, SQRT_A)
+            bits = put(bits, 224, 222, 2, toe >> 15)
+        else:
+            bits = put(bits, 224, 38, 15, toe)
+        frames.append(beidou_words(bits))
+    return frames
+
+
+def d2(seed: int, sow: int = 345_600, toe: int = 43_200) -> list[list[int]]:
+    """The ten pages of random bits; `toe` in 8 s."""
+    rng, pages = random.Random(seed), []
+    for page in range(1, 11):
+        bits = beidou_header(rng.getrandbits(224), 1, sow + 3 * (page - 1))
+        bits = put(bits, 224, 38, 4, page)
+        if page == 1:
+            bits = put(put(bits, 224, 52, 13, 1094), 224, 65, 17, toe)
+        elif page == 5:
+            bits = put(bits, 224, 96, 10, ECCENTRICITY >> 22)
+        elif page == 6:
+            bits = put(put(bits, 224, 42, 22, ECCENTRICITY), 224, 64, 32, SQRT_A)
+        elif page == 7:
+            bits = put(bits, 224, 68, 17, toe)
+        pages.append(beidou_words(bits))
+    return pages
+
+
+def inav(seed: int, prn: int = 7, issue: int = 77) -> list[list[int]]:
+    """Data words 1 to 5, as they come in an E1 subframe: 2, 4, 1, 3, 5."""
+    rng, pages = random.Random(seed), []
+    for kind in (2, 4, 1, 3, 5):
+        data = put(rng.getrandbits(128), 128, 0, 6, kind)
+        if kind < 5:
+            data = put(data, 128, 6, 10, issue)
+        if kind == 1:
+            data = put(data, 128, 16, 14, 5760 + seed)  # 60 s
+            data = put(put(data, 128, 62, 32, ECCENTRICITY), 128, 94, 32, SQRT_A)
+        elif kind == 4:
+            data = put(put(data, 128, 16, 6, prn), 128, 54, 14, 5760 + seed)
+        elif kind == 5:
+            data = put(put(data, 128, 73, 12, 1426), 128, 85, 20, 345_600)
+        pages.append(inav_words(data))
+    return pages
 
 
 def oracle_fields(eph: Any) -> dict[str, float]:

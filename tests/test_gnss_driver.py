@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pty_device import Device, until
-from raw_frames import measurement, put, rawx, rtcm, sfrbx, ubx
+from raw_frames import d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
 from test_nmea_driver import gga, rmc
-from test_raw_subframes import d1, lnav
 
 from drivers.base import Driver, Emitted, PermanentDriverError
 from drivers.measurements import DeviceEvent, PositionFix, TimeReport, UtcStamp

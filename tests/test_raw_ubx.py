@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from raw_frames import measurement, rawx, sfrbx, ubx
-from test_raw_subframes import d1, inav, lnav
+from raw_frames import d1, inav, lnav, measurement, rawx, sfrbx, ubx
 
 from drivers.measurements import UtcStamp
 from drivers.raw.decoder import RawDecoder
