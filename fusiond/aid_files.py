@@ -23,8 +23,10 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
+from drivers.raw.decoder import RawDecoder
+from drivers.raw.messages import RawEvent, RawGnssEpoch
 from fusiond.config import Config
-from fusiond.config_aiding import SarAiding, StarTrackerAiding
+from fusiond.config_aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
 from fusiond.csv_tables import Rejection, TableError
 from fusiond.files import (
     ImuTable,
@@ -43,20 +45,29 @@ EARLIEST_DATE = date(2000, 5, 1)
 SECONDS_OF_WEEK = 604800.0
 
 
+_REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset", "unknown")
+
+
 class Arrival(NamedTuple):
-    """A measurement and when it came."""
+    """A measurement, or what a satellite broadcast, and when it came."""
 
     t_arrival_ns: int
-    measurement: Measurement
+    measurement: Measurement | RawEvent
 
 
 def source_of(kind: str, config: Config) -> str:
     """The source that a file's measurements are taken to come from.
 
     The kind of the file (`gnss` for `nmea`); an attitude is a star tracker's where the
-    configuration has one and no [aiding.attitude], a bearing that of the configured radar.
+    configuration has one and no [aiding.attitude], a bearing that of the configured radar, raw data
+    that of the section of kind `raw`.
     """
-    wanted = {"attitude": StarTrackerAiding, "bearing": SarAiding}.get(kind)
+    sections: dict[str, type[Aiding]] = {
+        "attitude": StarTrackerAiding,
+        "bearing": SarAiding,
+        "raw": RawAiding,
+    }
+    wanted = sections.get(kind)
     if wanted is None or kind in config.aiding:
         return "gnss" if kind == "nmea" else kind
     fallback = "sar" if kind == "bearing" else kind
@@ -198,6 +209,37 @@ def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
     return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
 
 
+def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
+    """UBX or RTCM 3 as it came off the wire. An epoch's time is GPS time: the IMU's `t_s` must be
+    GPS second of week or POSIX seconds. What comes between two epochs has the time of the first."""
+    decoder = RawDecoder(source, earliest=EARLIEST_DATE)
+    of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    rows: list[Arrival] = []
+    now: int | None = None
+    waiting: list[RawEvent] = []
+    for event in [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]:
+        if not isinstance(event, RawGnssEpoch):
+            if now is None:
+                waiting.append(event)
+            else:
+                rows.append(Arrival(now, event))
+            continue
+        now = _ns(event.tow_s)
+        if not of_week and isinstance(event.stamp, UtcStamp):
+            now = event.stamp.utc_ns
+        rows += [Arrival(now, before) for before in waiting]
+        waiting.clear()
+        rows.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
+    if now is None:
+        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
+    refused = [
+        Rejection(0, name, f"{count} times")
+        for name, count in decoder.counters.items()
+        if count and name.endswith(_REFUSALS)
+    ]
+    return rows, refused
+
+
 READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
     "gnss": _read_gnss,
     "rdss": _read_rdss,
@@ -205,4 +247,5 @@ READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
     "bearing": _read_bearing,
     "wheel": _read_wheel,
     "nmea": _read_nmea,
+    "raw": _read_raw,
 }

@@ -20,13 +20,14 @@ import typer
 from fusiond.studies import STUDIES
 
 if TYPE_CHECKING:
+    from drivers.raw.messages import System
     from fusiond.config import Config
 
 EXIT_DATA = 65
 EXIT_UNAVAILABLE = 69
 EXIT_IO = 74
 EXIT_CONFIG = 78
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea")
+AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
@@ -141,6 +142,10 @@ def process(
     out: Annotated[
         Path | None, typer.Option(metavar="F.csv", help="Write the solution; - is standard output.")
     ] = None,
+    systems: Annotated[
+        str | None,
+        typer.Option(metavar="C,G,E", help="Satellite systems of raw data to use."),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Navigate through recorded files with the daemon's own navigator."""
@@ -152,7 +157,7 @@ def process(
     from fusiond.offline import process as run_process  # noqa: PLC0415
 
     with _data_errors(), _spinner("processing"):
-        result = run_process(loaded, imu, aids, outages, out)
+        result = run_process(loaded, imu, aids, outages, out, _systems(systems))
     _print_summary(result, err="-" in (json_path, str(out)))
     _write_json(result, json_path)
 
@@ -330,6 +335,17 @@ def _outage(text: str) -> tuple[float, float]:
     if not (isfinite(window[0]) and isfinite(window[1]) and window[1] > 0.0):
         raise typer.BadParameter(f"--outage {text}: START:LENGTH in seconds, LENGTH above 0")
     return window
+
+
+def _systems(text: str | None) -> tuple[System, ...] | None:
+    if text is None:
+        return None
+    from drivers.raw.messages import SYSTEMS  # noqa: PLC0415
+
+    letters = [letter.strip().upper() for letter in text.split(",")]
+    if not set(letters) <= set(SYSTEMS) or len(set(letters)) < len(letters):
+        raise typer.BadParameter(f"--systems {text}: G GPS, E Galileo, C BeiDou, each once")
+    return tuple(s for s in SYSTEMS if s in letters)
 
 
 def _spinner(text: str) -> AbstractContextManager[object]:

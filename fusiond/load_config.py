@@ -16,7 +16,14 @@ from pydantic import BaseModel
 
 from drivers.base import PermanentDriverError, monotonic_ns
 from fusiond.config import Config
-from fusiond.config_aiding import AnyAiding, GnssAiding, RdssAiding, SarAiding, StarTrackerAiding
+from fusiond.config_aiding import (
+    AnyAiding,
+    GnssAiding,
+    RawAiding,
+    RdssAiding,
+    SarAiding,
+    StarTrackerAiding,
+)
 from fusiond.config_mistakes import Location, did_you_mean, mistake, validate
 
 EXIT_CONFIG = 78
@@ -24,6 +31,7 @@ EXIT_CONFIG = 78
 
 _DEFAULT_AIDING: dict[str, AnyAiding] = {
     "nmea": GnssAiding(),
+    "gnss": RawAiding(),
     "rdss": RdssAiding(),
     "can_attitude": StarTrackerAiding(),
     "can_bearing": SarAiding(),

@@ -18,9 +18,10 @@ from drivers.measurements import (
     Measurement,
     MonotonicStamp,
 )
+from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.aid_files import READERS, Arrival, source_of
 from fusiond.config import Config
-from fusiond.config_aiding import GnssAiding
+from fusiond.config_aiding import GnssAiding, RawAiding
 from fusiond.csv_tables import Rejection, counts
 from fusiond.files import ImuTable, read_imu
 from fusiond.navigator import Navigator
@@ -40,11 +41,15 @@ def process(
     aids: list[tuple[str, Path]],
     outages: list[tuple[float, float]] | None = None,
     out: Path | None = None,
+    systems: tuple[System, ...] | None = None,
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
-    Raises `TableError` for a file that cannot be read as what it is said to be.
+    `systems` are the satellite systems of raw data to use, instead of the configuration's. Raises
+    `TableError` for a file that cannot be read as what it is said to be.
     """
+    if any(kind == "raw" for kind, _ in aids):
+        config = _with_raw(config, systems)
     imu = read_imu(imu_path)
     rows_read = len(imu.t_s) + len(imu.rejected)
     files: dict[str, Any] = {"imu": _account(rows_read, imu.rejected)}
@@ -91,6 +96,16 @@ def process(
     }
 
 
+def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
+    """The configuration with a section for the raw data of a file, and the systems asked for."""
+    name = source_of("raw", config)
+    section = config.aiding.get(name)
+    raw = section if isinstance(section, RawAiding) else RawAiding()
+    if systems is not None:
+        raw = raw.model_copy(update={"systems": systems})
+    return config.model_copy(update={"aiding": {**config.aiding, name: raw}})
+
+
 def _account(rows: int, rejected: list[Rejection]) -> dict[str, Any]:
     return {
         "rows": rows,
@@ -99,7 +114,7 @@ def _account(rows: int, rejected: list[Rejection]) -> dict[str, Any]:
     }
 
 
-def _withheld(m: Measurement, outages: Iterable[tuple[float, float]]) -> bool:
+def _withheld(m: Measurement | RawEvent, outages: Iterable[tuple[float, float]]) -> bool:
     stamp = getattr(m, "stamp", None)
     if not isinstance(stamp, MonotonicStamp):
         return False
@@ -147,14 +162,22 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], out: Path
 
 
 def _give(navigator: Navigator, arrival: Arrival) -> None:
-    stamp = arrival.measurement.stamp  # type: ignore[union-attr]
+    m = arrival.measurement
+    if isinstance(m, Ephemeris | Klobuchar):
+        navigator.learn(m)
+        return
+    stamp = m.stamp  # type: ignore[union-attr]
     assert isinstance(stamp, MonotonicStamp)
-    navigator.add(arrival.measurement, stamp.t_ns)
+    navigator.add(m, stamp.t_ns)
 
 
 def _is_late(arrival: Arrival, config: Config) -> bool:
     """Whether samples of its validity, or of an aid that it holds, come before it does."""
     m = arrival.measurement
+    if isinstance(m, Ephemeris | Klobuchar):
+        return False
+    if isinstance(m, RawGnssEpoch):
+        return True  # corrected for the place where the filter has come to
     stamp = m.stamp  # type: ignore[union-attr]
     assert isinstance(stamp, MonotonicStamp)
     section = config.aiding.get(m.source)

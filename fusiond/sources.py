@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Backoff, Driver
-from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
+from drivers.base import Backoff, Driver, Emitted
+from drivers.measurements import DeviceEvent, ImuSample, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar
 from fusiond.clock import Clock
 from fusiond.config import Config
 from fusiond.load_config import driver_entry_points
@@ -86,13 +87,16 @@ class Sources:
 
     # ------------------------------------------------------------------ arrivals
 
-    def _emit(self, item: Measurement | DeviceEvent) -> None:
+    def _emit(self, item: Emitted) -> None:
         if isinstance(item, DeviceEvent):
             self._on_event(item.source, item.code, item.text)
             return
         source = self.all[item.source]
         if isinstance(item, TimeReport):
             self._clock.report(item)
+            return
+        if isinstance(item, Ephemeris | Klobuchar):
+            self._navigator.learn(item)
             return
         source.received += 1
         source.last_seen_ns = item.t_seen_ns
