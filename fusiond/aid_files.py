@@ -211,33 +211,33 @@ def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     """UBX or RTCM 3 as it came off the wire. An epoch's time is GPS time: the IMU's `t_s` must be
-    GPS second of week or POSIX seconds. What comes between two epochs has the time of the first."""
+    GPS second of week or POSIX seconds.
+
+    What the satellites broadcast is known from the first epoch on, as to a receiver that has been
+    on for some minutes: a recording that starts in the middle would take half a minute to several
+    to say it again.
+    """
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
-    rows: list[Arrival] = []
-    now: int | None = None
-    waiting: list[RawEvent] = []
+    epochs: list[Arrival] = []
+    broadcast: list[RawEvent] = []
     for event in [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]:
         if not isinstance(event, RawGnssEpoch):
-            if now is None:
-                waiting.append(event)
-            else:
-                rows.append(Arrival(now, event))
+            broadcast.append(event)
             continue
         now = _ns(event.tow_s)
         if not of_week and isinstance(event.stamp, UtcStamp):
             now = event.stamp.utc_ns
-        rows += [Arrival(now, before) for before in waiting]
-        waiting.clear()
-        rows.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
-    if now is None:
+        epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
+    if not epochs:
         raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
     refused = [
         Rejection(0, name, f"{count} times")
         for name, count in decoder.counters.items()
         if count and name.endswith(_REFUSALS)
     ]
-    return rows, refused
+    first_ns = min(epoch.t_arrival_ns for epoch in epochs)
+    return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused
 
 
 READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
