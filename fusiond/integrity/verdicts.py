@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fusiond.aiding.pseudorange import PseudorangeAid
 from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.estimators.base import Outcome
 from fusiond.integrity.consistency import (
@@ -16,11 +18,16 @@ from fusiond.integrity.consistency import (
     Verdict,
 )
 from fusiond.integrity.monitor import ConsistencyMonitor
+from fusiond.raw_gnss import per_system
 from fusiond.timeline import Entry
+
+Array = NDArray[np.float64]
 
 
 class Verdicts:
     """Feeds each fused innovation to its source's monitor, once, however often it is applied.
+
+    A receiver's raw epochs have a monitor for each satellite system, `<source>_<system>`.
 
     `on_change(source, verdict)` hears when a verdict turns. `ignored` sources are not measured (the
     filter's own constraints): their innovations are neither independent nor white, and no verdict
@@ -45,6 +52,14 @@ class Verdicts:
         if entry.judged or not outcome.whitened or source in self._ignored:
             return
         entry.judged = True
+        if isinstance(entry.aid, PseudorangeAid):
+            for system, figures in per_system(entry.aid, outcome).items():
+                row = np.array(figures)
+                self._add(f"{source}_{system}", entry, row, float(row @ row))
+            return
+        self._add(source, entry, np.array(outcome.whitened), outcome.nis)
+
+    def _add(self, source: str, entry: Entry, row: Array, nis: float) -> None:
         monitor = self._monitors.get(source)
         if monitor is None:
             late = isinstance(entry.aid, RdssPositionAid)
@@ -52,7 +67,7 @@ class Verdicts:
             options = ConsistencyOptions(window, self._alpha, gate=entry.aid.gate)
             monitor = self._monitors[source] = ConsistencyMonitor(options)
         before = monitor.verdict
-        monitor.add_whitened(np.array(outcome.whitened), outcome.nis)
+        monitor.add_whitened(row, nis)
         if monitor.verdict != before:
             self._on_change(source, monitor.verdict)
 
