@@ -28,6 +28,7 @@ from fusiond.config_aiding import (
     Section,
     Vector,
 )
+from fusiond.estimators.wavelet import MOST_SCALES, wavelet_matrix
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -157,8 +158,22 @@ class Alignment(Section):
         return self
 
 
+def _orthonormal(wavelet: str) -> str:
+    wavelet_matrix(wavelet, 1)  # ValueError, with those that would do
+    return wavelet
+
+
+class Multiscale(Section):
+    """The filter `multiscale`; see `docs/estimators.md`."""
+
+    scales: Annotated[int, Field(ge=1, le=MOST_SCALES)] = 2
+    """N: blocks of 2^(N-1) epochs. 1 is the filter `kalman`."""
+    wavelet: Annotated[str, AfterValidator(_orthonormal)] = "haar"
+    """Any orthonormal wavelet, by its PyWavelets name."""
+
+
 class Estimator(Section):
-    filter: Literal["kalman"] = "kalman"
+    filter: Literal["kalman", "multiscale"] = "kalman"
     """Which estimator; see `docs/estimators.md`."""
     model: Literal["ins15", "ins21", "ins17", "ins23", "planar10", "planar15"] = "ins21"
     """Error state; see `docs/navigation.md`."""
@@ -170,6 +185,7 @@ class Estimator(Section):
     """Without a fused position for longer the mode is `coasting`."""
     invalid_sd_m: PositiveFloat = 5000.0
     """Horizontal sigma beyond which the mode is `invalid`."""
+    multiscale: Multiscale = Multiscale()
 
 
 class ConsistencyTest(Section):

@@ -10,6 +10,7 @@ from fusiond.config import Config
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Block, Model, make_model
+from fusiond.estimators.multiscale import MultiscaleEstimator
 from fusiond.settings import imu_noise
 
 
@@ -23,3 +24,6 @@ def estimator_of(config: Config, model: Model) -> Estimator:
     match config.estimator.filter:
         case "kalman":
             return KalmanEstimator(model, config.imu.gap_s)
+        case "multiscale":
+            m = config.estimator.multiscale
+            return MultiscaleEstimator(model, config.imu.gap_s, m.scales, m.wavelet)

@@ -24,6 +24,7 @@ SECTIONS = {
     "[constraints.non_holonomic]": config.NonHolonomic,
     "[alignment]": config.Alignment,
     "[estimator]": config.Estimator,
+    "[estimator.multiscale]": config.Multiscale,
     "[consistency]": config.ConsistencyTest,
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,
