@@ -29,52 +29,89 @@ from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.model import Model
 from fusiond.estimators.multiscale_block import (
     Block,
-    Epoch,
+    Window,
     begin,
     fold,
     newest,
     predict,
-    rebased,
+    rebase,
     rows_on,
 )
+from fusiond.estimators.propagation import sigmas
 from fusiond.estimators.update import fuse
 from fusiond.estimators.wavelet import wavelet_matrix
+from fusiond.imu_buffer import ImuBuffer
 
 Array = NDArray[np.float64]
+
+# W of an epoch by itself: the start's.
+_ALONE = np.ones((1, 1))
 
 
 class MultiscaleEstimator(ErrorStateFilter):
     """Block filter of paper 001 (`fusiond.estimators.base.Estimator`).
 
     `scales` N is 1 to 4; `wavelet` a PyWavelets name, orthonormal (ValueError if not).
-    Covariance 0 is the published P, covariance 1 the noise Q since the last epoch; error estimate 0
-    is what `hold` carries, 1 what was fed back since the last epoch apart from a measurement.
+    The covariance that is propagated is the noise Q since the last epoch, with the transition Phi;
+    P = Phi P_k Phi^T + Q is worked out when it is asked for. Error estimate 0 is what `hold`
+    carries, 1 what was fed back since the last epoch apart from a measurement.
     """
 
     def __init__(
         self, model: Model, gap_s: float, scales: int = 2, wavelet: str = "haar"
     ) -> None:
-        super().__init__(model, gap_s, (1.0, 1.0))
-        self._w = wavelet_matrix(wavelet, scales)
+        super().__init__(model, gap_s)
+        self._dxs = np.zeros((2, model.size))
+        self._w = wavelet_matrix(wavelet, scales).copy()  # kernels take no read-only array
         self._phi = np.eye(model.width)
-        self._window: list[Epoch] = []
+        self._window: Window | None = None
         self._blocks: list[Block] = []
         self._starts: list[tuple[Array, Array]] = []
         self._epoch_ns = 0
+        self._posterior: Array = np.zeros((model.size, model.size))
+
+    @property
+    def covariance(self) -> Array:
+        """P (n, n) of the published error state."""
+        n = self.model.size
+        phi = self._phi[:n, :n]
+        p: Array = phi @ self._posterior @ phi.T
+        p += self._covs[0, :n, :n]
+        return 0.5 * (p + p.T)
+
+    def sigmas(self) -> Array:
+        """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
+        out = np.empty(9)
+        sigmas(self.covariance, self.step, out)
+        return out
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self._begin_anew()
+        self._begin_anew(super().covariance.copy())
 
-    def _begin_anew(self) -> None:
-        """No epoch yet: what follows starts from covariance 0."""
-        self._window, self._blocks, self._starts = [], [], []
+    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+        if not record:
+            super().propagate(imu, target_ns)
+            return
+        # Sigmas at every sample want P at every sample.
+        n, noise, shares = self.model.size, self._covs, self._shares
+        self._covs, self._shares = np.concatenate((np.zeros_like(noise), noise)), np.ones(2)
+        self._covs[0, :n, :n] = self.covariance
+        super().propagate(imu, target_ns, record)
+        noise[0] = self._covs[1]
+        self._covs, self._shares = noise, shares
+
+    def _begin_anew(self, p: Array) -> None:
+        """No epoch yet: what follows starts from P (n, n)."""
+        self._posterior = p
+        self._window, self._blocks, self._starts = None, [], []
         self._since_epoch()
 
     def _since_epoch(self) -> None:
         """Nothing has happened since the last epoch."""
-        self._covs[1], self._dxs[1], self._carrying = 0.0, 0.0, False
+        self._covs[0], self._dxs[1], self._carrying = 0.0, 0.0, False
         self._phi[:] = np.eye(len(self._phi))
 
     def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
@@ -93,79 +130,102 @@ class MultiscaleEstimator(ErrorStateFilter):
             return Outcome("not_finite", nis, degrees)
         if not inflate:
             return Outcome("gated", nis, degrees)
-        self._widen(self._covs[0], z - h @ self._dxs[0], h)
-        self._begin_anew()
+        wide = self.covariance
+        self._widen(wide, z - h @ self._dxs[0], h)
+        self._begin_anew(wide)
         self._fuse(z, h, r, math.inf)
         return Outcome("fused", nis, degrees)
 
     def _fuse(self, z: Array, h: Array, r: Array, threshold: float) -> tuple[float, Array]:
         """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
-        n, w = self.model.size, self._w
-        again = bool(self._window) and self.t_ns == self._epoch_ns
+        n, w, last = self.model.size, self._w, self._window
+        again = last is not None and self.t_ns == self._epoch_ns
+        epochs = (0 if last is None else len(last.ends)) + (not again)
+        starting = not self._blocks and epochs < 2 * len(w)
         u = self._fed_back()
-        phi, q = self._phi[:n, :n].copy(), self._covs[1, :n, :n].copy()
-        epoch = Epoch(phi, q, u, z + h @ u, h, r)
-        starting = not self._blocks and len(self._window) + (not again) < 2 * len(w)
+        total = z + h @ u
+        blocks = self._blocks
         if starting:
-            block = Block(u + self._dxs[0], self._covs[0, :n, :n].copy())
-            w = np.ones((1, 1))
+            block, w = Block(u + self._dxs[0], self.covariance), _ALONE
         elif again:
-            last = self._blocks[-1]
-            block = Block(last.mean.copy(), last.cov.copy())
+            block = Block(blocks[-1].mean.copy(), blocks[-1].cov.copy())
         else:
-            blocks = self._blocks or self._first_blocks()
-            block = predict(w, blocks[0], [*self._window[1:], epoch])
-            fold(w, block, 0, self._window[len(w) :])
-        y = np.zeros(len(z))
-        rows = rows_on(w, len(w) - 1, h)
-        nis = fuse(self.nav, self.xi, block.cov, block.mean, epoch.z, rows, r, threshold, True, y)
+            assert last is not None
+            blocks = blocks or self._first_blocks(last)
+            block = self._next_block(last, blocks[0])
+        rows, y = rows_on(w, len(w) - 1, h), np.zeros(len(z))
+        nis = fuse(self.nav, self.xi, block.cov, block.mean, total, rows, r, threshold, True, y)
         if not nis <= threshold:
             return nis, y
-        mean, self._covs[0, :n, :n] = newest(w, block)
+        mean, cov = np.empty(n), np.empty((n, n))
+        newest(w, *block, mean, cov)
+        self._posterior = cov
         if self._holding:
             self._dxs[0] = mean - u
         else:
             self._feed_back(mean - u)
-            epoch = epoch._replace(u=mean)
+            u = mean
         if again:
-            before = self._window.pop()
-            epoch = Epoch(
-                before.phi,
-                before.q,
-                epoch.u,
-                np.concatenate([before.z, epoch.z]),
-                np.vstack([before.h, h]),
-                np.concatenate([before.r, r]),
-            )
-        self._window.append(epoch)
-        if starting:
-            del self._starts[len(self._window) - 1 :]
-            self._starts.append((mean, self._covs[0, :n, :n].copy()))
-        elif again:
-            self._blocks[-1] = block
+            assert last is not None
+            self._window = last.measured_again(u, total, h, r)
         else:
-            self._starts.clear()
-            self._window, self._blocks = rebased(self._w, self._window[1:], [*blocks[1:], block])
+            ends = np.array([len(z)])
+            phi, q = self._phi[None, :n, :n].copy(), self._covs[:, :n, :n].copy()
+            self._append(Window(phi, q, u[None], total, h, r, ends), starting)
+        if starting:
+            self._starts = [*self._starts[: epochs - 1], (mean, cov)]
+        elif again:
+            self._blocks = [*blocks[:-1], block]
+        else:
+            self._rebase([*blocks[1:], block])
         self._epoch_ns = self.t_ns
         self._since_epoch()
         return nis, y
 
-    def _first_blocks(self) -> list[Block]:
-        """Blocks that begin at the epochs 1 ... M of the start, from its posteriors there."""
-        m, found = len(self._w), []
-        for first, (mean, cov) in enumerate(self._starts[:m]):
-            following = self._window[first + 1 : first + m]
-            block = begin(self._w, mean, cov, following)
-            fold(self._w, block, 1, following)
-            found.append(block)
+    def _append(self, epoch: Window, starting: bool) -> None:
+        """One epoch more; in place of the oldest unless the start still gathers them."""
+        last = self._window
+        self._window = epoch if last is None else last.followed_by(epoch, 0 if starting else 1)
+
+    def _next_block(self, last: Window, block: Block) -> Block:
+        """The block that ends now, after `block`, updated with all that was measured before."""
+        n, m = self.model.size, len(self._w)
+        phi = np.concatenate((last.phi[1:], self._phi[None, :n, :n]))
+        q = np.concatenate((last.q[1:], self._covs[:, :n, :n]))
+        found = Block(np.empty(m * n), np.empty((m * n, m * n)))
+        predict(self._w, *block, phi, q, *found)
+        fold(self._w, *found, 0, m, 2 * m - 1, last.z, last.h, last.r, last.ends)
         return found
+
+    def _first_blocks(self, start: Window) -> list[Block]:
+        """Blocks that begin at the epochs 1 ... M of the start, from its posteriors there."""
+        n, m, blocks = self.model.size, len(self._w), []
+        for first, (mean, cov) in enumerate(self._starts[:m]):
+            block, rest = Block(np.empty(m * n), np.empty((m * n, m * n))), first + 1
+            begin(self._w, mean, cov, start.phi[rest : first + m], start.q[rest : first + m], *block)
+            fold(
+                self._w, *block, 1, rest, first + m, start.z, start.h, start.r, start.ends
+            )
+            blocks.append(block)
+        return blocks
+
+    def _rebase(self, blocks: list[Block]) -> None:
+        """Keep the blocks, with small numbers in them (`rebase`)."""
+        assert self._window is not None
+        window = self._window
+        means = np.array([b.mean for b in blocks])
+        u, z = window.u.copy(), window.z.copy()
+        rebase(self._w, window.phi, u, z, window.h, window.ends, means)
+        self._window = window._replace(u=u, z=z)
+        self._blocks = [Block(mean, b.cov) for mean, b in zip(means, blocks, strict=True)]
+        self._starts = []
 
     def _fed_back(self) -> Array:
         """u (n,), now."""
         since: Array = self._dxs[1].copy()
-        if self._window:
+        if self._window is not None:
             n = self.model.size
-            since += self._phi[:n, :n] @ self._window[-1].u
+            since += self._phi[:n, :n] @ self._window.u[-1]
         return since
 
     def hold(self) -> None:
@@ -181,13 +241,13 @@ class MultiscaleEstimator(ErrorStateFilter):
         self._carrying = bool(self._dxs[1].any())
 
     def _own_snapshot(self) -> object:
-        """Epochs, blocks and transition; their arrays are never written to again."""
-        lists = tuple(self._window), tuple(self._blocks), tuple(self._starts)
-        return (*lists, self._epoch_ns, self._carrying, self._phi.copy())
+        """Epochs, blocks and transition; lists and arrays are replaced, never written to."""
+        kept = self._window, self._blocks, self._starts
+        return (*kept, self._posterior, self._epoch_ns, self._carrying, self._phi.copy())
 
     def _own_restore(self, extra: object) -> None:
         """Back to what `_own_snapshot` gave."""
         assert isinstance(extra, tuple)
-        window, blocks, starts, self._epoch_ns, self._carrying, phi = extra
-        self._window, self._blocks, self._starts = list(window), list(blocks), list(starts)
+        self._window, self._blocks, self._starts, self._posterior = extra[:4]
+        self._epoch_ns, self._carrying, phi = extra[4:]
         self._phi[:] = phi

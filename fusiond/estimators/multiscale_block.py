@@ -26,22 +26,24 @@ Source: paper 001, eq. 6 to 10 and 19 to 27.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.update import update
+from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
-class Epoch(NamedTuple):
-    """An instant with measurements z = h x + v (m,), (m, n), variances r (m,).
+class Window(NamedTuple):
+    """Successive epochs (k): transition `phi` and noise `q` (k, n, n) from the epoch before, and
+    `u` (k, n), what feedback has taken out of the state until here, carried along.
 
-    `phi` and `q` (n, n): transition and noise from the epoch before. `u` (n,): what feedback has
-    taken out of the state until here, carried along by the transitions. None of it is ever changed.
+    What was measured at all of them: z = h x + v (m,), (m, n), variances r (m,); those of epoch i
+    are the rows up to ends[i]. The arrays are never written to.
     """
 
     phi: Array
@@ -50,6 +52,28 @@ class Epoch(NamedTuple):
     z: Array
     h: Array
     r: Array
+    ends: Indices
+
+    def followed_by(self, other: Window, dropped: int = 0) -> Window:
+        """These epochs without the oldest ones, then those of `other`."""
+        row = self.ends[dropped - 1] if dropped else 0
+        return Window(
+            *(
+                np.concatenate((mine[start:], theirs))
+                for mine, theirs, start in zip(
+                    self[:6], other[:6], (dropped, dropped, dropped, row, row, row), strict=True
+                )
+            ),
+            np.concatenate((self.ends[dropped:], other.ends + self.ends[-1])) - row,
+        )
+
+    def measured_again(self, u: Array, z: Array, h: Array, r: Array) -> Window:
+        """The same epochs, the last one with further rows and a new `u` (n,)."""
+        us, ends = self.u.copy(), self.ends.copy()
+        us[-1] = u
+        ends[-1] += len(z)
+        rows = np.concatenate((self.z, z)), np.concatenate((self.h, h)), np.concatenate((self.r, r))
+        return Window(self.phi, self.q, us, *rows, ends)
 
 
 class Block(NamedTuple):
@@ -59,100 +83,214 @@ class Block(NamedTuple):
     cov: Array
 
 
-def transformed(w: Array, rows: Array) -> Array:
-    """(W kron I) rows, for `rows` (M n,) or (M n, k); by W^T it is the inverse."""
-    return (w @ rows.reshape(len(w), -1)).reshape(rows.shape)
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])", forceinline=True)
+def _times(a: Array, b: Array, out: Array) -> None:
+    """out = a b; zeros of a cost nothing, and half of a transition is zero."""
+    out[:] = 0.0
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            c = a[i, k]
+            if c != 0.0:
+                for j in range(b.shape[1]):
+                    out[i, j] += c * b[k, j]
 
 
-def begin(w: Array, mean: Array, cov: Array, following: Sequence[Epoch]) -> Block:
-    """The block whose first element has `mean` (n,) and `cov` (n, n); the others follow from it.
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def _spread(phi: Array, cov: Array, q: Array) -> None:
+    """cov <- phi cov phi^T + q, cov symmetric."""
+    once, turned = np.empty_like(cov), np.empty_like(cov)
+    _times(phi, cov, once)
+    for i in range(len(cov)):
+        for j in range(len(cov)):
+            turned[j, i] = once[i, j]
+    _times(phi, turned, once)
+    for i in range(len(cov)):
+        for j in range(i + 1):
+            cov[i, j] = cov[j, i] = 0.5 * (once[i, j] + once[j, i] + q[i, j] + q[j, i])
 
-    Paper 001, eq. 21 and 22.
+
+@compiled("void(f8[:, ::1], f8[:, ::1])")
+def _transform_rows(w: Array, rows: Array) -> None:
+    """rows (M n, k) <- (W kron I) rows."""
+    m = len(w)
+    n = len(rows) // m
+    old = rows.copy()
+    rows[:] = 0.0
+    for i in range(m):
+        for k in range(m):
+            c = w[i, k]
+            if c != 0.0:
+                for a in range(n):
+                    for j in range(rows.shape[1]):
+                        rows[i * n + a, j] += c * old[k * n + a, j]
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])")
+def begin(
+    w: Array, first: Array, first_cov: Array, phi: Array, q: Array, mean: Array, cov: Array
+) -> None:
+    """Write the block (`mean`, `cov`) whose first element has `first` (n,) and `first_cov` (n, n).
+
+    `phi` and `q` (M - 1, n, n) lead from each element to the next. Paper 001, eq. 21 and 22.
     """
-    n, size = len(mean), len(w) * len(mean)
-    means, p = np.empty(size), np.empty((size, size))
-    means[:n], p[:n, :n] = mean, cov
-    for end, epoch in zip(range(n, size, n), following, strict=True):
-        here, before = slice(end, end + n), slice(end - n, end)
-        means[here] = epoch.phi @ means[before]
-        p[here, :end] = epoch.phi @ p[before, :end]
-        p[:end, here] = p[here, :end].T
-        p[here, here] = p[here, before] @ epoch.phi.T + epoch.q
-    if size == n:
-        return Block(means, p)
-    return Block(transformed(w, means), _symmetric(transformed(w, transformed(w, p).T)))
+    m, n = len(w), len(first)
+    here, across = first_cov.copy(), np.empty((n, n))
+    mean[:n] = first
+    cov[:n, :n] = here
+    for e in range(1, m):
+        at, before = e * n, (e - 1) * n
+        for i in range(n):
+            total = 0.0
+            for k in range(n):
+                total += phi[e - 1, i, k] * mean[before + k]
+            mean[at + i] = total
+        # Covariance with each element before: phi times that of the last one.
+        for c in range(e):
+            _times(phi[e - 1], cov[before:at, c * n : (c + 1) * n].copy(), across)
+            for i in range(n):
+                for j in range(n):
+                    cov[at + i, c * n + j] = across[i, j]
+                    cov[c * n + j, at + i] = across[i, j]
+        _spread(phi[e - 1], here, q[e - 1])
+        cov[at : at + n, at : at + n] = here
+    if m > 1:
+        _transform_rows(w, mean.reshape(m * n, 1))
+        _transform_rows(w, cov)
+        turned = cov.T.copy()
+        _transform_rows(w, turned)
+        for i in range(m * n):
+            for j in range(m * n):
+                cov[i, j] = 0.5 * (turned[i, j] + turned[j, i])
 
 
-def predict(w: Array, last: Block, epochs: Sequence[Epoch]) -> Block:
-    """The block after `last`; `epochs` (2M - 1): elements 2 to M of the last one, then the new.
+@compiled(
+    "void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
+)
+def predict(
+    w: Array, last: Array, last_cov: Array, phi: Array, q: Array, mean: Array, cov: Array
+) -> None:
+    """Write the block (`mean`, `cov`) after the block (`last`, `last_cov`).
 
-    Paper 001, eq. 8, 9, 24 and 25.
+    `phi` and `q` (2M - 1, n, n) lead from each of the 2M elements to the next. Paper 001, eq. 8, 9,
+    24 and 25.
     """
     m = len(w)
-    n = len(last.mean) // m
-    inner, first, rest = epochs[: m - 1], epochs[m - 1], epochs[m:]
-    g = np.empty((m * n, n))  # G^T
-    g[-n:] = np.eye(n) / m
-    for end in range((m - 1) * n, 0, -n):
-        g[end - n : end] = inner[end // n - 1].phi.T @ g[end : end + n]
-    noise = np.zeros((n, n))
-    for j, epoch in enumerate(inner, 1):
-        noise = epoch.phi @ noise @ epoch.phi.T + (j / m) ** 2 * epoch.q
-    g = transformed(w, g)
-    mean, cov = last.mean @ g, g.T @ last.cov @ g + noise
-    cov = first.phi @ cov @ first.phi.T + first.q
-    return begin(w, first.phi @ mean, _symmetric(cov), rest)
+    n = len(last) // m
+    g = np.zeros((n, m * n))  # G, then G W^T
+    part = np.zeros((n, n))
+    for i in range(n):
+        part[i, i] = 1.0 / m
+    g[:, (m - 1) * n :] = part
+    for e in range(m - 2, -1, -1):
+        _times(part.copy(), phi[e], part)
+        g[:, e * n : (e + 1) * n] = part
+    if m > 1:
+        turned = g.T.copy()
+        _transform_rows(w, turned)
+        g[:] = turned.T
+    inner = np.zeros((n, n))
+    for e in range(m - 1):
+        _spread(phi[e], inner, ((e + 1) / m) ** 2 * q[e])
+    middle = np.zeros(n)
+    for i in range(n):
+        for k in range(m * n):
+            middle[i] += g[i, k] * last[k]
+    once, here = np.empty((n, m * n)), np.empty((n, n))
+    _times(g, last_cov, once)
+    _times(g, once.T.copy(), here)
+    here += inner
+    first = np.zeros(n)
+    for i in range(n):
+        for k in range(n):
+            first[i] += phi[m - 1, i, k] * middle[k]
+    _spread(phi[m - 1], here, q[m - 1])
+    begin(w, first, here, phi[m:], q[m:], mean, cov)
 
 
+@compiled("f8[:, ::1](f8[:, ::1], i8, f8[:, ::1])")
 def rows_on(w: Array, element: int, h: Array) -> Array:
     """Rows h (m, n) on an element (from 0) as rows (m, M n) on the transformed block."""
-    if len(w) == 1:
-        return h
-    return (w[:, element, None] * h[:, None, :]).reshape(len(h), -1)
+    n = h.shape[1]
+    rows = np.empty((h.shape[0], len(w) * n))
+    for i in range(h.shape[0]):
+        for k in range(len(w)):
+            for j in range(n):
+                rows[i, k * n + j] = w[k, element] * h[i, j]
+    return rows
 
 
-def fold(w: Array, block: Block, first: int, epochs: Sequence[Epoch]) -> None:
-    """Update a block in place with what was measured in its elements from `first` on.
+@compiled(
+    "void(f8[:, ::1], f8[::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1], f8[::1], i8[::1])"
+)
+def fold(
+    w: Array,
+    mean: Array,
+    cov: Array,
+    element: int,
+    first: int,
+    end: int,
+    z: Array,
+    h: Array,
+    r: Array,
+    ends: Indices,
+) -> None:
+    """Update a block in place with the epochs first ... end - 1 of a window, the first of which is
+    the block's `element`.
 
     Paper 001, eq. 23, 26 and 27, one row after another.
     """
-    for element, epoch in enumerate(epochs, first):
-        update(block.cov, block.mean, epoch.z, rows_on(w, element, epoch.h), epoch.r)
+    for e in range(first, end):
+        a, b = ends[e - 1] if e else 0, ends[e]
+        update(cov, mean, z[a:b], rows_on(w, element + e - first, h[a:b]), r[a:b])
 
 
-def newest(w: Array, block: Block) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of the last element, out of the wavelet domain."""
-    m = len(w)
-    n = len(block.mean) // m
-    if m == 1:
-        return block.mean.copy(), block.cov.copy()
-    weight = w[:, -1]
-    across = np.tensordot(weight, block.cov.reshape(m, n, m, n), (0, 0))
-    return weight @ block.mean.reshape(m, n), _symmetric(np.tensordot(weight, across, (0, 1)))
+@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])")
+def newest(w: Array, mean: Array, cov: Array, last: Array, last_cov: Array) -> None:
+    """Write `last` (n,) and `last_cov` (n, n) of the last element, out of the wavelet domain."""
+    m, n = len(w), len(last)
+    last[:] = 0.0
+    across = np.zeros((n, m * n))
+    for k in range(m):
+        c = w[k, m - 1]
+        for i in range(n):
+            last[i] += c * mean[k * n + i]
+            for j in range(m * n):
+                across[i, j] += c * cov[k * n + i, j]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(m):
+                total += across[i, k * n + j] * w[k, m - 1]
+            last_cov[i, j] = total
+    for i in range(n):
+        for j in range(i):
+            last_cov[i, j] = last_cov[j, i] = 0.5 * (last_cov[i, j] + last_cov[j, i])
 
 
-def rebased(
-    w: Array, window: Sequence[Epoch], blocks: Sequence[Block]
-) -> tuple[list[Epoch], list[Block]]:
-    """The same estimates with the oldest epoch's `u` taken off everywhere.
+@compiled("void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1])")
+def rebase(
+    w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, means: Array
+) -> None:
+    """Take the oldest epoch's `u` off `u`, `z` and the blocks' `means` (M, M n), in place.
 
-    t_(j+1) = Phi_j t_j solves the states' own equation, so t may be taken off states, measurements
-    and `u` alike; from u of the oldest epoch it leaves only the window's own corrections, and no
-    number grows with time. `blocks` cover window[0:M], window[1:M+1] and so on.
+    t_(j+1) = Phi_j t_j solves the states' own equation, so t may be taken off all alike; from u of
+    the oldest epoch it leaves only the window's own corrections, and no number grows with time.
+    means[i] begins at epoch i.
     """
-    t = [window[0].u]
-    for epoch in window[1:]:
-        t.append(epoch.phi @ t[-1])
-    epochs = [
-        e._replace(u=e.u - off, z=e.z - e.h @ off) for e, off in zip(window, t, strict=True)
-    ]
-    along = np.array(t)
-    moved = [
-        Block(b.mean - transformed(w, along[i : i + len(w)].ravel()), b.cov)
-        for i, b in enumerate(blocks)
-    ]
-    return epochs, moved
-
-
-def _symmetric(p: Array) -> Array:
-    return 0.5 * (p + p.T)
+    m, n = len(w), u.shape[1]
+    t = np.zeros(u.shape)
+    t[0] = u[0]
+    for e in range(1, len(u)):
+        for i in range(n):
+            for k in range(n):
+                t[e, i] += phi[e, i, k] * t[e - 1, k]
+    for e in range(len(u)):
+        for row in range(ends[e - 1] if e else 0, ends[e]):
+            for i in range(n):
+                z[row] -= h[row, i] * t[e, i]
+    u -= t
+    for b in range(m):
+        for k in range(m):
+            for e in range(m):
+                for i in range(n):
+                    means[b, k * n + i] -= w[k, e] * t[b + e, i]
