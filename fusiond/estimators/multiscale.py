@@ -57,9 +57,7 @@ class MultiscaleEstimator(ErrorStateFilter):
     carries, 1 what was fed back since the last epoch apart from a measurement.
     """
 
-    def __init__(
-        self, model: Model, gap_s: float, scales: int = 2, wavelet: str = "haar"
-    ) -> None:
+    def __init__(self, model: Model, gap_s: float, scales: int = 2, wavelet: str = "haar") -> None:
         super().__init__(model, gap_s)
         self._dxs = np.zeros((2, model.size))
         self._w = wavelet_matrix(wavelet, scales).copy()  # kernels take no read-only array
@@ -78,6 +76,16 @@ class MultiscaleEstimator(ErrorStateFilter):
         p: Array = phi @ self._posterior @ phi.T
         p += self._covs[0, :n, :n]
         return 0.5 * (p + p.T)
+
+    @property
+    def length(self) -> int:
+        """M, epochs in a block."""
+        return len(self._w)
+
+    @property
+    def epochs(self) -> int:
+        """Epochs that are kept: up to 2 M - 1."""
+        return 0 if self._window is None else len(self._window.ends)
 
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
@@ -140,7 +148,7 @@ class MultiscaleEstimator(ErrorStateFilter):
         """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
         n, w, last = self.model.size, self._w, self._window
         again = last is not None and self.t_ns == self._epoch_ns
-        epochs = (0 if last is None else len(last.ends)) + (not again)
+        epochs = self.epochs + (not again)
         starting = not self._blocks and epochs < 2 * len(w)
         u = self._fed_back()
         total = z + h @ u
@@ -202,10 +210,10 @@ class MultiscaleEstimator(ErrorStateFilter):
         n, m, blocks = self.model.size, len(self._w), []
         for first, (mean, cov) in enumerate(self._starts[:m]):
             block, rest = Block(np.empty(m * n), np.empty((m * n, m * n))), first + 1
-            begin(self._w, mean, cov, start.phi[rest : first + m], start.q[rest : first + m], *block)
-            fold(
-                self._w, *block, 1, rest, first + m, start.z, start.h, start.r, start.ends
+            begin(
+                self._w, mean, cov, start.phi[rest : first + m], start.q[rest : first + m], *block
             )
+            fold(self._w, *block, 1, rest, first + m, start.z, start.h, start.r, start.ends)
             blocks.append(block)
         return blocks
 

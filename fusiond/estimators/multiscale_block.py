@@ -57,14 +57,15 @@ class Window(NamedTuple):
     def followed_by(self, other: Window, dropped: int = 0) -> Window:
         """These epochs without the oldest ones, then those of `other`."""
         row = self.ends[dropped - 1] if dropped else 0
+        join = np.concatenate
         return Window(
-            *(
-                np.concatenate((mine[start:], theirs))
-                for mine, theirs, start in zip(
-                    self[:6], other[:6], (dropped, dropped, dropped, row, row, row), strict=True
-                )
-            ),
-            np.concatenate((self.ends[dropped:], other.ends + self.ends[-1])) - row,
+            join((self.phi[dropped:], other.phi)),
+            join((self.q[dropped:], other.q)),
+            join((self.u[dropped:], other.u)),
+            join((self.z[row:], other.z)),
+            join((self.h[row:], other.h)),
+            join((self.r[row:], other.r)),
+            join((self.ends[dropped:], other.ends + self.ends[-1])) - row,
         )
 
     def measured_again(self, u: Array, z: Array, h: Array, r: Array) -> Window:
@@ -125,7 +126,9 @@ def _transform_rows(w: Array, rows: Array) -> None:
                         rows[i * n + a, j] += c * old[k * n + a, j]
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])")
+@compiled(
+    "void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
+)
 def begin(
     w: Array, first: Array, first_cov: Array, phi: Array, q: Array, mean: Array, cov: Array
 ) -> None:
@@ -268,9 +271,7 @@ def newest(w: Array, mean: Array, cov: Array, last: Array, last_cov: Array) -> N
 
 
 @compiled("void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1])")
-def rebase(
-    w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, means: Array
-) -> None:
+def rebase(w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, means: Array) -> None:
     """Take the oldest epoch's `u` off `u`, `z` and the blocks' `means` (M, M n), in place.
 
     t_(j+1) = Phi_j t_j solves the states' own equation, so t may be taken off all alike; from u of

@@ -5,7 +5,8 @@ r"""The wavelet transform of a block: an orthonormal matrix W (M, M), M = 2^(N-1
 H_i (smooth) and G_i (detail) take 2^i elements to 2^(i-1). A block wraps around (periodization): so
 W is square, and orthonormal for every orthonormal wavelet, however long its filters.
 
-Source: paper 001, eq. 12 to 18; Mallat, A Wavelet Tour of Signal Processing, 3rd ed., section 7.5.1.
+Source: paper 001, eq. 12 to 18; Mallat, A Wavelet Tour of Signal Processing, 3rd ed., section
+7.5.1.
 """
 
 from __future__ import annotations
