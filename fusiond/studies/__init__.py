@@ -11,5 +11,6 @@ STUDIES = {
     "rdss-dynamic": "fusiond.studies.rdss_dynamic",
     "rdss-correlated": "fusiond.studies.rdss_correlated",
     "rdss-map": "fusiond.studies.rdss_map",
+    "multiscale": "fusiond.studies.multiscale",
     "consistency": "fusiond.studies.consistency",
 }
