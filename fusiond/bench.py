@@ -8,7 +8,8 @@ process (user and system), so that what else runs does not count. Every figure i
 the repetitions. OpenBLAS uses one thread for matrices of this size (interface/gemm.c:
 up to m n k = 262 144; here 9261).
 
-The IMU runs at 200 Hz, but for `process` (100 Hz); the model is `ins21`.
+The IMU runs at 200 Hz, but for `process` and the step of an estimator (100 Hz); the model is
+`ins21`.
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Config, Imu
+from fusiond.estimators.base import Estimator
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
+from fusiond.estimators.multiscale import MultiscaleEstimator
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.earth import gravity
 from fusiond.offline import process
@@ -54,6 +58,7 @@ PRODUCTS = 300
 FIX_NS = 200_000_000
 LATE_NS = 2_000_000_000
 HISTORY_S = 4.0
+STEP_RATE_HZ, STEP_SECONDS = 100, 100
 LAT, LON, HEIGHT = np.radians(30.5276), np.radians(114.3556), 38.0
 
 
@@ -66,6 +71,9 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
     `process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
     velocity in order of validity, files read and the solution written at every row.
+
+    As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
+    multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity).
     """
     product = _product()
     figures: dict[str, Any] = {}
@@ -89,6 +97,9 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["block_step_ratio"] = ratio(_block, repetitions)
     figures["single_step_ratio"] = ratio(_single, repetitions)
     figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
+    figures["multiscale_step_ratio"] = _step_ratio(
+        lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), repetitions
+    )
     with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
         make = _process(Path(folder), process_s)
         figures["process_epoch_ratio"] = ratio(make, max(2, repetitions // 3))
@@ -121,15 +132,15 @@ def _product() -> Callable[[], float]:
 # --------------------------------------------------------------------------- what is timed
 
 
-def _filter(steps: int) -> tuple[Model, KalmanEstimator, ImuBuffer]:
+def _filter(steps: int, rate_hz: float = IMU_RATE_HZ) -> tuple[Model, KalmanEstimator, ImuBuffer]:
     """A filter at rest at time 0 and `steps` noisy samples ahead of it."""
-    imu = Imu(rate_hz=IMU_RATE_HZ)
+    imu = Imu(rate_hz=rate_hz)
     model = make_model("ins21", imu_noise(imu))
-    buffer = ImuBuffer(IMU_RATE_HZ, steps / IMU_RATE_HZ, np.eye(3), 0.0, imu.gap_s)
+    buffer = ImuBuffer(rate_hz, steps / rate_hz, np.eye(3), 0.0, imu.gap_s)
     rng = np.random.default_rng(1)
     samples = rng.standard_normal((steps, 6)) * np.array([1e-3] * 3 + [1e-2] * 3)
     samples[:, 5] -= gravity(LAT, HEIGHT)
-    buffer.append(STEP_NS * np.arange(1, steps + 1, dtype=np.int64), samples)
+    buffer.append(round(1e9 / rate_hz) * np.arange(1, steps + 1, dtype=np.int64), samples)
     estimator = KalmanEstimator(model, imu.gap_s)
     nav = np.array([LAT, LON, HEIGHT, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     sigma = model.initial.copy()
@@ -182,6 +193,36 @@ def _rewind(number: int) -> Callable[[], int]:
         return 1
 
     return work
+
+
+def _step_ratio(make: Callable[[Model, float], Estimator], repetitions: int) -> float:
+    """Processor time of an estimator's second over the centralised filter's, taken in turns.
+
+    100 IMU samples, one position and one velocity; median over the repetitions.
+    """
+    lever = (0.3, 0.0, -1.0)
+    steps, every = STEP_SECONDS * STEP_RATE_HZ, round(1e9 / STEP_RATE_HZ)
+    model, centralised, buffer = _filter(steps, STEP_RATE_HZ)
+    start = centralised.snapshot()
+    p = centralised.covariance.copy()
+    ratios = []
+    for _ in range(repetitions + 1):
+        spent = []
+        for estimator in (make(model, Imu().gap_s), KalmanEstimator(model, Imu().gap_s)):
+            estimator.initialise(0, 0, start.nav, start.xi, p)
+            gc.collect()
+            before = time.process_time()
+            for second in range(1, STEP_SECONDS + 1):
+                t_ns = second * STEP_RATE_HZ * every
+                estimator.propagate(buffer, t_ns)
+                estimator.update(_fix("gnss", t_ns))
+                velocity = VelocityAid(
+                    "gnss_velocity", t_ns, 0.9999, (0.0, 0.0, 0.0), (0.1,) * 3, lever
+                )
+                estimator.update(velocity)
+            spent.append(time.process_time() - before)
+        ratios.append(spent[0] / spent[1])
+    return statistics.median(ratios[1:])
 
 
 def _process(folder: Path, duration_s: float) -> Callable[[int], Callable[[], int]]:
