@@ -20,11 +20,12 @@ Source: paper 001, sections 3 and 4.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Linearised, NotApplicable
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.model import Model
 from fusiond.estimators.multiscale_block import (
@@ -38,7 +39,8 @@ from fusiond.estimators.multiscale_block import (
     rows_on,
 )
 from fusiond.estimators.propagation import sigmas
-from fusiond.estimators.update import fuse
+from fusiond.estimators.screening import KEPT
+from fusiond.estimators.update import fuse, update
 from fusiond.estimators.wavelet import wavelet_matrix
 from fusiond.imu_buffer import ImuBuffer
 
@@ -46,6 +48,18 @@ Array = NDArray[np.float64]
 
 # W of an epoch by itself: the start's.
 _ALONE = np.ones((1, 1))
+
+
+class _Open(NamedTuple):
+    """A block that ends now, not yet kept: W, the block, u (n,) now, the M blocks before it (none
+    in the start), whether its last epoch is kept already, whether the start still lasts."""
+
+    w: Array
+    block: Block
+    u: Array
+    blocks: list[Block]
+    again: bool
+    starting: bool
 
 
 class MultiscaleEstimator(ErrorStateFilter):
@@ -128,31 +142,75 @@ class MultiscaleEstimator(ErrorStateFilter):
         innovation = aid.innovation(self.state)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
-        z, h, r = innovation
+        if aid.screened:
+            return self._update_by_rows(aid, innovation, inflate)
+        z, h, _ = innovation
         degrees = z.shape[0]
         threshold = gate_threshold(aid.gate, degrees)
-        nis, y = self._fuse(z, h, r, threshold)
+        nis, y = self._fuse(innovation, threshold)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
         if not inflate:
             return Outcome("gated", nis, degrees)
+        self._begin_wide(z, h)
+        self._fuse(innovation, math.inf)
+        return Outcome("fused", nis, degrees)
+
+    def _fuse(self, rows: Innovation, threshold: float) -> tuple[float, Array]:
+        """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
+        z, h, r = rows
+        o = self._open()
+        total, y = z + h @ o.u, np.zeros(len(z))
+        on_block = rows_on(o.w, len(o.w) - 1, h)
+        nis = fuse(
+            self.nav, self.xi, o.block.cov, o.block.mean, total, on_block, r, threshold, True, y
+        )
+        if nis <= threshold:
+            self._commit(o, total, h, r)
+        return nis, y
+
+    def _update_by_rows(self, aid: Linearised, rows: Innovation, inflate: bool) -> Outcome:
+        """Rows that pass are folded in; none, or with `inflate` as many as a wider P lets.
+
+        They are judged on the newest element alone, which is all that they look at. Where the
+        receiver has set its clock, blocks that reach back before it are given up.
+        """
+        z, h, r = rows
+        o = self._open()
+        mean, cov = self._newest(o)
+        before, total = cov.copy(), z + h @ o.u
+        s = self._screen(aid, Innovation(total, h, r), cov, mean)
+        wide = inflate and 2 * int((s.codes == KEPT).sum()) < len(s.codes)
+        if wide or not np.array_equal(cov, before):
+            if wide:
+                self._begin_wide(z, h)
+            else:
+                self._begin_anew(self.covariance)
+            o = self._open()
+            total = z + h @ o.u
+            s = self._screen(aid, Innovation(total, h, r), o.block.cov, o.block.mean)
+        kept, codes = s.codes == KEPT, tuple(s.codes.tolist())
+        if not kept.any():
+            return Outcome("gated", s.nis, 0, (), codes)
+        total, h, r = total[kept], h[kept], r[kept]
+        update(o.block.cov, o.block.mean, total, rows_on(o.w, len(o.w) - 1, h), r)
+        self._commit(o, total, h, r)
+        return Outcome("fused", s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
+
+    def _begin_wide(self, z: Array, h: Array) -> None:
+        """Begin anew from P widened by an innovation that failed the gate."""
         wide = self.covariance
         self._widen(wide, z - h @ self._dxs[0], h)
         self._begin_anew(wide)
-        self._fuse(z, h, r, math.inf)
-        return Outcome("fused", nis, degrees)
 
-    def _fuse(self, z: Array, h: Array, r: Array, threshold: float) -> tuple[float, Array]:
-        """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
-        n, w, last = self.model.size, self._w, self._window
+    def _open(self) -> _Open:
+        """The block that ends now, with all that was measured before. Nothing changes."""
+        w, last = self._w, self._window
         again = last is not None and self.t_ns == self._epoch_ns
-        epochs = self.epochs + (not again)
-        starting = not self._blocks and epochs < 2 * len(w)
-        u = self._fed_back()
-        total = z + h @ u
-        blocks = self._blocks
+        starting = not self._blocks and self.epochs + (not again) < 2 * len(w)
+        u, blocks = self._fed_back(), self._blocks
         if starting:
             block, w = Block(u + self._dxs[0], self.covariance), _ALONE
         elif again:
@@ -161,34 +219,38 @@ class MultiscaleEstimator(ErrorStateFilter):
             assert last is not None
             blocks = blocks or self._first_blocks(last)
             block = self._next_block(last, blocks[0])
-        rows, y = rows_on(w, len(w) - 1, h), np.zeros(len(z))
-        nis = fuse(self.nav, self.xi, block.cov, block.mean, total, rows, r, threshold, True, y)
-        if not nis <= threshold:
-            return nis, y
+        return _Open(w, block, u, blocks, again, starting)
+
+    def _newest(self, o: _Open) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) now."""
+        n = self.model.size
         mean, cov = np.empty(n), np.empty((n, n))
-        newest(w, *block, mean, cov)
-        self._posterior = cov
+        newest(o.w, *o.block, mean, cov)
+        return mean, cov
+
+    def _commit(self, o: _Open, total: Array, h: Array, r: Array) -> None:
+        """Keep a block that was updated with total = h y + v, and what it says of now."""
+        n, u, last = self.model.size, o.u, self._window
+        mean, self._posterior = self._newest(o)
         if self._holding:
             self._dxs[0] = mean - u
         else:
             self._feed_back(mean - u)
             u = mean
-        if again:
+        if o.again:
             assert last is not None
             self._window = last.measured_again(u, total, h, r)
         else:
-            ends = np.array([len(z)])
             phi, q = self._phi[None, :n, :n].copy(), self._covs[:, :n, :n].copy()
-            self._append(Window(phi, q, u[None], total, h, r, ends), starting)
-        if starting:
-            self._starts = [*self._starts[: epochs - 1], (mean, cov)]
-        elif again:
-            self._blocks = [*blocks[:-1], block]
+            self._append(Window(phi, q, u[None], total, h, r, np.array([len(r)])), o.starting)
+        if o.starting:
+            self._starts = [*self._starts[: self.epochs - 1], (mean, self._posterior)]
+        elif o.again:
+            self._blocks = [*o.blocks[:-1], o.block]
         else:
-            self._rebase([*blocks[1:], block])
+            self._rebase([*o.blocks[1:], o.block])
         self._epoch_ns = self.t_ns
         self._since_epoch()
-        return nis, y
 
     def _append(self, epoch: Window, starting: bool) -> None:
         """One epoch more; in place of the oldest unless the start still gathers them."""
