@@ -11,6 +11,7 @@ FIGURES = (
     "block_step_ratio",
     "single_step_ratio",
     "rewind_2s_ratio",
+    "multiscale_step_ratio",
     "process_epoch_ratio",
 )
 

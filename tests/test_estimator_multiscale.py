@@ -1,27 +1,22 @@
-"""The multi-scale filter: against the ordinary one, against dense block algebra, and in a loop."""
+"""The multi-scale filter: against the ordinary one, through the timeline and the navigator."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
-import pywt
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Config, Imu
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.model import CLOCK_OFFSET, Model, clock_blocks, make_model
+from fusiond.estimators.model import Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
-from fusiond.estimators.multiscale_block import begin, fold, newest, predict, rebase
-from fusiond.estimators.wavelet import wavelet_matrix
 from fusiond.filters import estimator_of
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.load_config import ConfigError, load_config
@@ -37,11 +32,6 @@ IMU = Imu(rate_hz=50.0, gyro_scale_ppm=1e-6, accel_scale_ppm=1e-6)
 SECONDS = 40.0
 LEVER = (0.4, -0.3, -1.2)
 SD, SD_V = (1.5, 1.5, 3.0), (0.05, 0.05, 0.1)
-ORTHONORMAL = [
-    name
-    for family in ("haar", "db", "sym", "coif")
-    for name in pywt.wavelist(family, kind="discrete")
-]
 
 
 def drive(
@@ -89,142 +79,6 @@ def run(estimator: Either, buffer: ImuBuffer, aids: Sequence[Sequence[Linearised
         estimator.propagate(buffer, epoch[0].t_ns)
         for aid in epoch:
             assert estimator.update(aid).name == "fused"
-
-
-# --------------------------------------------------------------------------- wavelet
-
-
-@pytest.mark.parametrize("scales", [1, 2, 3, 4])
-def test_every_orthonormal_wavelet_gives_an_orthonormal_matrix(scales: int) -> None:
-    assert len(ORTHONORMAL) > 70
-    for name in ORTHONORMAL:
-        w = wavelet_matrix(name, scales)
-        assert w.shape == (2 ** (scales - 1),) * 2
-        np.testing.assert_allclose(w @ w.T, np.eye(len(w)), atol=1e-14)
-
-
-def test_haar_of_two_scales_is_difference_and_sum() -> None:
-    np.testing.assert_allclose(wavelet_matrix("haar", 2), np.array([[1, -1], [1, 1]]) / 2**0.5)
-
-
-def test_the_coarsest_row_is_the_mean_of_the_block() -> None:
-    np.testing.assert_allclose(wavelet_matrix("db3", 4)[-1], np.full(8, 8**-0.5), atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["bior2.2", "rbio3.1", "dmey", "mexh", "haa"])
-def test_what_is_not_orthonormal_is_refused_by_name(name: str) -> None:
-    with pytest.raises(ValueError, match=name) as refused:
-        wavelet_matrix(name, 2)
-    assert "db1 to db" in str(refused.value)
-    assert "dmey," not in str(refused.value)
-
-
-# --------------------------------------------------------------------------- block algebra
-
-
-def block_matrices(phi: Array) -> tuple[Array, Array]:
-    """A (M n, M n) and B (M n, (2M-1) n) of the step from one block to the next, written out."""
-    steps, n = phi.shape[:2]
-    m = (steps + 1) // 2
-
-    def transition(start: int, end: int) -> Array:
-        total = np.eye(n)
-        for k in range(start, end):
-            total = phi[k] @ total
-        return total
-
-    a, b = np.zeros((m * n, m * n)), np.zeros((m * n, steps * n))
-    for row in range(m):
-        here = slice(row * n, (row + 1) * n)
-        for i in range(m):
-            a[here, i * n : (i + 1) * n] = transition(i, m + row) / m
-        for k in range(m + row):
-            b[here, k * n : (k + 1) * n] = min(k + 1, m) / m * transition(k + 1, m + row)
-    return a, b
-
-
-@pytest.mark.parametrize(("name", "scales"), [("haar", 1), ("haar", 2), ("haar", 3), ("db2", 4)])
-def test_transformed_block_filter_is_the_dense_one(name: str, scales: int) -> None:
-    rng = np.random.default_rng(scales)
-    w = wavelet_matrix(name, scales).copy()
-    m, n = len(w), 5
-    phi = np.eye(n) + 0.3 * rng.standard_normal((2 * m - 1, n, n))
-    root = rng.standard_normal((2 * m - 1, n, n))
-    q = 0.1 * root @ root.transpose(0, 2, 1)
-    a, b = block_matrices(phi)
-    x = [rng.standard_normal(n)]
-    noise = rng.standard_normal((2 * m - 1, n))
-    for transition, white in zip(phi, noise, strict=True):
-        x.append(transition @ x[-1] + white)
-    # Equations 8 and 9 are an identity: no approximation in A and B themselves.
-    identity = a @ np.concatenate(x[:m]) + b @ noise.ravel()
-    np.testing.assert_allclose(identity, np.concatenate(x[m:]), rtol=1e-10)
-
-    root = rng.standard_normal((m * n, m * n))
-    mean, p = rng.standard_normal(m * n), root @ root.T
-    q_all = np.zeros((len(q) * n, len(q) * n))
-    for k, white_cov in enumerate(q):
-        q_all[k * n : (k + 1) * n, k * n : (k + 1) * n] = white_cov
-    mean_next, p_next = a @ mean, a @ p @ a.T + b @ q_all @ b.T
-    z, h, r = rng.standard_normal(2 * m), rng.standard_normal((2 * m, n)), rng.uniform(1, 2, 2 * m)
-    c = np.zeros((2 * m, m * n))
-    for row in range(2 * m):
-        c[row, row // 2 * n : (row // 2 + 1) * n] = h[row]
-    gain = p_next @ c.T @ np.linalg.inv(c @ p_next @ c.T + np.diag(r))
-    expected, expected_p = mean_next + gain @ (z - c @ mean_next), p_next - gain @ c @ p_next
-
-    t = np.kron(w, np.eye(n))
-    got, got_p = np.empty(m * n), np.empty((m * n, m * n))
-    predict(w, t @ mean, t @ p @ t.T, phi, q, got, got_p)
-    scale = np.abs(p_next).max()
-    np.testing.assert_allclose(t.T @ got, mean_next, rtol=1e-9)
-    np.testing.assert_allclose(t.T @ got_p @ t, p_next, atol=1e-11 * scale)
-    fold(w, got, got_p, 0, 0, m, z, h, r, np.arange(2, 2 * m + 1, 2))
-    np.testing.assert_allclose(t.T @ got, expected, rtol=1e-7, atol=1e-8)
-    np.testing.assert_allclose(t.T @ got_p @ t, expected_p, atol=1e-9 * scale)
-    last, last_p = np.empty(n), np.empty((n, n))
-    newest(w, got, got_p, last, last_p)
-    np.testing.assert_allclose(last, (t.T @ got)[-n:], rtol=1e-9)
-    np.testing.assert_allclose(last_p, (t.T @ got_p @ t)[-n:, -n:], atol=1e-11 * scale)
-
-
-def test_a_block_that_begins_holds_the_ordinary_prediction() -> None:
-    """Equations 21 and 22, and after its measurements the last element is a Kalman filter's."""
-    rng = np.random.default_rng(5)
-    w, n = wavelet_matrix("haar", 3).copy(), 4
-    phi = np.eye(n) + 0.2 * rng.standard_normal((3, n, n))
-    q = np.repeat(0.2 * np.eye(n)[None], 3, axis=0)
-    mean, p = rng.standard_normal(n), np.diag([1.0, 2.0, 3.0, 4.0])
-    z, h, r = rng.standard_normal(3), rng.standard_normal((3, n)), np.array([0.5, 1.0, 2.0])
-    block, block_p = np.empty(4 * n), np.empty((4 * n, 4 * n))
-    begin(w, mean, p, phi, q, block, block_p)
-    fold(w, block, block_p, 1, 0, 3, z, h, r, np.array([1, 2, 3]))
-    for k in range(3):
-        mean, p = phi[k] @ mean, phi[k] @ p @ phi[k].T + q[k]
-        gain = p @ h[k] / (h[k] @ p @ h[k] + r[k])
-        mean, p = mean + gain * (z[k] - h[k] @ mean), p - np.outer(gain, h[k] @ p)
-    last, last_p = np.empty(n), np.empty((n, n))
-    newest(w, block, block_p, last, last_p)
-    np.testing.assert_allclose(last, mean, rtol=1e-10)
-    np.testing.assert_allclose(last_p, p, atol=1e-12)
-
-
-def test_rebasing_takes_one_trajectory_off_everything() -> None:
-    rng = np.random.default_rng(6)
-    w, n = wavelet_matrix("haar", 2).copy(), 3
-    phi = np.eye(n) + 0.2 * rng.standard_normal((3, n, n))
-    u, z, h = rng.standard_normal((3, n)), rng.standard_normal(4), rng.standard_normal((4, n))
-    ends = np.array([1, 3, 4])
-    t = np.array([u[0], phi[1] @ u[0], phi[2] @ phi[1] @ u[0]])
-    kron = np.kron(w, np.eye(n))
-    means = rng.standard_normal((2, 2 * n))
-    expected = [means[i] - kron @ t[i : i + 2].ravel() for i in range(2)]
-    expected_u, expected_z = u - t, z - np.sum(h * t[[0, 1, 1, 2]], axis=1)
-    rebase(w, phi, u, z, h, ends, means)
-    np.testing.assert_allclose(means, expected)
-    np.testing.assert_allclose(u, expected_u)
-    np.testing.assert_allclose(z, expected_z)
-    assert not u[0].any()
 
 
 # --------------------------------------------------------------------------- estimator
@@ -422,136 +276,6 @@ def test_covariance_stays_symmetric_and_positive() -> None:
         scale = np.sqrt(np.diag(p))
         assert np.linalg.eigvalsh(p / np.outer(scale, scale)).min() > 0.0
     assert math.hypot(*scale[6:8]) < 1.5
-
-
-# --------------------------------------------------------------------------- screened aids
-
-
-@dataclass(frozen=True, slots=True)
-class Ranges(Aid):
-    """A fix's axes, twice, each with the receiver's clock in it (m); `wrong` is added to one row."""
-
-    screened: ClassVar[bool] = True
-
-    fix: PositionAid
-    clock_m: float
-    wrong: float = 0.0
-    left_out: bool = False
-
-    def innovation(self, state: State) -> Innovation | NotApplicable:
-        once = self.fix.innovation(state)
-        assert isinstance(once, Innovation)
-        z, h, r = np.tile(once.z, 2), np.tile(once.h, (2, 1)), np.tile(once.r, 2)
-        slot = state.model.slots_of(CLOCK_OFFSET)[0]
-        h[:, slot] = -1.0
-        z += state.xi[slot] - self.clock_m
-        z[4] += self.wrong
-        keep = np.arange(6) != 4 if self.left_out else np.full(6, True)
-        return Innovation(z[keep], h[keep], r[keep])
-
-
-def ranges(
-    aids: list[list[Linearised]], jump_at: int = 99, wrong_at: int = 99, left_out: bool = False
-) -> list[list[Linearised]]:
-    """The fixes of a drive as ranges: the clock at 5 m, then 3 km; one bad row at an epoch."""
-    found: list[list[Linearised]] = []
-    for k, (fix, velocity) in enumerate(aids):
-        assert isinstance(fix, PositionAid)
-        clock = 3000.0 if k >= jump_at else 5.0
-        wrong = 300.0 if k == wrong_at else 0.0
-        skip = left_out and k == wrong_at
-        found.append([velocity, Ranges("raw", fix.t_ns, 1 - 1e-9, fix, clock, wrong, skip)])
-    return found
-
-
-@pytest.mark.parametrize("scales", [1, 2, 3])
-def test_a_bad_row_goes_alone(scales: int) -> None:
-    _, buffer, aids, start, _ = drive()
-    model = make_model("ins15", imu_noise(IMU), *clock_blocks(("G",)))
-    sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
-    found = []
-    for left_out in (False, True):
-        estimator = MultiscaleEstimator(model, IMU.gap_s, scales)
-        begun(estimator, start, sd)
-        run(estimator, buffer, ranges(aids, wrong_at=20, left_out=left_out))
-        found.append(estimator)
-    np.testing.assert_allclose(found[0].nav, found[1].nav, rtol=1e-12, atol=1e-9)
-    np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-9, atol=1e-15)
-
-
-def test_screened_aids_in_one_scale_are_the_ordinary_filters() -> None:
-    _, buffer, aids, start, _ = drive()
-    model = make_model("ins15", imu_noise(IMU), *clock_blocks(("G",)))
-    sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
-    one, ordinary = MultiscaleEstimator(model, IMU.gap_s, 1), KalmanEstimator(model, IMU.gap_s)
-    for estimator in (one, ordinary):
-        begun(estimator, start, sd)
-        run(estimator, buffer, ranges(aids, jump_at=25, wrong_at=20))
-    np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-9, atol=1e-8)
-    np.testing.assert_allclose(one.xi, ordinary.xi, rtol=1e-6, atol=1e-9)
-
-
-def test_a_clock_that_was_set_gives_the_blocks_up() -> None:
-    _, buffer, aids, start, _ = drive()
-    model = make_model("ins15", imu_noise(IMU), *clock_blocks(("G",)))
-    sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
-    estimator = MultiscaleEstimator(model, IMU.gap_s, 3)
-    begun(estimator, start, sd)
-    epochs = ranges(aids, jump_at=20)
-    run(estimator, buffer, epochs[:20])
-    assert estimator.epochs == 7
-    before = estimator.nav.copy()
-    estimator.propagate(buffer, epochs[20][0].t_ns)
-    velocity, raw = epochs[20]
-    assert estimator.update(velocity).name == "fused"
-    outcome = estimator.update(raw)
-    assert outcome.name == "fused"
-    assert outcome.degrees == 6
-    assert estimator.epochs == 1
-    slot = model.slots_of(CLOCK_OFFSET)[0]
-    assert abs(estimator.xi[slot] - 3000.0) < 5.0
-    run(estimator, buffer, epochs[21:])
-    assert abs(estimator.xi[slot] - 3000.0) < 5.0
-    assert np.abs(runs.nav_error(estimator.nav, before)[6:]).max() < 400.0
-
-
-def test_no_row_left_is_gated_and_leaves_nothing() -> None:
-    _, buffer, aids, start, _ = drive()
-    model = make_model("ins15", imu_noise(IMU), *clock_blocks(("G",)))
-    sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
-    estimator = MultiscaleEstimator(model, IMU.gap_s, 2)
-    begun(estimator, start, sd)
-    run(estimator, buffer, ranges(aids)[:20])
-    far = aids[20][0]
-    assert isinstance(far, PositionAid)
-    estimator.propagate(buffer, far.t_ns)
-    off = replace(far, lat_rad=far.lat_rad + 1e-3, lon_rad=far.lon_rad + 1e-3, height_m=9e3)
-    nav, p = estimator.nav.copy(), estimator.covariance.copy()
-    one_row = Ranges("raw", far.t_ns, 1 - 1e-9, off, 5.0)
-    outcome = estimator.update(OneRow(one_row))
-    assert outcome.name == "gated"
-    assert outcome.rows == (1,)
-    assert (estimator.nav == nav).all()
-    assert (estimator.covariance == p).all()
-
-
-@dataclass(frozen=True)
-class OneRow:
-    """The first row of another screened aid: too few for a clock that was set."""
-
-    of: Ranges
-    screened: ClassVar[bool] = True
-    source: str = "raw"
-    gate: float = 1 - 1e-9
-
-    @property
-    def t_ns(self) -> int:
-        return self.of.t_ns
-
-    def innovation(self, state: State) -> Innovation | NotApplicable:
-        rows = self.of.innovation(state)
-        assert isinstance(rows, Innovation)
-        return Innovation(rows.z[:1], rows.h[:1], rows.r[:1])
 
 
 # --------------------------------------------------------------------------- configuration
