@@ -22,7 +22,7 @@ from fusiond.clock import Clock
 from fusiond.config import Config
 from fusiond.load_config import driver_entry_points
 from fusiond.navigator import Navigator
-from fusiond.outputs.messages import SourceHealth
+from fusiond.outputs.messages import SkyHealth, SourceHealth
 
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]
@@ -171,6 +171,8 @@ class Sources:
                 )
                 continue
             counters = {k: int(v) for k, v in source.driver.counters.items() if v}
+            if name in navigator.raw:
+                counters |= dict(navigator.raw[name].refused)
             fused = ended["fused"]
             if name == self._imu_source:
                 counters |= {k: int(v) for k, v in self.counters.items() if v}
@@ -194,5 +196,17 @@ class Sources:
                 latency_s=None if source.latency_s is None else round(source.latency_s, 4),
                 counters=counters,
                 verdict=navigator.verdicts.verdict(name),
+                sky=self._sky(name),
             )
         return health
+
+    def _sky(self, name: str) -> SkyHealth | None:
+        receiver = self._navigator.raw.get(name)
+        if receiver is None:
+            return None
+        sky = receiver.sky()
+        figures: dict[str, float | None] = {"innovation_rms": sky.innovation_rms}
+        if sky.dops is not None:
+            figures |= sky.dops._asdict()
+        rounded = {k: None if v is None else round(v, 2) for k, v in figures.items()}
+        return SkyHealth(used=sky.used, refused=sky.refused, **rounded)

@@ -7,19 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from fusiond import config
+from fusiond import config, config_aiding
 
 PAGE = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text(encoding="utf-8")
 SECTIONS = {
     "[imu]": config.Imu,
-    "[aiding.gnss]": config.GnssAiding,
-    "[aiding.rdss]": config.RdssAiding,
-    "[aiding.attitude]": config.AttitudeAiding,
-    "[aiding.star_tracker]": config.StarTrackerAiding,
-    "[aiding.sar]": config.SarAiding,
-    "[aiding.heading]": config.HeadingAiding,
-    "[aiding.height]": config.HeightAiding,
-    "[aiding.wheel]": config.WheelAiding,
+    "[aiding.gnss]": config_aiding.GnssAiding,
+    "[aiding.raw]": config_aiding.RawAiding,
+    "[aiding.rdss]": config_aiding.RdssAiding,
+    "[aiding.attitude]": config_aiding.AttitudeAiding,
+    "[aiding.star_tracker]": config_aiding.StarTrackerAiding,
+    "[aiding.sar]": config_aiding.SarAiding,
+    "[aiding.heading]": config_aiding.HeadingAiding,
+    "[aiding.height]": config_aiding.HeightAiding,
+    "[aiding.wheel]": config_aiding.WheelAiding,
     "[constraints.zero_velocity]": config.ZeroVelocity,
     "[constraints.non_holonomic]": config.NonHolonomic,
     "[alignment]": config.Alignment,
@@ -45,10 +46,12 @@ def test_every_key_is_documented_with_its_default(title: str) -> None:
 
 
 def test_every_section_is_in_the_list() -> None:
-    def sections(model: type[config.Section]) -> set[type]:
+    def sections(model: type[config_aiding.Section]) -> set[type]:
         found = set()
         for field in model.model_fields.values():
-            if isinstance(field.annotation, type) and issubclass(field.annotation, config.Section):
+            if isinstance(field.annotation, type) and issubclass(
+                field.annotation, config_aiding.Section
+            ):
                 found |= {field.annotation} | sections(field.annotation)
         return found
 

@@ -78,6 +78,23 @@ class StatusMessage(Message):
     mqtt_reconnects: Count
 
 
+class SkyHealth(BaseModel):
+    """The last epoch of a receiver's raw data."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    used: tuple[str, ...] = Field(default=(), description="satellites, such as C21")
+    refused: dict[str, str] = Field(default_factory=dict, description="satellite to reason")
+    gdop: Number = None
+    pdop: Number = None
+    hdop: Number = None
+    vdop: Number = None
+    tdop: Number = None
+    innovation_rms: Number = Field(
+        default=None, description="of the ranges used, normalised; 1 is expected"
+    )
+
+
 class SourceHealth(BaseModel):
     """One device: what it is doing, and what became of its measurements."""
 
@@ -93,6 +110,7 @@ class SourceHealth(BaseModel):
     latency_s: Number = Field(default=None, description="from validity to arrival, the last one")
     counters: dict[str, Count] = Field(default_factory=dict, description="of the driver")
     verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
+    sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
 
 
 class SourceConsistency(BaseModel):
