@@ -14,7 +14,7 @@ from fusiond.gnss.constellation import (
     constellation,
     slots,
 )
-from fusiond.gps_time import WEEK_S
+from fusiond.gnss.orbit import WEEK_S
 
 WEEK, TOW = 2400, 345_678.0
 T = WEEK * WEEK_S + TOW

@@ -34,29 +34,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw.messages import Ephemeris, System
-from fusiond.gps_time import WEEK_S
+from fusiond.gnss.orbit import (
+    BDT_BEHIND_GPS_S,
+    BDT_WEEK_0_IN_GPS_WEEKS,
+    CONSTANTS,
+    GEO_TILT_RAD,
+    WEEK_S,
+    Orbits,
+    gps_time,
+)
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 
 Array = NDArray[np.float64]
 
-BDT_WEEKS = 1356
-"""GPS weeks before BeiDou week 0 (2006-01-01)."""
-BDT_OFFSET_S = 14
-"""GPST - BDT."""
 EPOCH_S = 2300.0 * WEEK_S
 """GPS time where the inertial axes coincide with the Earth's: 2024-02-04."""
-MU_M3_S2: dict[System, float] = {"G": 3.986005e14, "E": 3.986004418e14, "C": 3.986004418e14}
-EARTH_RATE_RAD_S: dict[System, float] = {
-    "G": 7.2921151467e-5,
-    "E": 7.2921151467e-5,
-    "C": 7.292115e-5,
-}
 J2 = 1.082629821e-3
 UPDATE_S: dict[System, float] = {"G": 7200.0, "E": 600.0, "C": 3600.0}
 """How often a new ephemeris is broadcast; toe lies on its multiples."""
 
 INCLINATION_RAD = math.radians(55.0)
-GEO_TILT_RAD = math.radians(5.0)
 GEO_LONGITUDES_DEG = {59: 140.0, 60: 80.0, 61: 110.5}
 """PRN and slot of the BeiDou-3 GEO."""
 IGSO_PRNS = (38, 39, 40)
@@ -75,13 +72,6 @@ GPS_SLOTS_DEG = (
 )
 """Planes A to F: node and the four arguments of latitude. PRN 1 to 24 in this order."""
 _ECCENTRICITY = {"geo": 3e-4, "igso": 2e-3, "meo": 8e-4, "gps": 8e-3}
-_KEPLER_ITERATIONS = 6
-"""Newton's steps: with e < 0.03 the error squares from 1e-3 to below rounding in four."""
-
-
-def is_geostationary(system: System, prn: int) -> bool:
-    """BeiDou satellites whose user algorithm is that of a GEO: C01 to C05, C59 to C63."""
-    return system == "C" and (prn <= 5 or prn >= 59)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +93,7 @@ class Slot:
         """Precession of the node by J2, rad/s."""
         if self.kind == "geo":
             return 0.0
-        n = math.sqrt(MU_M3_S2[self.system] / self.semi_major_m**3)
+        n = math.sqrt(CONSTANTS[self.system].gm / self.semi_major_m**3)
         return _node_rate(n, self.semi_major_m, _ECCENTRICITY[self.kind])
 
 
@@ -114,8 +104,8 @@ def _node_rate(n: float, a: float, e: float) -> float:
 
 def _synchronous_m(node_rate: float) -> float:
     """Semi-major axis with n + node' = omega_e."""
-    n = EARTH_RATE_RAD_S["C"] - node_rate
-    return math.cbrt(MU_M3_S2["C"] / (n * n))
+    n = CONSTANTS["C"].earth_rate - node_rate
+    return math.cbrt(CONSTANTS["C"].gm / (n * n))
 
 
 def beidou_slots() -> Iterator[Slot]:
@@ -125,7 +115,7 @@ def beidou_slots() -> Iterator[Slot]:
         yield Slot("C", prn, "geo", a, 0.0, math.radians(longitude))
     e = _ECCENTRICITY["igso"]
     for _ in range(4):  # node' changes a by 1e-5: a fixed point in two steps
-        n = math.sqrt(MU_M3_S2["C"] / a**3)
+        n = math.sqrt(CONSTANTS["C"].gm / a**3)
         a = _synchronous_m(_node_rate(n, a, e))
     for k, prn in enumerate(IGSO_PRNS):
         node = 2.0 * math.pi * k / len(IGSO_PRNS)
@@ -163,14 +153,13 @@ def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
     """
     system = slot.system
     beidou = system == "C"
-    mu, rate = MU_M3_S2[system], EARTH_RATE_RAD_S[system]
+    mu, rate = CONSTANTS[system].gm, CONSTANTS[system].earth_rate
     own_week, own_tow = system_time(system, week, tow_s)
     toe = round(own_tow / UPDATE_S[system]) * UPDATE_S[system]
     if toe >= WEEK_S:
         own_week, toe = own_week + 1, toe - WEEK_S
-    week_start = (own_week + (BDT_WEEKS if beidou else 0)) * float(WEEK_S) - EPOCH_S
-    if beidou:
-        week_start += BDT_OFFSET_S
+    gps_week, start_s = gps_time(system, own_week, 0.0)
+    week_start = gps_week * WEEK_S + start_s - EPOCH_S
     tau = week_start + toe
     e = _ECCENTRICITY[slot.kind]
     n = math.sqrt(mu / slot.semi_major_m**3)
@@ -180,7 +169,7 @@ def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
         node = math.pi + rate * toe
         u = slot.latitude_argument + math.pi
         perigee = spread - rate * tau
-        inclination = GEO_TILT_RAD
+        inclination = -GEO_TILT_RAD
     else:
         node = slot.node + slot.node_rate * tau - rate * week_start
         u = slot.latitude_argument + n * tau
@@ -233,9 +222,9 @@ def system_time(system: System, week: int, tow_s: float) -> tuple[int, float]:
     """GPS time as week and second of week of the system's own time."""
     if system != "C":
         return week, tow_s
-    tow_s -= BDT_OFFSET_S
+    tow_s -= BDT_BEHIND_GPS_S
     back = tow_s < 0.0
-    return week - BDT_WEEKS - back, tow_s + WEEK_S * back
+    return week - BDT_WEEK_0_IN_GPS_WEEKS - back, tow_s + WEEK_S * back
 
 
 def _wrap(angle: float) -> float:
@@ -273,80 +262,17 @@ class Constellation:
     def __init__(self, ephemerides: Sequence[Ephemeris]) -> None:
         self.ephemerides = tuple(ephemerides)
         self.satellites = tuple(e.satellite for e in self.ephemerides)
+        self.orbits = Orbits.of(self.ephemerides)
 
-        def column(name: str) -> Array:
-            return np.array([getattr(e, name) for e in self.ephemerides], dtype=np.float64)
-
-        self._a = column("sqrt_a") ** 2
-        self._e = column("eccentricity")
-        mu = np.array([MU_M3_S2[e.system] for e in self.ephemerides])
-        self._n = np.sqrt(mu / self._a**3) + column("mean_motion_correction")
-        self._mean_anomaly = column("mean_anomaly")
-        self._perigee = column("perigee")
-        self._inclination, self._inclination_rate = (
-            column("inclination"),
-            column("inclination_rate"),
-        )
-        self._node, self._node_rate = column("ascending_node"), column("ascending_node_rate")
-        self._cu = column("cuc"), column("cus")
-        self._cr = column("crc"), column("crs")
-        self._ci = column("cic"), column("cis")
-        self._rate = np.array([EARTH_RATE_RAD_S[e.system] for e in self.ephemerides])
-        self._toe = column("toe_s")
-        beidou = np.array([e.system == "C" for e in self.ephemerides])
-        self._toe_gps = (column("week") + BDT_WEEKS * beidou) * WEEK_S + (
-            self._toe + BDT_OFFSET_S * beidou
-        )
-        self._geo = np.array([is_geostationary(e.system, e.prn) for e in self.ephemerides])
-
-    def positions(self, t_s: float | Array) -> tuple[Array, Array]:
+    def positions(self, t_s: float) -> tuple[Array, Array]:
         """ECEF positions (n, 3) in m and velocities in m/s at GPS time `t_s`.
 
-        `t_s` is counted from 1980-01-06 (week * 604800 + second of week): one for all, or one for
-        each satellite (n,). Doubles resolve it to 0.2 us, 1 mm of a satellite's way.
+        `t_s` is counted from 1980-01-06 (week * 604800 + second of week). Doubles resolve it to
+        0.2 us, 1 mm of a satellite's way.
         """
-        t = np.asarray(t_s, dtype=np.float64) - self._toe_gps
-        a, e = self._a, self._e
-        mean = self._mean_anomaly + self._n * t
-        anomaly = mean + e * np.sin(mean)
-        for _ in range(_KEPLER_ITERATIONS):
-            anomaly -= (anomaly - e * np.sin(anomaly) - mean) / (1.0 - e * np.cos(anomaly))
-        sin_e, cos_e = np.sin(anomaly), np.cos(anomaly)
-        shrink = 1.0 - e * cos_e
-        root = np.sqrt(1.0 - e * e)
-        anomaly_rate = self._n / shrink
-        phi = np.arctan2(root * sin_e, cos_e - e) + self._perigee
-        phi_rate = root * anomaly_rate / shrink
-        s2, c2 = np.sin(2.0 * phi), np.cos(2.0 * phi)
-
-        def harmonic(pair: tuple[Array, Array]) -> tuple[Array, Array]:
-            c, s = pair
-            return c * c2 + s * s2, 2.0 * phi_rate * (s * c2 - c * s2)
-
-        (du, du_rate), (dr, dr_rate), (di, di_rate) = map(harmonic, (self._cu, self._cr, self._ci))
-        u, u_rate = phi + du, phi_rate + du_rate
-        r, r_rate = a * shrink + dr, a * e * sin_e * anomaly_rate + dr_rate
-        i = self._inclination + di + self._inclination_rate * t
-        i_rate = self._inclination_rate + di_rate
-        x, y = r * np.cos(u), r * np.sin(u)
-        x_rate, y_rate = r_rate * np.cos(u) - y * u_rate, r_rate * np.sin(u) + x * u_rate
-        node_rate = self._node_rate - np.where(self._geo, 0.0, self._rate)
-        node = self._node + node_rate * t - self._rate * self._toe
-        sn, cn, si, ci = np.sin(node), np.cos(node), np.sin(i), np.cos(i)
-        p = np.stack((x * cn - y * ci * sn, x * sn + y * ci * cn, y * si), axis=-1)
-        v = np.stack(
-            (
-                x_rate * cn - y_rate * ci * sn + y * si * sn * i_rate - p[:, 1] * node_rate,
-                x_rate * sn + y_rate * ci * cn - y * si * cn * i_rate + p[:, 0] * node_rate,
-                y_rate * si + y * ci * i_rate,
-            ),
-            axis=-1,
-        )
-        geo = self._geo
-        if geo.any():
-            turn = (self._rate * t)[geo]
-            p[geo], v[geo] = _turn_geo(p[geo], v[geo], turn, self._rate[geo])
-        return p, v
+        week, tow_s = divmod(t_s, WEEK_S)
+        states = self.orbits.at(int(week), tow_s)
+        return states.position, states.velocity
 
     def line_of_sight(self, lat: float, lon: float, height_m: float, t_s: float) -> Sky:
         """The sky over a geodetic place (rad, m) at GPS time `t_s`; satellites below ground too.
@@ -367,20 +293,6 @@ class Constellation:
             p,
             v,
         )
-
-
-def _turn_geo(p: Array, v: Array, turn: Array, rate: Array) -> tuple[Array, Array]:
-    """Rz(omega_e t_k) Rx(-5 deg) and its derivative; rotations of the axes, as in the ICD."""
-    c, s = math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD)
-    tilt = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    p, v = p @ tilt.T, v @ tilt.T
-    ct, st = np.cos(turn), np.sin(turn)
-    x, y = ct * p[:, 0] + st * p[:, 1], -st * p[:, 0] + ct * p[:, 1]
-    vx, vy = ct * v[:, 0] + st * v[:, 1], -st * v[:, 0] + ct * v[:, 1]
-    return (
-        np.stack((x, y, p[:, 2]), axis=-1),
-        np.stack((vx + rate * y, vy - rate * x, v[:, 2]), axis=-1),
-    )
 
 
 def ecef(lat: float, lon: float, height_m: float) -> Array:
