@@ -206,7 +206,7 @@ def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
         clock_drift_rate=0.0,
         group_delay_s=(1.2e-8 * math.sin(spread), 7e-9 * math.cos(spread))[: 2 if beidou else 1],
         issue=1 if beidou else round(toe / UPDATE_S[system]) % 240,
-        accuracy_m=2.4,
+        accuracy_m=2.0,
         healthy=True,
     )
 

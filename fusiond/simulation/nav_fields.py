@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from drivers.raw.messages import Ephemeris, Klobuchar, System
+from drivers.raw.subframes import ura_m
 
 SEMICIRCLE = math.pi
 
@@ -77,11 +78,6 @@ FIELDS: dict[System, dict[str, Field]] = {
 GROUP_DELAY: dict[System, Field] = {"G": Field(8, 2.0**-31), "C": Field(10, 1e-10)}
 ALPHA = tuple(Field(8, 2.0**power) for power in (-30, -27, -24, -24))
 BETA = tuple(Field(8, 2.0**power) for power in (11, 14, 16, 16))
-ACCURACY_M = (2.4, 3.4, 4.85, 6.85, 9.65, 13.65, 24.0, 48.0, 96.0, 192.0, 384.0, 768.0, 1536.0,
-              3072.0, 6144.0)  # fmt: skip
-"""Upper limits of URA and URAI 0 to 14; 15 says none."""
-
-
 @dataclass(frozen=True, slots=True)
 class Wire:
     """An ephemeris as integers: `raw` by field name of `Ephemeris`, the rest beside it."""
@@ -108,10 +104,19 @@ def wire(ephemeris: Ephemeris) -> Wire:
         ephemeris.week,
         {name: f.encode(getattr(ephemeris, name)) for name, f in FIELDS[system].items()},
         tuple(GROUP_DELAY[system].encode(delay) for delay in ephemeris.group_delay_s),
-        next((k for k, most in enumerate(ACCURACY_M) if limit <= most), 15),
+        _accuracy_index(limit),
         ephemeris.issue,
         ephemeris.healthy,
     )
+
+
+def _accuracy_index(accuracy_m: float) -> int:
+    """The least index (URA, URAI) that does not state less; 15 states none."""
+    for index in range(15):
+        stated = ura_m(index)
+        if stated is not None and accuracy_m <= stated:
+            return index
+    return 15
 
 
 def quantised(ephemeris: Ephemeris) -> Ephemeris:
@@ -121,8 +126,7 @@ def quantised(ephemeris: Ephemeris) -> Ephemeris:
         name: f.decode(numbers.raw[name]) for name, f in FIELDS[system].items()
     }
     delays = tuple(GROUP_DELAY[system].decode(raw) for raw in numbers.group_delay)
-    accuracy = ACCURACY_M[numbers.accuracy] if numbers.accuracy < len(ACCURACY_M) else None
-    return replace(ephemeris, **values, group_delay_s=delays, accuracy_m=accuracy)
+    return replace(ephemeris, **values, group_delay_s=delays, accuracy_m=ura_m(numbers.accuracy))
 
 
 def klobuchar_wire(model: Klobuchar) -> tuple[int, ...]:

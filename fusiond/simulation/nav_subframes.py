@@ -78,12 +78,12 @@ def lnav_subframe(number: int, tow_s: int, body: Bits) -> tuple[int, ...]:
     return lnav_words(head.words([24] * 10))
 
 
-def lnav(ephemeris: Ephemeris, tow_s: int) -> tuple[tuple[int, ...], ...]:
-    """Subframes 1, 2 and 3, the first starting at `tow_s`. Raises ValueError as `wire`."""
+def lnav(ephemeris: Ephemeris, week: int, tow_s: int) -> tuple[tuple[int, ...], ...]:
+    """Subframes 1, 2 and 3 sent from GPS time `week`, `tow_s`. Raises ValueError as `wire`."""
     w = wire(ephemeris)
     f = _Putter(w)
     one = Bits().put_all(
-        ((w.week % 1024, 10), (1, 2), (w.accuracy, 4), (0 if w.healthy else 63, 6), (0, 2))
+        ((week % 1024, 10), (1, 2), (w.accuracy, 4), (0 if w.healthy else 63, 6), (0, 2))
     )
     one.put_all(((0, 24), (0, 24), (0, 24), (0, 16), (w.group_delay[0], 8), (w.issue, 8)))
     f(one, "toc_s", "clock_drift_rate", "clock_drift", "clock_bias_s").put(0, 2)
@@ -134,12 +134,14 @@ def _beidou_head(number: int, sow_s: int) -> Bits:
     return Bits().put_all(((BEIDOU_PREAMBLE, 11), (0, 4), (number, 3), (sow_s % 604_800, 20)))
 
 
-def d1(ephemeris: Ephemeris, model: Klobuchar, sow_s: int) -> tuple[tuple[int, ...], ...]:
-    """D1 subframes 1, 2 and 3, the first starting at `sow_s` of BDT. Raises ValueError."""
+def d1(
+    ephemeris: Ephemeris, model: Klobuchar, week: int, sow_s: int
+) -> tuple[tuple[int, ...], ...]:
+    """D1 subframes 1, 2 and 3 sent from BDT `week`, `sow_s`. Raises ValueError as `wire`."""
     w = wire(ephemeris)
     f = _Putter(w)
     one = _beidou_head(1, sow_s)
-    one.put_all(((not w.healthy, 1), (w.issue, 5), (w.accuracy, 4), (w.week % 8192, 13)))
+    one.put_all(((not w.healthy, 1), (w.issue, 5), (w.accuracy, 4), (week % 8192, 13)))
     f(one, "toc_s").put_all((delay, 10) for delay in w.group_delay)
     one.put_all((value, 8) for value in klobuchar_wire(model))
     f(one, "clock_drift_rate", "clock_bias_s", "clock_drift").put(w.issue, 5)
@@ -153,14 +155,16 @@ def d1(ephemeris: Ephemeris, model: Klobuchar, sow_s: int) -> tuple[tuple[int, .
     return tuple(map(beidou_words, (one, two, three)))
 
 
-def d2(ephemeris: Ephemeris, model: Klobuchar, sow_s: int) -> tuple[tuple[int, ...], ...]:
-    """The ten pages of D2 subframe 1, the first starting at `sow_s` of BDT. Raises ValueError.
+def d2(
+    ephemeris: Ephemeris, model: Klobuchar, week: int, sow_s: int
+) -> tuple[tuple[int, ...], ...]:
+    """The ten pages of D2 subframe 1 sent from BDT `week`, `sow_s`. Raises ValueError as `wire`.
 
     Words 6 to 10 are reserved; they are sent as zeros with their parity (which is zero).
     """
     w = wire(ephemeris)
     f = _Putter(w)
-    first = Bits().put_all(((not w.healthy, 1), (w.issue, 5), (w.accuracy, 4), (w.week % 8192, 13)))
+    first = Bits().put_all(((not w.healthy, 1), (w.issue, 5), (w.accuracy, 4), (week % 8192, 13)))
     f(first, "toc_s").put_all((delay, 10) for delay in w.group_delay).put(0, 12)
     ionosphere = Bits().put_all((value, 8) for value in klobuchar_wire(model)).put(0, 8)
     # Pages 3 to 10: the fields run on from page to page over reserved bits.
