@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -170,15 +170,27 @@ def simulate(
     duration: Annotated[
         float | None, typer.Option(min=1.0, help="Seconds; the scenario's own by default.")
     ] = None,
+    gnss_raw: Annotated[
+        Literal["ubx", "rtcm3"] | None, typer.Option(help="Write the raw GNSS stream too.")
+    ] = None,
+    gnss_mask: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND:START:LENGTH", help="canyon, canyon2 to canyon4, tunnel; s."),
+    ] = None,
 ) -> None:
-    """Write imu.csv, gnss.csv, rdss.csv and truth.csv of a simulated vehicle."""
+    """Write imu.csv, gnss.csv, rdss.csv, truth.csv, gnss.ubx of a simulated vehicle."""
     from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
+    from fusiond.simulation.gnss_masks import parse_mask  # noqa: PLC0415
     from fusiond.simulation.scenarios import SCENARIOS  # noqa: PLC0415
 
     if scenario not in SCENARIOS:
         raise typer.BadParameter(f"{scenario!r}: there are {', '.join(SCENARIOS)}")
+    try:
+        masked = SCENARIOS[scenario].masked([parse_mask(text) for text in gnss_mask or ()])
+    except ValueError as error:
+        raise typer.BadParameter(f"--gnss-mask: {error}") from error
     with _data_errors(), _spinner("simulating"):
-        written = run_simulate(SCENARIOS[scenario], out, seed, duration)
+        written = run_simulate(masked, out, seed, duration, gnss_raw=gnss_raw)
     for name, path in written.files.items():
         typer.echo(f"{path}: {written.rows[name]} rows")
 

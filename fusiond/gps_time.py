@@ -26,5 +26,11 @@ def leap_seconds(utc_ns: int) -> int:
 
 def utc_ns_to_gps_week_seconds(utc_ns: int) -> float:
     """GPS second of week of a POSIX instant in ns."""
+    return utc_ns_to_gps(utc_ns)[1]
+
+
+def utc_ns_to_gps(utc_ns: int) -> tuple[int, float]:
+    """GPS week and second of week of a POSIX instant in ns."""
     gps_ns = utc_ns + (leap_seconds(utc_ns) - GPS_EPOCH_POSIX_S) * 1_000_000_000
-    return (gps_ns % (WEEK_S * 1_000_000_000)) * 1e-9
+    week, rest = divmod(gps_ns, WEEK_S * 1_000_000_000)
+    return week, rest * 1e-9

@@ -121,11 +121,12 @@ def test_vibration_and_resolution() -> None:
 
 
 def test_streams_of_devices_are_independent() -> None:
-    imu, gnss, rdss = (rng.standard_normal(4) for rng in random_streams(7))
+    imu, gnss, rdss, raw = (rng.standard_normal(4) for rng in random_streams(7))
     again = random_streams(7)
     assert np.array_equal(gnss, again[1].standard_normal(4))
     assert not np.allclose(imu, gnss)
     assert not np.allclose(gnss, rdss)
+    assert not np.allclose(gnss, raw)
 
 
 # --------------------------------------------------------------------------- files

@@ -23,8 +23,9 @@ from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.messages import Fix, Identity, IdentityRequest, PositionRequest
 from fusiond.files import read_truth
 from fusiond.simulation.can_imu import SIM_IMU
+from fusiond.simulation.pty_line import PtyLine
 from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.simulation.vehicle import PtyLine, SimulatedVehicle
+from fusiond.simulation.vehicle import SimulatedVehicle
 
 
 def test_what_nobody_listens_to_is_lost(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw.messages import Ephemeris, System
+from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.gnss.orbit import (
     BDT_BEHIND_GPS_S,
     BDT_WEEK_0_IN_GPS_WEEKS,
@@ -43,7 +44,7 @@ from fusiond.gnss.orbit import (
     Orbits,
     gps_time,
 )
-from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
+from fusiond.navigation.earth import SEMI_MAJOR_M
 
 Array = NDArray[np.float64]
 
@@ -149,7 +150,7 @@ def slots(systems: Sequence[System] = ("C", "G")) -> tuple[Slot, ...]:
 def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
     """What the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest one.
 
-    Unquantised: `fusiond.simulation.gnss_encoders` rounds to what a message can carry.
+    Unquantised: `fusiond.simulation.nav_fields.quantised` rounds to what a message can carry.
     """
     system = slot.system
     beidou = system == "C"
@@ -281,9 +282,9 @@ class Constellation:
         to 400 m, 1e-5 rad as seen from here.
         """
         p, v = self.positions(t_s)
-        delta = p - ecef(lat, lon, height_m)
+        delta = p - np.array(to_ecef(lat, lon, height_m))
         distance = np.linalg.norm(delta, axis=1)
-        unit = (delta / distance[:, None]) @ ned_to_ecef(lat, lon)
+        unit = (delta / distance[:, None]) @ ned_axes(lat, lon)
         return Sky(
             self.satellites,
             np.arctan2(unit[:, 1], unit[:, 0]) % (2.0 * math.pi),
@@ -293,17 +294,3 @@ class Constellation:
             p,
             v,
         )
-
-
-def ecef(lat: float, lon: float, height_m: float) -> Array:
-    """ECEF position (3,) in m of a geodetic place (rad, m)."""
-    transverse = SEMI_MAJOR_M / math.sqrt(1.0 - ECCENTRICITY_SQUARED * math.sin(lat) ** 2)
-    level = (transverse + height_m) * math.cos(lat)
-    up = (transverse * (1.0 - ECCENTRICITY_SQUARED) + height_m) * math.sin(lat)
-    return np.array([level * math.cos(lon), level * math.sin(lon), up])
-
-
-def ned_to_ecef(lat: float, lon: float) -> Array:
-    """Matrix (3, 3) whose columns are north, east and down in ECEF axes."""
-    sl, cl, so, co = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
-    return np.array([[-sl * co, -so, -cl * co], [-sl * so, co, -cl * so], [cl, 0.0, -sl]])

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from fusiond.fixed_decimal import MAX_CELL, format_rows
 from fusiond.simulation.aid_sensors import aid_tables
+from fusiond.simulation.gnss_raw import GnssRaw
+from fusiond.simulation.gnss_raw_stream import GnssRawStream, RawFormat
 from fusiond.simulation.gnss_receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss_centre import RdssCentre
@@ -48,7 +50,7 @@ _TRUTH = (_TIME, *_PLACE, *_V, *((f"{angle}_deg", 7) for angle in ("roll", "pitc
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """What was written: the files, and their rows without the header."""
+    """What was written: the files, and their rows without the header (epochs of a raw stream)."""
 
     scenario: str
     seed: int
@@ -58,16 +60,23 @@ class Simulated:
 
 
 def simulate(
-    scenario: Scenario, out_dir: Path, seed: int = 0, duration_s: float | None = None
+    scenario: Scenario,
+    out_dir: Path,
+    seed: int = 0,
+    duration_s: float | None = None,
+    *,
+    gnss_raw: RawFormat | None = None,
 ) -> Simulated:
     """Write imu.csv, gnss.csv, rdss.csv and truth.csv into `out_dir`, which is made if need be;
     attitude.csv and bearing.csv where star tracker and radar are on board.
 
-    The same scenario, seed and duration write the same bytes. `t_s` counts from the start of the
-    trajectory. Raises OSError where the files cannot be written.
+    With `gnss_raw` also the receiver's raw stream, gnss.ubx or gnss.rtcm3. The same scenario, seed
+    and duration write the same bytes. `t_s` counts from the start of the trajectory, which is the
+    start of a GPS week in the raw stream (`gnss_raw.START`). Raises OSError where the files cannot
+    be written.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
-    imu_rng, gnss_rng, rdss_rng = random_streams(seed)
+    imu_rng, gnss_rng, rdss_rng, raw_rng = random_streams(seed)
     truth = scenario.truth(duration_s)
     imu = scenario.imu_output(truth, imu_rng)
     stamps = truth.t_s[1:] - scenario.imu.time_offset_s
@@ -81,13 +90,15 @@ def simulate(
     files = {name: out_dir / f"{name}.csv" for name in tables}
     for name, (columns, rows) in tables.items():
         _write(files[name], columns, rows)
-    return Simulated(
-        scenario.name,
-        seed,
-        truth.duration_s,
-        files,
-        {name: len(rows) for name, (_, rows) in tables.items()},
-    )
+    count = {name: len(rows) for name, (_, rows) in tables.items()}
+    if gnss_raw is not None:
+        files["raw"] = out_dir / f"gnss.{gnss_raw}"
+        stream = GnssRawStream(GnssRaw(truth, scenario.gnss_raw, raw_rng), gnss_raw)
+        count["raw"] = len(stream.receiver)
+        with files["raw"].open("wb") as raw_file:
+            for k in range(len(stream.receiver)):
+                raw_file.write(stream.bytes_of(k))
+    return Simulated(scenario.name, seed, truth.duration_s, files, count)
 
 
 def write_truth(path: Path, truth: Truth) -> None:

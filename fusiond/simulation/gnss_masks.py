@@ -55,6 +55,21 @@ def tunnel(start_s: float, length_s: float) -> Mask:
     return Mask("tunnel", start_s, length_s)
 
 
+def parse_mask(text: str) -> Mask:
+    """KIND:START:LENGTH in s, such as canyon3:100:60; canyon, canyon2 to canyon4, tunnel.
+
+    Raises ValueError.
+    """
+    kind, _, window = text.partition(":")
+    start_s, length_s = (float(part) for part in window.split(":"))
+    if kind == "tunnel":
+        return tunnel(start_s, length_s)
+    if kind in {"canyon", "canyon2", "canyon3", "canyon4"}:
+        satellites = int(kind[-1]) if kind[-1].isdigit() else None
+        return canyon(satellites, start_s, length_s)
+    raise ValueError(f"no mask {kind!r}: there are canyon, canyon2, canyon3, canyon4, tunnel")
+
+
 @dataclass(slots=True)
 class View:
     """Which satellites are seen along the way. Asked in the order of time."""

@@ -102,6 +102,8 @@ class GnssRawOptions:
     clock_drift_correlation_s: float = 300.0
     clock_noise_m_sqrt_s: float = 0.05
     inter_system_sd_m: float = 5.0
+    latency_s: tuple[float, float] = (0.05, 0.1)
+    """From an epoch to its last byte, uniform."""
 
     @property
     def systems(self) -> tuple[System, ...]:
@@ -128,6 +130,7 @@ class GnssRaw:
         o = options
         n, step = int(truth.duration_s * o.rate_hz + 1e-9), 1.0 / o.rate_hz
         self.t_s = np.arange(1, n + 1) / o.rate_hz
+        self.t_arrival_s = np.maximum.accumulate(self.t_s + rng.uniform(*o.latency_s, n))
         states = truth.at(self.t_s, o.lever_arm_m)
         self._position, self._v_ned = states.position, states.v_ned
         self._heading = states.rpy[:, 2]

@@ -78,6 +78,8 @@ FIELDS: dict[System, dict[str, Field]] = {
 GROUP_DELAY: dict[System, Field] = {"G": Field(8, 2.0**-31), "C": Field(10, 1e-10)}
 ALPHA = tuple(Field(8, 2.0**power) for power in (-30, -27, -24, -24))
 BETA = tuple(Field(8, 2.0**power) for power in (11, 14, 16, 16))
+
+
 @dataclass(frozen=True, slots=True)
 class Wire:
     """An ephemeris as integers: `raw` by field name of `Ephemeris`, the rest beside it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from fusiond.config import Config, Imu
 from fusiond.config_aiding import GnssAiding, RdssAiding, SarAiding
 from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
+from fusiond.simulation.gnss_masks import Mask
+from fusiond.simulation.gnss_raw import GnssRawOptions
 from fusiond.simulation.gnss_receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss_centre import RdssOptions
@@ -46,6 +48,7 @@ class Scenario:
     origin_deg_m: tuple[float, float, float] = (30.5276, 114.3556, 38.0)
     imu: Imu = CAR_IMU
     gnss: GnssOptions = field(default_factory=lambda: GnssOptions(lever_arm_m=ANTENNA_M))
+    gnss_raw: GnssRawOptions = field(default_factory=lambda: GnssRawOptions(lever_arm_m=ANTENNA_M))
     rdss: RdssOptions = field(default_factory=lambda: RdssOptions(lever_arm_m=ANTENNA_M))
     vibration: Vibration = field(default_factory=Vibration)
     no_slip_m: tuple[float, float, float] = REAR_AXLE_M
@@ -68,11 +71,13 @@ class Scenario:
 
     def fitted(self, config: Config) -> Scenario:
         """This scenario with the IMU, the lever arms and the no-slip point of a configuration."""
-        gnss, rdss, no_slip, sar = self.gnss, self.rdss, self.no_slip_m, self.sar
+        gnss, raw, rdss, no_slip = self.gnss, self.gnss_raw, self.rdss, self.no_slip_m
+        sar = self.sar
         for aiding in config.aiding.values():
             match aiding:
                 case GnssAiding():
                     gnss = replace(gnss, lever_arm_m=aiding.lever_arm_m)
+                    raw = replace(raw, lever_arm_m=aiding.lever_arm_m)
                 case RdssAiding():
                     rdss = replace(rdss, lever_arm_m=aiding.lever_arm_m)
                 case SarAiding() if sar is not None:
@@ -80,7 +85,23 @@ class Scenario:
                     sar = replace(sar, lever_arm_m=aiding.lever_arm_m, targets_deg_m=points)
         if config.constraints.non_holonomic.enabled:
             no_slip = config.constraints.non_holonomic.lever_arm_m
-        return replace(self, imu=config.imu, gnss=gnss, rdss=rdss, sar=sar, no_slip_m=no_slip)
+        return replace(
+            self, imu=config.imu, gnss=gnss, gnss_raw=raw, rdss=rdss, sar=sar, no_slip_m=no_slip
+        )
+
+    def masked(self, masks: Sequence[Mask]) -> Scenario:
+        """This scenario with what stands in the sky's way. A receiver has no fix of its own in a
+        tunnel and with fewer than four satellites, so its NMEA falls out there."""
+        windows = tuple(
+            (mask.start_s, mask.length_s)
+            for mask in masks
+            if mask.kind == "tunnel" or (mask.satellites is not None and mask.satellites < 4)
+        )
+        return replace(
+            self,
+            gnss=replace(self.gnss, outages=(*self.gnss.outages, *windows)),
+            gnss_raw=replace(self.gnss_raw, masks=(*self.gnss_raw.masks, *masks)),
+        )
 
 
 FLIGHT = Scenario(
@@ -110,6 +131,7 @@ SCENARIOS = {
 
 
 def random_streams(seed: int) -> tuple[np.random.Generator, ...]:
-    """Independent generators for IMU, GNSS and RDSS: changing one device leaves the others."""
-    children = np.random.SeedSequence(seed).spawn(3)
+    """Independent generators for IMU, GNSS fixes, RDSS and raw GNSS: changing one device leaves
+    the others."""
+    children = np.random.SeedSequence(seed).spawn(4)
     return tuple(np.random.default_rng(child) for child in children)

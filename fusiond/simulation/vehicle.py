@@ -16,12 +16,9 @@ import argparse
 import asyncio
 import contextlib
 import json
-import os
-import select
 import sys
 import threading
 import time
-import tty
 from collections import Counter
 from dataclasses import replace
 from functools import partial
@@ -32,12 +29,17 @@ import can
 import numpy as np
 
 from drivers.can_signals import CanImuOptions
+from fusiond.gps_time import utc_ns_to_gps
 from fusiond.load_config import load_config
 from fusiond.simulation.can_aids import CanAid, can_aids
 from fusiond.simulation.can_imu import SIM_IMU, CanImu
 from fusiond.simulation.files import write_truth
+from fusiond.simulation.gnss_masks import parse_mask
+from fusiond.simulation.gnss_raw import GnssRaw
+from fusiond.simulation.gnss_raw_stream import GnssRawStream, RawFormat
 from fusiond.simulation.gnss_receiver import GnssReceiver
 from fusiond.simulation.imu_truth import States
+from fusiond.simulation.pty_line import PtyLine
 from fusiond.simulation.rdss_terminal import RdssTerminal
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
 from fusiond.simulation.trajectories import drive
@@ -46,69 +48,6 @@ Device = Literal["imu", "gnss", "rdss", "star_tracker", "sar"]
 
 SERIAL_POLL_S = 0.01
 """How often the terminal's line is read: far below the 50 ms that its answers take."""
-_READ_BYTES = 4096
-
-
-class PtyLine:
-    """The device's end of a serial line: a pseudo terminal behind a symbolic link.
-
-    What is written while nobody has the line open is lost, as on a real line.
-    """
-
-    def __init__(self, link: Path) -> None:
-        self.link = link
-        self._master: int | None = None
-        self._hangup = select.poll()
-
-    def plug(self) -> None:
-        """Make the port appear. Raises OSError."""
-        if self._master is not None:
-            return
-        master, slave = os.openpty()
-        try:
-            tty.setraw(slave)
-            os.set_blocking(master, False)
-            path = os.ttyname(slave)
-            fresh = self.link.with_name(self.link.name + ".new")
-            fresh.unlink(missing_ok=True)
-            fresh.symlink_to(path)
-            fresh.replace(self.link)
-        except OSError:
-            os.close(master)
-            raise
-        finally:
-            os.close(slave)
-        self._master = master
-        self._hangup = select.poll()
-        self._hangup.register(master, 0)
-
-    def unplug(self) -> None:
-        """Make the port vanish; whoever has it open sees a hang-up."""
-        if self._master is None:
-            return
-        self.link.unlink(missing_ok=True)
-        os.close(self._master)
-        self._master = None
-
-    def _open_by_host(self) -> bool:
-        """Linux reports a hang-up on the master while no slave is open."""
-        return self._master is not None and not self._hangup.poll(0)
-
-    def read(self) -> bytes:
-        """What the host has written, b"" for nothing."""
-        if self._master is not None and self._open_by_host():
-            with contextlib.suppress(OSError):
-                return os.read(self._master, _READ_BYTES)
-        return b""
-
-    def write(self, data: bytes) -> bool:
-        """Send; False if it was lost, in whole or in part: nobody listens, or does not read."""
-        if self._master is None or not self._open_by_host():
-            return False
-        try:
-            return os.write(self._master, data) == len(data)
-        except OSError:
-            return False
 
 
 class SimulatedVehicle:
@@ -128,13 +67,18 @@ class SimulatedVehicle:
         can_imu: CanImuOptions = SIM_IMU,
         gnss_link: Path | None = None,
         rdss_link: Path | None = None,
+        gnss_raw: RawFormat | None = None,
     ) -> None:
-        imu_rng, gnss_rng, rdss_rng = random_streams(seed)
+        imu_rng, gnss_rng, rdss_rng, raw_rng = random_streams(seed)
         self.scenario = scenario
         self.truth = scenario.truth(duration_s)
         self.imu = scenario.imu_output(self.truth, imu_rng)
         self.gnss = GnssReceiver(self.truth, scenario.gnss, gnss_rng)
         self.terminal = RdssTerminal(self.truth, scenario.rdss, rdss_rng, 0)
+        self.raw: GnssRawStream | None = None
+        if gnss_raw is not None:
+            receiver = GnssRaw(self.truth, scenario.gnss_raw, raw_rng)
+            self.raw = GnssRawStream(receiver, gnss_raw)
         self._start_clock()
         self.counters: Counter[str] = Counter()
         self._encoder = CanImu(can_imu)
@@ -150,6 +94,7 @@ class SimulatedVehicle:
             self._lines["rdss"] = PtyLine(rdss_link)
         self._next_imu = 0
         self._next_gnss = 0
+        self._next_raw = 0
 
     def _start_clock(self) -> None:
         """Start at the next full tenth of a UTC second, where receivers have their epochs."""
@@ -157,6 +102,8 @@ class SimulatedVehicle:
         wait_ns = -utc_ns % 100_000_000
         self.start_ns = monotonic_ns + wait_ns
         self.utc_start_ns = self.terminal.utc_start_ns = utc_ns + wait_ns
+        if self.raw is not None:
+            self.raw.receiver.begin(*utc_ns_to_gps(self.utc_start_ns))
 
     # ------------------------------------------------------------------ truth
 
@@ -217,6 +164,8 @@ class SimulatedVehicle:
             due.append(float(self.truth.t_s[self._next_imu + 1]))
         if self._next_gnss < len(self.gnss):
             due.append(float(self.gnss.t_arrival_s[self._next_gnss]))
+        if self.raw is not None and self._next_raw < len(self.raw.receiver):
+            due.append(float(self.raw.receiver.t_arrival_s[self._next_raw]))
         return min(due)
 
     def _serve(self, t_s: float) -> None:
@@ -236,11 +185,23 @@ class SimulatedVehicle:
             self._next_gnss += 1
             if "gnss" in self._lines:
                 self._write("gnss", self.gnss.nmea(k, self.utc_start_ns))
+        if self.raw is not None:
+            self._serve_raw(self.raw, t_s)
         if "rdss" in self._lines:
             if data := self._lines["rdss"].read():
                 self.terminal.receive(data, t_s)
             if data := self.terminal.take(t_s):
                 self._write("rdss", data)
+
+    def _serve_raw(self, raw: GnssRawStream, t_s: float) -> None:
+        while self._next_raw < len(raw.receiver):
+            if raw.receiver.t_arrival_s[self._next_raw] > t_s:
+                break
+            data = raw.bytes_of(self._next_raw)
+            self._next_raw += 1
+            if "gnss" in self._lines:
+                sent = self._lines["gnss"].write(data)
+                self.counters[f"gnss_raw_{'sent' if sent else 'lost'}"] += 1
 
     def _send_sample(self, k: int) -> None:
         if self._bus is None:
@@ -272,6 +233,17 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--rest", type=float, help="s at rest before the drive; 60 by default")
     parser.add_argument("--can", default="socketcan:vcan0", help="INTERFACE:CHANNEL")
     parser.add_argument("--gnss-link", type=Path)
+    parser.add_argument(
+        "--gnss-raw", choices=("ubx", "rtcm3", "none"), default="none", help="on the GNSS line too"
+    )
+    parser.add_argument(
+        "--gnss-mask",
+        type=parse_mask,
+        action="append",
+        default=[],
+        metavar="KIND:START:LENGTH",
+        help="canyon, canyon2 to canyon4, tunnel; s; repeatable",
+    )
     parser.add_argument("--rdss-link", type=Path)
     parser.add_argument("--rdss-family", choices=("4.0", "2.1"), default="4.0")
     parser.add_argument("--service-frequency", type=int, default=10, help="of the RDSS card, s")
@@ -334,6 +306,7 @@ async def _main(args: argparse.Namespace) -> None:
         scenario = scenario.fitted(load_config(args.config))
     if args.rest is not None:
         scenario = replace(scenario, path=partial(drive, rest_s=args.rest))
+    scenario = scenario.masked(args.gnss_mask)
     rdss = replace(
         scenario.rdss,
         family=args.rdss_family,
@@ -350,6 +323,7 @@ async def _main(args: argparse.Namespace) -> None:
         can_imu=SIM_IMU.model_copy(update={"interface": interface, "channel": channel}),
         gnss_link=args.gnss_link,
         rdss_link=args.rdss_link,
+        gnss_raw=None if args.gnss_raw == "none" else args.gnss_raw,
     )
     if args.truth:
         write_truth(args.truth, vehicle.truth)

@@ -32,7 +32,7 @@ from fusiond.offline import process
 from fusiond.simulation.can_imu import SIM_IMU as SIM_IMU_OPTIONS
 from fusiond.simulation.can_imu import CanImu
 from fusiond.simulation.gnss_receiver import KNOT_M_S, latitude, longitude, sentence
-from fusiond.simulation.vehicle import PtyLine
+from fusiond.simulation.pty_line import PtyLine
 from tests.broker import Broker, listening
 from tests.hil.processes import REPOSITORY, SIM_IMU, DaemonProcess, Heard
 from tests.runs import metres

@@ -1,0 +1,73 @@
+"""A serial line of a simulated device: a pseudo terminal behind a symbolic link."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import tty
+from pathlib import Path
+
+_READ_BYTES = 4096
+
+
+class PtyLine:
+    """The device's end of a serial line: a pseudo terminal behind a symbolic link.
+
+    What is written while nobody has the line open is lost, as on a real line.
+    """
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self._master: int | None = None
+        self._hangup = select.poll()
+
+    def plug(self) -> None:
+        """Make the port appear. Raises OSError."""
+        if self._master is not None:
+            return
+        master, slave = os.openpty()
+        try:
+            tty.setraw(slave)
+            os.set_blocking(master, False)
+            path = os.ttyname(slave)
+            fresh = self.link.with_name(self.link.name + ".new")
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(path)
+            fresh.replace(self.link)
+        except OSError:
+            os.close(master)
+            raise
+        finally:
+            os.close(slave)
+        self._master = master
+        self._hangup = select.poll()
+        self._hangup.register(master, 0)
+
+    def unplug(self) -> None:
+        """Make the port vanish; whoever has it open sees a hang-up."""
+        if self._master is None:
+            return
+        self.link.unlink(missing_ok=True)
+        os.close(self._master)
+        self._master = None
+
+    def _open_by_host(self) -> bool:
+        """Linux reports a hang-up on the master while no slave is open."""
+        return self._master is not None and not self._hangup.poll(0)
+
+    def read(self) -> bytes:
+        """What the host has written, b"" for nothing."""
+        if self._master is not None and self._open_by_host():
+            with contextlib.suppress(OSError):
+                return os.read(self._master, _READ_BYTES)
+        return b""
+
+    def write(self, data: bytes) -> bool:
+        """Send; False if it was lost, in whole or in part: nobody listens, or does not read."""
+        if self._master is None or not self._open_by_host():
+            return False
+        try:
+            return os.write(self._master, data) == len(data)
+        except OSError:
+            return False
