@@ -92,4 +92,4 @@ def _power(sd: float | None, unit: float) -> int:
     """The least n with unit * 2^n >= sd, 0 to 15; 15 for what is not stated."""
     if sd is None:
         return 15
-    return min(15, max(0, math.ceil(math.log2(sd / unit))))
+    return min(15, math.ceil(math.log2(sd / unit))) if sd > unit else 0
