@@ -190,9 +190,11 @@ class RtcmDecoder:
     def _observe(
         self, system: System, kind: int, message: Any, t_seen_ns: int, found: list[RawEvent]
     ) -> None:
-        tow_s = getattr(message, _EPOCH_FIELD[system]) * 1e-3
+        # Whole ms until the end: the same instant from BDT and from GPS time has to compare equal.
+        tow_ms = int(getattr(message, _EPOCH_FIELD[system]))
         if system == "C":
-            tow_s = (tow_s + BDT_BEHIND_GPS_S) % WEEK_S
+            tow_ms = (tow_ms + BDT_BEHIND_GPS_S * 1000) % (WEEK_S * 1000)
+        tow_s = tow_ms * 1e-3
         if not 0.0 <= tow_s < WEEK_S:
             self._counters["rtcm_unreadable"] += 1
             return
