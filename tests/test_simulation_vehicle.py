@@ -18,11 +18,18 @@ import pytest
 import serial
 
 from drivers.can_signals import CanImuDecoder
-from drivers.measurements import DeviceStamp, ImuSample
+from drivers.measurements import DeviceStamp, ImuSample, UtcStamp
+from drivers.raw.decoder import RawDecoder
+from drivers.raw.messages import RawGnssEpoch
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.messages import Fix, Identity, IdentityRequest, PositionRequest
 from fusiond.files import read_truth
+from fusiond.gnss.ecef import to_ecef
+from fusiond.gnss.ranges import RangeModel
+from fusiond.gnss.single_point import SinglePoint, single_point
+from fusiond.gnss.store import EphemerisStore
 from fusiond.simulation.can_imu import SIM_IMU
+from fusiond.simulation.gnss_raw_stream import RawFormat
 from fusiond.simulation.pty_line import PtyLine
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -134,6 +141,56 @@ async def test_all_devices_speak_in_real_time(vehicle: SimulatedVehicle, tmp_pat
         assert vehicle.counters["imu_frames"] == before
         vehicle.plug("imu")
         await _until(lambda: vehicle.counters["imu_frames"] > before)
+
+
+@pytest.mark.parametrize("raw_format", ["ubx", "rtcm3"])
+async def test_raw_gnss_beside_nmea_gives_the_true_position(
+    tmp_path: Path, raw_format: RawFormat
+) -> None:
+    """What comes out of the port, through splitter and decoder, solved as a single point."""
+    made = SimulatedVehicle(
+        SCENARIOS["drive"],
+        seed=3,
+        duration_s=30.0,
+        can_imu=SIM_IMU.model_copy(update={"channel": f"test-{tmp_path.name}"}),
+        gnss_link=tmp_path / "gnss",
+        gnss_raw=raw_format,
+    )
+    decoder = RawDecoder("gnss")
+    decoder.note_utc(made.utc_start_ns)
+    store = EphemerisStore()
+    epochs: list[RawGnssEpoch] = []
+    task = asyncio.create_task(made.run())
+    try:
+        # The port is opened late: the messages have to wait for it.
+        await _until(lambda: made.counters["gnss_raw_lost"] >= 2)
+        with serial.Serial(str(tmp_path / "gnss"), 115200, timeout=0) as port:
+
+            def take() -> bool:
+                for event in decoder.feed(port.read(65536), time.monotonic_ns()):
+                    if isinstance(event, RawGnssEpoch):
+                        epochs.append(event)
+                    else:
+                        store.add(event)
+                return len(epochs) >= 10 and decoder.counters["sentences"] >= 10
+
+            await _until(take)
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+    assert len(store) >= 12
+    solved = single_point(RangeModel(store), epochs[-1])
+    assert isinstance(solved, SinglePoint)
+    stamp = epochs[-1].stamp
+    assert isinstance(stamp, UtcStamp)
+    t_ns = made.start_ns + stamp.utc_ns - made.utc_start_ns
+    assert abs(t_ns - time.monotonic_ns()) < 20e9
+    lat, lon, height = (float(x) for x in made.truth_at(t_ns).position[0])
+    # Ionosphere of whatever time of day it is: 20 m of zenith delay are half modelled.
+    assert np.linalg.norm(solved.position - np.array(to_ecef(lat, lon, height))) < 25.0
+    assert solved.velocity is not None
+    assert np.linalg.norm(solved.velocity) < 0.5  # it stands still for the first minute
 
 
 async def test_truth_on_the_monotonic_clock(vehicle: SimulatedVehicle) -> None:

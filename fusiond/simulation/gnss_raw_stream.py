@@ -9,7 +9,8 @@ What is sent with an epoch:
                     page of subframe 1 every 3 s. BeiDou's frames begin 14 s after full half minutes
     RTCM 3          1019 or 1042 of every satellite in view, every 30 s
     at the start    after the first epoch with a satellite, the whole message of all in view, as a
-                    receiver sends that had them before the line was opened; `warm` off: not
+                    receiver sends that had them before the line was opened; `warm` off: not.
+                    Epochs that nobody read (`repeat`) put this off
 
 A satellite that comes into view later is complete after 30 s at most, or 18 s of its message.
 """
@@ -47,7 +48,7 @@ class GnssRawStream:
         self.counters: Counter[str] = Counter()
         self._send: Callable[[int, RawGnssEpoch], bytes]
         self._send = self._ubx if raw_format == "ubx" else self._rtcm3
-        self._warm = warm
+        self._warm = self._is_warm = warm
         self._locked_s: dict[tuple[str, str], float] = {}
         self._before_s = 0.0
         self._frames: dict[str, tuple[int, int, tuple[tuple[int, ...], ...]]] = {}
@@ -61,6 +62,10 @@ class GnssRawStream:
         data = self._send(k, epoch)
         self._before_s = float(self.receiver.t_s[k])
         return data
+
+    def repeat(self) -> None:
+        """What was sent was lost: all messages in view are due at once again, if they ever were."""
+        self._warm = self._is_warm
 
     def _locks_ms(self, k: int, signals: tuple[RawSignal, ...]) -> list[int]:
         """For how long each signal has been tracked; one that was away starts anew."""

@@ -202,6 +202,8 @@ class SimulatedVehicle:
             if "gnss" in self._lines:
                 sent = self._lines["gnss"].write(data)
                 self.counters[f"gnss_raw_{'sent' if sent else 'lost'}"] += 1
+                if not sent:
+                    raw.repeat()
 
     def _send_sample(self, k: int) -> None:
         if self._bus is None:
