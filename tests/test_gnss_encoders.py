@@ -20,6 +20,7 @@ from drivers.raw.messages import (
     RawGnssEpoch,
     RawSignal,
 )
+from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.gnss.orbit import gps_time, is_beidou_geo
 from fusiond.simulation import rtcm3_encode, ubx_encode
 from fusiond.simulation.gnss_raw import GnssRaw, GnssRawOptions
@@ -281,3 +282,43 @@ def test_a_stream_comes_back(raw_format: RawFormat, start: tuple[int, float]) ->
         assert math.isclose(got_first[name].mean_anomaly, e.mean_anomaly, rel_tol=1e-12)
     bad = {"parity_bad", "ephemeris_mixed", "ephemeris_implausible", "rtcm_unreadable"}
     assert not bad & {name for name, n in decoder.counters.items() if n}
+
+
+def test_rtklib_finds_the_true_position_in_our_stream() -> None:
+    """Simulator, messages and observations at once, with nothing of ours on the other side."""
+    truth = SCENARIOS["drive"].truth(60.0)
+    receiver = GnssRaw(
+        truth, GnssRawOptions(rate_hz=1.0), np.random.default_rng(1), (2400, 40000.0)
+    )
+    stream = GnssRawStream(receiver, "ubx")
+    data = b"".join(stream.bytes_of(k) for k in range(len(receiver)))
+    raw = rtk.raw_t()
+    assert rtk.init_raw(raw, rtk.STRFMT_UBX)
+    options = rtk.prcopt_default
+    options.mode, options.navsys = rtk.PMODE_SINGLE, rtk.SYS_GPS | rtk.SYS_CMP
+    options.ionoopt, options.tropopt = rtk.IONOOPT_BRDC, rtk.TROPOPT_SAAS
+    k, errors, drifts = -1, [], []
+    for byte in data:
+        if rtk.input_ubx(raw, byte) != 1:
+            continue
+        k += 1
+        solution, angles = rtk.sol_t(), rtk.Arr1Ddouble(2 * rtk.MAXOBS)
+        status = rtk.Arr1Dssat_t(rtk.MAXSAT).ptr
+        found = rtk.pntpos(
+            raw.obs.data.ptr, raw.obs.n, raw.nav, options, solution, angles, status,
+            rtk.Arr1Dchar(128),
+        )  # fmt: skip
+        if not found:  # the first epoch: its ephemerides come after it
+            assert k == 0
+            continue
+        lat, lon, height = (float(x) for x in truth.at(receiver.t_s[k : k + 1]).position[0])
+        off = np.array([solution.rr[i] for i in range(3)]) - np.array(to_ecef(lat, lon, height))
+        errors.append(ned_axes(lat, lon).T @ off)
+        drifts.append([solution.rr[i] for i in range(3, 6)])
+    assert k == len(receiver) - 1
+    # Evening: the broadcast models leave a metre or two, mostly in height.
+    mean = np.abs(np.mean(errors, axis=0))
+    assert mean[:2].max() < 1.0
+    assert mean[2] < 4.0
+    assert np.std(errors, axis=0).max() < 1.0
+    assert np.abs(np.mean(drifts, axis=0)).max() < 0.03
