@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fusiond.config import Config, Imu
-from fusiond.config_aiding import GnssAiding, RdssAiding, SarAiding
+from fusiond.config_aiding import GnssAiding, RawAiding, RdssAiding, SarAiding
 from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
 from fusiond.simulation.gnss_masks import Mask
 from fusiond.simulation.gnss_raw import GnssRawOptions
@@ -77,6 +77,7 @@ class Scenario:
             match aiding:
                 case GnssAiding():
                     gnss = replace(gnss, lever_arm_m=aiding.lever_arm_m)
+                case RawAiding():
                     raw = replace(raw, lever_arm_m=aiding.lever_arm_m)
                 case RdssAiding():
                     rdss = replace(rdss, lever_arm_m=aiding.lever_arm_m)
