@@ -60,14 +60,21 @@ def moved(model: Model, seconds: float = 4.0) -> KalmanEstimator:
     return estimator
 
 
-def test_a_wide_covariance_holds_the_same_numbers_as_a_narrow_one() -> None:
+@pytest.mark.parametrize(
+    ("name", "more", "widths"),
+    [("ins15", 2, (20, 24)), ("ins17", 4, (20, 32)), ("ins21", 3, (24, 32))],
+)
+def test_a_wide_covariance_holds_the_same_numbers_as_a_narrow_one(
+    name: str, more: int, widths: tuple[int, int]
+) -> None:
     noise = imu_noise(IMU)
-    narrow = moved(make_model("ins21", noise))
-    model = make_model("ins21", noise, *(misalignment(f"m{k}", 1e-3) for k in range(3)))
+    narrow = moved(make_model(name, noise))
+    model = make_model(name, noise, *(misalignment(f"m{k}", 1e-3) for k in range(more)))
     wide = moved(model)
-    assert (narrow.model.width, model.width) == (24, 32)
+    n = narrow.model.size
+    assert (narrow.model.width, model.width) == widths
     np.testing.assert_allclose(wide.nav, narrow.nav, rtol=0, atol=0)
-    np.testing.assert_allclose(wide.covariance[:21, :21], narrow.covariance, rtol=1e-12)
+    np.testing.assert_allclose(wide.covariance[:n, :n], narrow.covariance, rtol=1e-12)
 
 
 def test_clock_offset_is_the_integral_of_its_drift() -> None:

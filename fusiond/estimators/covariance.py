@@ -63,8 +63,10 @@ def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
 
 # By name, not as variables of a closure: a kernel that closes over a kernel is never found in
 # numba's cache again. The branch on a closure's constant is gone when the code is compiled.
-_gather_core, _gather_narrow, _gather_wide = (_gather_for(w) for w in (CORE_STRIDE, *WIDTHS))
-_apply_narrow, _apply_wide = (apply_for(w) for w in WIDTHS)
+_gather_core, _gather_narrow, _gather_middle, _gather_wide = (
+    _gather_for(w) for w in (CORE_STRIDE, *WIDTHS)
+)
+_apply_narrow, _apply_middle, _apply_wide = (apply_for(w) for w in WIDTHS)
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[::1])", forceinline=True)
@@ -81,7 +83,7 @@ def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
 @cache
 def covariance_for(width: int) -> Callable[..., None]:
     """`propagate_covariance` for matrices of `width` rows."""
-    size, narrow = work_size(width), width == WIDTHS[0]
+    size, rank = work_size(width), WIDTHS.index(width)
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8,"
@@ -119,9 +121,12 @@ def covariance_for(width: int) -> Callable[..., None]:
         for i in range(CORE_SIZE):
             flat[i * width + i] += half * white[i]
 
-        if narrow:
+        if rank == 0:
             _gather_narrow(flat, sensor_slot, weight, sensor)
             _apply_narrow(flat, sensor, c, top)
+        elif rank == 1:
+            _gather_middle(flat, sensor_slot, weight, sensor)
+            _apply_middle(flat, sensor, c, top)
         else:
             _gather_wide(flat, sensor_slot, weight, sensor)
             _apply_wide(flat, sensor, c, top)
@@ -172,7 +177,7 @@ def covariance_for(width: int) -> Callable[..., None]:
 @cache
 def transition_for(width: int) -> Callable[..., None]:
     """`propagate_transition` for matrices of `width` rows."""
-    size, narrow = work_size(width), width == WIDTHS[0]
+    size, rank = work_size(width), WIDTHS.index(width)
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
@@ -195,9 +200,12 @@ def transition_for(width: int) -> Callable[..., None]:
         weight = work[size - 12 :]
         _weights(step, sensor_terms, weight)
         sensor, top = work[: 6 * width], work[6 * width : 15 * width]
-        if narrow:
+        if rank == 0:
             _gather_narrow(flat, sensor_terms[0], weight, sensor)
             _apply_narrow(flat, sensor, c, top)
+        elif rank == 1:
+            _gather_middle(flat, sensor_terms[0], weight, sensor)
+            _apply_middle(flat, sensor, c, top)
         else:
             _gather_wide(flat, sensor_terms[0], weight, sensor)
             _apply_wide(flat, sensor, c, top)

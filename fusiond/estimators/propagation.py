@@ -105,14 +105,14 @@ def widen_for_gap(cov: Array, active: NDArray[np.bool_], whole: float, h: float)
             cov[r, r] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
 
 
-_covariance_narrow, _covariance_wide = (covariance_for(w) for w in WIDTHS)
-_transition_narrow, _transition_wide = (transition_for(w) for w in WIDTHS)
+_covariance_narrow, _covariance_middle, _covariance_wide = (covariance_for(w) for w in WIDTHS)
+_transition_narrow, _transition_middle, _transition_wide = (transition_for(w) for w in WIDTHS)
 
 
 @cache
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
-    narrow = width == WIDTHS[0]
+    rank = WIDTHS.index(width)
 
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1],"
@@ -189,14 +189,18 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 coefficients(nav, step, h, c)
                 for k in range(covs.shape[0]):
                     arguments = (active, sensor_terms, rate_terms, noise, 1.0 / shares[k], work)
-                    if narrow:
+                    if rank == 0:
                         _covariance_narrow(covs[k], step, c, h, *arguments)
+                    elif rank == 1:
+                        _covariance_middle(covs[k], step, c, h, *arguments)
                     else:
                         _covariance_wide(covs[k], step, c, h, *arguments)
                 if phi.shape[0]:
                     terms = (active, sensor_terms, rate_terms, noise, work)
-                    if narrow:
+                    if rank == 0:
                         _transition_narrow(phi, step, c, h, *terms)
+                    elif rank == 1:
+                        _transition_middle(phi, step, c, h, *terms)
                     else:
                         _transition_wide(phi, step, c, h, *terms)
                 if carry:

@@ -52,9 +52,10 @@ PHI, DV, DR, CORE_SIZE = 0, 3, 6, 9
 RATE_ERROR, FORCE_ERROR, RATE_SCALE, FORCE_SCALE, COLUMN_END = 9, 12, 15, 18, 21
 
 COEFFICIENTS = 58
-# Row widths of the arrays that `apply` works on: whole vectors of 8 doubles. A covariance has rows
-# of the first of WIDTHS that holds its states; CORE_STRIDE holds the nine navigation errors.
-WIDTHS = (24, 32)
+# Row widths of the arrays that `apply` works on: whole vectors of 4 or 8 doubles. A covariance has
+# rows of the first of WIDTHS that holds its states (the models of 15 and 17, of 21 and 23, and
+# those with more); CORE_STRIDE holds the nine navigation errors.
+WIDTHS = (20, 24, 32)
 CORE_STRIDE = 16
 
 
