@@ -42,7 +42,7 @@ def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: A
                 for j in range(n):
                     u[a, j] += c * cov[i, j]
     for a in range(m):
-        for b in range(m):
+        for b in range(a + 1):
             total = 0.0
             for j in range(n):
                 total += u[a, j] * h[b, j]
