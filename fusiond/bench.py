@@ -41,6 +41,7 @@ from fusiond.offline import process
 from fusiond.settings import imu_noise
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
+from fusiond.studies import reduced_cost
 from fusiond.timeline import Timeline
 
 Array = NDArray[np.float64]
@@ -74,6 +75,9 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
 
     As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
     multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity).
+
+    Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
+    (`fusiond.studies.reduced_cost`).
     """
     product = _product()
     figures: dict[str, Any] = {}
@@ -103,6 +107,7 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
         make = _process(Path(folder), process_s)
         figures["process_epoch_ratio"] = ratio(make, max(2, repetitions // 3))
+    figures["reduced_order_step_ratio"] = reduced_cost.step_ratio(repetitions)
     return {
         "numpy_product_us": round(statistics.median(products) * 1e6, 3),
         **{name: round(value, 4) for name, value in figures.items()},

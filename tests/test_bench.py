@@ -13,6 +13,7 @@ FIGURES = (
     "rewind_2s_ratio",
     "multiscale_step_ratio",
     "process_epoch_ratio",
+    "reduced_order_step_ratio",
 )
 
 

@@ -164,7 +164,7 @@ def observability(epochs: Iterable[Epoch], sigma: Array) -> Observability:
         if len(r) == 0:
             continue
         block = (h @ theta) * sigma / np.sqrt(r)[:, None]
-        factor = np.linalg.qr(np.vstack([factor, block]), mode="r")
+        factor = np.asarray(np.linalg.qr(np.vstack([factor, block]), mode="r"))
         rows += len(r)
     return Observability(factor, sigma.copy(), theta, rows)
 

@@ -13,4 +13,5 @@ STUDIES = {
     "rdss-map": "fusiond.studies.rdss_map",
     "multiscale": "fusiond.studies.multiscale",
     "consistency": "fusiond.studies.consistency",
+    "reduced-order": "fusiond.studies.reduced_order",
 }
