@@ -73,9 +73,11 @@ class RawAiding(Aiding):
     best_four: bool = False
     """Use the four satellites of smallest GDOP alone (paper 002), not all in view."""
     bias_sd_m: NonNegativeFloat = 1.5
-    """Displacement that the ranges share for minutes (multipath, orbits), one sigma an axis; 0:
-    none is estimated, and sigma shrinks as if errors were white."""
-    bias_correlation_s: PositiveFloat = 120.0
+    """Displacement that the ranges share for minutes (orbits, multipath), one sigma north and
+    east; 0: none is estimated, and sigma shrinks as if errors were white."""
+    bias_down_sd_m: PositiveFloat = 5.0
+    """The same downwards, where what the ionosphere's model leaves goes."""
+    bias_correlation_s: PositiveFloat = 1800.0
     """Correlation time of that displacement."""
     clock_phase_m_sqrt_s: PositiveFloat = 0.1
     """Random walk of the receiver clock's offset; a temperature-compensated crystal's."""

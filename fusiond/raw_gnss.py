@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch, System
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import IONOSPHERE, RANGE_BIAS, PseudorangeAid
+from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config_aiding import RawAiding
 from fusiond.estimators.base import Outcome
@@ -34,8 +34,6 @@ Array = NDArray[np.float64]
 
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """What screening calls a row in `health`; everything else is `gated`."""
-# The ionosphere that is left over changes with the hour (Klobuchar's model is refitted daily).
-IONOSPHERE_TAU_S = 1800.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +52,11 @@ def raw_blocks(section: RawAiding) -> list[Block]:
     share."""
     blocks = clock_blocks(section.systems, clock_noise(section))
     if section.bias_sd_m > 0.0:
-        sd, tau_s = section.bias_sd_m, section.bias_correlation_s
-        axes = ("n", "e", "d")
-        blocks.append(Block(RANGE_BIAS, "m", axes, (-1, -1, -1), sd, tau_s=tau_s, steady=sd))
-    blocks.append(
-        Block(IONOSPHERE, "1", ("share",), (-1,), 1.0, tau_s=IONOSPHERE_TAU_S, steady=1.0)
-    )
+        tau_s = section.bias_correlation_s
+        sds = (section.bias_sd_m, section.bias_down_sd_m)
+        for name, axes, sd in zip(RANGE_BIAS, (("n", "e"), ("d",)), sds, strict=True):
+            columns = (-1,) * len(axes)
+            blocks.append(Block(name, "m", axes, columns, sd, tau_s=tau_s, steady=sd))
     return blocks
 
 
@@ -119,11 +116,10 @@ class RawGnss:
             rows.velocity,
             rows.pseudorange_m,
             rows.rate_m_s,
-            rows.variance * scale,
+            (rows.variance + rows.ionosphere_sigma_m**2) * scale,
             rows.rate_variance * scale,
             np.array([self._clock[SYSTEMS[s]] for s in rows.system], dtype=np.int64),
             self._section.lever_arm_m,
-            rows.ionosphere_sigma_m,
             epoch.clock_reset,
         )
 

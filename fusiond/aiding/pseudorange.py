@@ -10,13 +10,11 @@ and drift as a range:
              + (g + turn) . dr + v
     g = -(I - u u^T)(s' - v - b) / |s - p - a|
 
-Two errors that many ranges share may be states of the model (blocks `RANGE_BIAS`, `IONOSPHERE`): a
-displacement t of the antenna, slowly changing, that stands for multipath and orbit errors that last
-for minutes, and the ionosphere that is left, n times each range's own `ionosphere`:
+An error that all ranges share for many minutes may be a state of the model (blocks of
+`RANGE_BIAS`): a displacement t of the antenna that stands for orbit errors, multipath and,
+downwards, the ionosphere that is left:
 
-    rho^ = |s - p^ - a - t^| + c_k^ + i n^,    z_rho += u . dt - i dn
-
-with dt and dn true minus estimated.
+    rho^ = |s - p^ - a - t^| + c_k^,    z_rho += u . dt    (dt true minus estimated)
 
 `turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
 transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
@@ -52,7 +50,8 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, STEP_RATE_B, VN
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-RANGE_BIAS, IONOSPHERE = "range_bias", "ionosphere"
+RANGE_BIAS = ("range_bias", "range_bias_down")
+"""Blocks of the displacement: north and east, down."""
 NO_CLOCK = -1
 """In place of a clock offset: the range knows no receiver clock."""
 
@@ -167,8 +166,7 @@ class PseudorangeAid(Aid):
     `ranges` (m), `rates` (m/s; positive: going away), their variances (m^2, (m/s)^2), each (n,);
     NaN is not measured. `clock` (n,): which of the states of the model's block `clock_offset` each
     range has, or NO_CLOCK; a rate of a satellite with NO_CLOCK has no drift either. `lever` (m,
-    body axes) of the antenna. `ionosphere` (n,): one sigma (m) of what the ionosphere leaves in
-    each range, common to all but for this factor. `clock_reset`: the receiver has set its clock.
+    body axes) of the antenna. `clock_reset`: the receiver has set its clock.
     Rows: the finite ranges in order, then the finite rates (`labels`).
 
     ValueError for shapes that do not fit, a variance that is not positive where there is a value,
@@ -186,7 +184,6 @@ class PseudorangeAid(Aid):
     rate_variance: Array
     clock: Indices
     lever: Vector3 = (0.0, 0.0, 0.0)
-    ionosphere: Array | None = None
     clock_reset: bool = False
     _r: Array = field(init=False, repr=False)
 
@@ -196,8 +193,6 @@ class PseudorangeAid(Aid):
             _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), shape)
         for name in ("rates", "range_variance", "rate_variance"):
             _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), (n,))
-        if self.ionosphere is not None:
-            _keep(self, "ionosphere", np.ascontiguousarray(self.ionosphere, dtype=float), (n,))
         _keep(self, "clock", np.ascontiguousarray(self.clock, dtype=np.int64), (n,))
         rates = np.isfinite(self.rates)
         r = np.concatenate(
@@ -235,7 +230,6 @@ class PseudorangeAid(Aid):
             self.rate_variance[mask],
             self.clock[mask],
             self.lever,
-            None if self.ionosphere is None else self.ionosphere[mask],
             self.clock_reset,
         )
 
@@ -271,22 +265,15 @@ class PseudorangeAid(Aid):
         return Innovation(z, h, self._r)
 
     def _shared(self, state: State, z: Array, h: Array) -> None:
-        """Errors that the ranges share, where the model has states for them."""
-        model, xi = state.model, state.xi
-        bias = model.slots_of(RANGE_BIAS)
-        ionosphere = model.slots_of(IONOSPHERE) if self.ionosphere is not None else []
-        if not (bias or ionosphere):
+        """The displacement that the ranges share, where the model has states for it."""
+        model = state.model
+        slots = [slot for block in RANGE_BIAS for slot in model.slots_of(block)]
+        if len(slots) != 3:
             return
-        measured = np.isfinite(self.ranges)
-        count = int(measured.sum())
-        if bias:
-            toward = -h[:count, 6:9]
-            h[:count, bias] = toward
-            z[:count] -= toward @ xi[bias]
-        if ionosphere and self.ionosphere is not None:
-            sigma = self.ionosphere[measured]
-            h[:count, ionosphere[0]] = -sigma
-            z[:count] += sigma * xi[ionosphere[0]]
+        count = int(np.isfinite(self.ranges).sum())
+        toward = -h[:count, 6:9]
+        h[:count, slots] = toward
+        z[:count] -= toward @ state.xi[slots]
 
 
 def _keep(
