@@ -142,6 +142,33 @@ def test_simulate_writes_what_the_readers_read(tmp_path: Path) -> None:
     assert fusiond("simulate", "boat", "--out", tmp_path).returncode == 2
 
 
+@pytest.mark.parametrize("raw_format", ["ubx", "rtcm3"])
+def test_a_simulated_raw_stream_is_processed(tmp_path: Path, raw_format: str) -> None:
+    """Tightly coupled from the bytes of the simulated receiver, through 20 s with three satellites,
+    without any other aid."""
+    done = fusiond(
+        *("simulate", "drive", "--out", tmp_path, "--seed", "2", "--duration", "150"),
+        *("--gnss-raw", raw_format, "--gnss-mask", "canyon3:110:20"),
+    )
+    assert done.returncode == 0, done.stderr
+    config = tmp_path / "vehicle.toml"
+    config.write_text(
+        'vehicle = "simulated"\n[imu]\naxes = ["+x", "-y", "-z"]\n'
+        "[aiding.raw]\nlever_arm_m = [0.0, 0.0, -1.0]\n"
+    )
+    out, raw = tmp_path / "nav.csv", tmp_path / f"gnss.{raw_format}"
+    done = fusiond(
+        "process", config, "--imu", tmp_path / "imu.csv", "--aid", f"raw={raw}", "--out", out
+    )
+    assert done.returncode == 0, done.stderr
+    judged = fusiond("compare", out, tmp_path / "truth.csv", "--after", "20", "--json", "-")
+    report = json.loads(judged.stdout)
+    assert report["horizontal_rms_m"] < 2.0
+    bad = fusiond("simulate", "drive", "--out", tmp_path, "--gnss-mask", "cave:1:2")
+    assert bad.returncode == 2
+    assert "no mask 'cave'" in bad.stderr
+
+
 def test_process_names_what_it_rejected(tmp_path: Path) -> None:
     assert fusiond("simulate", "static", "--out", tmp_path, "--duration", "20").returncode == 0
     imu, gnss = tmp_path / "imu.csv", tmp_path / "gnss.csv"
