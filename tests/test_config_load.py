@@ -10,6 +10,7 @@ from fusiond.config_aiding import GnssAiding, RdssAiding
 from fusiond.load_config import ConfigError, config_digest, driver_entry_points, load_config
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "config").glob("*.toml"))
+EXAMPLES_BY_NAME = {path.name: path for path in EXAMPLES}
 
 
 def write(folder: Path, text: str) -> Path:
@@ -90,12 +91,12 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             '[aiding.roof]\nkind = "gns"',
             "aiding.roof.kind = \"gns\": did you mean 'gnss'? "
-            "allowed: attitude, gnss, heading, height, rdss, sar, star_tracker, wheel",
+            "allowed: attitude, gnss, heading, height, raw, rdss, sar, star_tracker, wheel",
         ),
         (
             "[aiding.roof]",
             "aiding.roof: lacks the key kind; "
-            "allowed: gnss, rdss, attitude, star_tracker, sar, heading, height, wheel",
+            "allowed: gnss, raw, rdss, attitude, star_tracker, sar, heading, height, wheel",
         ),
         ("[sources.rx]", "sources.rx.driver: missing; expected text in quotes"),
         (
@@ -172,7 +173,7 @@ def test_every_mistake_is_listed(tmp_path: Path) -> None:
 
 
 def test_a_signal_that_the_dbc_lacks(tmp_path: Path) -> None:
-    text = EXAMPLES[-1].read_text(encoding="utf-8")
+    text = EXAMPLES_BY_NAME["vehicle.toml"].read_text(encoding="utf-8")
     assert "RATE_OF_TURN.GYRO_X" in text
     (line,) = mistakes(tmp_path, text.replace("RATE_OF_TURN.GYRO_X", "RATE_OF_TURN.GYRO_W"))
     assert line.startswith("sources.imu: ")
