@@ -172,8 +172,34 @@ class Multiscale(Section):
     """Any orthonormal wavelet, by its PyWavelets name."""
 
 
+class Federated(Section):
+    """The federated filter, where `filter = "federated"`; see `docs/estimators.md`."""
+
+    sources: tuple[str, ...] = ()
+    """Which `[aiding.NAME]` have a local filter; empty: all of them."""
+    mode: Literal["no_reset", "fusion_reset", "zero_reset", "rescale"] = "no_reset"
+    """What becomes of the local filters after a fusion; only `no_reset` keeps a fault in its own
+    filter."""
+    sharing: Literal["fixed", "adaptive"] = "fixed"
+    """Whether the sharing factors stay or follow the local covariances."""
+    shares: dict[str, PositiveFloat] = Field(default_factory=dict)
+    """Relative factors by local filter, brought to a sum of 1; empty: all equal."""
+    master_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Of the process noise, for the master's own estimate in `rescale`."""
+    retained: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Of its information, what an updated local filter keeps in `rescale`."""
+    fault_detection: bool = True
+    """Whether a local filter that fails its tests is left out."""
+    false_alarm_probability: Probability = 1e-6
+    """Of one innovation or difference test."""
+    window: Annotated[int, Field(ge=2, le=100)] = 10
+    """Innovations judged together."""
+    readmit_after: PositiveInt = 20
+    """Innovations in a row that must fit the master before a source is taken back."""
+
+
 class Estimator(Section):
-    filter: Literal["kalman", "multiscale"] = "kalman"
+    filter: Literal["kalman", "federated", "multiscale"] = "kalman"
     """Which estimator; see `docs/estimators.md`."""
     model: Literal["ins15", "ins21", "ins17", "ins23", "planar10", "planar15"] = "ins21"
     """Error state; see `docs/navigation.md`."""
@@ -185,6 +211,8 @@ class Estimator(Section):
     """Without a fused position for longer the mode is `coasting`."""
     invalid_sd_m: PositiveFloat = 5000.0
     """Horizontal sigma beyond which the mode is `invalid`."""
+    federated: Federated = Federated()
+    """The section of that name below."""
     multiscale: Multiscale = Multiscale()
 
 
@@ -286,4 +314,19 @@ class Config(Section):
         raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
         if len(raw) > 1:
             raise ValueError(f"{' and '.join(raw)}: one receiver's raw data at most, one clock")
+        return self
+
+    @model_validator(mode="after")
+    def _local_filters_exist(self) -> Config:
+        if self.estimator.filter != "federated":
+            return self
+        federated = self.estimator.federated
+        names = federated.sources or tuple(self.aiding)
+        if not names:
+            raise ValueError("estimator.filter 'federated' needs a section [aiding.NAME] a source")
+        unknown = [name for name in names if name not in self.aiding]
+        if unknown:
+            raise ValueError(f"estimator.federated.sources: no [aiding.{unknown[0]}]")
+        if federated.shares and set(federated.shares) != set(names):
+            raise ValueError("estimator.federated.shares must name every local filter, no other")
         return self

@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from fusiond.config import Config
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.federated import FederatedFilter
+from fusiond.estimators.federated_options import FederatedOptions
+from fusiond.estimators.federated_reset import ResetFilter
+from fusiond.estimators.federated_standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Block, Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
@@ -27,3 +31,30 @@ def estimator_of(config: Config, model: Model) -> Estimator:
         case "multiscale":
             m = config.estimator.multiscale
             return MultiscaleEstimator(model, config.imu.gap_s, m.scales, m.wavelet)
+        case "federated":
+            return _federated(config, model)
+
+
+def federated(
+    model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
+) -> FederatedFilter:
+    """The federated filter of a mode."""
+    resets = options.mode in ("fusion_reset", "zero_reset")
+    return (ResetFilter if resets else StandingFilter)(model, gap_s, names, options)
+
+
+def _federated(config: Config, model: Model) -> FederatedFilter:
+    o = config.estimator.federated
+    names = o.sources or tuple(config.aiding)
+    options = FederatedOptions(
+        mode=o.mode,
+        shares=tuple(o.shares[name] for name in names) if o.shares else (),
+        adaptive=o.sharing == "adaptive",
+        master_share=o.master_share,
+        retained=o.retained,
+        fault_detection=o.fault_detection,
+        false_alarm=o.false_alarm_probability,
+        window=o.window,
+        readmit_after=o.readmit_after,
+    )
+    return federated(model, config.imu.gap_s, names, options)

@@ -35,47 +35,51 @@ FIRST_ADDITION = 1e-13
 
 @compiled("b1(f8[:, ::1])")
 def cholesky(a: Array) -> bool:
-    """a (n, n) <- its lower factor, in place, upper part untouched; False if there is none."""
+    """a (n, n) <- U with a = U^T U, in place from its upper part, lower part untouched; False if
+    there is none."""
     n = a.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            value = a[i, j]
-            for k in range(j):
-                value -= a[i, k] * a[j, k]
-            if i == j:
-                if not value > 0.0:
-                    return False
-                a[i, i] = math.sqrt(value)
-            else:
-                a[i, j] = value / a[j, j]
+    for k in range(n):
+        if not a[k, k] > 0.0:
+            return False
+        pivot = math.sqrt(a[k, k])
+        for j in range(k, n):
+            a[k, j] /= pivot
+        for i in range(k + 1, n):
+            c = a[k, i]
+            for j in range(i, n):
+                a[i, j] -= c * a[k, j]
     return True
 
 
 @compiled("void(f8[:, ::1], f8[:, ::1])")
-def inverse_of_factor(lower: Array, out: Array) -> None:
-    """out (n, n) <- (L L^T)^-1; the upper part of `lower` is overwritten."""
-    n = lower.shape[0]
-    # The columns of L^-1, as rows of the upper part; its diagonal apart.
-    for j in range(n):
-        for i in range(j + 1, n):
-            value = -lower[i, j] / lower[j, j]
-            for k in range(j + 1, i):
-                value -= lower[i, k] * lower[j, k]
-            lower[j, i] = value / lower[i, i]
+def inverse_of_factor(upper: Array, out: Array) -> None:
+    """out (n, n) <- (U^T U)^-1, from the rows of U^-T."""
+    n = upper.shape[0]
+    rows = np.zeros((n, n))
     for i in range(n):
+        rows[i, i] = 1.0
+        for k in range(i):
+            c = upper[k, i]
+            for j in range(k + 1):
+                rows[i, j] -= c * rows[k, j]
+        c = upper[i, i]
         for j in range(i + 1):
-            # sum over k >= i of (L^-1)[k, i] (L^-1)[k, j]
-            value = lower[j, i] / lower[i, i] if j < i else 1.0 / (lower[i, i] * lower[i, i])
-            for k in range(i + 1, n):
-                value += lower[i, k] * lower[j, k]
-            out[i, j] = value
-            out[j, i] = value
+            rows[i, j] /= c
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 0.0
+    for k in range(n):
+        for i in range(k + 1):
+            c = rows[k, i]
+            for j in range(i + 1):
+                out[i, j] += c * rows[k, j]
+    for i in range(n):
+        for j in range(i):
+            out[j, i] = out[i, j]
 
 
 @compiled("b1(f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[::1])")
-def _scaled_information(
-    cov: Array, order: Indices, out: Array, work: Array, sigma: Array
-) -> bool:
+def _scaled_information(cov: Array, order: Indices, out: Array, work: Array, sigma: Array) -> bool:
     """out (a, a) <- P^-1 of the states `order` of `cov`, times sigma_i sigma_j, their sigmas (a,)
     written too; False if P cannot be made positive definite."""
     a = order.shape[0]
@@ -84,7 +88,7 @@ def _scaled_information(
     addition = 0.0
     while addition < 1e-3:
         for i in range(a):
-            for j in range(i):
+            for j in range(i + 1, a):
                 work[i, j] = cov[order[i], order[j]] / (sigma[i] * sigma[j])
             work[i, i] = 1.0 + addition
         if cholesky(work):
@@ -161,9 +165,7 @@ def combine(
     return True
 
 
-@compiled(
-    "f8(f8[:, ::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], i8, i8)"
-)
+@compiled("f8(f8[:, ::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], i8, i8)")
 def difference(
     cov: Array,
     dx: Array,
@@ -177,26 +179,26 @@ def difference(
     """The statistic of estimate `member` (`cov`, `dx`) against all others that `combine` has fused,
     on the last `tested` states of `order`; 0 if the others know nothing."""
     k, a, b = infos.shape[0] - 1, order.shape[0], tested
-    lower, y = np.empty((a, a)), np.empty(a)
+    upper, y = np.empty((a, a)), np.empty(a)
     for i in range(a):
-        for j in range(i + 1):
-            lower[i, j] = infos[k, i, j] - infos[member, i, j]
+        for j in range(i, a):
+            upper[i, j] = infos[k, i, j] - infos[member, i, j]
         y[i] = vectors[k, i] - vectors[member, i]
-    if not cholesky(lower):
+    if not cholesky(upper):
         return 0.0
     for i in range(a):
-        for j in range(i):
-            y[i] -= lower[i, j] * y[j]
-        y[i] /= lower[i, i]
+        y[i] /= upper[i, i]
+        for j in range(i + 1, a):
+            y[j] -= upper[i, j] * y[i]
     first = a - b
     for i in range(a - 1, first - 1, -1):
         for j in range(i + 1, a):
-            y[i] -= lower[j, i] * y[j]
-        y[i] /= lower[i, i]
-    tail, s, d = np.empty((b, b)), np.empty((b, b)), np.empty(b)
+            y[i] -= upper[i, j] * y[j]
+        y[i] /= upper[i, i]
+    tail, s, d = np.zeros((b, b)), np.empty((b, b)), np.empty(b)
     for i in range(b):
-        for j in range(b):
-            tail[i, j] = lower[first + i, first + j] if j <= i else 0.0
+        for j in range(i, b):
+            tail[i, j] = upper[first + i, first + j]
     inverse_of_factor(tail, s)
     for i in range(b):
         unit = scale[first + i]
@@ -207,31 +209,65 @@ def difference(
         return 0.0
     total = 0.0
     for i in range(b):
-        for j in range(i):
-            d[i] -= s[i, j] * d[j]
         d[i] /= s[i, i]
         total += d[i] * d[i]
+        for j in range(i + 1, b):
+            d[j] -= s[i, j] * d[i]
     return total
 
 
-@compiled("void(f8[:, :, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], f8[::1], b1[::1])")
-def distribute(
-    covs: Array,
-    dxs: Array,
-    order: Indices,
-    fused: Array,
-    estimate: Array,
-    shares: Array,
-    reset: NDArray[np.bool_],
-) -> None:
-    """Write the fused estimate into each of `dxs` and the fused covariance over its share into each
-    of `covs` where `reset` (k,) is set."""
-    a = order.shape[0]
-    for m in range(covs.shape[0]):
-        if reset[m]:
-            covs[m] = 0.0
-            dxs[m] = 0.0
-            for i in range(a):
-                dxs[m, order[i]] = estimate[i]
-                for j in range(a):
-                    covs[m, order[i], order[j]] = fused[i, j] / shares[m]
+@compiled("void(f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+def carry(covs: Array, dxs: Array, shares: Array, phi: Array, before: Array, after: Array) -> None:
+    """Bring a bank over an interval with transition `phi` (width, width), in place:
+
+        P_k <- phi (P_k - B / beta_k) phi^T + A / beta_k,   x_k <- phi x_k
+
+    `before` B and `after` A are a covariance with the whole process noise at both ends, so that A -
+    phi B phi^T is the noise of the interval.
+    """
+    width, n = phi.shape[0], dxs.shape[1]
+    d, half, x = np.empty((width, width)), np.empty((width, width)), np.empty(n)
+    for k in range(covs.shape[0]):
+        part = 1.0 / shares[k]
+        for i in range(n):
+            for j in range(width):
+                d[i, j] = covs[k, i, j] - before[i, j] * part
+        # Rows of the parameters hold one or two elements.
+        for i in range(n):
+            x[i] = 0.0
+            for j in range(width):
+                half[i, j] = 0.0
+            for m in range(n):
+                c = phi[i, m]
+                if c != 0.0:
+                    x[i] += c * dxs[k, m]
+                    for j in range(width):
+                        half[i, j] += c * d[m, j]
+        for i in range(n):
+            for j in range(i + 1):
+                d[i, j] = half[j, i]
+                d[j, i] = half[i, j]
+        # d = (phi D)^T, so that phi (phi D)^T = phi D phi^T by rows again.
+        for i in range(n):
+            for j in range(width):
+                half[i, j] = 0.0
+            for m in range(n):
+                c = phi[i, m]
+                if c != 0.0:
+                    for j in range(width):
+                        half[i, j] += c * d[m, j]
+        for i in range(n):
+            dxs[k, i] = x[i]
+            for j in range(i + 1):
+                value = 0.5 * (half[i, j] + half[j, i]) + after[i, j] * part
+                covs[k, i, j] = value
+                covs[k, j, i] = value
+
+
+@compiled("void(f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[::1])")
+def publish(cov: Array, dx: Array, order: Indices, fused: Array, estimate: Array) -> None:
+    """Write what `combine` has fused into `cov` (width, width) and `dx` (n,)."""
+    for i in range(order.shape[0]):
+        dx[order[i]] = estimate[i]
+        for j in range(order.shape[0]):
+            cov[order[i], order[j]] = fused[i, j]

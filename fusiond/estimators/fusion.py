@@ -10,7 +10,7 @@ for scalars). Of all x_g = x_1 + W (x_2 - x_1) the one with the least covariance
     W = (P_11 - P_12) D^-1,   D = P_11 - P_12 - P_21 + P_22 = cov(x_2 - x_1)
     P_g = P_11 - (P_11 - P_12) D^-1 (P_11 - P_12)^T
 
-Both are weighted least squares: y = A x + e with the estimates stacked, A identities, cov(e) theirs.
+Both are weighted least squares: y = A x + e, y the stacked estimates, A stacked identities.
 
 Source: paper 004, section 3; Bar-Shalom and Campo, IEEE Trans. AES 22 (1986), 803.
 """

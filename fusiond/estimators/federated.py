@@ -1,0 +1,239 @@
+r"""Federated filter: a local filter for each source of aids, a master, fault isolation.
+
+Every local filter estimates the whole error state of the one common navigation state from its own
+source's aids; the master fuses the estimates and feeds the result back. What all share, the initial
+estimate, the process noise and aids of no source of its own (standstill, an operator), is split by
+the sharing factors beta_i, sum beta_i = 1:
+
+    P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common aid
+
+so that the sum of the information is that of one filter. P_i is then an upper bound that makes the
+estimates as good as uncorrelated (Carlson, 1990, section III), and P_g = (sum P_i^-1)^-1 one of the
+fused estimate: its very covariance where the parts are put together at once, more where local
+filters go on alone, as (sum (P_i + Q / beta_i)^-1)^-1 >= (sum P_i^-1)^-1 + Q.
+
+What becomes of the local filters after a fusion, which is after every update:
+
+`no_reset`      nothing; x_i <- x_i - x_g as the navigation state is corrected. Nothing comes from
+                one local filter into another.
+`fusion_reset`  x_i <- x_g, P_i <- P_g / beta_i. Equal to the centralised filter.
+`zero_reset`    the master keeps all, a local filter starts its next update with no information:
+                beta_i = 1e-6, the master's own part beta_m = 1 - sum beta_i.
+`rescale`       a local filter that was updated keeps the part `retained` of its information and
+                hands the rest to the master's own estimate: P_i <- P_i / retained.
+
+The first and the last are in fusiond.estimators.federated_standing, those with a reset in
+fusiond.estimators.federated_reset; here is what they share.
+
+Source: Carlson, IEEE Trans. AES 26 (1990), 517; Carlson and Berarducci, NAVIGATION 41 (1994), 297;
+paper 004, section 3. Tests and isolation: fusiond.estimators.isolation.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable
+from fusiond.estimators.bank import combine
+from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.federated_options import FederatedOptions, local_of
+from fusiond.estimators.isolation import FaultDetection
+from fusiond.estimators.model import Model
+from fusiond.estimators.update import fuse, normalised_innovation_squared
+
+Array = NDArray[np.float64]
+
+# No adaptive factor falls below this part of an equal one: a filter that starves cannot come back.
+LEAST_PART = 0.1
+
+
+class FederatedFilter(ErrorStateFilter):
+    """What the modes share; `names` are the local filters.
+
+    `_bank` (k, width, width) and `_bank_dxs` (k, n) are estimates to be fused, `_factors` (N,) the
+    sharing factors of the local filters.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        gap_s: float,
+        names: tuple[str, ...],
+        options: FederatedOptions,
+        estimates: int,
+    ) -> None:
+        super().__init__(model, gap_s)
+        if not names:
+            raise ValueError("a federated filter needs at least one local filter")
+        if options.shares and (len(options.shares) != len(names) or not min(options.shares) > 0.0):
+            raise ValueError("one positive share for each local filter")
+        self.options, self.names = options, names
+        relative = np.array(options.shares) if options.shares else np.ones(len(names))
+        self._nominal: Array = relative / relative.sum()
+        self._factors: Array = np.zeros(len(names))
+        self._faults = FaultDetection(
+            len(names), options.false_alarm, options.window, options.readmit_after
+        )
+        self._local_of: dict[str, int | None] = {}
+        self._bank: Array = np.zeros((estimates, model.width, model.width))
+        self._bank_dxs: Array = np.zeros((estimates, model.size))
+        self._weight: Array = np.zeros(estimates)
+        self._arrange(model.active)
+        self._share_out(self._nominal)
+
+    def _arrange(self, used: NDArray[np.bool_]) -> None:
+        """Lay out the work space: the used states, position and velocity last."""
+        slots = np.flatnonzero(used)
+        tested = (slots >= 3) & (slots < 9)
+        self._order = np.concatenate([slots[~tested], slots[tested]]).astype(np.int64)
+        self._tested = int(tested.sum())
+        k, a = len(self._weight), len(slots)
+        self._infos: Array = np.zeros((k + 1, a, a))
+        self._vectors: Array = np.zeros((k + 1, a))
+        self._scale: Array = np.ones(a)
+        self._fused: Array = np.zeros((a, a))
+        self._estimate: Array = np.zeros(a)
+        self._trace: Array = np.zeros(k)
+
+    @property
+    def isolated(self) -> dict[str, str]:
+        """Sources that a fault detection keeps out of the solution, and why."""
+        records = zip(self.names, self._faults.records, strict=True)
+        return {name: record.reason for name, record in records if record.reason}
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The sharing factors of the local filters."""
+        return dict(zip(self.names, self._factors.tolist(), strict=True))
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+        super().initialise(t_ns, sample, nav, xi, covariance)
+        # A state that is known exactly and stays so has no information matrix.
+        known = (np.diag(covariance) <= 0.0) & (self.model.noise[1:] <= 0.0).all(axis=0)
+        self._arrange(self.model.active & ~known)
+        self._faults.reset()
+        self._share_out(self._nominal)
+
+    # ------------------------------------------------------------------ update
+
+    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
+        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes.
+
+        NIS and whitened innovation of the outcome are those of what is published.
+        """
+        innovation = aid.innovation(self.state)
+        if isinstance(innovation, NotApplicable):
+            return Outcome(innovation.outcome)
+        z, h, r = innovation
+        degrees = z.shape[0]
+        threshold = gate_threshold(aid.gate, degrees)
+        y = np.zeros(degrees)
+        nis = normalised_innovation_squared(self._covs[0], z - h @ self._dxs[0], h, r, y)
+        if not math.isfinite(nis):
+            return Outcome("not_finite", nis, degrees)
+        if aid.source not in self._local_of:
+            self._local_of[aid.source] = local_of(aid.source, self.names)
+        local = self._local_of[aid.source]
+        if local is None:
+            name = self._common(innovation, nis, threshold, inflate)
+        elif not self._faults.is_isolated(local):
+            name = self._local(local, innovation, nis, threshold, inflate)
+        else:
+            name = "isolated"
+            if self._faults.behaves(local, nis, degrees, threshold):
+                self._take_back(local)
+        return Outcome(name, nis, degrees, tuple(y.tolist()) if nis <= threshold else ())
+
+    def _common(self, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
+        """An aid of no local filter; `nis` is the published filter's. The outcome's name."""
+        raise NotImplementedError
+
+    def _local(self, local: int, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
+        """An aid of a local filter that is believed; `nis` is the published filter's."""
+        raise NotImplementedError
+
+    def _take_back(self, local: int) -> None:
+        """Start a local filter that is believed again from the master."""
+        raise NotImplementedError
+
+    def _leave_out(self, local: int) -> None:
+        """Take what an isolated local filter knows out of the master."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------ parts of an update
+
+    def _widen_by(self, cov: Array, dx: Array, i: Innovation) -> None:
+        """Open a filter for an innovation that it refuses."""
+        self._widen(cov, i.z - i.h @ dx, i.h)
+
+    def _fuse_into(
+        self, cov: Array, dx: Array, i: Innovation, share: float, threshold: float
+    ) -> float:
+        """Fold an innovation into an estimate, without feedback; its NIS there."""
+        z, h, r = i
+        y = np.zeros(z.shape[0])
+        return fuse(self.nav, self.xi, cov, dx, z, h, r / share, threshold, True, y)
+
+    def _combine(self) -> bool:
+        """Fuse the bank's estimates with `_weight` into the work space."""
+        return combine(
+            self._bank,
+            self._bank_dxs,
+            self._weight,
+            self._order,
+            self._infos,
+            self._vectors,
+            self._scale,
+            self._fused,
+            self._estimate,
+            self._trace,
+        )
+
+    def _isolate(self, local: int, reason: str) -> bool:
+        """Leave a local filter out, if the others can do without it; whether that was done."""
+        if not (self.options.fault_detection and self._faults.may_isolate(local, self.t_ns)):
+            return False
+        self._faults.isolate(local, reason)
+        self._share_out(self._nominal)
+        self._leave_out(local)
+        return True
+
+    def _believed(self) -> list[int]:
+        return [i for i in range(len(self.names)) if not self._faults.is_isolated(i)]
+
+    def _share_out(self, parts: Array) -> None:
+        """Set the factors from `parts` (N,): those of the believed filters sum to 1."""
+        believed = self._believed()
+        self._factors[:] = parts
+        self._factors[believed] /= parts[believed].sum()
+
+    def _adapt(self, trace: Array) -> None:
+        """Factors proportional to 1 / `trace` (N,), scaled traces of the local covariances."""
+        part = np.divide(1.0, trace, out=np.zeros_like(trace), where=trace > 0.0)
+        self._share_out(np.maximum(part / part.sum(), LEAST_PART / len(part)))
+
+    # ------------------------------------------------------------------ feedback
+
+    def _feed_back_published(self) -> None:
+        """Take the published estimate out of the navigation state, unless it is to be carried."""
+        if self._holding:
+            return
+        self._feed_back(self._dxs[0])
+        self._shift(self._dxs[0])
+        self._dxs[0] = 0.0
+
+    def _shift(self, x: Array) -> None:
+        """The navigation state has been corrected by `x` (n,): so are estimates of its error."""
+
+    def hold(self) -> None:
+        """From now on estimate without feedback: errors are carried along with the state."""
+        self._holding = True
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        self._holding = False
+        self._feed_back_published()

@@ -1,0 +1,37 @@
+"""How a federated filter is set up, and which aids belong to which of its local filters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Mode = Literal["no_reset", "fusion_reset", "zero_reset", "rescale"]
+
+
+@dataclass(frozen=True, slots=True)
+class FederatedOptions:
+    """How a federated filter shares, resets and isolates.
+
+    `shares`: relative factors by local filter, equal where there is none. `master_share` is the
+    part of process noise and initial information of the master's own estimate in `rescale`,
+    `retained` what an updated local filter keeps there.
+    """
+
+    mode: Mode = "no_reset"
+    shares: tuple[float, ...] = ()
+    adaptive: bool = False
+    master_share: float = 0.5
+    retained: float = 0.5
+    fault_detection: bool = True
+    false_alarm: float = 1e-6
+    window: int = 10
+    readmit_after: int = 20
+
+
+def local_of(source: str, names: tuple[str, ...]) -> int | None:
+    """Which of the local filters `names` an aid's source belongs to: the filter of that name, else
+    the longest one that it begins with (`gnss_velocity` to `gnss`); None: common to all."""
+    if source in names:
+        return names.index(source)
+    begun = [name for name in names if source.startswith(f"{name}_")]
+    return names.index(max(begun, key=len)) if begun else None

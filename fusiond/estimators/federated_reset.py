@@ -1,0 +1,105 @@
+r"""Federated filter with a reset after each fusion: `fusion_reset` and `zero_reset`.
+
+After a fusion, and as all are propagated alike, until the next,
+
+    x_i = x_g,   P_i = P_g / beta_i
+
+so a local filter need not be kept: it is made from the master when its aid comes, updated, and
+fused with what the others know together, (1 - beta_i) P_g^-1. An aid that is common to all adds R /
+beta_i to each, which is R to the master. The result is the centralised filter's but for rounding,
+whatever the factors are. `zero_reset` has beta_i = 1e-6, its master the rest.
+
+The difference of a local filter and the others is its last innovation again, so that the difference
+test has nothing to say here, and what a fault has done before it was noticed is in the master.
+
+Source: Carlson, IEEE Trans. AES 26 (1990), 517.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation
+from fusiond.estimators.bank import publish
+from fusiond.estimators.federated import FederatedFilter
+from fusiond.estimators.federated_options import FederatedOptions
+from fusiond.estimators.isolation import INNOVATION, Record
+from fusiond.estimators.model import Model
+
+Array = NDArray[np.float64]
+
+# Share of a local filter that is to know nothing: 1e-6 of the information changes no digit that
+# counts, and 1e6 times a variance is still far from where doubles lose the sum.
+LITTLE = 1e-6
+UPDATED, OTHERS = 0, 1
+
+
+class _Own(NamedTuple):
+    factors: Array
+    records: tuple[Record, ...]
+
+
+class ResetFilter(FederatedFilter):
+    """`fusion_reset` and `zero_reset` (`fusiond.estimators.base.Estimator`)."""
+
+    def __init__(
+        self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
+    ) -> None:
+        super().__init__(model, gap_s, names, options, 2)
+
+    def _common(self, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
+        if nis > threshold:
+            if not inflate:
+                return "gated"
+            self._widen_by(self._covs[0], self._dxs[0], i)
+        self._fuse_into(self._covs[0], self._dxs[0], i, 1.0, math.inf)
+        self._feed_back_published()
+        return "fused"
+
+    def _local(self, local: int, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
+        sound = self._faults.innovation(local, nis, i.z.shape[0], threshold)
+        if not sound and self._isolate(local, INNOVATION):
+            return "isolated"
+        if nis > threshold:
+            if not inflate:
+                return "gated"
+            self._widen_by(self._covs[0], self._dxs[0], i)
+        share = float(self._factors[local])
+        self._bank[UPDATED] = self._covs[0] / share
+        self._bank[OTHERS] = self._covs[0]
+        self._bank_dxs[:] = self._dxs[0]
+        self._weight[:] = 1.0, 1.0 - share
+        self._fuse_into(self._bank[UPDATED], self._bank_dxs[UPDATED], i, 1.0, math.inf)
+        if not self._combine():
+            return "not_positive_definite"
+        self._faults.heard(local, self.t_ns)
+        if self.options.adaptive and self.options.mode == "fusion_reset" and share < 1.0:
+            trace = self._trace[OTHERS] / self._factors
+            trace[local] = self._trace[UPDATED]
+            self._adapt(trace)
+        publish(self._covs[0], self._dxs[0], self._order, self._fused, self._estimate)
+        self._feed_back_published()
+        return "fused"
+
+    def _share_out(self, parts: Array) -> None:
+        super()._share_out(parts)
+        if self.options.mode == "zero_reset":
+            self._factors[:] = LITTLE
+
+    def _take_back(self, local: int) -> None:
+        self._share_out(self._nominal)
+
+    def _leave_out(self, local: int) -> None:
+        """Nothing: what is published has taken no part in this update."""
+
+    def _own_snapshot(self) -> object:
+        return _Own(self._factors.copy(), tuple(self._faults.records))
+
+    def _own_restore(self, extra: object) -> None:
+        assert isinstance(extra, _Own)
+        self._factors[:] = extra.factors
+        self._faults.records = list(extra.records)
