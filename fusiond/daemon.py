@@ -64,6 +64,7 @@ FORGET_SPEED_M_S = 1.0
 # Words in an event's code that make it a warning or an error for whoever filters by level.
 WARNINGS = (
     "absent",
+    "isolated",
     "optimistic",
     "pessimistic",
     "coloured",

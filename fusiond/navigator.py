@@ -23,6 +23,7 @@ from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aligner import Aligner, AlignmentOptions
 from fusiond.config import Config
+from fusiond.estimators.federated_options import local_of
 from fusiond.estimators.propagation import compensate
 from fusiond.filters import estimator_of, model_of
 from fusiond.imu_buffer import ImuBuffer
@@ -83,6 +84,7 @@ class Navigator:
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
         self._last_slide_cell = -1
+        self._told_isolated: dict[str, str] = {}
         self.started: Start | None = None
         for name in config.aiding:
             receiver = self._intake.raw_receiver(name)
@@ -209,6 +211,27 @@ class Navigator:
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
+        self._tell_isolation()
+
+    def _tell_isolation(self) -> None:
+        """Events where the isolated sources are no longer those last told."""
+        now, told = self.estimator.isolated, self._told_isolated
+        for source, reason in now.items():
+            if source not in told:
+                self._event("isolated", f"{source} is left out of the solution: {reason}")
+        for source in told:
+            if source not in now:
+                self._event("readmitted", f"{source} is believed again")
+        self._told_isolated = now
+
+    def isolated(self, source: str) -> str | None:
+        """Why the fault detection leaves a source out; None if it does not."""
+        found = self.estimator.isolated
+        if not found:
+            return None
+        names = self.config.estimator.federated.sources or tuple(self.config.aiding)
+        local = local_of(source, names)
+        return None if local is None else found.get(names[local])
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, carried ahead of the newest sample by holding its rates.

@@ -167,6 +167,7 @@ class Sources:
                     fused=ended["fused"],
                     rejected=rejected,
                     fused_age_s=fused_age,
+                    isolated=navigator.isolated(name),
                     verdict=navigator.verdicts.verdict(name),
                 )
                 continue
@@ -195,6 +196,7 @@ class Sources:
                 fused_age_s=fused_age,
                 latency_s=None if source.latency_s is None else round(source.latency_s, 4),
                 counters=counters,
+                isolated=navigator.isolated(name),
                 verdict=navigator.verdicts.verdict(name),
                 sky=self._sky(name),
             )

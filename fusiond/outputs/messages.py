@@ -109,6 +109,9 @@ class SourceHealth(BaseModel):
     fused_age_s: Number = Field(default=None, description="since the last one was fused")
     latency_s: Number = Field(default=None, description="from validity to arrival, the last one")
     counters: dict[str, Count] = Field(default_factory=dict, description="of the driver")
+    isolated: str | None = Field(
+        default=None, description="why the fault detection leaves it out; null: it does not"
+    )
     verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
 
