@@ -28,13 +28,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Config, Imu
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.federated_options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
+from fusiond.filters import federated
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.earth import gravity
 from fusiond.offline import process
@@ -60,6 +63,7 @@ FIX_NS = 200_000_000
 LATE_NS = 2_000_000_000
 HISTORY_S = 4.0
 STEP_RATE_HZ, STEP_SECONDS = 100, 100
+LOCAL_FILTERS = ("first", "second", "third")
 LAT, LON, HEIGHT = np.radians(30.5276), np.radians(114.3556), 38.0
 
 
@@ -74,7 +78,9 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     velocity in order of validity, files read and the solution written at every row.
 
     As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
-    multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity).
+    multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
+    `federated_step_ratio`, a second of a federated filter with three local filters (IMU at 100 Hz,
+    one position of each of three sources, fault detection on, mode `no_reset`).
 
     Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
     (`fusiond.studies.reduced_cost`).
@@ -102,7 +108,12 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["single_step_ratio"] = ratio(_single, repetitions)
     figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
     figures["multiscale_step_ratio"] = _step_ratio(
-        lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), repetitions
+        lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), _one_source(), repetitions
+    )
+    figures["federated_step_ratio"] = _step_ratio(
+        lambda model, gap_s: federated(model, gap_s, LOCAL_FILTERS, FederatedOptions()),
+        _three_sources(),
+        repetitions,
     )
     with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
         make = _process(Path(folder), process_s)
@@ -200,14 +211,34 @@ def _rewind(number: int) -> Callable[[], int]:
     return work
 
 
-def _step_ratio(make: Callable[[Model, float], Estimator], repetitions: int) -> float:
+def _one_source() -> list[Linearised]:
+    """A position and a velocity each second."""
+    lever, rest, sd = (0.3, 0.0, -1.0), (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)
+    aids: list[Linearised] = []
+    for second in range(1, STEP_SECONDS + 1):
+        t_ns = second * 1_000_000_000
+        aids.append(_fix("gnss", t_ns))
+        aids.append(VelocityAid("gnss_velocity", t_ns, 0.9999, rest, sd, lever))
+    return aids
+
+
+def _three_sources() -> list[Linearised]:
+    """A position of each source each second, one after the other."""
+    count = len(LOCAL_FILTERS)
+    return [
+        _fix(LOCAL_FILTERS[k % count], (k + 1) * 1_000_000_000 // count)
+        for k in range(count * STEP_SECONDS)
+    ]
+
+
+def _step_ratio(
+    make: Callable[[Model, float], Estimator], aids: list[Linearised], repetitions: int
+) -> float:
     """Processor time of an estimator's second over the centralised filter's, taken in turns.
 
-    100 IMU samples, one position and one velocity; median over the repetitions.
+    100 IMU samples and the aids, in order of validity; median over the repetitions.
     """
-    lever = (0.3, 0.0, -1.0)
-    steps, every = STEP_SECONDS * STEP_RATE_HZ, round(1e9 / STEP_RATE_HZ)
-    model, centralised, buffer = _filter(steps, STEP_RATE_HZ)
+    model, centralised, buffer = _filter(STEP_SECONDS * STEP_RATE_HZ, STEP_RATE_HZ)
     start = centralised.snapshot()
     p = centralised.covariance.copy()
     ratios = []
@@ -217,14 +248,9 @@ def _step_ratio(make: Callable[[Model, float], Estimator], repetitions: int) -> 
             estimator.initialise(0, 0, start.nav, start.xi, p)
             gc.collect()
             before = time.process_time()
-            for second in range(1, STEP_SECONDS + 1):
-                t_ns = second * STEP_RATE_HZ * every
-                estimator.propagate(buffer, t_ns)
-                estimator.update(_fix("gnss", t_ns))
-                velocity = VelocityAid(
-                    "gnss_velocity", t_ns, 0.9999, (0.0, 0.0, 0.0), (0.1,) * 3, lever
-                )
-                estimator.update(velocity)
+            for aid in aids:
+                estimator.propagate(buffer, aid.t_ns)
+                estimator.update(aid)
             spent.append(time.process_time() - before)
         ratios.append(spent[0] / spent[1])
     return statistics.median(ratios[1:])

@@ -12,6 +12,7 @@ FIGURES = (
     "single_step_ratio",
     "rewind_2s_ratio",
     "multiscale_step_ratio",
+    "federated_step_ratio",
     "process_epoch_ratio",
     "reduced_order_step_ratio",
 )

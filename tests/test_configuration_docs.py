@@ -26,6 +26,7 @@ SECTIONS = {
     "[alignment]": config.Alignment,
     "[estimator]": config.Estimator,
     "[estimator.multiscale]": config.Multiscale,
+    "[estimator.federated]": config.Federated,
     "[consistency]": config.ConsistencyTest,
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,

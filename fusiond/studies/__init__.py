@@ -12,6 +12,7 @@ STUDIES = {
     "rdss-correlated": "fusiond.studies.rdss_correlated",
     "rdss-map": "fusiond.studies.rdss_map",
     "multiscale": "fusiond.studies.multiscale",
+    "federated": "fusiond.studies.federated",
     "consistency": "fusiond.studies.consistency",
     "reduced-order": "fusiond.studies.reduced_order",
 }
