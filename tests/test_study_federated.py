@@ -80,7 +80,6 @@ def test_fusion_of_two_sensors_that_share_their_process_noise() -> None:
 
 
 def test_pictures_and_tables(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     path = tmp_path / "federated.png"
     federated.plot(result(), path)
     assert path.read_bytes().startswith(b"\x89PNG")
