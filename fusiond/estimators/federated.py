@@ -40,9 +40,10 @@ from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.bank import combine
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.federated_options import FederatedOptions, local_of
-from fusiond.estimators.isolation import FaultDetection
-from fusiond.estimators.model import Model
-from fusiond.estimators.update import fuse, normalised_innovation_squared
+from fusiond.estimators.isolation import INNOVATION, FaultDetection
+from fusiond.estimators.model import CLOCK_OFFSET, Model
+from fusiond.estimators.screening import KEPT
+from fusiond.estimators.update import normalised_innovation_squared, update
 
 Array = NDArray[np.float64]
 
@@ -123,37 +124,113 @@ class FederatedFilter(ErrorStateFilter):
     def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
         """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes.
 
-        NIS and whitened innovation of the outcome are those of what is published.
+        NIS and whitened innovation of the outcome are those of what is published; those of a
+        screened aid are of the filter that judges its rows.
         """
-        innovation = aid.innovation(self.state)
-        if isinstance(innovation, NotApplicable):
-            return Outcome(innovation.outcome)
-        z, h, r = innovation
-        degrees = z.shape[0]
-        threshold = gate_threshold(aid.gate, degrees)
-        y = np.zeros(degrees)
-        nis = normalised_innovation_squared(self._covs[0], z - h @ self._dxs[0], h, r, y)
-        if not math.isfinite(nis):
-            return Outcome("not_finite", nis, degrees)
+        i = aid.innovation(self.state)
+        if isinstance(i, NotApplicable):
+            return Outcome(i.outcome)
         if aid.source not in self._local_of:
             self._local_of[aid.source] = local_of(aid.source, self.names)
         local = self._local_of[aid.source]
+        isolated = local is not None and self._faults.is_isolated(local)
+        self._bring_up()
+        judge = None if isolated else local
+        cov, dx = self._judge(judge)
+        if aid.screened:
+            return self._update_by_rows(aid, i, local, cov, dx, inflate)
+        degrees = i.z.shape[0]
+        threshold = gate_threshold(aid.gate, degrees)
+        y = np.zeros(degrees)
+        nis = published = normalised_innovation_squared(cov, i.z - i.h @ dx, i.h, i.r, y)
+        if judge is not None and self.options.mode == "no_reset":
+            z = i.z - i.h @ self._dxs[0]
+            published = normalised_innovation_squared(self._covs[0], z, i.h, i.r, y)
+        if not (math.isfinite(nis) and math.isfinite(published)):
+            return Outcome("not_finite", nis, degrees)
+        whitened = tuple(y.tolist()) if published <= threshold else ()
+        if not self._believes(local, nis, degrees, threshold):
+            return Outcome("isolated", published, degrees, whitened)
+        if nis > threshold:
+            if not inflate:
+                return Outcome("gated", published, degrees)
+            self._doubt(local, i)
+        return Outcome(self._fold(local, i), published, degrees, whitened)
+
+    def _update_by_rows(
+        self,
+        aid: Linearised,
+        rows: Innovation,
+        local: int | None,
+        cov: Array,
+        dx: Array,
+        inflate: bool,
+    ) -> Outcome:
+        """Rows that pass are folded in; none, or with `inflate` as many as a wider P lets.
+
+        For the innovation test an epoch counts with the rows that pass, or as failed where most do
+        not: single bad satellites are the screening's business.
+        """
+        trial = cov.copy()
+        s = self._screen(aid, rows, trial, dx)
+        kept = s.codes == KEPT
+        count, most = int(kept.sum()), 2 * int(kept.sum()) >= len(kept)
+        degrees = count if most else len(kept)
+        nis = s.nis if most else math.inf
+        codes = tuple(s.codes.tolist())
+        if not self._believes(local, nis, degrees, gate_threshold(aid.gate, degrees)):
+            return Outcome("isolated", s.nis, count, (), codes)
+        if inflate and not most:
+            self._doubt(local, rows)
+            trial = cov.copy()
+            s = self._screen(aid, rows, trial, dx)
+            kept, codes = s.codes == KEPT, tuple(s.codes.tolist())
+        if not kept.any():
+            return Outcome("gated", s.nis, 0, (), codes)
+        offsets = self.model.slots_of(CLOCK_OFFSET)
+        if not np.array_equal(trial[offsets], cov[offsets]):
+            self._forget_clock(offsets)
+        name = self._fold(local, Innovation(rows.z[kept], rows.h[kept], rows.r[kept]))
+        return Outcome(name, s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
+
+    def _believes(self, local: int | None, nis: float, degrees: int, threshold: float) -> bool:
+        """Take an innovation into the tests; whether its filter is believed after it."""
         if local is None:
-            name = self._common(innovation, nis, threshold, inflate)
-        elif not self._faults.is_isolated(local):
-            name = self._local(local, innovation, nis, threshold, inflate)
-        else:
-            name = "isolated"
+            return True
+        if self._faults.is_isolated(local):
             if self._faults.behaves(local, nis, degrees, threshold):
                 self._take_back(local)
-        return Outcome(name, nis, degrees, tuple(y.tolist()) if nis <= threshold else ())
+            return False
+        sound = self._faults.innovation(local, nis, degrees, threshold)
+        return sound or not self._isolate(local, INNOVATION)
 
-    def _common(self, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
-        """An aid of no local filter; `nis` is the published filter's. The outcome's name."""
+    def _forget_clock(self, offsets: list[int]) -> None:
+        """The receiver has set its clock: nobody knows the offset."""
+        initial = self.model.initial[offsets] ** 2
+        for cov, share in self._kept():
+            cov[offsets] = 0.0
+            cov[:, offsets] = 0.0
+            cov[offsets, offsets] = initial / share
+
+    # ------------------------------------------------------------------ what a mode says
+
+    def _bring_up(self) -> None:
+        """Make the bank ready for an update."""
+
+    def _judge(self, local: int | None) -> tuple[Array, Array]:
+        """Covariance and error estimate by which an aid is gated."""
+        return self._covs[0], self._dxs[0]
+
+    def _kept(self) -> list[tuple[Array, float]]:
+        """The covariances that are kept between updates, with their shares."""
+        return [(self._covs[0], 1.0)]
+
+    def _doubt(self, local: int | None, i: Innovation) -> None:
+        """Open what an innovation has to pass, and go on."""
         raise NotImplementedError
 
-    def _local(self, local: int, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
-        """An aid of a local filter that is believed; `nis` is the published filter's."""
+    def _fold(self, local: int | None, i: Innovation) -> str:
+        """Take an innovation that has passed in, of a local filter or of all; its outcome."""
         raise NotImplementedError
 
     def _take_back(self, local: int) -> None:
@@ -170,13 +247,10 @@ class FederatedFilter(ErrorStateFilter):
         """Open a filter for an innovation that it refuses."""
         self._widen(cov, i.z - i.h @ dx, i.h)
 
-    def _fuse_into(
-        self, cov: Array, dx: Array, i: Innovation, share: float, threshold: float
-    ) -> float:
-        """Fold an innovation into an estimate, without feedback; its NIS there."""
-        z, h, r = i
-        y = np.zeros(z.shape[0])
-        return fuse(self.nav, self.xi, cov, dx, z, h, r / share, threshold, True, y)
+    @staticmethod
+    def _fuse_into(cov: Array, dx: Array, i: Innovation, share: float = 1.0) -> None:
+        """Fold the share of an innovation into an estimate, without gate and feedback."""
+        update(cov, dx, i.z, i.h, i.r / share)
 
     def _combine(self) -> bool:
         """Fuse the bank's estimates with `_weight` into the work space."""

@@ -17,7 +17,6 @@ Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from fusiond.aiding.base import Innovation
 from fusiond.estimators.bank import publish
 from fusiond.estimators.federated import FederatedFilter
 from fusiond.estimators.federated_options import FederatedOptions
-from fusiond.estimators.isolation import INNOVATION, Record
+from fusiond.estimators.isolation import Record
 from fusiond.estimators.model import Model
 
 Array = NDArray[np.float64]
@@ -51,29 +50,20 @@ class ResetFilter(FederatedFilter):
     ) -> None:
         super().__init__(model, gap_s, names, options, 2)
 
-    def _common(self, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
-        if nis > threshold:
-            if not inflate:
-                return "gated"
-            self._widen_by(self._covs[0], self._dxs[0], i)
-        self._fuse_into(self._covs[0], self._dxs[0], i, 1.0, math.inf)
-        self._feed_back_published()
-        return "fused"
+    def _doubt(self, local: int | None, i: Innovation) -> None:
+        self._widen_by(self._covs[0], self._dxs[0], i)
 
-    def _local(self, local: int, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
-        sound = self._faults.innovation(local, nis, i.z.shape[0], threshold)
-        if not sound and self._isolate(local, INNOVATION):
-            return "isolated"
-        if nis > threshold:
-            if not inflate:
-                return "gated"
-            self._widen_by(self._covs[0], self._dxs[0], i)
+    def _fold(self, local: int | None, i: Innovation) -> str:
+        if local is None:
+            self._fuse_into(self._covs[0], self._dxs[0], i)
+            self._feed_back_published()
+            return "fused"
         share = float(self._factors[local])
         self._bank[UPDATED] = self._covs[0] / share
         self._bank[OTHERS] = self._covs[0]
         self._bank_dxs[:] = self._dxs[0]
         self._weight[:] = 1.0, 1.0 - share
-        self._fuse_into(self._bank[UPDATED], self._bank_dxs[UPDATED], i, 1.0, math.inf)
+        self._fuse_into(self._bank[UPDATED], self._bank_dxs[UPDATED], i)
         if not self._combine():
             return "not_positive_definite"
         self._faults.heard(local, self.t_ns)

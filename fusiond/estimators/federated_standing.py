@@ -20,7 +20,6 @@ Source: Carlson, IEEE Trans. AES 26 (1990), 517.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +29,7 @@ from fusiond.aiding.base import Innovation
 from fusiond.estimators.bank import carry, cholesky, difference, inverse_of_factor, publish
 from fusiond.estimators.federated import FederatedFilter
 from fusiond.estimators.federated_options import FederatedOptions
-from fusiond.estimators.isolation import DIFFERENCE, INNOVATION, Record
+from fusiond.estimators.isolation import DIFFERENCE, Record
 from fusiond.estimators.model import Model
 
 Array = NDArray[np.float64]
@@ -106,35 +105,34 @@ class StandingFilter(FederatedFilter):
 
     # ------------------------------------------------------------------ update
 
-    def _common(self, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
-        if nis > threshold and not inflate:
-            return "gated"
+    def _bring_up(self) -> None:
         self._settle()
-        for k in self._members():
-            cov, dx = self._bank[k], self._bank_dxs[k]
-            if nis > threshold:
-                self._widen_by(cov, dx, i)
-            self._fuse_into(cov, dx, i, float(self._bank_shares[k]), math.inf)
-        return self._fuse_all(None)
 
-    def _local(self, local: int, i: Innovation, nis: float, threshold: float, inflate: bool) -> str:
-        self._settle()
-        cov, dx = self._bank[local], self._bank_dxs[local]
-        if not self._rescales:
-            nis = self._fuse_into(cov, dx, i, 1.0, threshold)
-            if not math.isfinite(nis):
-                return "not_finite"
-        sound = self._faults.innovation(local, nis, i.z.shape[0], threshold)
-        if not sound and self._isolate(local, INNOVATION):
-            return "isolated"
-        if nis > threshold:
-            if not inflate:
-                return "gated"
-            for k in self._members() if self._rescales else [local]:
+    def _judge(self, local: int | None) -> tuple[Array, Array]:
+        if local is None or self._rescales:
+            return self._covs[0], self._dxs[0]
+        return self._bank[local], self._bank_dxs[local]
+
+    def _kept(self) -> list[tuple[Array, float]]:
+        bank = zip(self._bank, self._bank_shares.tolist(), strict=True)
+        return [(self._covs[0], 1.0), *bank]
+
+    def _doubt(self, local: int | None, i: Innovation) -> None:
+        if local is None or self._rescales:
+            for k in self._members():
                 self._widen_by(self._bank[k], self._bank_dxs[k], i)
-        if self._rescales or nis > threshold:
-            self._fuse_into(cov, dx, i, 1.0, math.inf)
-        self._faults.heard(local, self.t_ns)
+            self._widen_by(self._covs[0], self._dxs[0], i)
+        else:
+            self._widen_by(self._bank[local], self._bank_dxs[local], i)
+
+    def _fold(self, local: int | None, i: Innovation) -> str:
+        if local is None:
+            for k in self._members():
+                share = float(self._bank_shares[k])
+                self._fuse_into(self._bank[k], self._bank_dxs[k], i, share)
+        else:
+            self._fuse_into(self._bank[local], self._bank_dxs[local], i)
+            self._faults.heard(local, self.t_ns)
         return self._fuse_all(local)
 
     def _fuse_all(self, updated: int | None) -> str:
@@ -230,7 +228,6 @@ class StandingFilter(FederatedFilter):
         self._bank_dxs[local] = self._dxs[0]
 
     def _take_back(self, local: int) -> None:
-        self._settle()
         self._share_out(self._nominal)
         share = float(self._bank_shares[local])
         for other in self._members():
