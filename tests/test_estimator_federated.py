@@ -124,7 +124,7 @@ def distance(estimator: Estimator, other: Estimator) -> tuple[float, float]:
         ("fusion_reset", {}, 1e-8),
         ("fusion_reset", {"shares": (5.0, 2.0, 1.0)}, 1e-8),
         ("fusion_reset", {"adaptive": True}, 1e-8),
-        ("zero_reset", {}, 1e-6),
+        ("zero_reset", {}, 1e-12),
     ],
 )
 def test_with_a_reset_it_is_the_centralised_filter(

@@ -18,7 +18,7 @@ What becomes of the local filters after a fusion, which is after every update:
                 one local filter into another.
 `fusion_reset`  x_i <- x_g, P_i <- P_g / beta_i. Equal to the centralised filter.
 `zero_reset`    the master keeps all, a local filter starts its next update with no information:
-                beta_i = 1e-6, the master's own part beta_m = 1 - sum beta_i.
+                beta_i = 0, the master's own part is 1. Equal to the centralised filter too.
 `rescale`       a local filter that was updated keeps the part `retained` of its information and
                 hands the rest to the master's own estimate: P_i <- P_i / retained.
 

@@ -7,7 +7,9 @@ After a fusion, and as all are propagated alike, until the next,
 so a local filter need not be kept: it is made from the master when its aid comes, updated, and
 fused with what the others know together, (1 - beta_i) P_g^-1. An aid that is common to all adds R /
 beta_i to each, which is R to the master. The result is the centralised filter's but for rounding,
-whatever the factors are. `zero_reset` has beta_i = 1e-6, its master the rest.
+whatever the factors are. In `zero_reset` the master has all: beta_i = 0. A local filter that begins
+with no information holds, after its aid, that of the aid, H^T R^-1 H, and the master that adds it
+makes a measurement update: so that is what is done.
 
 The difference of a local filter and the others is its last innovation again, so that the difference
 test has nothing to say here, and what a fault has done before it was noticed is in the master.
@@ -31,9 +33,6 @@ from fusiond.estimators.model import Model
 
 Array = NDArray[np.float64]
 
-# Share of a local filter that is to know nothing: 1e-6 of the information changes no digit that
-# counts, and 1e6 times a variance is still far from where doubles lose the sum.
-LITTLE = 1e-6
 UPDATED, OTHERS = 0, 1
 
 
@@ -54,9 +53,11 @@ class ResetFilter(FederatedFilter):
         self._widen_by(self._covs[0], self._dxs[0], i)
 
     def _fold(self, local: int | None, i: Innovation) -> str:
-        if local is None:
+        if local is None or self.options.mode == "zero_reset":
             self._fuse_into(self._covs[0], self._dxs[0], i)
             self._feed_back_published()
+            if local is not None:
+                self._faults.heard(local, self.t_ns)
             return "fused"
         share = float(self._factors[local])
         self._bank[UPDATED] = self._covs[0] / share
@@ -67,7 +68,7 @@ class ResetFilter(FederatedFilter):
         if not self._combine():
             return "not_positive_definite"
         self._faults.heard(local, self.t_ns)
-        if self.options.adaptive and self.options.mode == "fusion_reset" and share < 1.0:
+        if self.options.adaptive and share < 1.0:
             trace = self._trace[OTHERS] / self._factors
             trace[local] = self._trace[UPDATED]
             self._adapt(trace)
@@ -78,7 +79,7 @@ class ResetFilter(FederatedFilter):
     def _share_out(self, parts: Array) -> None:
         super()._share_out(parts)
         if self.options.mode == "zero_reset":
-            self._factors[:] = LITTLE
+            self._factors[:] = 0.0
 
     def _take_back(self, local: int) -> None:
         self._share_out(self._nominal)
