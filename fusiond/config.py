@@ -198,8 +198,17 @@ class Federated(Section):
     """Innovations in a row that must fit the master before a source is taken back."""
 
 
+class Unscented(Section):
+    """The filter `unscented`."""
+
+    spread: Annotated[float, Field(ge=0.1, le=5.0)] = 1.7320508
+    """Sigmas from the mean to a sigma point: sqrt(3) by the fourth moment of a Gaussian."""
+    propagation: bool = False
+    """Sigma points in the propagation too: dearer, honest for large attitude errors."""
+
+
 class Estimator(Section):
-    filter: Literal["kalman", "federated", "multiscale"] = "kalman"
+    filter: Literal["kalman", "unscented", "federated", "multiscale"] = "kalman"
     """Which estimator; see `docs/estimators.md`."""
     model: Literal["ins15", "ins21", "ins17", "ins23", "planar10", "planar15"] = "ins21"
     """Error state; see `docs/navigation.md`."""
@@ -214,6 +223,7 @@ class Estimator(Section):
     federated: Federated = Federated()
     """The section of that name below."""
     multiscale: Multiscale = Multiscale()
+    unscented: Unscented = Unscented()
 
 
 class ConsistencyTest(Section):

@@ -15,6 +15,7 @@ from fusiond.estimators.federated_standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Block, Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
+from fusiond.estimators.unscented import UnscentedEstimator
 from fusiond.settings import imu_noise
 
 
@@ -31,6 +32,9 @@ def estimator_of(config: Config, model: Model) -> Estimator:
         case "multiscale":
             m = config.estimator.multiscale
             return MultiscaleEstimator(model, config.imu.gap_s, m.scales, m.wavelet)
+        case "unscented":
+            u = config.estimator.unscented
+            return UnscentedEstimator(model, config.imu.gap_s, u.spread, u.propagation)
         case "federated":
             return _federated(config, model)
 

@@ -27,6 +27,7 @@ SECTIONS = {
     "[estimator]": config.Estimator,
     "[estimator.multiscale]": config.Multiscale,
     "[estimator.federated]": config.Federated,
+    "[estimator.unscented]": config.Unscented,
     "[consistency]": config.ConsistencyTest,
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -88,6 +89,9 @@ class AttitudeAid(Aid):
 @dataclass(frozen=True, slots=True)
 class HeadingAid(Aid):
     """True heading (rad) of the body's forward axis with `sd_rad`."""
+
+    period: ClassVar[float] = 2.0 * math.pi
+    """The innovation repeats."""
 
     yaw_rad: float
     sd_rad: float
