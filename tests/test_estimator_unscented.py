@@ -17,6 +17,7 @@ from fusiond.config import Imu
 from fusiond.estimators.base import ErrorStateFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import clock_blocks, make_model
+from fusiond.estimators.sigma_points import linear_form
 from fusiond.estimators.sigma_propagation import error_of
 from fusiond.estimators.unscented import SPREAD, UnscentedEstimator
 from fusiond.estimators.update import feed_back
@@ -196,6 +197,34 @@ def test_a_heading_is_the_same_across_the_turn() -> None:
             assert f.update(HeadingAid("h", 0, GATE, 0.3, 0.3), inflate=True).name == "fused"
         assert u.covariance[2, 2] == pytest.approx(e.covariance[2, 2], rel=1e-4)
         found.append(u)
+
+
+def test_rows_judged_one_by_one_stay_apart_with_no_less_noise() -> None:
+    """10 km of position: the second order of a range of 4e7 m is metres, and common to ranges of
+    like direction. The same numbers decorrelated, and with a variance for each."""
+    rng = np.random.default_rng(2)
+    m, rows, n = 4, 5, 15
+    slots = np.array([3, 5, 6, 9])
+    root = np.ascontiguousarray(np.linalg.cholesky(np.eye(m) + 0.5).T)
+    points = rng.standard_normal((2 * m + 1, rows))
+    r, dx = rng.uniform(0.5, 2.0, rows), np.zeros(n)
+    forms = []
+    for one_by_one in (False, True):
+        z, h, d = np.empty(rows), np.empty((rows, n)), np.empty(rows)
+        linear_form(points, np.zeros((rows, n)), r, dx, slots, root, SPREAD, one_by_one, z, h, d)
+        forms.append((z, h, d))
+    (z, h, d), (apart_z, apart_h, apart_d) = forms
+    even = (points[1::2] + points[2::2] - 2.0 * points[0]) / (2.0 * SPREAD)
+    odd = (points[2::2] - points[1::2]) / (2.0 * SPREAD)
+    noise = np.diag(r) + even.T @ even
+    assert apart_z == pytest.approx(points[0] + even.sum(axis=0) / SPREAD)
+    assert apart_h[:, slots] @ root.T == pytest.approx(odd.T)
+    assert np.linalg.eigvalsh(np.diag(apart_d) - noise).min() > -1e-12
+    # U from the rows themselves: U^-1 noise U^-T = D.
+    unit = np.linalg.cholesky(noise) / np.diag(np.linalg.cholesky(noise))
+    assert np.linalg.solve(unit, apart_z) == pytest.approx(z)
+    assert np.linalg.solve(unit, apart_h) == pytest.approx(h)
+    assert np.diag(np.linalg.cholesky(noise)) ** 2 == pytest.approx(d)
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,6 @@ class HeadingAid(Aid):
     """True heading (rad) of the body's forward axis with `sd_rad`."""
 
     period: ClassVar[float] = 2.0 * math.pi
-    """The innovation repeats."""
 
     yaw_rad: float
     sd_rad: float

@@ -66,10 +66,12 @@ class Aid:
     """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
     `gate` is the probability with which a consistent innovation passes. The rows of a `screened`
-    aid are gated one by one, and a bad one goes alone (fusiond.estimators.screening).
+    aid are gated one by one, and a bad one goes alone (fusiond.estimators.screening). An innovation
+    that is an angle repeats with its `period`.
     """
 
     screened: ClassVar[bool] = False
+    period: ClassVar[float] = math.inf
 
     source: str
     t_ns: int
@@ -81,6 +83,8 @@ class Linearised(Protocol):
 
     @property
     def screened(self) -> bool: ...
+    @property
+    def period(self) -> float: ...
     @property
     def source(self) -> str: ...
     @property

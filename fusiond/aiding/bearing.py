@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -65,6 +66,8 @@ class BearingAid(Aid):
 
     `block` names the model's block of the sensor's misalignment; a model without it has none.
     """
+
+    period: ClassVar[float] = 2.0 * math.pi
 
     azimuth_rad: float
     elevation_rad: float

@@ -20,7 +20,8 @@ A measurement z_0 = g(dx) + v is taken as z = H dx + v', which is exact for mean
 
 Then H P H^T + cov(v') = cov(g) + R, the innovation's covariance, and P H^T = cov(x, g). U is unit
 lower triangular; rows U^-1 z, U^-1 H with variances D are uncorrelated. Where g is linear, e = 0
-and U = 1.
+and U = 1. Rows that are to be judged one by one stay what they are: each gets, for its variance,
+the sum of its row of |cov(v')|, a diagonal matrix that is nowhere below cov(v') (Gershgorin).
 
 Source: Julier, Uhlmann, Unscented Filtering and Nonlinear Estimation, Proc. IEEE 92 (2004),
 sections III and VI; odd and even parts: Norgaard, Poulsen, Ravn, Automatica 36 (2000), section 3;
@@ -121,8 +122,8 @@ def spread_states(
 
 
 @compiled(
-    "void(f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1],"
-    "f8[::1])"
+    "void(f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8[::1], f8[:, ::1], f8, b1, f8[::1],"
+    "f8[:, ::1], f8[::1])"
 )
 def linear_form(
     points: Array,
@@ -132,6 +133,7 @@ def linear_form(
     slots: Indices,
     root: Array,
     spread: float,
+    one_by_one: bool,
     z: Array,
     h: Array,
     d: Array,
@@ -139,7 +141,8 @@ def linear_form(
     """Write z (rows,), h (rows, n) and variances d (rows,) of uncorrelated rows.
 
     `points` (2m + 1, rows): innovations at the states of `spread_states`; a pair with a NaN goes by
-    `central` (rows, n), the Jacobian at the centre. `r` (rows,) variances of the noise.
+    `central` (rows, n), the Jacobian at the centre. `r` (rows,) variances of the noise. Rows that
+    will be judged `one_by_one` stay apart.
     """
     m, rows = slots.shape[0], r.shape[0]
     odd, even = np.zeros((m, rows)), np.zeros((m, rows))
@@ -184,6 +187,15 @@ def linear_form(
             if even[i, a] != 0.0:
                 for b in range(a + 1):
                     u[a, b] += even[i, a] * even[i, b]
+    if one_by_one:
+        for a in range(rows):
+            d[a] = r[a]
+        for a in range(rows):
+            d[a] += u[a, a]
+            for b in range(a):
+                d[a] += abs(u[a, b])
+                d[b] += abs(u[a, b])
+        return
     for a in range(rows):
         d[a] = u[a, a] + r[a]
         for b in range(a):

@@ -97,12 +97,12 @@ class UnscentedEstimator(KalmanEstimator):
                 points[p] = found.z
         if not np.isfinite(points[0]).all():
             points[0] = central.z - central.h @ dx
-        period = getattr(aid, "period", math.inf)
-        if math.isfinite(period):
-            turns = np.round((points - points[0]) / period)
-            points -= period * np.nan_to_num(turns)
+        if math.isfinite(aid.period):
+            points -= aid.period * np.nan_to_num(np.round((points - points[0]) / aid.period))
         z, h, r = np.empty(rows), np.empty((rows, model.size)), np.empty(rows)
-        linear_form(points, central.h, central.r, dx, slots, root, self.spread, z, h, r)
+        linear_form(
+            points, central.h, central.r, dx, slots, root, self.spread, aid.screened, z, h, r
+        )
         return Innovation(z, h, r)
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
