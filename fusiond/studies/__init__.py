@@ -13,6 +13,7 @@ STUDIES = {
     "rdss-map": "fusiond.studies.rdss_map",
     "multiscale": "fusiond.studies.multiscale",
     "federated": "fusiond.studies.federated",
+    "ukf": "fusiond.studies.ukf",
     "consistency": "fusiond.studies.consistency",
     "reduced-order": "fusiond.studies.reduced_order",
 }
