@@ -38,6 +38,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
 from fusiond.filters import federated
+from fusiond.estimators.unscented import UnscentedEstimator
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.earth import gravity
 from fusiond.offline import process
@@ -81,6 +82,8 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
     `federated_step_ratio`, a second of a federated filter with three local filters (IMU at 100 Hz,
     one position of each of three sources, fault detection on, mode `no_reset`).
+    `unscented_step_ratio` and `unscented_propagation_step_ratio`, of the unscented filter as it is
+    by default and with sigma points in the propagation too.
 
     Against each other: `reduced_order_step_ratio`, a step of 17 states to one of 23
     (`fusiond.studies.reduced_cost`).
@@ -114,6 +117,10 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
         lambda model, gap_s: federated(model, gap_s, LOCAL_FILTERS, FederatedOptions()),
         _three_sources(),
         repetitions,
+    )
+    figures["unscented_step_ratio"] = _step_ratio(UnscentedEstimator, repetitions)
+    figures["unscented_propagation_step_ratio"] = _step_ratio(
+        lambda model, gap_s: UnscentedEstimator(model, gap_s, propagation=True), repetitions
     )
     with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
         make = _process(Path(folder), process_s)

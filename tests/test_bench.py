@@ -13,6 +13,8 @@ FIGURES = (
     "rewind_2s_ratio",
     "multiscale_step_ratio",
     "federated_step_ratio",
+    "unscented_step_ratio",
+    "unscented_propagation_step_ratio",
     "process_epoch_ratio",
     "reduced_order_step_ratio",
 )
