@@ -37,8 +37,8 @@ from fusiond.estimators.federated_options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
-from fusiond.filters import federated
 from fusiond.estimators.unscented import UnscentedEstimator
+from fusiond.filters import federated
 from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.earth import gravity
 from fusiond.offline import process
@@ -118,9 +118,11 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
         _three_sources(),
         repetitions,
     )
-    figures["unscented_step_ratio"] = _step_ratio(UnscentedEstimator, repetitions)
+    figures["unscented_step_ratio"] = _step_ratio(UnscentedEstimator, _one_source(), repetitions)
     figures["unscented_propagation_step_ratio"] = _step_ratio(
-        lambda model, gap_s: UnscentedEstimator(model, gap_s, propagation=True), repetitions
+        lambda model, gap_s: UnscentedEstimator(model, gap_s, propagation=True),
+        _one_source(),
+        repetitions,
     )
     with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
         make = _process(Path(folder), process_s)

@@ -61,7 +61,7 @@ async def _stretch_without_overrun(heard: Heard) -> None:
             return
 
 
-@pytest.mark.parametrize("name", ["kalman", "multiscale"])
+@pytest.mark.parametrize("name", ["kalman", "unscented", "federated", "multiscale"])
 async def test_estimator_keeps_up(name: str, tmp_path: Path, broker: Broker) -> None:
     vehicle = VehicleProcess(
         tmp_path,
