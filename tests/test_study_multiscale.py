@@ -29,7 +29,8 @@ def test_keys_are_those_promised() -> None:
     assert found["finding"].endswith(".")
     assert found["paper_figures"]["federated"]["position_std_m"] == [6.0023, 5.2128]
     for case in (found, found["variants"]["bias"]):
-        assert {"multiscale", "centralised", "multiscale_n1"} <= set(case["filters"])
+        names = {"multiscale", "federated", "centralised", "multiscale_n1", "multiscale_n4"}
+        assert names <= set(case["filters"])
         for figures in case["filters"].values():
             assert set(figures) >= KEYS
             assert all(isinstance(figures[key], float) for key in KEYS)
@@ -41,6 +42,13 @@ def test_one_scale_is_the_centralised_filter() -> None:
     for key in KEYS - {"time_per_step_us"}:
         one, centralised = found["multiscale_n1"][key], found["centralised"][key]
         assert abs(one / centralised - 1.0) < 1e-6, key
+
+
+def test_a_federated_filter_with_fusion_reset_is_the_centralised_filter() -> None:
+    found = result()["filters"]
+    for key in KEYS - {"time_per_step_us"}:
+        reset, centralised = found["federated_fusion_reset"][key], found["centralised"][key]
+        assert abs(reset / centralised - 1.0) < 1e-6, key
 
 
 def test_the_matched_centralised_filter_is_not_beaten() -> None:

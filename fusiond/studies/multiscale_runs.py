@@ -7,6 +7,9 @@ the steady sigma of the Markov states, 3600 s (paper 000's); 1e-3 g is white fro
 which is all that a model without accelerometer states can hold; angle random walk 0.3 deg/sqrt(h),
 a MEMS gyro's; a micro air vehicle at 8 to 16 m/s that flies level in circuits of coordinated turns.
 
+`federated` has one local filter for GPS and one for the star tracker and no reset: nothing comes
+from one into the other. `federated_fusion_reset` begins anew from the master after every fusion.
+
 In the case `bias` the accelerometer has a constant 1e-3 g (one sigma) beside, of which the model
 knows nothing.
 
@@ -34,6 +37,9 @@ from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config import Imu
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.federated_options import FederatedOptions
+from fusiond.estimators.federated_reset import ResetFilter
+from fusiond.estimators.federated_standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
@@ -82,6 +88,10 @@ CIRCUIT = (
 )
 """Of 12 m/s at first; one after the other. Turns bank as coordinated ones do."""
 
+LOCAL_FILTERS = ("gps", "star_tracker")
+NO_RESET = FederatedOptions("no_reset", fault_detection=False)
+FUSION_RESET = FederatedOptions("fusion_reset", fault_detection=False)
+
 ALL = slice(0, 7)
 GROUPS = {"attitude": slice(0, 3), "velocity": slice(3, 5), "position": slice(5, 7)}
 
@@ -108,6 +118,8 @@ def filters() -> dict[str, Callable[[Model], Estimator]]:
     """Every filter of the study by its name in the result."""
     return {
         "multiscale": lambda m: MultiscaleEstimator(m, IMU.gap_s, 2),
+        "federated": lambda m: StandingFilter(m, IMU.gap_s, LOCAL_FILTERS, NO_RESET),
+        "federated_fusion_reset": lambda m: ResetFilter(m, IMU.gap_s, LOCAL_FILTERS, FUSION_RESET),
         "centralised": lambda m: KalmanEstimator(m, IMU.gap_s),
         "multiscale_n1": lambda m: MultiscaleEstimator(m, IMU.gap_s, 1),
         "multiscale_n3": lambda m: MultiscaleEstimator(m, IMU.gap_s, 3),
