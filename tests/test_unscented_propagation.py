@@ -146,7 +146,8 @@ def test_an_imu_silence_widens_as_in_the_extended_filter() -> None:
 
 def test_clock_states_follow_their_rate() -> None:
     times, samples = _buffer(3.0)
-    model = make_model("ins15", imu_noise(IMU), *clock_blocks(("C", "G")))
+    model = make_model("ins21", imu_noise(IMU), *clock_blocks(("C", "G", "E", "R", "J")))
+    assert model.width == 32  # the widest rows that the kernels have
     p = np.diag(runs.initial_sd(model, np.full(3, 1e-4), 0.01, 0.1) ** 2)
     xi = np.zeros(model.size)
     xi[model.slots_of("clock_drift")] = 5.0

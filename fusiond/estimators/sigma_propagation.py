@@ -55,7 +55,7 @@ _NO_PIVOT = 1e-15
 # Columns along which points are drawn: the attitude, slots 0 to 2.
 POINTS = 3
 
-_covariance_narrow, _covariance_wide = (covariance_for(w) for w in WIDTHS)
+_covariance_narrow, _covariance_middle, _covariance_wide = (covariance_for(w) for w in WIDTHS)
 
 
 @compiled("void(f8[:, ::1], f8[:, ::1])")
@@ -214,14 +214,13 @@ def propagate_points(
             scale[1] = (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT])
 
             coefficients(nav, step, h, c)
+            terms = (active, sensor_terms, rate_terms, noise, 1.0, work)
             if width == WIDTHS[0]:
-                _covariance_narrow(
-                    cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
-                )
+                _covariance_narrow(cov, step, c, h, *terms)
+            elif width == WIDTHS[1]:
+                _covariance_middle(cov, step, c, h, *terms)
             else:
-                _covariance_wide(
-                    cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
-                )
+                _covariance_wide(cov, step, c, h, *terms)
 
             # Point 0 is the mean, 2 k + 1 and 2 k + 2 are the pair along L_k.
             for point in range(2 * POINTS + 1):
