@@ -141,6 +141,7 @@ class Row:
     gate: float = 1.0 - 1e-12
     source: str = "row"
     t_ns: int = 0
+    screened: bool = False
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return Innovation(self.z, self.h, self.r)

@@ -12,8 +12,8 @@ from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
 from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.aiding.rdss_position import BIAS_BLOCK
 from fusiond.config import Config
-from fusiond.config import StarTrackerAiding as Star
 from fusiond.config_aiding import AnyAiding, AttitudeAiding, RdssAiding, SarAiding
+from fusiond.config_aiding import StarTrackerAiding as Star
 from fusiond.intake import Intake
 from fusiond.navigator import Navigator
 from fusiond.settings import ARCSEC, DEG

@@ -12,6 +12,7 @@ from raw_frames import measurement, rawx
 from drivers.raw.driver import GnssOptions
 from drivers.raw.messages import RawGnssEpoch
 from drivers.raw.ubx import SIGNALS, SYSTEM_BY_ID
+from fusiond.config_aiding import RawAiding
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "gnss-raw.md").read_text()
@@ -25,8 +26,11 @@ COMPOSED = {
 FRAMING = {"ubx_damaged", "rtcm_damaged", "frame_cut", "garbage_bytes"}
 
 
-def block(language: str) -> str:
-    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+def block(language: str, chapter: str = "") -> str:
+    """The only block of a language in a chapter; without one: before the first."""
+    title = f"\n## {chapter}\n" if chapter else ""
+    text = PAGE.partition(title)[2] if title else PAGE
+    (found,) = re.findall(rf"```{language}\n(.*?)```", text.partition("\n## ")[0], re.DOTALL)
     return str(found)
 
 
@@ -41,6 +45,10 @@ def test_configuration_is_accepted_with_every_option() -> None:
     assert set(options) == set(GnssOptions.model_fields)
     defaults = GnssOptions(port=options["port"], baud=460_800, last_sentence="GST")
     assert GnssOptions.model_validate(options) == defaults
+
+
+def test_aiding_is_accepted() -> None:
+    RawAiding.model_validate(tomllib.loads(block("toml", "In the filter"))["aiding"]["gnss"])
 
 
 def test_counters_are_those_of_the_code() -> None:
@@ -67,6 +75,6 @@ def test_program_runs_on_a_log(tmp_path: Path) -> None:
     log = tmp_path / "log"
     log.write_bytes(rawx(measurement()))
     names: dict[str, Any] = {"path": log}
-    exec(compile(block("python"), "docs/gnss-raw.md", "exec"), names)
+    exec(compile(block("python", "Without a daemon"), "docs/gnss-raw.md", "exec"), names)
     (epoch,) = names["events"]
     assert isinstance(epoch, RawGnssEpoch)
