@@ -15,6 +15,7 @@ from typing import Any
 
 import aiomqtt
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from fusiond.files import read_truth
@@ -153,6 +154,25 @@ class Heard:
         await self._listener.until(
             lambda heard: heard.payloads(f"{self._base}/online")[-1:] == [word], PATIENCE_S
         )
+
+
+STRETCH_S = 5.0
+"""Without an overrun. Longer silences of a busy host are not the daemon's; a filter that takes
+longer than a tick never manages such a stretch."""
+
+
+async def stretch_without_overrun(heard: Heard, rate_hz: float) -> None:
+    """Wait until the daemon has kept its ticks for `STRETCH_S`, at `rate_hz`."""
+    first = await heard.until("status")
+    while True:
+        status = await heard.until("status")
+        if status["overruns"] > first["overruns"]:
+            first = status
+        elif status["uptime_s"] - first["uptime_s"] >= STRETCH_S:
+            ticks = status["ticks"] - first["ticks"]
+            elapsed_s = status["uptime_s"] - first["uptime_s"]
+            assert ticks == pytest.approx(elapsed_s * rate_hz, abs=3)
+            return
 
 
 def _payload(message: aiomqtt.Message) -> bytes:

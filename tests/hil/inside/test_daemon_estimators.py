@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from tests.broker import Broker, listening
-from tests.hil.processes import SIM_IMU, DaemonProcess, Heard, VehicleProcess, nav_errors
+from tests.hil.processes import (
+    SIM_IMU,
+    DaemonProcess,
+    Heard,
+    VehicleProcess,
+    nav_errors,
+    stretch_without_overrun,
+)
 
 VEHICLE = "estimators"
 RATE_HZ = 100.0
@@ -43,22 +50,6 @@ nav_rate_hz = 10.0
 """
 # As in test_daemon: what no error may exceed whatever the sigma.
 BOUNDS = {"m": 6.0, "m_s": 1.0, "deg": 5.0}
-STRETCH_S = 5.0
-"""Without an overrun. Longer silences of a busy host are not the daemon's; a filter that takes
-longer than a tick never manages such a stretch."""
-
-
-async def _stretch_without_overrun(heard: Heard) -> None:
-    first = await heard.until("status")
-    while True:
-        status = await heard.until("status")
-        if status["overruns"] > first["overruns"]:
-            first = status
-        elif status["uptime_s"] - first["uptime_s"] >= STRETCH_S:
-            ticks = status["ticks"] - first["ticks"]
-            elapsed_s = status["uptime_s"] - first["uptime_s"]
-            assert ticks == pytest.approx(elapsed_s * RATE_HZ, abs=3)
-            return
 
 
 @pytest.mark.parametrize("name", ["kalman", "unscented", "federated", "multiscale"])
@@ -81,7 +72,7 @@ async def test_estimator_keeps_up(name: str, tmp_path: Path, broker: Broker) -> 
             await heard.until("status", lambda m: m["mode"] == "navigating")
             await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 2)
             since = heard.count
-            await _stretch_without_overrun(heard)
+            await stretch_without_overrun(heard, RATE_HZ)
             solutions = heard.all("nav", since)
             assert len(solutions) > 20
             for nav in solutions:

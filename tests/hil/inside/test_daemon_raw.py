@@ -1,0 +1,108 @@
+"""Tight coupling in the running daemon at 100 Hz: a receiver's UBX and NMEA on one serial line.
+
+RDSS fixes come beside it; for a while a street canyon leaves two satellites, so no fix.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.broker import Broker, listening
+from tests.hil.processes import (
+    SIM_IMU,
+    DaemonProcess,
+    Heard,
+    VehicleProcess,
+    nav_errors,
+    stretch_without_overrun,
+)
+
+VEHICLE = "raw"
+RATE_HZ = 100.0
+CONFIG = """
+vehicle = "raw"
+[imu]
+axes = ["+x", "-y", "-z"]
+rate_hz = 100.0
+{imu}
+[sources.gnss]
+driver = "gnss"
+port = "{gnss}"
+allow_simulator = true
+[aiding.gnss]
+kind = "raw"
+lever_arm_m = [0.0, 0.0, -1.0]
+[sources.rdss]
+driver = "rdss"
+port = "{rdss}"
+baud = 115200
+family = "4.0"
+[aiding.rdss]
+lever_arm_m = [0.0, 0.0, -1.0]
+[scheduler]
+rate_hz = {rate}
+[mqtt]
+host = "127.0.0.1"
+port = {port}
+nav_rate_hz = 10.0
+"""
+CANYON_S = (50.0, 40.0)
+"""Start and length on the trajectory, the drive's motion from 4 s on."""
+BOUNDS = {"m": 15.0, "m_s": 1.0, "deg": 5.0}
+"""What no error may exceed whatever the sigma: ranges with errors of metres, downwards more."""
+WITHIN_SIGMA = 5.0
+
+
+def _judge(vehicle: VehicleProcess, solutions: list[dict[str, object]]) -> None:
+    for nav in solutions:
+        assert nav["mode"] == "navigating"
+        for figure, (error, sd) in nav_errors(nav, vehicle.truth(nav["t_ms"])).items():
+            assert abs(error) < BOUNDS[figure.split("_", 1)[1]], (figure, error, sd)
+            assert abs(error) < WITHIN_SIGMA * sd, (figure, error, sd)
+
+
+async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: Broker) -> None:
+    start_s, length_s = CANYON_S
+    vehicle = VehicleProcess(
+        tmp_path,
+        *("--scenario", "drive", "--rest", "4", "--duration", "200", "--seed", "5"),
+        *("--can", "socketcan:vcan0", "--service-frequency", "2", "--gnss-raw", "ubx"),
+        *("--gnss-mask", f"canyon2:{start_s}:{length_s}"),
+    )
+    config = tmp_path / "raw.toml"
+    imu = SIM_IMU.format(interface="socketcan", channel="vcan0")
+    devices = {"gnss": vehicle.gnss, "rdss": vehicle.rdss, "port": broker.port}
+    config.write_text(CONFIG.format(imu=imu, rate=RATE_HZ, **devices))
+    daemon = DaemonProcess(config)
+    try:
+        await vehicle.start()
+        await daemon.start()
+        async with listening(broker) as (listener, _):
+            heard = Heard(listener, VEHICLE)
+            await heard.until("status", lambda m: m["mode"] == "navigating")
+            health = await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
+            sky = health["sources"]["gnss"]["sky"]
+            assert len(sky["used"]) >= 8
+            assert {name[0] for name in sky["used"]} == {"G", "C"}
+            assert 0.5 < sky["hdop"] < 3.0
+            assert sky["innovation_rms"] < 3.0
+            since = heard.count
+            await stretch_without_overrun(heard, RATE_HZ)
+            _judge(vehicle, heard.all("nav", since))
+
+            await heard.until("health", lambda m: len(m["sources"]["gnss"]["sky"]["used"]) == 2)
+            since, before = heard.count, await heard.until("health")
+            await heard.until("nav", lambda m: vehicle.t_s(m["t_ms"]) > start_s + length_s)
+            after = await heard.until("health")
+            _judge(vehicle, heard.all("nav", since))
+            fused = [h["sources"]["gnss"]["fused"] for h in (before, after)]
+            assert fused[1] - fused[0] > 20
+            verdicts = (await heard.until("consistency"))["sources"]
+            assert {"gnss_G", "gnss_C"} <= set(verdicts)
+        assert await daemon.terminate() == 0
+    except BaseException:
+        print(daemon.log)
+        raise
+    finally:
+        await daemon.kill()
+        await vehicle.quit()
