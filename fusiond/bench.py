@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
+from fusiond.bench_epoch import raw_epoch
 from fusiond.config import Config, Imu
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated_options import FederatedOptions
@@ -76,7 +77,8 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     one sample; `rewind_2s_ratio`, a position 2 s old inserted into the timeline and everything run
     again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
     `process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
-    velocity in order of validity, files read and the solution written at every row.
+    velocity in order of validity, files read and the solution written at every row;
+    `raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench_epoch`).
 
     As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
     multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
@@ -110,6 +112,7 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["block_step_ratio"] = ratio(_block, repetitions)
     figures["single_step_ratio"] = ratio(_single, repetitions)
     figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
+    figures["raw_epoch_40_ratio"] = ratio(raw_epoch, repetitions)
     figures["multiscale_step_ratio"] = _step_ratio(
         lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), _one_source(), repetitions
     )

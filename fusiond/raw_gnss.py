@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch, System
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
+from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config_aiding import RawAiding
 from fusiond.estimators.base import Outcome
@@ -71,7 +71,8 @@ class RawGnss:
             section.systems, math.radians(section.elevation_mask_deg), section.cno_mask_db_hz
         )
         self._model = RangeModel(self._store, options)
-        self._clock = {system: k for k, system in enumerate(section.systems)}
+        clocks = [section.systems.index(s) if s in section.systems else NO_CLOCK for s in SYSTEMS]
+        self._clock = np.array(clocks, dtype=np.int64)
         self._guess: Array | None = None
         self._rows: Rows | None = None
         self._judged: tuple[PseudorangeAid, Outcome] | None = None
@@ -118,7 +119,7 @@ class RawGnss:
             rows.rate_m_s,
             (rows.variance + rows.ionosphere_sigma_m**2) * scale,
             rows.rate_variance * scale,
-            np.array([self._clock[SYSTEMS[s]] for s in rows.system], dtype=np.int64),
+            self._clock[rows.system],
             self._section.lever_arm_m,
             epoch.clock_reset,
         )
@@ -126,9 +127,11 @@ class RawGnss:
     def judged(self, aid: PseudorangeAid, outcome: Outcome) -> None:
         """The filter has looked at an epoch."""
         self._judged = aid, outcome
-        for (satellite, what), code in zip(aid.labels, outcome.rows, strict=False):
-            if code != KEPT:
-                self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
+        refused = [(k, code) for k, code in enumerate(outcome.rows) if code != KEPT]
+        labels = aid.labels if refused else []
+        for k, code in refused:
+            satellite, what = labels[k]
+            self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
     def sky(self) -> Sky:
         """What the last epoch came to."""
@@ -180,18 +183,16 @@ def per_system(aid: PseudorangeAid, outcome: Outcome) -> dict[System, tuple[floa
     """Two standard normal figures a system for its verdict: the sums of the whitened innovations
     of its ranges and of its rates over the root of their number. White innovations give N(0, 1)
     whatever the number of satellites, so that epochs of any sky form one series."""
-    sums: dict[System, dict[str, list[float]]] = {}
-    rows = zip(aid.labels, outcome.rows, outcome.whitened, strict=False)
-    for (satellite, what), code, innovation in rows:
-        if code == KEPT:
-            system: System = next(s for s in SYSTEMS if s == satellite[0])
-            sums.setdefault(system, {"range": [], "rate": []})[what].append(innovation)
+    satellite_of = dict(zip(aid.clock.tolist(), aid.satellites, strict=True))
+    count = max(satellite_of) + 1
+    ranges, rates = aid.clock[np.isfinite(aid.ranges)], aid.clock[np.isfinite(aid.rates)] + count
+    kept = np.flatnonzero(np.array(outcome.rows) == KEPT)
+    series = np.concatenate((ranges, rates))[kept]
+    sums = np.bincount(series, np.array(outcome.whitened)[kept], 2 * count)
+    numbers = np.bincount(series, minlength=2 * count)
+    figures = (sums / np.sqrt(np.maximum(numbers, 1))).tolist()
     return {
-        system: (_normalised(by["range"]), _normalised(by["rate"]))
-        for system, by in sums.items()
-        if by["range"] and by["rate"]
+        next(s for s in SYSTEMS if s == satellite[0]): (figures[k], figures[count + k])
+        for k, satellite in satellite_of.items()
+        if numbers[k] and numbers[count + k]
     }
-
-
-def _normalised(values: list[float]) -> float:
-    return sum(values) / math.sqrt(len(values))

@@ -11,6 +11,7 @@ FIGURES = (
     "block_step_ratio",
     "single_step_ratio",
     "rewind_2s_ratio",
+    "raw_epoch_40_ratio",
     "multiscale_step_ratio",
     "federated_step_ratio",
     "unscented_step_ratio",

@@ -200,7 +200,8 @@ class PseudorangeAid(Aid):
         )
         if not bool(np.all((r > 0.0) & np.isfinite(r))):
             raise ValueError("variances must be positive and finite")
-        if len({bool(c < 0) for c in self.clock[rates]}) > 1:
+        timed = self.clock[rates] >= 0
+        if timed.any() and not timed.all():
             raise ValueError("rates of satellites with and without a clock in one epoch")
         object.__setattr__(self, "_r", r)
 
@@ -210,7 +211,7 @@ class PseudorangeAid(Aid):
         return [
             (name, what)
             for what, values in (("range", self.ranges), ("rate", self.rates))
-            for name, value in zip(self.satellites, values, strict=True)
+            for name, value in zip(self.satellites, values.tolist(), strict=True)
             if math.isfinite(value)
         ]
 

@@ -89,23 +89,19 @@ def screened_update(
                 s += h[a, columns[a, p]] * u[columns[a, p]]
             y[a] = innovation / np.sqrt(s)
             nis += y[a] * y[a]
-            hk = 0.0
+            hk, root = 0.0, np.sqrt(s)
             for i in range(n):
                 k[i] = u[i] / s
+                u[i] /= root
                 dx_out[i] += k[i] * innovation
             for p in range(counts[a]):
                 hk += h[a, columns[a, p]] * k[columns[a, p]]
-            # Joseph form of one row, as in fusiond.estimators.update.
+            # Joseph form of one row, as in fusiond.estimators.update; each product is the same to
+            # the bit with i and j exchanged.
             c = r[a] - (1.0 - hk) * s
             for i in range(n):
-                ck = c * k[i]
                 for j in range(n):
-                    cov_out[i, j] += ck * k[j] - k[i] * u[j]
-            for i in range(n):
-                for j in range(i):
-                    mean = 0.5 * (cov_out[i, j] + cov_out[j, i])
-                    cov_out[i, j] = mean
-                    cov_out[j, i] = mean
+                    cov_out[i, j] += c * (k[i] * k[j]) - u[i] * u[j]
         worst, greatest = -1, threshold
         for a in range(m):
             if codes[a] != KEPT:

@@ -23,8 +23,9 @@ its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -178,6 +179,12 @@ class Picked(NamedTuple):
     measured: Array
 
 
+_KEY: Callable[[RawSignal], tuple[System, int, str]] = attrgetter("system", "prn", "signal")
+_MEASURED: Callable[[RawSignal], tuple[float, ...]] = attrgetter(
+    "pseudorange_m", "range_rate_m_s", "cno_db_hz", "sd_pseudorange_m", "sd_range_rate_m_s"
+)
+
+
 class RangeModel:
     """Turns epochs into rows with the ephemerides of a store."""
 
@@ -197,7 +204,7 @@ class RangeModel:
 
     def pick(self, epoch: RawGnssEpoch) -> Picked:
         """Choose the signals that serve."""
-        keys = [(s.system, s.prn, s.signal) for s in epoch.signals]
+        keys = list(map(_KEY, epoch.signals))
         now = epoch.week * WEEK_S + epoch.tow_s
         plan = self._plan
         if (
@@ -208,16 +215,7 @@ class RangeModel:
         ):
             self._plan = plan = self._make_plan(epoch, keys, now)
         signals = epoch.signals
-        values = [
-            (
-                s.pseudorange_m,
-                s.range_rate_m_s,
-                s.cno_db_hz,
-                s.sd_pseudorange_m,
-                s.sd_range_rate_m_s,
-            )
-            for s in map(signals.__getitem__, plan.measured_at.tolist())
-        ]
+        values = [_MEASURED(signals[k]) for k in plan.measured_at.tolist()]
         measured = np.array(values, float).reshape(len(values), rk.MEASURED_COLUMNS)
         return Picked(plan, epoch.week, epoch.tow_s, measured)
 

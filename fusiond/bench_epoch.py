@@ -1,0 +1,73 @@
+"""What an epoch of raw GNSS data costs: 40 satellites, a range and a rate of each.
+
+From the decoded epoch to the filter that has used it: signals chosen, satellites and corrections
+computed, 80 rows linearised, gated one by one, folded in and tested by their residuals, the
+solution corrected; then what `health` and the verdicts keep. The same epoch comes again and again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from drivers.raw.messages import RawGnssEpoch
+from fusiond.config import Imu
+from fusiond.config_aiding import RawAiding
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.model import make_model
+from fusiond.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.settings import imu_noise
+from fusiond.simulation.gnss_raw import GnssRaw, GnssRawOptions
+from fusiond.simulation.scenarios import SCENARIOS
+
+SATELLITES = 40
+EPOCHS = 100
+COPIED_PRN = 40
+"""Added to a number: the simulated sky has 25 or so, the rest are doubles; the work is the same."""
+
+
+def raw_epoch(_: int) -> Callable[[], int]:
+    """Work of `EPOCHS` epochs, each with all that the daemon does with one."""
+    truth = SCENARIOS["drive"].truth(10.0)
+    receiver = GnssRaw(truth, GnssRawOptions(), np.random.default_rng(1))
+    section = RawAiding(systems=("G", "C"))
+    raw = RawGnss("gnss", section)
+    epoch = _crowded(receiver, raw)
+    start = truth.at(np.array([epoch.tow_s - receiver.start[1]]))
+    imu = Imu()
+    model = make_model("ins21", imu_noise(imu), *raw_blocks(section))
+    estimator = KalmanEstimator(model, imu.gap_s)
+    place = start.position[0]
+    nav = np.array([*place, *start.v_ned[0], 1.0, 0.0, 0.0, 0.0])
+    sigma = model.initial.copy()
+    sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [3.0] * 3
+    estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sigma**2))
+
+    def work() -> int:
+        for _ in range(EPOCHS):
+            aid = raw.aid(epoch, 0, place)
+            assert not isinstance(aid, str)
+            outcome = estimator.update(aid)
+            assert outcome.name == "fused"
+            assert len(outcome.rows) == 2 * SATELLITES
+            raw.judged(aid, outcome)
+            per_system(aid, outcome)
+        return EPOCHS
+
+    return work
+
+
+def _crowded(receiver: GnssRaw, raw: RawGnss) -> RawGnssEpoch:
+    """An epoch of 40 satellites; `raw` knows their ephemerides."""
+    for model in receiver.ionosphere:
+        raw.learn(model)
+    epoch = receiver.epoch(10)
+    doubles = [replace(s, prn=s.prn + COPIED_PRN) for s in epoch.signals]
+    signals = (*epoch.signals, *doubles)[:SATELLITES]
+    seen = {(s.system, s.prn) for s in epoch.signals}
+    for e in receiver.broadcast(float(receiver.t_s[10]), seen):
+        raw.learn(e)
+        raw.learn(replace(e, prn=e.prn + COPIED_PRN))
+    return replace(epoch, signals=signals)
