@@ -2,7 +2,8 @@
 
 From the decoded epoch to the filter that has used it: signals chosen, satellites and corrections
 computed, 80 rows linearised, gated one by one, folded in and tested by their residuals, the
-solution corrected; then what `health` and the verdicts keep. The same epoch comes again and again.
+solution corrected; then what `health` and the verdicts keep. The same epoch comes again and again,
+so the choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.raw.messages import RawGnssEpoch
+from drivers.raw.messages import RawGnssEpoch, System
 from fusiond.config import Imu
 from fusiond.config_aiding import RawAiding
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import make_model
+from fusiond.gnss.orbit import is_beidou_geo
 from fusiond.raw_gnss import RawGnss, per_system, raw_blocks
 from fusiond.settings import imu_noise
 from fusiond.simulation.gnss_raw import GnssRaw, GnssRawOptions
@@ -24,8 +26,6 @@ from fusiond.simulation.scenarios import SCENARIOS
 
 SATELLITES = 40
 EPOCHS = 100
-COPIED_PRN = 40
-"""Added to a number: the simulated sky has 25 or so, the rest are doubles; the work is the same."""
 
 
 def raw_epoch(_: int) -> Callable[[], int]:
@@ -56,18 +56,29 @@ def raw_epoch(_: int) -> Callable[[], int]:
             per_system(aid, outcome)
         return EPOCHS
 
+    work()
     return work
 
 
 def _crowded(receiver: GnssRaw, raw: RawGnss) -> RawGnssEpoch:
-    """An epoch of 40 satellites; `raw` knows their ephemerides."""
+    """An epoch of 40 satellites; `raw` knows their ephemerides.
+
+    Half of them are doubles under numbers that the simulated constellations leave free, BeiDou's of
+    the same kind of orbit.
+    """
     for model in receiver.ionosphere:
         raw.learn(model)
     epoch = receiver.epoch(10)
-    doubles = [replace(s, prn=s.prn + COPIED_PRN) for s in epoch.signals]
-    signals = (*epoch.signals, *doubles)[:SATELLITES]
-    seen = {(s.system, s.prn) for s in epoch.signals}
-    for e in receiver.broadcast(float(receiver.t_s[10]), seen):
+    geostationary, others = iter(range(1, 6)), iter(range(6, 23))
+    gps = iter(range(33, 64))
+    doubles: dict[tuple[System, int], int] = {}
+    for s in epoch.signals:
+        free = gps if s.system == "G" else others
+        if is_beidou_geo(s.system, s.prn):
+            free = geostationary
+        doubles[s.system, s.prn] = next(free)
+    for e in receiver.broadcast(float(receiver.t_s[10]), set(doubles)):
         raw.learn(e)
-        raw.learn(replace(e, prn=e.prn + COPIED_PRN))
-    return replace(epoch, signals=signals)
+        raw.learn(replace(e, prn=doubles[e.system, e.prn]))
+    copied = [replace(s, prn=doubles[s.system, s.prn]) for s in epoch.signals]
+    return replace(epoch, signals=(*epoch.signals, *copied)[:SATELLITES])
