@@ -4,6 +4,10 @@ Experiments: `fusiond.studies.federated_papers` (1 to 3), `fusiond.studies.feder
 Faults and honesty: `fusiond.studies.federated_runs`. A fault lasts 100 s; errors count from its
 start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
 is the median over the runs; a run in which it is not detected counts as later than any.
+
+The daemon believes a source again that its gate has refused for ten seconds
+(`fusiond.timeline`), because a filter that trusts nobody cannot recover; a persistent fault enters
+a centralised filter that way. `rms_centralised_gate_only_m` is without that rule.
 """
 
 from __future__ import annotations
@@ -51,13 +55,17 @@ PAPER = {
 FAULTS: tuple[FaultKind, ...] = ("step", "drift", "frozen")
 MODES = ("no_reset", "fusion_reset", "zero_reset", "rescale")
 HONEST_FROM_S = 20.0
-_CENTRALISED, _UNISOLATED = "centralised", "unisolated"
+_CENTRALISED, _UNISOLATED, _GATE_ONLY = "centralised", "unisolated", "centralised_gate_only"
 FILTERS = (
     *(Filter(mode, FederatedOptions(mode=mode)) for mode in MODES),  # type: ignore[arg-type]
     Filter("adaptive", FederatedOptions(adaptive=True)),
     Filter(_CENTRALISED),
 )
-FAULT_FILTERS = (*FILTERS, Filter(_UNISOLATED, FederatedOptions(fault_detection=False)))
+FAULT_FILTERS = (
+    *FILTERS,
+    Filter(_UNISOLATED, FederatedOptions(fault_detection=False)),
+    Filter(_GATE_ONLY, recovers=False),
+)
 
 
 def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
@@ -158,6 +166,7 @@ def _fault(found: list[dict[str, Trace]]) -> dict[str, Any]:
         "rms_isolated_m": rms["no_reset"],
         "rms_unisolated_m": rms[_UNISOLATED],
         "rms_centralised_m": rms[_CENTRALISED],
+        "rms_centralised_gate_only_m": rms[_GATE_ONLY],
         "modes": modes,
     }
 
@@ -172,7 +181,7 @@ def _detected(found: list[dict[str, Trace]], name: str) -> dict[str, Any]:
 
 
 def _course(found: list[dict[str, Trace]]) -> dict[str, list[float]]:
-    names = ("no_reset", "fusion_reset", _UNISOLATED, _CENTRALISED)
+    names = ("no_reset", "fusion_reset", _UNISOLATED, _CENTRALISED, _GATE_ONLY)
     return {n: np.sqrt(np.mean(_horizontal(found, n) ** 2, axis=0)).tolist() for n in names}
 
 
@@ -182,7 +191,8 @@ def _finding(result: dict[str, Any]) -> str:
         after = "never" if f["detected_after_s"] is None else f"after {f['detected_after_s']:.0f} s"
         parts.append(
             f"{name} {after}, {f['rms_isolated_m']:.2f} m with isolation, "
-            f"{f['rms_unisolated_m']:.1f} m without, {f['rms_centralised_m']:.1f} m centralised"
+            f"{f['rms_unisolated_m']:.1f} m without, {f['rms_centralised_m']:.1f} m centralised "
+            f"({f['rms_centralised_gate_only_m']:.2f} m if its gate never gives in)"
         )
     unequal = result["honesty"]["unequal"]
     drift = result["faults"]["drift"]["modes"]["fusion_reset"]
@@ -266,6 +276,8 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
         ]
         rows.append(["no isolation", "", f"{fault['rms_unisolated_m']:.2f}"])
         rows.append(["centralised", "", f"{fault['rms_centralised_m']:.2f}"])
+        gate_only = fault["rms_centralised_gate_only_m"]
+        rows.append(["centralised, gate for ever", "", f"{gate_only:.2f}"])
         found.append((f"fault: {name}", ["", "isolated after s", "horizontal RMS m"], rows))
     return found
 

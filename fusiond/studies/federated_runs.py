@@ -24,9 +24,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.config import Imu
-from fusiond.estimators.base import Estimator
+from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated_options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.model import Model, make_model
@@ -71,10 +72,20 @@ linearisation, not the filter, sets the NEES."""
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A line of the result; no options: the centralised filter."""
+    """A line of the result; no options: the centralised filter. `recovers`: a source that the gate
+    has refused for ten seconds is believed again, as the daemon does."""
 
     name: str
     options: FederatedOptions | None = None
+    recovers: bool = True
+
+
+class _GateOnly(KalmanEstimator):
+    """The centralised filter that refuses for ever what its gate refuses."""
+
+    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
+        """As the centralised filter, never widened."""
+        return super().update(aid, inflate=False)
 
 
 @dataclass(slots=True)
@@ -139,7 +150,8 @@ def fixes(
 def estimator_of(filter_: Filter, model: Model) -> Estimator:
     """A filter of the study."""
     if filter_.options is None:
-        return KalmanEstimator(model, STUDY_IMU.gap_s)
+        kind = KalmanEstimator if filter_.recovers else _GateOnly
+        return kind(model, STUDY_IMU.gap_s)
     return federated(model, STUDY_IMU.gap_s, SOURCES, filter_.options)
 
 
