@@ -1,4 +1,5 @@
-"""Monte Carlo: the filter's sigma is honest (NEES, NIS) for every shipped model.
+"""Monte Carlo: the filter's sigma is honest (NEES, NIS) for every shipped model without a clock;
+those with one are in tests/test_estimator_consistency_clock.py.
 
 Each run draws its sensor errors from `fusiond.simulation.sensor_errors` with the very `Imu` that
 the filter is configured with, starts from the true state plus an error drawn from P0, and feeds
@@ -49,6 +50,18 @@ MATCHED = {
         gyro_scale_ppm=NO_SCALE,
         accel_scale_ppm=NO_SCALE,
     ),
+    # As planar15, but for what it has no states for: the gyro's constant part, the accelerometer.
+    "planar10": Imu(
+        rate_hz=RATE_HZ,
+        gyro_noise_deg_sqrt_h=0.05,
+        accel_noise_m_s_sqrt_h=0.02,
+        gyro_bias_initial_deg_h=1e-9,
+        gyro_bias_instability_deg_h=3.0,
+        accel_bias_initial_mg=1e-9,
+        accel_bias_instability_mg=1e-9,
+        gyro_scale_ppm=NO_SCALE,
+        accel_scale_ppm=NO_SCALE,
+    ),
 }
 
 
@@ -63,9 +76,10 @@ class Figures:
 
 
 def _aids(name: str, truth: Truth, t_s: Array, rng: np.random.Generator) -> list[list[Linearised]]:
-    """GNSS position and velocity; horizontal 20 m fixes for the planar model."""
+    """GNSS position and velocity; horizontal 20 m fixes for the planar models."""
     states = truth.at(t_s, LEVER)
-    sd, sd_v = (20.0, 20.0, 20.0) if name == "planar15" else (1.5, 1.5, 3.0), (0.05, 0.05, 0.1)
+    planar = name.startswith("planar")
+    sd, sd_v = (20.0, 20.0, 20.0) if planar else (1.5, 1.5, 3.0), (0.05, 0.05, 0.1)
     aids: list[list[Linearised]] = []
     for t, p, v in zip(t_s, states.position, states.v_ned, strict=True):
         lat, lon, height = (
@@ -73,7 +87,7 @@ def _aids(name: str, truth: Truth, t_s: Array, rng: np.random.Generator) -> list
             for x in p + rng.standard_normal(3) * sd / runs.metres(float(p[0]), float(p[2]))
         )
         t_ns = round(t * 1e9)
-        if name == "planar15":
+        if planar:
             aids.append([PositionAid("rdss", t_ns, 1 - 1e-9, lat, lon, None, sd, LEVER)])
             continue
         n, e, d = (float(x) for x in v + rng.standard_normal(3) * sd_v)
@@ -100,7 +114,7 @@ def _projection(model: Model) -> Array:
 def monte_carlo(name: str, count: int, first_seed: int = 1000) -> Figures:
     """Run `count` drives and collect the figures."""
     imu = MATCHED[name]
-    truth = runs.town_truth(SECONDS, RATE_HZ, 0.0 if name == "planar15" else 3.0)
+    truth = runs.town_truth(SECONDS, RATE_HZ, 0.0 if name.startswith("planar") else 3.0)
     times = runs.sample_times(truth)
     fixes_s = np.arange(FIRST_FIX_S, SECONDS, 1.0)
     true_at = runs.true_nav(truth, np.array([0.0, *INSTANTS_S]))
