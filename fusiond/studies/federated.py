@@ -200,7 +200,7 @@ def _finding(result: dict[str, Any]) -> str:
     late = drift["detected_after_s"]
     sees = "never" if late is None else f"after {late:.0f} s"
     return (
-        f"Three local filters, one faulty: {'; '.join(parts)}. Without reset the NEES with unequal "
+        f"Three local filters, one faulty: {'; '.join(parts)}; without reset the NEES with unequal "
         f"sources is {unequal['filters']['no_reset']['nees_mean']:.1f} (centralised and fusion "
         f"reset {unequal['filters']['fusion_reset']['nees_mean']:.1f}, {low:.1f} to {high:.1f} "
         f"expected); fusion reset sees the drift {sees} and has {drift['rms_m']:.2f} m."
