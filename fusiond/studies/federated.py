@@ -188,7 +188,7 @@ def _course(found: list[dict[str, Trace]]) -> dict[str, list[float]]:
 def _finding(result: dict[str, Any]) -> str:
     parts = []
     for name, f in result["faults"].items():
-        after = "never" if f["detected_after_s"] is None else f"after {f['detected_after_s']:.0f} s"
+        after = "never" if f["detected_after_s"] is None else f"after {f['detected_after_s']:g} s"
         parts.append(
             f"{name} {after}, {f['rms_isolated_m']:.2f} m with isolation, "
             f"{f['rms_unisolated_m']:.1f} m without, {f['rms_centralised_m']:.1f} m centralised "
@@ -198,7 +198,7 @@ def _finding(result: dict[str, Any]) -> str:
     drift = result["faults"]["drift"]["modes"]["fusion_reset"]
     low, high = unequal["nees_interval"]
     late = drift["detected_after_s"]
-    sees = "never" if late is None else f"after {late:.0f} s"
+    sees = "never" if late is None else f"after {late:g} s"
     return (
         f"Three local filters, one faulty: {'; '.join(parts)}; without reset the NEES with unequal "
         f"sources is {unequal['filters']['no_reset']['nees_mean']:.1f} (centralised and fusion "
@@ -269,7 +269,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
         rows = [
             [
                 mode,
-                "" if f["detected_after_s"] is None else f"{f['detected_after_s']:.0f}",
+                "" if f["detected_after_s"] is None else f"{f['detected_after_s']:g}",
                 f"{f['rms_m']:.2f}",
             ]
             for mode, f in fault["modes"].items()
