@@ -299,10 +299,11 @@ def plot(result: dict[str, Any], path: Path) -> None:
             panel.plot(result["series"]["t_s"], values, label=name.replace("_", " "))
         panel.axvspan(result["fault"]["start_s"], result["fault"]["end_s"], alpha=0.1)
         panel.set_yscale("log")
+        panel.set_ylim(top=10.0 * panel.get_ylim()[1])  # room for the legend
         panel.set_title(f"fault in one of three sources: {fault}", loc="left")
         panel.set_xlabel("s")
         panel.set_ylabel("horizontal RMS, m")
     for panel in axes:
         panel.grid(alpha=0.3)
-        panel.legend(fontsize="small", ncols=4)
+        panel.legend(fontsize="small", ncols=5, loc="upper left")
     figure.savefig(path, dpi=120)
