@@ -9,25 +9,29 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
+from fusiond.cli_shared import (
+    AID_KINDS,
+    EXIT_DATA,
+    EXIT_UNAVAILABLE,
+    aid_argument,
+    config_errors,
+    data_errors,
+    load,
+    outage_argument,
+    plain,
+    print_file,
+    print_summary,
+    progress_bar,
+    spinner,
+    systems_argument,
+    write_json,
+)
 from fusiond.studies import STUDIES
-
-if TYPE_CHECKING:
-    from drivers.raw.messages import System
-    from fusiond.config import Config
-
-EXIT_DATA = 65
-EXIT_UNAVAILABLE = 69
-EXIT_IO = 74
-EXIT_CONFIG = 78
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
@@ -69,7 +73,7 @@ def _root(
 @app.command()
 def run(config: ConfigPath) -> None:
     """Run the daemon."""
-    loaded = _load(config)
+    loaded = load(config)
     from fusiond.daemon import run as run_daemon  # noqa: PLC0415
 
     run_daemon(loaded, config)
@@ -89,7 +93,7 @@ def demo(
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
-    typer.echo(json.dumps(_plain(summary), allow_nan=False))
+    typer.echo(json.dumps(plain(summary), allow_nan=False))
 
 
 @app.command()
@@ -99,10 +103,17 @@ def check(
         bool, typer.Option("--compile", help="Also compile what the daemon would compile at start.")
     ] = False,
 ) -> None:
-    """Validate a configuration: 0, or 78 with every mistake."""
-    loaded = _load(config)
+    """Validate a configuration: 0, or 78 with every mistake.
+
+    With --compile also that the model, with all that its aids add, fits the kernels.
+    """
+    loaded = load(config)
     if compile_kernels:
         import fusiond.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
+        from fusiond.model_report import model_report  # noqa: PLC0415
+
+        with config_errors():
+            model_report(loaded.estimator.model, loaded)
     typer.echo(f"{config}: ok, vehicle {loaded.vehicle}")
     for name, source in loaded.sources.items():
         aid = loaded.aiding.get(name)
@@ -118,7 +129,7 @@ def doctor(
     seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen.")] = 5.0,
 ) -> None:
     """Open every port for some seconds: what arrives, how often, how old, what is wrong."""
-    loaded = _load(config)
+    loaded = load(config)
     from fusiond.doctor import doctor as run_doctor  # noqa: PLC0415
 
     raise typer.Exit(run_doctor(loaded, seconds))
@@ -149,17 +160,17 @@ def process(
     json_path: JsonPath = None,
 ) -> None:
     """Navigate through recorded files with the daemon's own navigator."""
-    aids = [_aid(text) for text in aid or []]
-    outages = [_outage(text) for text in outage or []]
+    aids = [aid_argument(text) for text in aid or []]
+    outages = [outage_argument(text) for text in outage or []]
     if out is not None and str(out) == "-" == json_path:
         raise typer.BadParameter("--out and --json cannot both be standard output")
-    loaded = _load(config)
+    loaded = load(config)
     from fusiond.offline import process as run_process  # noqa: PLC0415
 
-    with _data_errors(), _spinner("processing"):
-        result = run_process(loaded, imu, aids, outages, out, _systems(systems))
-    _print_summary(result, err="-" in (json_path, str(out)))
-    _write_json(result, json_path)
+    with config_errors(), data_errors(), spinner("processing"):
+        result = run_process(loaded, imu, aids, outages, out, systems_argument(systems))
+    print_summary(result, err="-" in (json_path, str(out)))
+    write_json(result, json_path)
 
 
 @app.command()
@@ -189,7 +200,7 @@ def simulate(
         masked = SCENARIOS[scenario].masked([parse_mask(text) for text in gnss_mask or ()])
     except ValueError as error:
         raise typer.BadParameter(f"--gnss-mask: {error}") from error
-    with _data_errors(), _spinner("simulating"):
+    with data_errors(), spinner("simulating"):
         written = run_simulate(masked, out, seed, duration, gnss_raw=gnss_raw)
     for name, path in written.files.items():
         typer.echo(f"{path}: {written.rows[name]} rows")
@@ -213,11 +224,11 @@ def compare(
     from fusiond.csv_tables import file_report  # noqa: PLC0415
     from fusiond.files import read_solution, read_truth  # noqa: PLC0415
 
-    with _data_errors():
+    with data_errors():
         tables = read_solution(solution), read_truth(truth)
         for path, table in zip((solution, truth), tables, strict=True):
             if table.rejected:
-                _print_file(str(path), file_report(len(table.t_s), table.rejected), err=True)
+                print_file(str(path), file_report(len(table.t_s), table.rejected), err=True)
         try:
             report = run_compare(*tables, after_s=after)
         except NothingToCompareError as error:
@@ -225,7 +236,7 @@ def compare(
             raise typer.Exit(EXIT_DATA) from error
     if json_path != "-":
         print_report(report)
-    _write_json(report, json_path)
+    write_json(report, json_path)
 
 
 @app.command()
@@ -259,15 +270,15 @@ def study(
         typer.echo("fusiond: --plot needs matplotlib: pip install fusiond[report]", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE)
     module = import_module(STUDIES[name])
-    with _progress(name) as progress:
+    with progress_bar(name) as progress:
         result = module.run(runs, progress=progress)
     if json_path != "-":
         from fusiond.studies.report import print_study  # noqa: PLC0415
 
         print_study(module, result)
-    _write_json(result, json_path)
+    write_json(result, json_path)
     if plot is not None:
-        with _data_errors():
+        with data_errors():
             module.plot(result, plot)
 
 
@@ -286,10 +297,12 @@ def model(
 
     if name not in MODELS:
         raise typer.BadParameter(f"{name!r}: there are {', '.join(MODELS)}")
-    report = model_report(name, None if config is None else _load(config))
+    loaded = None if config is None else load(config)
+    with config_errors():
+        report = model_report(name, loaded)
     if json_path != "-":
         print_model(report)
-    _write_json(report, json_path)
+    write_json(report, json_path)
 
 
 @app.command()
@@ -297,128 +310,6 @@ def bench() -> None:
     """Time the kernels against one numpy product; prints JSON."""
     from fusiond.bench import bench as run_bench  # noqa: PLC0415
 
-    with _spinner("timing"):
+    with spinner("timing"):
         figures = run_bench()
-    _write_json(figures, "-")
-
-
-# --------------------------------------------------------------------------- shared
-
-
-def _load(path: Path) -> Config:
-    from fusiond.load_config import ConfigError, load_config  # noqa: PLC0415
-
-    try:
-        return load_config(path)
-    except ConfigError as error:
-        typer.echo(error, err=True)
-        raise typer.Exit(EXIT_CONFIG) from error
-
-
-@contextmanager
-def _data_errors() -> Iterator[None]:
-    from fusiond.csv_tables import TableError  # noqa: PLC0415
-
-    try:
-        yield
-    except TableError as error:
-        typer.echo(f"fusiond: {error}", err=True)
-        raise typer.Exit(EXIT_DATA) from error
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        typer.echo(f"fusiond: {error.filename or 'output'}: {error.strerror or error}", err=True)
-        raise typer.Exit(EXIT_IO) from error
-
-
-def _aid(text: str) -> tuple[str, Path]:
-    kind, equals, path = text.partition("=")
-    if not equals or not path or kind not in AID_KINDS:
-        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(AID_KINDS)}")
-    return kind, Path(path)
-
-
-def _outage(text: str) -> tuple[float, float]:
-    start, _, length = text.partition(":")
-    try:
-        window = float(start), float(length)
-    except ValueError:
-        window = (0.0, 0.0)
-    if not (isfinite(window[0]) and isfinite(window[1]) and window[1] > 0.0):
-        raise typer.BadParameter(f"--outage {text}: START:LENGTH in seconds, LENGTH above 0")
-    return window
-
-
-def _systems(text: str | None) -> tuple[System, ...] | None:
-    if text is None:
-        return None
-    from drivers.raw.messages import SYSTEMS  # noqa: PLC0415
-
-    letters = [letter.strip().upper() for letter in text.split(",")]
-    if not set(letters) <= set(SYSTEMS) or len(set(letters)) < len(letters):
-        raise typer.BadParameter(f"--systems {text}: G GPS, E Galileo, C BeiDou, each once")
-    return tuple(s for s in SYSTEMS if s in letters)
-
-
-def _spinner(text: str) -> AbstractContextManager[object]:
-    """A moving sign on a terminal, nothing in a pipe."""
-    if not sys.stderr.isatty():
-        return nullcontext()
-    from rich.console import Console  # noqa: PLC0415
-
-    return Console(stderr=True).status(text)
-
-
-@contextmanager
-def _progress(text: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on a terminal, called with (done, total); nothing in a pipe."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import Progress  # noqa: PLC0415
-
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(text, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _plain(value: object) -> object:
-    """The same value in what JSON knows: nan and inf become null, paths text."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if isfinite(value) else None
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    return str(value)
-
-
-def _write_json(value: object, path: str | None) -> None:
-    if path is None:
-        return
-    text = json.dumps(_plain(value), indent=2, allow_nan=False)
-    if path == "-":
-        typer.echo(text)
-        return
-    with _data_errors():
-        Path(path).write_text(text + "\n", encoding="utf-8")
-
-
-def _print_file(name: str, report: dict[str, Any], err: bool) -> None:
-    """One file as `csv_tables.file_report` describes it."""
-    rejected = sum(report["rejected"].values())
-    typer.echo(f"{name}: {report['rows']} rows, {rejected} rejected", err=err)
-    for row in report["first_rejected"]:
-        typer.echo(f"  {row}", err=err)
-
-
-def _print_summary(result: dict[str, Any], err: bool) -> None:
-    """`files`: what was read; `sources`: each aid's measurements by outcome."""
-    for name, report in result["files"].items():
-        _print_file(name, report, err)
-    for name, outcomes in result["sources"].items():
-        counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
-        typer.echo(f"{name}: {counts or 'nothing'}", err=err)
+    write_json(figures, "-")

@@ -13,15 +13,26 @@ from fusiond.estimators.federated_options import FederatedOptions
 from fusiond.estimators.federated_reset import ResetFilter
 from fusiond.estimators.federated_standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.model import Block, Model, make_model
+from fusiond.estimators.model import Block, Model, TooManyStatesError, make_model
 from fusiond.estimators.multiscale import MultiscaleEstimator
 from fusiond.estimators.unscented import UnscentedEstimator
+from fusiond.load_config import ConfigError
 from fusiond.settings import imu_noise
 
 
 def model_of(config: Config, *extra: Block) -> Model:
-    """The error-state model of a configuration, with the blocks that its aids need."""
-    return make_model(config.estimator.model, imu_noise(config.imu), *extra)
+    """The error-state model of a configuration, with the blocks that its aids need.
+
+    Raises `ConfigError` where those are more states than the kernels hold.
+    """
+    try:
+        return make_model(config.estimator.model, imu_noise(config.imu), *extra)
+    except TooManyStatesError as error:
+        names = ", ".join(block.name for block in extra)
+        raise ConfigError(
+            f"estimator.model: {error}; the aids add {names}: choose a smaller model, such as"
+            " 'ins15', or fewer aids"
+        ) from error
 
 
 def estimator_of(config: Config, model: Model) -> Estimator:

@@ -139,8 +139,10 @@ class RawGnss:
             return Sky(refused=dict(self._rows.refused) if self._rows is not None else {})
         aid, outcome = self._judged
         used, refused, squares = [], dict(self._rows.refused), []
-        rows = zip(aid.labels, outcome.rows, outcome.whitened, strict=False)
-        for (satellite, what), code, innovation in rows:
+        whitened = outcome.whitened or (0.0,) * len(outcome.rows)  # an epoch that failed as a whole
+        for (satellite, what), code, innovation in zip(
+            aid.labels, outcome.rows, whitened, strict=False
+        ):
             if what == "range":
                 if code == KEPT:
                     used.append(satellite)

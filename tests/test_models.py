@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def test_a_further_block_takes_the_place_of_its_namesake() -> None:
 
 
 def test_more_states_than_the_kernels_hold() -> None:
-    with pytest.raises(ValueError, match="kernels hold 32"):
+    with pytest.raises(ValueError, match="at most 32 fit"):
         make_model("ins23", imu_noise(IMU), *(misalignment(f"m{k}", 1e-3) for k in range(4)))
 
 
@@ -127,3 +128,37 @@ def test_model_command_names_what_there_is() -> None:
     result = CliRunner().invoke(app, ["model", "ins99"])
     assert result.exit_code == 2
     assert "ins15" in result.output
+
+
+IMU_CSV = (
+    "t_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2\n"
+    "0.01,0,0,0,0,0,-9.8\n"
+)
+TOO_MANY = """
+vehicle = "all"
+[aiding.raw]
+[aiding.rdss]
+[aiding.star_tracker]
+[aiding.sar]
+targets_deg_m = { P1 = [30.0, 114.0, 20.0] }
+"""
+
+
+def test_a_model_that_outgrows_the_kernels_is_a_mistake_of_the_configuration(
+    tmp_path: Path,
+) -> None:
+    config, imu = tmp_path / "all.toml", tmp_path / "imu.csv"
+    config.write_text(TOO_MANY)
+    imu.write_text(IMU_CSV)
+    runner = CliRunner()
+    for command in (
+        ["check", "--compile", str(config)],
+        ["model", "ins21", "--config", str(config)],
+        ["process", str(config), "--imu", str(imu)],
+    ):
+        result = runner.invoke(app, command)
+        assert result.exit_code == 78, command
+        assert "36 states, at most 32" in result.stderr
+        assert "sar_misalignment" in result.stderr
+    config.write_text(TOO_MANY + '[estimator]\nmodel = "ins15"\n')
+    assert runner.invoke(app, ["check", "--compile", str(config)]).exit_code == 0

@@ -112,6 +112,10 @@ class Block:
     rate: str = ""
 
 
+class TooManyStatesError(ValueError):
+    """A model of more states than the kernels hold."""
+
+
 @dataclass(frozen=True)
 class Model:
     """A list of blocks, laid out in slots for the kernels.
@@ -144,7 +148,7 @@ class Model:
         size = CORE_SIZE + parameters
         width = next((w for w in WIDTHS if w >= size), None)
         if width is None:
-            raise ValueError(f"model {self.name}: {size} states, the kernels hold {WIDTHS[-1]}")
+            raise TooManyStatesError(f"{self.name} has {size} states, at most {WIDTHS[-1]} fit")
         noise, initial = np.zeros((3, size)), np.zeros(size)
         active = np.zeros(size, dtype=np.bool_)
         column_of = np.full(size, -1, dtype=np.int64)

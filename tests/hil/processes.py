@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import signal
 import socket
@@ -196,6 +197,22 @@ def nav_errors(nav: dict[str, Any], truth: NDArray[np.float64]) -> dict[str, tup
         "yaw_deg": (nav["yaw_deg"] - degrees(yaw) + 180.0) % 360.0 - 180.0,
     }
     return {name: (error, nav[f"sd_{name}"]) for name, error in errors.items()}
+
+
+WITHIN_SIGMA = 5.0
+"""An error beyond it is one in 1.7 million, if sigma is right."""
+
+
+def judge(
+    vehicle: VehicleProcess, solutions: list[dict[str, Any]], bounds: dict[str, float]
+) -> None:
+    """`nav` messages against the truth: each error within five of its sigmas, and within the bound
+    of its unit (m, m_s, deg), where there is one, whatever the sigma."""
+    for nav in solutions:
+        assert nav["mode"] == "navigating"
+        for figure, (error, sd) in nav_errors(nav, vehicle.truth(nav["t_ms"])).items():
+            assert abs(error) < bounds.get(figure.split("_", 1)[1], math.inf), (figure, error, sd)
+            assert abs(error) < WITHIN_SIGMA * sd, (figure, error, sd)
 
 
 class VehicleProcess:
