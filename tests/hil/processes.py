@@ -25,7 +25,7 @@ from tests.runs import metres
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FUSIOND = Path(sys.executable).with_name("fusiond")
-PATIENCE_S = 60.0
+PATIENCE_S = 240.0
 """Only bounds a broken run; nothing passes or fails by its length."""
 
 SIM_IMU = """
