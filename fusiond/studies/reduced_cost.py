@@ -1,11 +1,13 @@
 r"""What a step costs in study `reduced-order`, as CPU time.
 
 `step`: the filter's own recursion, as paper 002 times it: the covariance propagated once, then the
-epoch's four ranges, four rates and two angles folded in. These are the live filter's kernels, with
-its judgement of every range, called from compiled code: no INS, no geometry, no Python.
+epoch's four ranges, four rates and two angles gated, folded in and fed back. These are the live
+filter's kernels, called from compiled code: no INS, no geometry, no Python, and no judgement of
+single ranges (`fusiond.estimators.screening`), which the paper's filter does not have.
 
 `live second`: a second of the running filter (`KalmanEstimator`): 100 IMU samples through the
-strapdown equations and the covariance, rows computed from satellites and radar point, update.
+strapdown equations and the covariance, rows computed from satellites and radar point, every range
+judged, update.
 What does not depend on the number of states is most of it.
 """
 
@@ -22,10 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, State
+from fusiond.aiding.base import State
 from fusiond.estimators.covariance import covariance_for, work_size
 from fusiond.estimators.model import Model
-from fusiond.estimators.screening import screened_update
 from fusiond.estimators.update import fuse
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, WIDTHS, coefficients
@@ -41,7 +42,7 @@ IMU_RATE_HZ = 100.0
 LIVE_S = 30
 RECURSIONS = 1000
 """Timed at once: some milliseconds, long against the resolution of the clock."""
-ROUNDS = 15
+ROUNDS = 45
 
 _covariance_narrow, _covariance_middle = (covariance_for(w) for w in WIDTHS[:2])
 
@@ -60,7 +61,7 @@ def _recursions_for(width: int) -> Callable[..., None]:
 
     @compiled(
         "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+        "f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
     )
     def recursions(
         count: int,
@@ -73,19 +74,13 @@ def _recursions_for(width: int) -> Callable[..., None]:
         rate_terms: Indices,
         noise: Array,
         work: Array,
-        ranges: Array,
-        range_r: Array,
-        angles: Array,
-        angle_r: Array,
-        cov_out: Array,
+        rows: Array,
+        r: Array,
         nav: Array,
         xi: Array,
     ) -> None:
-        """`count` times: `cov` over h seconds, rows `ranges` (8, n) and `angles` (2, n)."""
-        range_z, angle_z = np.zeros(ranges.shape[0]), np.zeros(angles.shape[0])
-        range_y, angle_y = np.zeros(ranges.shape[0]), np.zeros(angles.shape[0])
-        codes = np.zeros(ranges.shape[0], dtype=np.int64)
-        dx, dx_out = np.zeros(xi.shape[0]), np.zeros(xi.shape[0])
+        """`count` times: `cov` over h seconds, then `rows` (m, n) with variances `r` (m,)."""
+        z, y, dx = np.zeros(r.shape[0]), np.zeros(r.shape[0]), np.zeros(xi.shape[0])
         for _ in range(count):
             if narrow:
                 _covariance_narrow(
@@ -95,12 +90,7 @@ def _recursions_for(width: int) -> Callable[..., None]:
                 _covariance_middle(
                     cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
                 )
-            codes[:] = 0
-            screened_update(
-                cov, dx, range_z, ranges, range_r, math.inf, codes, range_y, cov_out, dx_out
-            )
-            cov[:] = cov_out
-            fuse(nav, xi, cov, dx, angle_z, angles, angle_r, math.inf, False, angle_y)
+            fuse(nav, xi, cov, dx, z, rows, r, math.inf, False, y)
 
     return recursions
 
@@ -110,8 +100,7 @@ def _recursion(of: Model) -> Callable[[], float]:
     nav = flight.true_nav(flight.truth(float(LIVE_S)))[1]
     scene = flight.scenes(float(LIVE_S))[0]
     state = State(nav, np.zeros(of.size), np.zeros(STEP_SIZE), of)
-    found = [aid.innovation(state) for aid in flight.aids(scene, np.zeros(flight.ROWS))]
-    ranges, angles = (f for f in found if isinstance(f, Innovation))
+    _, rows, r = flight.rows(flight.aids(scene, np.zeros(flight.ROWS)), state)
     step, c = level_step(nav), np.zeros(COEFFICIENTS)
     h = 1.0 / IMU_RATE_HZ
     coefficients(nav, step, h, c)
@@ -120,13 +109,12 @@ def _recursion(of: Model) -> Callable[[], float]:
     p[: of.size, : of.size] = np.diag(flight.initial_sd(of) ** 2)
 
     def timed() -> float:
-        cov, work, out = p.copy(), np.zeros(work_size(width)), np.zeros((width, width))
-        xi = np.zeros(of.size)
+        cov, work, xi = p.copy(), np.zeros(work_size(width)), np.zeros(of.size)
         start = time.process_time_ns()
         kernel(
             *(RECURSIONS, cov, step, c, h),
             *(of.active, of.sensor_terms, of.rate_terms, of.noise, work),
-            *(ranges.h, ranges.r, angles.h, angles.r, out, nav.copy(), xi),
+            *(rows, r, nav.copy(), xi),
         )
         return (time.process_time_ns() - start) * 1e-9 / RECURSIONS
 
@@ -166,25 +154,29 @@ def _live_second(of: Model) -> Callable[[], float]:
 
 
 def costs(models: dict[str, Model], rounds: int = ROUNDS) -> dict[str, Cost]:
-    """Medians over `rounds`; the filters take turns, so that a processor which changes its clock
-    changes it for all."""
-    timed = {name: (_recursion(of), _live_second(of)) for name, of in models.items()}
-    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
-    gc.collect()
-    for _ in range(rounds + 1):
-        for name, (step, second) in timed.items():
-            spent[name].append((step(), second()))
-    # The first round warms caches.
-    return {
-        name: Cost(median(a for a, _ in values[1:]), median(b for _, b in values[1:]))
-        for name, values in spent.items()
-    }
+    """Medians over `rounds` of recursions, then over a third as many of live seconds.
+
+    The filters take turns, so that a processor which changes its clock changes it for all.
+    """
+    steps = _in_turn({name: _recursion(of) for name, of in models.items()}, rounds)
+    seconds = _in_turn({name: _live_second(of) for name, of in models.items()}, -(-rounds // 3))
+    return {name: Cost(steps[name], seconds[name]) for name in models}
 
 
 def step_ratio(rounds: int = ROUNDS) -> float:
     """Time of a step of 17 states over that of 23."""
-    found = costs({"17": flight.model("ins17"), "23": flight.model("ins23")}, rounds)
-    return found["17"].step_s / found["23"].step_s
+    models = {"17": flight.model("ins17"), "23": flight.model("ins23")}
+    steps = _in_turn({name: _recursion(of) for name, of in models.items()}, rounds)
+    return steps["17"] / steps["23"]
+
+
+def _in_turn(timed: dict[str, Callable[[], float]], rounds: int) -> dict[str, float]:
+    spent: dict[str, list[float]] = {name: [] for name in timed}
+    gc.collect()
+    for _ in range(rounds + 1):
+        for name, once in timed.items():
+            spent[name].append(once())
+    return {name: median(values[1:]) for name, values in spent.items()}  # the first warms caches
 
 
 # Compiled, or loaded from the cache, when this module is imported.
