@@ -91,7 +91,7 @@ def test_live_filters_err_as_the_analysis_says_and_the_reduced_ones_do_not_know(
 
 def test_runs_repeat() -> None:
     models = {"23": flight.model("ins23")}
-    a, b, other = (fly(models, 100.0, 1, k)["23"].error for k in (4, 4, 5))
+    a, b, other = (fly(models, 100.0, 100, False, 1, k)["23"].error for k in (4, 4, 5))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, other)
 
@@ -105,9 +105,9 @@ def test_measured_values_are_those_of_the_true_state() -> None:
     xi[of.slots_of("clock_offset")], xi[of.slots_of("clock_drift")] = 2e5, -120.0
     xi[of.slots_of("sar_misalignment")] = 1e-4, -2e-4, 3e-4
     true = State(nav, xi, np.zeros(STEP_SIZE), of)
-    aids = flight.measured(scene, true, np.zeros(flight.ROWS))
+    aids = flight.measured(scene, true, np.zeros(scene.rows))
     np.testing.assert_allclose(flight.rows(aids, true).z, 0.0, atol=1e-7)
-    z = flight.rows(flight.measured(scene, true, np.ones(flight.ROWS)), true).z
+    z = flight.rows(flight.measured(scene, true, np.ones(scene.rows)), true).z
     sd = [5.0] * 4 + [0.05] * 4 + [1e-3] * 2
     np.testing.assert_allclose(z, -np.array(sd), rtol=1e-6)
 
@@ -172,7 +172,7 @@ def test_azimuth_of_the_points_stays_where_the_text_says() -> None:
     angles = []
     for k, scene in enumerate(flight.scenes(600.0)):
         state = State(nav[k + 1], np.zeros(of.size), np.zeros(STEP_SIZE), of)
-        angles.append(flight.rows(flight.aids(scene, np.zeros(flight.ROWS)), state).z[8])
+        angles.append(flight.rows(flight.aids(scene, np.zeros(scene.rows)), state).z[8])
     degrees = np.degrees(np.abs(angles))
     assert 52.0 < degrees.min() < 54.5
     assert 125.5 < degrees.max() < 128.0

@@ -16,4 +16,5 @@ STUDIES = {
     "ukf": "fusiond.studies.ukf",
     "consistency": "fusiond.studies.consistency",
     "reduced-order": "fusiond.studies.reduced_order",
+    "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
 }

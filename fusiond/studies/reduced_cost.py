@@ -1,14 +1,14 @@
-r"""What a step costs in study `reduced-order`, as CPU time.
+r"""What a step costs in studies `reduced-order` and `ins-gnss-sar`, as CPU time.
 
 `step`: the filter's own recursion, as paper 002 times it: the covariance propagated once, then the
-epoch's four ranges, four rates and two angles gated, folded in and fed back. These are the live
-filter's kernels, called from compiled code: no INS, no geometry, no Python, and no judgement of
-single ranges (`fusiond.estimators.screening`), which the paper's filter does not have.
+epoch's ranges, rates (of four satellites or of all in view) and two angles gated, folded in and fed
+back. These are the live filter's kernels, called from compiled code: no INS, no geometry, no
+Python, and no judgement of single ranges (`fusiond.estimators.screening`), which the paper's filter
+does not have.
 
 `live second`: a second of the running filter (`KalmanEstimator`): 100 IMU samples through the
 strapdown equations and the covariance, rows computed from satellites and radar point, every range
-judged, update.
-What does not depend on the number of states is most of it.
+judged, update. What does not depend on the number of states is most of it.
 """
 
 from __future__ import annotations
@@ -95,12 +95,12 @@ def _recursions_for(width: int) -> Callable[..., None]:
     return recursions
 
 
-def _recursion(of: Model) -> Callable[[], float]:
+def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
     """A function that times the recursion of a model: CPU seconds of one."""
     nav = flight.true_nav(flight.truth(float(LIVE_S)))[1]
-    scene = flight.scenes(float(LIVE_S))[0]
+    scene = flight.scenes(float(LIVE_S), all_in_view)[0]
     state = State(nav, np.zeros(of.size), np.zeros(STEP_SIZE), of)
-    _, rows, r = flight.rows(flight.aids(scene, np.zeros(flight.ROWS)), state)
+    _, rows, r = flight.rows(flight.aids(scene, np.zeros(scene.rows)), state)
     step, c = level_step(nav), np.zeros(COEFFICIENTS)
     h = 1.0 / IMU_RATE_HZ
     coefficients(nav, step, h, c)
@@ -130,15 +130,15 @@ def level_step(nav: Array) -> Array:
     return step
 
 
-def _live_second(of: Model) -> Callable[[], float]:
+def _live_second(of: Model, all_in_view: bool) -> Callable[[], float]:
     """A function that times the running filter: CPU seconds of a second of flight."""
     path = flight.truth(float(LIVE_S), IMU_RATE_HZ)
     nav = flight.true_nav(path)
     buffer = flight.imu_buffer(np.hstack([path.gyro, path.accel]), IMU_RATE_HZ)
     true = State(nav[1], np.zeros(of.size), np.zeros(STEP_SIZE), of)
     given = [
-        flight.measured(scene, true._replace(nav=nav[k + 1]), np.zeros(flight.ROWS))
-        for k, scene in enumerate(flight.scenes(float(LIVE_S)))
+        flight.measured(scene, true._replace(nav=nav[k + 1]), np.zeros(scene.rows))
+        for k, scene in enumerate(flight.scenes(float(LIVE_S), all_in_view))
     ]
 
     def timed() -> float:
@@ -153,13 +153,16 @@ def _live_second(of: Model) -> Callable[[], float]:
     return timed
 
 
-def costs(models: dict[str, Model], rounds: int = ROUNDS) -> dict[str, Cost]:
+def costs(
+    models: dict[str, Model], rounds: int = ROUNDS, all_in_view: bool = False
+) -> dict[str, Cost]:
     """Medians over `rounds` of recursions, then over a third as many of live seconds.
 
     The filters take turns, so that a processor which changes its clock changes it for all.
     """
-    steps = _in_turn({name: _recursion(of) for name, of in models.items()}, rounds)
-    seconds = _in_turn({name: _live_second(of) for name, of in models.items()}, -(-rounds // 3))
+    recursions = {name: _recursion(of, all_in_view) for name, of in models.items()}
+    live = {name: _live_second(of, all_in_view) for name, of in models.items()}
+    steps, seconds = _in_turn(recursions, rounds), _in_turn(live, -(-rounds // 3))
     return {name: Cost(steps[name], seconds[name]) for name in models}
 
 

@@ -1,8 +1,10 @@
-r"""The flight of study `reduced-order`: truth, satellites, radar points, and what is measured.
+r"""The flight of paper 002 (studies `reduced-order` and `ins-gnss-sar`): truth, satellites, radar
+points, and what is measured.
 
-Set-up of paper 002: 120 deg E, 30 deg N, 1000 m, due east at 300 m/s for 4000 s, gyro 0.1 deg/h,
-accelerometer 1e-4 g, pseudorange and its rate to the four satellites of best GDOP, SAR azimuth and
-elevation of known points. What the paper does not print is chosen here, each with its reason.
+Set-up: 120 deg E, 30 deg N, 1000 m, due east at 300 m/s for 4000 s, gyro 0.1 deg/h, accelerometer
+1e-4 g, pseudorange and its rate to the four satellites of best GDOP (or to all in view), SAR
+azimuth and elevation of known points. What the paper does not print is chosen here, each with its
+reason.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from fusiond.config import Imu
 from fusiond.estimators.base import ErrorStateFilter
 from fusiond.estimators.covariance_analysis import System
 from fusiond.estimators.model import SAR_MISALIGNMENT, Model, make_model, misalignment
-from fusiond.gnss.constellation import EPOCH_S, Constellation, constellation
+from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.selection import best_four
 from fusiond.imu_buffer import ImuBuffer
@@ -67,7 +69,7 @@ seconds cannot come out of a radar that is mounted less well than that."""
 EPOCH_NS = 1_000_000_000
 MASK_RAD = 10.0 * DEG
 CHOICE_S = 60.0
-"""The four satellites are chosen anew this often."""
+"""The satellites are chosen anew this often."""
 WEEK = round(EPOCH_S / WEEK_S)
 POINT_SPACING_S = 150.0
 POINT_ASIDE_M = 30_000.0
@@ -116,6 +118,18 @@ def model(name: str, sar_sd: float = SAR_SD_RAD, bias_as_noise: bool = False) ->
     return make_model(name, noise, misalignment(SAR_MISALIGNMENT, sar_sd))
 
 
+def filters(sar_sd: float = SAR_SD_RAD) -> dict[str, Model]:
+    """The filters compared; the first describes the truth.
+
+    `17_bare` takes no notice of the accelerometer biases, `17` has them as white noise.
+    """
+    return {
+        "23": model("ins23", sar_sd),
+        "17": model("ins17", sar_sd, bias_as_noise=True),
+        "17_bare": model("ins17", sar_sd),
+    }
+
+
 def initial_sd(of: Model) -> Array:
     """One sigma (n,) at the start."""
     sd = of.initial.copy()
@@ -125,26 +139,38 @@ def initial_sd(of: Model) -> Array:
 
 
 class Scene(NamedTuple):
-    """What can be measured at an instant: four satellites (4, 3), ECEF, and a point for the radar.
+    """What can be measured at an instant: n satellites (n, 3), ECEF, their places `at` (n,) in the
+    constellation, and a point for the radar.
 
     Geometry of one instant: truth and filter leave the flight time of the signal out alike.
     """
 
     t_ns: int
     names: tuple[str, ...]
+    at: list[int]
     position: Array
     velocity: Array
     point: Vector3
 
+    @property
+    def rows(self) -> int:
+        """n ranges, n rates, azimuth, elevation."""
+        return 2 * len(self.names) + 2
+
+    def noise(self, drawn: Array) -> Array:
+        """Noise (rows,) out of that of all the constellation (DRAWN, 2): a satellite's is the same
+        whichever others are used."""
+        return np.concatenate([drawn[self.at, 0], drawn[self.at, 1], drawn[-1]])
+
 
 Aids = tuple[PseudorangeAid, BearingAid]
-ROWS = 10
-"""Four ranges, four rates, azimuth, elevation."""
+DRAWN = len(list(beidou_slots())) + 1
+"""Pairs of noise an epoch: range and rate of each satellite, then azimuth and elevation."""
 
 
-@lru_cache(maxsize=2)
-def scenes(seconds: float) -> tuple[Scene, ...]:
-    """One for each second of the flight, from 1 s on."""
+@lru_cache(maxsize=4)
+def scenes(seconds: float, all_in_view: bool = False) -> tuple[Scene, ...]:
+    """One for each second of the flight, from 1 s on: the best four, or all above the mask."""
     nav = true_nav(truth(seconds))
     sky_of = Constellation(constellation(WEEK, 0.0, ("C",)))
     names: tuple[str, ...] = ()
@@ -157,12 +183,10 @@ def scenes(seconds: float) -> tuple[Scene, ...]:
             best = best_four(up.unit_ned)
             if best is None:
                 raise ValueError(f"no four satellites at {k} s")
-            names = tuple(up.satellites[i] for i in best[0])
+            names = up.satellites if all_in_view else tuple(up.satellites[i] for i in best[0])
         at = [sky.satellites.index(name) for name in names]
-        point = _point(nav, k)
-        found.append(
-            Scene(k * EPOCH_NS, names, sky.position_ecef_m[at], sky.velocity_ecef_m_s[at], point)
-        )
+        position, velocity = sky.position_ecef_m[at], sky.velocity_ecef_m_s[at]
+        found.append(Scene(k * EPOCH_NS, names, at, position, velocity, _point(nav, k)))
     return tuple(found)
 
 
@@ -177,8 +201,8 @@ def _point(nav: Array, k: int) -> Vector3:
 
 
 def aids(scene: Scene, values: Array) -> Aids:
-    """The epoch's aids with measured `values` (10,): ranges, rates, azimuth, elevation."""
-    four = np.ones(4)
+    """The epoch's aids with measured `values` (rows,): ranges, rates, azimuth, elevation."""
+    n = len(scene.names)
     ranges = PseudorangeAid(
         "gnss",
         scene.t_ns,
@@ -186,18 +210,18 @@ def aids(scene: Scene, values: Array) -> Aids:
         scene.names,
         scene.position,
         scene.velocity,
-        values[:4],
-        values[4:8],
-        RANGE_SD_M**2 * four,
-        RATE_SD_M_S**2 * four,
-        np.zeros(4, dtype=np.int64),
+        values[:n],
+        values[n : 2 * n],
+        np.full(n, RANGE_SD_M**2),
+        np.full(n, RATE_SD_M_S**2),
+        np.zeros(n, dtype=np.int64),
     )
     bearing = BearingAid(
         "sar",
         scene.t_ns,
         GATE,
-        float(values[8]),
-        float(values[9]),
+        float(values[-2]),
+        float(values[-1]),
         (BEARING_SD_RAD, BEARING_SD_RAD),
         scene.point,
         (0.0, 0.0, 0.0),
@@ -218,8 +242,8 @@ def rows(of: Aids, state: State) -> Innovation:
 
 
 def measured(scene: Scene, true: State, noise: Array) -> Aids:
-    """What is measured in the `true` state, its parameters among it; `noise` (10,) in sigmas."""
-    z, _, r = rows(aids(scene, np.zeros(ROWS)), true)  # of measured zeros: what is predicted
+    """What is measured in the `true` state, its parameters among it; `noise` (rows,) in sigmas."""
+    z, _, r = rows(aids(scene, np.zeros(scene.rows)), true)  # of measured zeros: what is predicted
     return aids(scene, z + np.sqrt(r) * noise)
 
 
@@ -256,5 +280,5 @@ def systems(of: Model, seconds: float) -> Iterator[System]:
     for k, scene in enumerate(scenes(seconds)):
         phi, q = transitions.over_a_second(buffer, nav[k], k)
         state = State(nav[k + 1], xi, transitions.step, of)
-        _, h, r = rows(aids(scene, np.zeros(ROWS)), state)
+        _, h, r = rows(aids(scene, np.zeros(scene.rows)), state)
         yield System(phi, q, h, r)

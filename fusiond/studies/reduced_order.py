@@ -23,7 +23,19 @@ from fusiond.estimators.observability import Epoch, Observability, observability
 from fusiond.settings import DEG
 from fusiond.studies import reduced_flight as flight
 from fusiond.studies.reduced_cost import IMU_RATE_HZ, costs
-from fusiond.studies.reduced_runs import CHECKED_S, VALIDATION_S, Flown, combinations, monte_carlo
+from fusiond.studies.reduced_report import (
+    BELIEVED,
+    EAST_NORTH_UP,
+    HEADER,
+    PAPER,
+    curves,
+    list_of,
+    paper_rows,
+    picture,
+    sigma_cells,
+    sigmas,
+)
+from fusiond.studies.reduced_runs import Flown, combinations, monte_carlo, nees
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -34,38 +46,9 @@ SERIES_EVERY_S = 20
 WEAKEST = 6
 COARSE_SAR_RAD = 0.1 * DEG
 """The models' own default for a radar mounted mechanically."""
-EAST_NORTH_UP = [1, 0, 2]
-AXES = ("E", "N", "U")
-
-PAPER: dict[str, Any] = {
-    "source": "paper 002, tables 1 and 2: 120 E, 30 N, 1000 m, due east, 300 m/s, 4000 s",
-    "models": {
-        "23": {
-            "attitude_sigma_arcsec": [33.11, 36.25, 33.08],
-            "velocity_sigma_m_s": [0.023, 0.0163, 0.002],
-            "time_per_step_us": 110_000,
-        },
-        "17": {
-            "attitude_sigma_arcsec": [36.52, 65.62, 56.11],
-            "velocity_sigma_m_s": [0.0609, 0.0384, 0.008],
-            "time_per_step_us": 50_000,
-        },
-    },
-    "time_ratio": 0.45,
-    "not_printed": "measurement noise, radar misalignment, white IMU noise, initial sigma",
-}
-
-
-def filters(sar_sd: float = flight.SAR_SD_RAD) -> dict[str, Model]:
-    """The filters compared; the first describes the truth.
-
-    `17_bare` takes no notice of the accelerometer biases, `17` has them as white noise.
-    """
-    return {
-        "23": flight.model("ins23", sar_sd),
-        "17": flight.model("ins17", sar_sd, bias_as_noise=True),
-        "17_bare": flight.model("ins17", sar_sd),
-    }
+VALIDATION_S = 600.0
+CHECKED_S = 100
+"""Errors of the live filters are taken at every 100th second."""
 
 
 def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
@@ -84,13 +67,14 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
         if progress is not None:
             progress(done, steps)
 
-    models = filters()
+    models = flight.filters()
     fine = _analysis(models, flight.DURATION_S)
     advance()
-    coarse = _analysis(filters(COARSE_SAR_RAD), flight.DURATION_S)
+    coarse = _analysis(flight.filters(COARSE_SAR_RAD), flight.DURATION_S)
     advance()
     short = _analysis(models, VALIDATION_S)
-    validation = _validation(models, short, monte_carlo(models, count, seed, advance))
+    flown = monte_carlo(models, VALIDATION_S, CHECKED_S, count, seed, advance)
+    validation = _validation(models, short, flown)
     times = costs(models)
     advance()
     result: dict[str, Any] = {
@@ -157,24 +141,10 @@ def _analysis(models: dict[str, Model], seconds: float) -> dict[str, Analysed]:
     return found
 
 
-def _east_north_up(p: Array) -> tuple[list[float], list[float]]:
-    """Attitude (arc seconds) and velocity (m/s), one sigma each, of a covariance."""
-    sd = np.sqrt(np.diag(p)[:6])
-    attitude = sd[:3][EAST_NORTH_UP] / flight.ARC_SECOND
-    return attitude.tolist(), sd[3:6][EAST_NORTH_UP].tolist()
-
-
 def _sigmas(of: Analysed) -> dict[str, Any]:
     """True error and belief at the end."""
     last = of.results[-1]
-    attitude, velocity = _east_north_up(last.true)
-    believed_attitude, believed_velocity = _east_north_up(last.believed)
-    return {
-        "attitude_sigma_arcsec": attitude,
-        "velocity_sigma_m_s": velocity,
-        "believed_attitude_sigma_arcsec": believed_attitude,
-        "believed_velocity_sigma_m_s": believed_velocity,
-    }
+    return {**sigmas(last.true), **sigmas(last.believed, BELIEVED)}
 
 
 def _series(found: dict[str, Analysed]) -> dict[str, Any]:
@@ -185,14 +155,8 @@ def _series(found: dict[str, Analysed]) -> dict[str, Any]:
     for name, of in found.items():
         chosen = of.results[every]
         out["models"][name] = {
-            what: {
-                "attitude_sigma_arcsec": [_east_north_up(p)[0] for p in ps],
-                "velocity_sigma_m_s": [_east_north_up(p)[1] for p in ps],
-            }
-            for what, ps in (
-                ("true", [r.true for r in chosen]),
-                ("believed", [r.believed for r in chosen]),
-            )
+            "true": curves([r.true for r in chosen]),
+            "believed": curves([r.believed for r in chosen]),
         }
     return out
 
@@ -256,15 +220,15 @@ def _validation(
         at = [short[name].results[second - 1] for second in _checked()]
         error = flown[name].error
         true = np.array([project @ r.true @ project.T for r in at])
-        nees = _nees(error, true[None])
+        analysed = nees(error, true[None])
         estimated = combinations(of).any(axis=1)
         own = flown[name].believed[:, :, estimated][:, :, :, estimated]
-        believed = _nees(error[:, :, estimated], own)
+        believed = nees(error[:, :, estimated], own)
         sd = np.sqrt(np.array([np.diag(p) for p in true]))
         ratio = np.sqrt(np.mean(np.square(error / sd), axis=0))[-1]
         found["models"][name] = {
-            "nees_mean": float(nees[:, -1].mean()),
-            "nees_all_instants": float(nees.mean()),
+            "nees_mean": float(analysed[:, -1].mean()),
+            "nees_all_instants": float(analysed.mean()),
             "believed_nees_per_dof": float(believed[:, -1].mean() / estimated.sum()),
             "attitude_rms_to_sigma": ratio[:3][EAST_NORTH_UP].tolist(),
             "velocity_rms_to_sigma": ratio[3:6][EAST_NORTH_UP].tolist(),
@@ -276,29 +240,12 @@ def _checked() -> range:
     return range(CHECKED_S, round(VALIDATION_S) + 1, CHECKED_S)
 
 
-def _nees(error: Array, p: Array) -> Array:
-    """e^T P^-1 e (runs, k) for errors (runs, k, m) and covariances (1 or runs, k, m, m).
-
-    States differ by ten orders of magnitude: scaled to unit variance first.
-    """
-    sd = np.sqrt(np.diagonal(p, axis1=-2, axis2=-1))
-    unit = p / (sd[..., :, None] * sd[..., None, :])
-    scaled = error / sd
-    solved = np.linalg.solve(
-        np.broadcast_to(unit, (*error.shape, error.shape[-1])), scaled[..., None]
-    )
-    return np.asarray((scaled * solved[..., 0]).sum(axis=-1))
-
-
 # --------------------------------------------------------------------------- for people
 
 
 def _finding(result: dict[str, Any]) -> str:
     full, small, bare = (result["models"][k] for k in ("23", "17", "17_bare"))
     seen = result["observability"]
-
-    def list_of(values: list[float], digits: int) -> str:
-        return "/".join(f"{v:.{digits}f}" for v in values)
 
     return (
         f"A step of the filter takes 17 states {result['time_ratio']:.2f} of the time of 23 (the "
@@ -319,21 +266,20 @@ def _finding(result: dict[str, Any]) -> str:
 
 def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
     """Sigmas beside the paper's, observability, validation."""
-    header = ["", *(f'phi {a} "' for a in AXES), *(f"dV {a} m/s" for a in AXES), "us/step"]
     found = []
     cases = {"radar misalignment": result, **result["variants"]}
     for case in cases.values():
         rows = []
         for name, figures in case["models"].items():
-            rows.append([f"{name} true error", *_figures(figures, "")])
-            rows.append([f"{name} believes", *_figures(figures, "believed_")[:6], ""])
-        for name, figures in result["paper"]["models"].items():
-            rows.append([f"{name} paper", *_figures(figures, "")])
+            spent = f"{figures['time_per_step_us']:.1f}" if "time_per_step_us" in figures else ""
+            rows.append([f"{name} true error", *sigma_cells(figures), spent])
+            rows.append([f"{name} believes", *sigma_cells(figures, BELIEVED), ""])
+        rows.extend(paper_rows())
         title = (
             f"radar misalignment {case['sar_misalignment_sd_arcsec']:.0f} arc seconds: "
             f"one sigma after {result['duration_s']:.0f} s"
         )
-        found.append((title, header, rows))
+        found.append((title, HEADER, rows))
         seen = case["observability"]
         title = (
             f"observability: rank {seen['rank']} of {seen['states']}, {seen['informative']} "
@@ -358,40 +304,6 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
     return found
 
 
-def _figures(of: dict[str, Any], before: str) -> list[str]:
-    spent = of.get("time_per_step_us")
-    return [
-        *(f"{v:.2f}" for v in of[f"{before}attitude_sigma_arcsec"]),
-        *(f"{v:.4f}" for v in of[f"{before}velocity_sigma_m_s"]),
-        "" if spent is None else f"{spent:.1f}",
-    ]
-
-
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Sigmas over time: attitude left, velocity right, one row an axis; dashed what is believed."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
-
-    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
-    axes = figure.subplots(3, 2, sharex=True)
-    series = result["series"]
-    for column, (key, unit) in enumerate(
-        (("attitude_sigma_arcsec", "arc seconds"), ("velocity_sigma_m_s", "m/s"))
-    ):
-        for row, axis in enumerate(AXES):
-            panel = axes[row, column]
-            for number, (name, curves) in enumerate(series["models"].items()):
-                for what, line in (("true", "-"), ("believed", "--")):
-                    values = [sigma[row] for sigma in curves[what][key]]
-                    label = f"{name.replace('_', ' ')} states" if what == "true" else None
-                    panel.plot(series["t_s"], values, line, color=f"C{number}", label=label)
-            for number, of in enumerate(result["paper"]["models"].values()):
-                panel.axhline(of[key][row], color=f"C{number}", linewidth=0.8, linestyle=":")
-            panel.set_yscale("log")
-            panel.set_ylabel(f"{axis}, {unit}")
-            panel.grid(alpha=0.3)
-    axes[0, 0].set_title("attitude, one sigma", loc="left")
-    axes[0, 1].set_title("velocity: solid true, dashed believed, dotted the paper's", loc="left")
-    axes[0, 1].legend(fontsize="small")
-    for panel in axes[2]:
-        panel.set_xlabel("s")
-    figure.savefig(path, dpi=120)
+    """Sigmas over time, true and believed, beside the paper's."""
+    picture(result["series"], path)

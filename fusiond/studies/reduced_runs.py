@@ -1,14 +1,15 @@
-r"""Live runs of study `reduced-order`: errors of the running filters.
+r"""Live runs of studies `reduced-order` and `ins-gnss-sar`: errors of the running filters.
 
 A run draws IMU errors, clock, misalignment and noise as the 23 states describe them and lets the
-daemon's filter (`fusiond.estimators.kalman`) fly with it. Its error is taken in the combinations
-that truth and every filter have: navigation errors, gyro drift (constant and Markov together),
-accelerometer bias, clock, misalignment. A state that the filter lacks counts with all of itself.
+daemon's filter (`fusiond.estimators.kalman`) fly with it on the daemon's timeline. Its error is
+taken in the combinations that truth and every filter have: navigation errors, gyro drift (constant
+and Markov together), accelerometer bias, clock, misalignment. A state that the filter lacks counts
+with all of itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -26,17 +27,16 @@ from fusiond.estimators.model import (
     ClockNoise,
     Model,
 )
+from fusiond.imu_buffer import ImuBuffer
 from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.studies import reduced_flight as flight
-from fusiond.studies.rdss_runs import nav_error, with_error
+from fusiond.studies.rdss_runs import CHECKPOINT_S, HISTORY_S, nav_error, with_error
+from fusiond.timeline import Timeline
 
 Array = NDArray[np.float64]
 
-VALIDATION_S = 600.0
-CHECKED_S = 100
-"""Errors are taken at every 100th second."""
 WORKERS = 2
 
 
@@ -60,47 +60,86 @@ class Flown:
     believed: Array
 
 
-def fly(models: dict[str, Model], seconds: float, seed: int, number: int) -> dict[str, Flown]:
-    """Run `number`: every filter on the same errors. The first of `models` describes the truth."""
+def fly(
+    models: dict[str, Model],
+    seconds: float,
+    every_s: int,
+    all_in_view: bool,
+    seed: int,
+    number: int,
+) -> dict[str, Flown]:
+    """Run `number`: every filter on the same errors, taken every `every_s` seconds.
+
+    The first of `models` describes the truth. With `all_in_view` a run has the same IMU, clock,
+    start and noise of each satellite as without.
+    """
     rng = np.random.default_rng([seed, number])
     true_model = next(iter(models.values()))
     path = flight.truth(seconds)
     nav = flight.true_nav(path)
-    scenes = flight.scenes(seconds)
+    scenes = flight.scenes(seconds, all_in_view)
     imu = imu_output(flight.IMU, path.gyro, path.accel, rng)
-    samples = np.hstack([imu.gyro, imu.accel])
     sd = flight.initial_sd(true_model)
     start = rng.standard_normal(CORE_SIZE) * sd[:CORE_SIZE]
     xi = sd * rng.standard_normal(len(sd))  # of it the clock and the misalignment are used
     clock = _clock(rng, xi[_clock_slots(true_model)], len(scenes))
-    noise = rng.standard_normal((len(scenes), flight.ROWS))
-    step = np.zeros(STEP_SIZE)
+    noise = rng.standard_normal((len(scenes), flight.DRAWN, 2))
+
+    def given() -> Iterator[flight.Aids]:
+        for k, scene in enumerate(scenes):
+            xi[_clock_slots(true_model)] = clock[k]
+            true = State(nav[k + 1], xi, np.zeros(STEP_SIZE), true_model)
+            yield flight.measured(scene, true, scene.noise(noise[k]))
+
     filters = {name: started(of, with_error(nav[0], start)) for name, of in models.items()}
-    buffer = flight.imu_buffer(samples)
     true = np.zeros(len(combinations(true_model)))
     errors: dict[str, list[Array]] = {name: [] for name in models}
     beliefs: dict[str, list[Array]] = {name: [] for name in models}
     project = {name: combinations(of) for name, of in models.items()}
-    for k, scene in enumerate(scenes):
-        xi[_clock_slots(true_model)] = clock[k]
-        aids = flight.measured(scene, State(nav[k + 1], xi, step, true_model), noise[k])
-        for estimator in filters.values():
-            estimator.propagate(buffer, scene.t_ns)
-            for aid in aids:
-                if (outcome := estimator.update(aid)).name != "fused":
-                    raise ValueError(f"run {number}, {aid.source} at {k + 1} s: {outcome.name}")
-        if (k + 1) % CHECKED_S == 0:
-            sample = round((k + 1) * flight.IMU.rate_hz) - 1
-            true[9:12], true[12:15] = imu.gyro_bias[sample], imu.accel_bias[sample]
-            true[15:17] = clock[k]
-            true[17:20] = xi[true_model.slots_of(SAR_MISALIGNMENT)]
-            for name, e in filters.items():
-                m = project[name]
-                error = true - m @ e.xi
-                error[:CORE_SIZE] = nav_error(e.nav, nav[k + 1])
-                errors[name].append(error)
-                beliefs[name].append(m @ e.covariance @ m.T)
+    for second in live(filters.values(), np.hstack([imu.gyro, imu.accel]), given()):
+        if second % every_s:
+            continue
+        sample = round(second * flight.IMU.rate_hz) - 1
+        true[9:12], true[12:15] = imu.gyro_bias[sample], imu.accel_bias[sample]
+        true[15:17] = clock[second - 1]
+        true[17:20] = xi[true_model.slots_of(SAR_MISALIGNMENT)]
+        for name, e in filters.items():
+            m = project[name]
+            error = true - m @ e.xi
+            error[:CORE_SIZE] = nav_error(e.nav, nav[second])
+            errors[name].append(error)
+            beliefs[name].append(m @ e.covariance @ m.T)
     return {name: Flown(np.array(errors[name]), np.array(beliefs[name])) for name in models}
+
+
+def live(
+    filters: Iterable[KalmanEstimator],
+    samples: Array,
+    given: Iterable[flight.Aids],
+    rate_hz: float = flight.IMU.rate_hz,
+) -> Iterator[int]:
+    """Fly started filters on the daemon's timeline; yields the seconds flown, after each.
+
+    `samples` (n, 6) at `rate_hz`; `given` are the aids of each second. ValueError for an aid that
+    is not fused.
+    """
+    count = round(rate_hz)
+    times = np.arange(1, len(samples) + 1, dtype=np.int64) * round(1e9 / rate_hz)
+    timelines = []
+    for estimator in filters:
+        buffer = ImuBuffer(rate_hz, HISTORY_S, np.eye(3), 0.0, flight.IMU.gap_s)
+        timelines.append(Timeline(estimator, buffer, HISTORY_S, CHECKPOINT_S))
+        timelines[-1].start()
+    for k, aids in enumerate(given):
+        second = slice(k * count, (k + 1) * count)
+        for timeline in timelines:
+            timeline.imu.append(times[second], samples[second])
+            entries = [timeline.insert(aid) for aid in aids]
+            timeline.run()
+            for entry in entries:
+                if entry.outcome is None or entry.outcome.name != "fused":
+                    raise ValueError(f"{entry.aid.source} at {k + 1} s: {entry.outcome}")
+        yield k + 1
 
 
 def _clock_slots(of: Model) -> list[int]:
@@ -128,12 +167,19 @@ def started(of: Model, nav: Array) -> KalmanEstimator:
 
 
 def monte_carlo(
-    models: dict[str, Model], runs: int, seed: int, progress: Callable[[], None]
+    models: dict[str, Model],
+    seconds: float,
+    every_s: int,
+    runs: int,
+    seed: int,
+    progress: Callable[[], None],
+    all_in_view: bool = False,
 ) -> dict[str, Flown]:
-    """All runs, stacked: error (runs, k, 20) and belief (runs, k, 20, 20) of each filter."""
+    """All runs of `fly`, stacked: error (runs, k, 20) and belief (runs, k, 20, 20) by filter."""
     found = []
     with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
-        for one in pool.map(partial(fly, models, VALIDATION_S, seed), range(runs)):
+        one_run = partial(fly, models, seconds, every_s, all_in_view, seed)
+        for one in pool.map(one_run, range(runs)):
             found.append(one)
             progress()
     return {
@@ -143,3 +189,17 @@ def monte_carlo(
         )
         for name in models
     }
+
+
+def nees(error: Array, p: Array) -> Array:
+    """e^T P^-1 e (runs, k) for errors (runs, k, m) and covariances (1 or runs, k, m, m).
+
+    States differ by ten orders of magnitude: scaled to unit variance first.
+    """
+    sd = np.sqrt(np.diagonal(p, axis1=-2, axis2=-1))
+    unit = p / (sd[..., :, None] * sd[..., None, :])
+    scaled = error / sd
+    solved = np.linalg.solve(
+        np.broadcast_to(unit, (*error.shape, error.shape[-1])), scaled[..., None]
+    )
+    return np.asarray((scaled * solved[..., 0]).sum(axis=-1))

@@ -1,0 +1,235 @@
+r"""Study `ins-gnss-sar`: the flight of paper 002 flown, 23 states against 17, four satellites
+against all.
+
+The paper computes covariances; here the daemon's filter flies on its timeline through drawn errors
+of IMU, clock, radar and start (`fusiond.studies.reduced_runs`), with the best four BeiDou
+satellites by GDOP or with all in view (`fusiond.studies.reduced_flight`), both on the same draws.
+A radar sees a point for a while only: points lie every 45 km, 30 km to both sides in turn, and the
+one that is abeam next or was last is measured, each for 150 s.
+
+`*_std_*`: root mean square of the error, which has no mean but the one drawn, over all runs and the
+last quarter of the flight; axes east, north, up. `believed_*`: sigma of the filter's mean
+covariance for the same. NEES is that of attitude, velocity and position (9); `nees_interval` holds
+for the average over the runs at one instant.
+
+`integration`: a flight without any error at the study's IMU rate and at a finer one.
+`error_to_sigma` is what the integration errs by at the end at the study's rate, the greatest of the
+nine over sigma, `sigma_change` the greatest change of a sigma to that at the finer rate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import State
+from fusiond.estimators.model import Model
+from fusiond.navigation.error_model import CORE_SIZE
+from fusiond.navigation.strapdown import STEP_SIZE
+from fusiond.studies import reduced_flight as flight
+from fusiond.studies.rdss import nees_interval
+from fusiond.studies.rdss_runs import nav_error
+from fusiond.studies.reduced_cost import IMU_RATE_HZ, Cost, costs
+from fusiond.studies.reduced_report import (
+    BELIEVED,
+    HEADER,
+    PAPER,
+    curves,
+    list_of,
+    paper_rows,
+    picture,
+    sigma_cells,
+    sigmas,
+)
+from fusiond.studies.reduced_runs import Flown, live, monte_carlo, nees, started
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+DEFAULT_RUNS = 50
+CHECKED_S = 50
+"""Errors are taken at every 50th second: three instants for each radar point."""
+COUNTED_FROM = 0.75
+"""Share of the flight after which they count."""
+STATES = ("23", "17")
+SKIES = {"four": False, "all": True}
+STD = ("attitude_std_arcsec", "velocity_std_m_s")
+FINE_RATE_HZ = 100.0
+
+
+def run(
+    runs: int | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    seconds: float = flight.DURATION_S,
+) -> dict[str, Any]:
+    """The study with `runs` flights (default 50) of each sky. All but times repeat exactly."""
+    count = DEFAULT_RUNS if runs is None else runs
+    if count < 2:
+        raise ValueError("runs must be at least 2")
+    steps, done = 2 * count + 1, 0
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, steps)
+
+    models = {name: of for name, of in flight.filters().items() if name in STATES}
+    instants = np.arange(CHECKED_S, round(seconds) + 1, CHECKED_S)
+    counted = instants >= COUNTED_FROM * seconds
+    cases: dict[str, Any] = {}
+    series: dict[str, Any] = {"t_s": instants.tolist(), "models": {}}
+    for sky, all_in_view in SKIES.items():
+        flown = monte_carlo(models, seconds, CHECKED_S, count, seed, advance, all_in_view)
+        spent = costs(models, all_in_view=all_in_view)
+        cases[sky] = {name: _figures(flown[name], counted, spent[name]) for name in models}
+        for name, of in flown.items():
+            series["models"][f"{sky} {name}"] = {
+                "true": curves(_second_moment(of.error)),
+                "believed": curves(of.believed.mean(axis=0)),
+            }
+    integration = _integration(models["23"], seconds)
+    advance()
+    result: dict[str, Any] = {
+        "study": "ins-gnss-sar",
+        "runs": count,
+        "seed": seed,
+        "duration_s": seconds,
+        "counted_from_s": float(instants[counted][0]),
+        "imu_rate_hz": flight.IMU.rate_hz,
+        "live_imu_rate_hz": IMU_RATE_HZ,
+        "satellites": {sky: _satellites(seconds, SKIES[sky]) for sky in SKIES},
+        "nees_dof": CORE_SIZE,
+        "nees_expected": float(CORE_SIZE),
+        "nees_interval": nees_interval(count, CORE_SIZE),
+        "cases": cases,
+        "integration": integration,
+        "series": series,
+        "paper": PAPER,
+    }
+    result["finding"] = _finding(result)
+    return result
+
+
+def _figures(of: Flown, counted: NDArray[np.bool_], spent: Cost) -> dict[str, Any]:
+    error, believed = of.error[:, counted, :CORE_SIZE], of.believed[:, counted]
+    believed = believed[..., :CORE_SIZE, :CORE_SIZE]
+    true = _second_moment(error).mean(axis=0)
+    stated = believed.mean(axis=(0, 1))
+    mean = float(nees(error, believed).mean())
+    return {
+        **sigmas(true, STD),
+        **sigmas(stated, BELIEVED),
+        "horizontal_rms_m": _horizontal(true),
+        "believed_horizontal_m": _horizontal(stated),
+        "nees_mean": mean,
+        "nees_to_expected": mean / CORE_SIZE,
+        "time_per_step_us": spent.step_s * 1e6,
+        "live_second_us": spent.live_second_s * 1e6,
+    }
+
+
+def _second_moment(error: Array) -> Array:
+    """Average over the runs of e e^T (k, m, m), of errors (runs, k, m)."""
+    return np.asarray(np.einsum("rki,rkj->kij", error, error) / len(error))
+
+
+def _horizontal(p: Array) -> float:
+    return math.sqrt(p[6, 6] + p[7, 7])
+
+
+def _satellites(seconds: float, all_in_view: bool) -> dict[str, float]:
+    used = [len(scene.names) for scene in flight.scenes(seconds, all_in_view)]
+    return {"least": min(used), "mean": float(np.mean(used)), "most": max(used)}
+
+
+def _integration(of: Model, seconds: float) -> dict[str, float]:
+    """What the IMU's rate does to a flight without errors of the sensors."""
+    nav = flight.true_nav(flight.truth(seconds))
+    true = State(nav[0], np.zeros(of.size), np.zeros(STEP_SIZE), of)
+    errors, sd = [], []
+    for rate in (flight.IMU.rate_hz, FINE_RATE_HZ):
+        path = flight.truth(seconds, rate)
+        estimator = started(of, nav[0])
+        given = (
+            flight.measured(scene, true._replace(nav=nav[k + 1]), np.zeros(scene.rows))
+            for k, scene in enumerate(flight.scenes(seconds))
+        )
+        for _ in live([estimator], np.hstack([path.gyro, path.accel]), given, rate):
+            pass
+        errors.append(nav_error(estimator.nav, nav[-1]))
+        sd.append(np.sqrt(np.diag(estimator.covariance)[:CORE_SIZE]))
+    return {
+        "rate_hz": flight.IMU.rate_hz,
+        "fine_rate_hz": FINE_RATE_HZ,
+        "error_to_sigma": float(np.abs(errors[0] / sd[0]).max()),
+        "sigma_change": float(np.abs(sd[0] / sd[1] - 1.0).max()),
+    }
+
+
+# --------------------------------------------------------------------------- for people
+
+
+def _finding(result: dict[str, Any]) -> str:
+    four, every = result["cases"]["four"], result["cases"]["all"]
+
+    def pair(of: dict[str, Any], key: str, digits: int) -> str:
+        return f"{list_of(of['17'][key], digits)} against {list_of(of['23'][key], digits)}"
+
+    return (
+        f"With four satellites 17 states err by {pair(four, STD[0], 1)} arc seconds and "
+        f"{pair(four, STD[1], 3)} m/s with 23 (east/north/up), and all in view make it "
+        f"{pair(every, STD[0], 1)} and {pair(every, STD[1], 3)}, and "
+        f"{every['23']['horizontal_rms_m']:.2f} instead of {four['23']['horizontal_rms_m']:.2f} m "
+        f"horizontally with 23; but the 17 states' own sigma is not their error: with four they "
+        f"state {list_of(four['17'][BELIEVED[0]], 1)} arc seconds and "
+        f"{list_of(four['17'][BELIEVED[1]], 3)} m/s, their NEES is "
+        f"{four['17']['nees_mean']:.0f} (all in view: {every['17']['nees_mean']:.0f}) where "
+        f"{result['nees_dof']} are expected and 23 states have {four['23']['nees_mean']:.1f} "
+        f"({every['23']['nees_mean']:.1f}), and they save "
+        f"{four['23']['time_per_step_us'] - four['17']['time_per_step_us']:.1f} us of "
+        f"{four['23']['time_per_step_us']:.1f} us a step."
+    )
+
+
+def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Errors beside what the filters state and what the paper has; position, NEES and times."""
+    errors: list[list[str]] = []
+    others: list[list[str]] = []
+    for sky, of in result["cases"].items():
+        for name, f in of.items():
+            spent = f"{f['time_per_step_us']:.1f}"
+            errors.append([f"{sky}, {name}", *sigma_cells(f, STD), spent])
+            errors.append([f"{sky}, {name} states", *sigma_cells(f, BELIEVED), ""])
+            others.append(
+                [
+                    f"{sky}, {name}",
+                    f"{f['horizontal_rms_m']:.2f}",
+                    f"{f['believed_horizontal_m']:.2f}",
+                    f"{f['nees_mean']:.2f}",
+                    f"{f['live_second_us']:.0f}",
+                ]
+            )
+    low, high = result["nees_interval"]
+    title = (
+        f"{result['runs']} flights of {result['duration_s']:.0f} s, from "
+        f"{result['counted_from_s']:.0f} s on: root mean square error, and sigma that the filter "
+        "states"
+    )
+    second = (
+        f"horizontal position, NEES of {result['nees_dof']} (mean of one instant in "
+        f"[{low:.2f}, {high:.2f}]), and a live second at {result['live_imu_rate_hz']:.0f} Hz"
+    )
+    header = ["", "horizontal m", "states m", "NEES", "live us"]
+    return [(title, HEADER, [*errors, *paper_rows()]), (second, header, others)]
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Root mean square errors over time and what the filters state, beside the paper's."""
+    picture(result["series"], path)
