@@ -101,7 +101,7 @@ def picture(series: dict[str, Any], path: Path) -> None:
             panel.set_ylabel(f"{axis}, {unit}")
             panel.grid(alpha=0.3)
     axes[0, 0].set_title("attitude, one sigma", loc="left")
-    axes[0, 1].set_title("velocity: solid true, dashed believed, dotted the paper's", loc="left")
+    axes[0, 1].set_title("velocity: dashed what is believed, dotted the paper's", loc="left")
     axes[0, 1].legend(fontsize="small")
     for panel in axes[2]:
         panel.set_xlabel("s")
