@@ -148,16 +148,18 @@ def _statistics(name: str, unit: str, error: Floats, mean: bool = False) -> Repo
 
 def _consistency(position: Floats, sigma: Floats) -> Report:
     """Shares inside 1, 2, 3 sigma beside a Gaussian's, and mean NEES (see the module)."""
-    known = np.isfinite(sigma).all(axis=1)
-    normalised = (position[known] / sigma[known]) ** 2
+    normalised = (position / sigma) ** 2
     horizontal = normalised[:, 0] + normalised[:, 1]
+    horizontal = horizontal[np.isfinite(horizontal)]
+    total = normalised.sum(axis=1)
+    total = total[np.isfinite(total)]  # none where the height is held, not estimated
     report: Report = {}
     for k in (1, 2, 3):
-        share = float(np.mean(horizontal <= k * k)) if known.any() else None
+        share = float(np.mean(horizontal <= k * k)) if len(horizontal) else None
         report[f"horizontal_inside_{k}_sigma"] = share
         report[f"expected_inside_{k}_sigma"] = float(1.0 - np.exp(-k * k / 2.0))
-    report["horizontal_nees"] = float(horizontal.mean()) if known.any() else None
-    report["position_nees"] = float(normalised.sum(axis=1).mean()) if known.any() else None
+    report["horizontal_nees"] = float(horizontal.mean()) if len(horizontal) else None
+    report["position_nees"] = float(total.mean()) if len(total) else None
     report["expected_horizontal_nees"] = 2.0
     report["expected_position_nees"] = 3.0
     return report

@@ -258,7 +258,7 @@ class Navigator:
                 self.model.hold_height,
                 np.zeros(STEP_SIZE),
             )
-        sd = [float(s) for s in e.sigmas()]
+        sd = np.where(self.model.stated, e.sigmas(), np.nan).tolist()
         values = [float(v) for v in nav]
         bias = e.sensor_errors
         lon = (values[1] + math.pi) % (2.0 * math.pi) - math.pi

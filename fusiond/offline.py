@@ -220,7 +220,7 @@ class _Recorder:
             nav[:, 2],
             nav[:, 3:6],
             _rpy(nav[:, 6:]),
-            imu.sigmas[rows],
+            np.where(navigator.model.stated, imu.sigmas[rows], np.nan),
             np.full(count, STATUS.index(mode), dtype=np.int64),
         )
 

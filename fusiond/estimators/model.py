@@ -200,6 +200,12 @@ class Model:
         return self._slots_by_name.get(block, [])
 
     @cached_property
+    def stated(self) -> NDArray[np.bool_]:
+        """(9,): whether position, velocity (n, e, d), roll, pitch, yaw are estimated at all, and
+        not held."""
+        return np.concatenate((self.active[6:9], self.active[3:6], self.active[:3]))
+
+    @cached_property
     def _slots_by_name(self) -> dict[str, list[int]]:
         return {block.name: slots for block, slots in self._slots()}
 
