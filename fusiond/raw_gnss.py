@@ -76,6 +76,7 @@ class RawGnss:
         self._guess: Array | None = None
         self._rows: Rows | None = None
         self._judged: tuple[PseudorangeAid, Outcome] | None = None
+        self._counted_ns = -1
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: Ephemeris | Klobuchar) -> None:
@@ -125,8 +126,11 @@ class RawGnss:
         )
 
     def judged(self, aid: PseudorangeAid, outcome: Outcome) -> None:
-        """The filter has looked at an epoch."""
+        """The filter has looked at an epoch; one that a rewind brings again counts once."""
         self._judged = aid, outcome
+        if aid.t_ns <= self._counted_ns:
+            return
+        self._counted_ns = aid.t_ns
         refused = [(k, code) for k, code in enumerate(outcome.rows) if code != KEPT]
         labels = aid.labels if refused else []
         for k, code in refused:
