@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 KEPT = 20_000
 """Measurements of a kind remembered for rate and age: 20 s of an IMU at 1 kHz."""
+BURST_S = 0.1
+"""What comes within one read of a line, such as all ephemerides, has no rate."""
 MAX_TILT_DEG = 30.0
 """No vehicle is parked on a steeper slope; a wrong axis is 90 or 180 degrees off."""
 GRAVITY_TOLERANCE = 0.05
@@ -57,9 +59,10 @@ class Kind:
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean rate between the first and the last arrival that are remembered."""
+        """Mean rate between the first and the last arrival that are remembered; a burst has
+        none."""
         span_s = (self.seen_ns[-1] - self.seen_ns[0]) * 1e-9
-        return (len(self.seen_ns) - 1) / span_s if span_s > 0.0 else None
+        return (len(self.seen_ns) - 1) / span_s if span_s > BURST_S else None
 
 
 class Heard:
