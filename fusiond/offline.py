@@ -115,11 +115,17 @@ def _account(rows: int, rejected: list[Rejection]) -> dict[str, Any]:
 
 
 def _withheld(m: Measurement | RawEvent, outages: Iterable[tuple[float, float]]) -> bool:
-    stamp = getattr(m, "stamp", None)
-    if not isinstance(stamp, MonotonicStamp):
+    if isinstance(m, Ephemeris | Klobuchar):
         return False
-    t = stamp.t_ns * 1e-9
+    t = _valid_ns(m) * 1e-9
     return any(start <= t < start + length for start, length in outages)
+
+
+def _valid_ns(m: Measurement | RawGnssEpoch) -> int:
+    """The instant of the IMU's clock that a recorded measurement is valid at."""
+    stamp = getattr(m, "stamp", None)
+    assert isinstance(stamp, MonotonicStamp)
+    return stamp.t_ns
 
 
 def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], out: Path | None) -> int:
@@ -166,9 +172,7 @@ def _give(navigator: Navigator, arrival: Arrival) -> None:
     if isinstance(m, Ephemeris | Klobuchar):
         navigator.learn(m)
         return
-    stamp = m.stamp  # type: ignore[union-attr]
-    assert isinstance(stamp, MonotonicStamp)
-    navigator.add(m, stamp.t_ns)
+    navigator.add(m, _valid_ns(m))
 
 
 def _is_late(arrival: Arrival, config: Config) -> bool:
@@ -178,11 +182,9 @@ def _is_late(arrival: Arrival, config: Config) -> bool:
         return False
     if isinstance(m, RawGnssEpoch):
         return True  # corrected for the place where the filter has come to
-    stamp = m.stamp  # type: ignore[union-attr]
-    assert isinstance(stamp, MonotonicStamp)
     section = config.aiding.get(m.source)
     delayed = isinstance(section, GnssAiding) and section.velocity_delay_s > 0.0
-    return delayed or config.imu.time_offset_s > 0.0 or stamp.t_ns < arrival.t_arrival_ns
+    return delayed or config.imu.time_offset_s > 0.0 or _valid_ns(m) < arrival.t_arrival_ns
 
 
 def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
