@@ -219,6 +219,29 @@ def test_a_clock_set_by_a_millisecond_moves_nothing_but_the_clock() -> None:
         assert (after - offset)[heard] == pytest.approx([jump, jump], abs=5.0)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_fewer_than_four_satellites_help(count: int) -> None:
+    """Each takes off variance along its line, none makes the place worse."""
+    sim, section = receiver(), RawAiding()
+    raw, estimator = informed(section, sim), started(section)
+    epoch = sim.epoch(0)
+    for _ in range(3):  # clocks are known from a fuller sky
+        aid = raw.aid(epoch, 0, estimator.nav[:3])
+        assert isinstance(aid, PseudorangeAid)
+        estimator.update(aid)
+    for slot in range(6, 9):
+        estimator.covariance[slot, slot] += 20.0**2
+    before = estimator.sigmas()[:3].copy()
+    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0, estimator.nav[:3])
+    assert isinstance(aid, PseudorangeAid)
+    outcome = estimator.update(aid)
+    assert (outcome.name, outcome.degrees) == ("fused", 2 * count)
+    after = estimator.sigmas()[:3]
+    assert (after < before).all()
+    assert (after**2).sum() < (before**2).sum() - count * 10.0**2
+    assert off(estimator) < 5.0
+
+
 def test_one_bad_satellite_is_refused_alone() -> None:
     sim, section = receiver(), RawAiding()
     raw, estimator = informed(section, sim), started(section)
