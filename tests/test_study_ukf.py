@@ -15,6 +15,7 @@ from fusiond.aiding.base import Innovation, State
 from fusiond.aiding.pseudorange import PseudorangeAid
 from fusiond.navigation.strapdown import STEP_RATE_B, STEP_SIZE
 from fusiond.studies import STUDIES, ukf, ukf_runs
+from fusiond.studies.live_filter import drive_truth
 
 
 @cache
@@ -73,7 +74,7 @@ def test_measurements_fit_the_truth() -> None:
             assert isinstance(aid, PseudorangeAid)
             step = np.zeros(STEP_SIZE)
             sample = round((k + 1) * problem.every_s * ukf_runs.IMU.rate_hz) - 1
-            step[STEP_RATE_B : STEP_RATE_B + 3] = ukf_runs._truth().gyro[sample]
+            step[STEP_RATE_B : STEP_RATE_B + 3] = drive_truth().gyro[sample]
             if problem.clock:
                 xi[model.slots_of("clock_offset")] = offset[sample]
                 xi[model.slots_of("clock_drift")] = drift[sample]

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from fusiond.studies.live_filter import DURATION_S
 from fusiond.studies.ukf_runs import (
     COUNTED_S,
-    DURATION_S,
     FILTERS,
     NEES_EVERY_S,
     PROBLEMS,

@@ -18,10 +18,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from os import cpu_count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,22 +36,24 @@ from fusiond.estimators.screening import KEPT
 from fusiond.estimators.unscented import UnscentedEstimator
 from fusiond.gnss.constellation import Constellation, constellation
 from fusiond.gnss.ecef import ned_axes, to_ecef
-from fusiond.imu_buffer import ImuBuffer
 from fusiond.settings import DEG, imu_noise
-from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.sensor_errors import imu_output
-from fusiond.simulation.trajectories import drive
+from fusiond.studies.live_filter import (
+    DURATION_S,
+    ORIGIN_DEG_M,
+    RATE_HZ,
+    LiveFilter,
+    drive_samples,
+    drive_truth,
+    on_processes,
+)
 from fusiond.studies.rdss_runs import nav_error, true_nav, with_error
-from fusiond.timeline import Entry, Timeline
+from fusiond.timeline import Entry
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-DURATION_S = 500.0
-REST_S = 20.0
-ORIGIN_DEG_M = (30.5, 114.3, 40.0)
 IMU = Imu(
-    rate_hz=50.0,
+    rate_hz=RATE_HZ,
     gyro_noise_deg_sqrt_h=0.05,
     accel_noise_m_s_sqrt_h=0.02,
     gyro_bias_initial_deg_h=10.0,
@@ -77,8 +77,6 @@ START = (2300, 345_600.0)
 """GPS week and second of it."""
 GATE = 1.0 - 1e-9
 """So wide that a matched filter refuses nothing: what is refused was badly predicted."""
-HISTORY_S, CHECKPOINT_S = 15.0, 0.5
-"""As the daemon has them."""
 COUNTED_S = 30.0
 """Errors count from here: the first corrections of a poor start have been made."""
 NEES_EVERY_S = 15.0
@@ -131,13 +129,6 @@ class Trace:
 # --------------------------------------------------------------------------- what is simulated
 
 
-@lru_cache(maxsize=1)
-def _truth() -> Truth:
-    lat, lon, height = ORIGIN_DEG_M
-    path = drive(DURATION_S, REST_S)
-    return Truth(path, (lat * DEG, lon * DEG, height), IMU.rate_hz, DURATION_S)
-
-
 def epochs(problem: Problem) -> Array:
     """Instants (n,), s."""
     return np.arange(1, int(DURATION_S / problem.every_s) + 1, dtype=np.float64) * problem.every_s
@@ -148,13 +139,13 @@ def _true_states(every_s: float) -> tuple[Array, Array, Array]:
     """At 0 and each epoch: navigation states (n + 1, 10), the antenna's ECEF position and velocity
     (n + 1, 3)."""
     t_s: Array = np.arange(int(DURATION_S / every_s) + 1, dtype=np.float64) * every_s
-    antenna = _truth().at(t_s, LEVER)
+    antenna = drive_truth().at(t_s, LEVER)
     place = np.array([to_ecef(*map(float, p)) for p in antenna.position])
     turned = [
         ned_axes(float(p[0]), float(p[1])) @ v
         for p, v in zip(antenna.position, antenna.v_ned, strict=True)
     ]
-    return true_nav(_truth(), t_s), place, np.array(turned)
+    return true_nav(drive_truth(), t_s), place, np.array(turned)
 
 
 @lru_cache(maxsize=1)
@@ -304,10 +295,7 @@ def _model(problem: Problem) -> Model:
 def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
     """Run `number` of a problem: every filter on the same errors."""
     rng = np.random.default_rng([seed, number])
-    truth = _truth()
-    imu = imu_output(IMU, truth.gyro, truth.accel, rng)
-    samples = np.hstack([imu.gyro, imu.accel])
-    times = np.rint(np.arange(1, len(samples) + 1) * 1e9 / IMU.rate_hz).astype(np.int64)
+    samples = drive_samples(IMU, rng)
     aids, epoch_sd_m = _pseudoranges(rng, number) if problem.clock else _double_star(rng)
     model = _model(problem)
     sd = model.initial.copy()
@@ -318,20 +306,11 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
     start = with_error(nav[0], error)
     traces = {}
     for name, make in FILTERS.items():
-        estimator = make(model)
-        buffer = ImuBuffer(IMU.rate_hz, HISTORY_S, np.eye(3), 0.0, IMU.gap_s)
-        entries: list[Entry] = []
-        timeline = Timeline(estimator, buffer, HISTORY_S, CHECKPOINT_S, entries.append)
-        estimator.initialise(0, 0, start, np.zeros(model.size), np.diag(sd**2))
-        timeline.start()
-        off, nees, first, given = np.empty(len(aids)), [], math.nan, 0
+        live = LiveFilter(make(model), IMU.gap_s, samples, start, sd)
+        estimator = live.estimator
+        off, nees, first = np.empty(len(aids)), [], math.nan
         for k, epoch in enumerate(aids):
-            end = round((k + 1) * problem.every_s * IMU.rate_hz)
-            buffer.append(times[given:end], samples[given:end])
-            given = end
-            for aid in epoch:
-                timeline.insert(aid)
-            timeline.run()
+            live.advance((k + 1) * problem.every_s, epoch)
             x = nav_error(estimator.nav, nav[k + 1])
             off[k] = math.hypot(x[6], x[7])
             if k == 0 or (k + 1) % round(NEES_EVERY_S / problem.every_s) == 0:
@@ -341,7 +320,7 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
                 else:
                     nees.append(value)
         last = off[-round(LAST_S / problem.every_s) :]
-        refused = sum(_refused(entry) for entry in entries)
+        refused = sum(_refused(entry) for entry in live.entries)
         converged = math.sqrt(float(np.mean(last**2))) <= epoch_sd_m
         traces[name] = Trace(off, first, np.array(nees), converged, refused)
     return traces
@@ -359,10 +338,4 @@ def monte_carlo(
     problem: Problem, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """All runs of a problem, in order, on two processes."""
-    results = []
-    with ProcessPoolExecutor(min(2, cpu_count() or 1, runs)) as pool:
-        for traces in pool.map(partial(simulate, problem, seed), range(runs)):
-            results.append(traces)
-            if progress is not None:
-                progress()
-    return results
+    return list(on_processes(partial(simulate, problem, seed), runs, progress))

@@ -1,0 +1,95 @@
+"""One filter of a study, fed as the daemon feeds it; a drive to feed it on; runs on two processes.
+
+The vehicle is the drive of `fusiond simulate`, 500 s as in paper 003, on IMU samples at `RATE_HZ`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from os import cpu_count
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Linearised
+from fusiond.config import Imu
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.imu_buffer import ImuBuffer
+from fusiond.settings import DEG
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.sensor_errors import imu_output
+from fusiond.simulation.trajectories import drive
+from fusiond.timeline import Entry, Timeline
+
+Array = NDArray[np.float64]
+
+DURATION_S = 500.0
+REST_S = 20.0
+ORIGIN_DEG_M = (30.5, 114.3, 40.0)
+RATE_HZ = 50.0
+HISTORY_S, CHECKPOINT_S = 15.0, 0.5
+"""As the daemon has them."""
+WORKERS = 2
+
+R = TypeVar("R")
+
+
+@lru_cache(maxsize=1)
+def drive_truth() -> Truth:
+    """The drive, sampled at `RATE_HZ`."""
+    lat, lon, height = ORIGIN_DEG_M
+    path = drive(DURATION_S, REST_S)
+    return Truth(path, (lat * DEG, lon * DEG, height), RATE_HZ, DURATION_S)
+
+
+def drive_samples(imu: Imu, rng: np.random.Generator) -> Array:
+    """What an IMU at `RATE_HZ` says on the drive (n, 6): rate (rad/s) and force (m/s^2)."""
+    truth = drive_truth()
+    output = imu_output(imu, truth.gyro, truth.accel, rng)
+    return np.hstack([output.gyro, output.accel])
+
+
+class LiveFilter:
+    """An estimator on the IMU samples (n, 6) of a run, through the daemon's timeline.
+
+    `gap_s` is the longest pause of the IMU that is none. The filter starts at 0 at the navigation
+    state `nav` (10,) with one sigma `sd` (states,). `entries` are the aids in the order in which
+    they were applied, with their outcomes.
+    """
+
+    def __init__(
+        self, estimator: KalmanEstimator, gap_s: float, samples: Array, nav: Array, sd: Array
+    ) -> None:
+        self.estimator = estimator
+        self.entries: list[Entry] = []
+        self._samples, self._given = samples, 0
+        self._times = np.rint(np.arange(1, len(samples) + 1) * 1e9 / RATE_HZ).astype(np.int64)
+        self._buffer = ImuBuffer(RATE_HZ, HISTORY_S, np.eye(3), 0.0, gap_s)
+        self._timeline = Timeline(
+            estimator, self._buffer, HISTORY_S, CHECKPOINT_S, self.entries.append
+        )
+        estimator.initialise(0, 0, nav.copy(), np.zeros(estimator.model.size), np.diag(sd**2))
+        self._timeline.start()
+
+    def advance(self, t_s: float, aids: Iterable[Linearised] = ()) -> None:
+        """IMU samples up to `t_s` and then `aids` arrive."""
+        end = round(t_s * RATE_HZ)
+        self._buffer.append(self._times[self._given : end], self._samples[self._given : end])
+        self._given = end
+        for aid in aids:
+            self._timeline.insert(aid)
+        self._timeline.run()
+
+
+def on_processes(
+    work: Callable[[int], R], runs: int, progress: Callable[[], None] | None = None
+) -> Iterator[R]:
+    """`work` of 0 to `runs` - 1, in order, on two processes."""
+    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
+        for result in pool.map(work, range(runs)):
+            yield result
+            if progress is not None:
+                progress()
