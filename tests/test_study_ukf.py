@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.raw.messages import SPEED_OF_LIGHT_M_S
 from fusiond.aiding.base import Innovation, State
 from fusiond.aiding.pseudorange import PseudorangeAid
 from fusiond.navigation.strapdown import STEP_RATE_B, STEP_SIZE
 from fusiond.studies import STUDIES, ukf, ukf_runs
-from fusiond.studies.live_filter import drive_truth
+from fusiond.studies.live_filter import LiveFilter, drive_samples, drive_truth
 
 
 @cache
@@ -106,3 +108,29 @@ def test_clock_drift_is_the_markov_process_of_the_filter() -> None:
     assert abs(correlation - math.exp(-0.5)) < 4.0 * (1.0 - math.exp(-1.0)) / math.sqrt(200.0)
     offset, drift = ends[0]
     assert np.diff(offset) * ukf_runs.IMU.rate_hz == pytest.approx(drift[:-1], abs=5.0)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf_measurements", "ukf"])
+def test_a_clock_that_is_set_unannounced_is_found(name: str) -> None:
+    """By a millisecond at the eleventh epoch: all ranges move, no rate does, nothing is refused."""
+    problem = ukf_runs.PROBLEMS[2]
+    rng = np.random.default_rng(4)
+    samples = drive_samples(ukf_runs.IMU, rng)
+    aids = ukf_runs._pseudoranges(rng, 5)[0][:20]
+    model = ukf_runs._model(problem)
+    sd = model.initial.copy()
+    sd[:9] = [0.003, 0.003, 0.03, 0.5, 0.5, 0.5, 30.0, 30.0, 30.0]
+    start = ukf_runs._true_states(problem.every_s)[0][0]
+    live = LiveFilter(ukf_runs.FILTERS[name](model), ukf_runs.IMU.gap_s, samples, start, sd)
+    (slot,) = model.slots_of("clock_offset")
+    for k, epoch in enumerate(aids):
+        aid = epoch[0]
+        assert isinstance(aid, PseudorangeAid)
+        before = live.estimator.xi[slot]
+        if k >= 10:
+            aid = replace(aid, ranges=aid.ranges + SPEED_OF_LIGHT_M_S * 1e-3)
+        live.advance(k + 1.0, [aid])
+        if k == 10:
+            moved = live.estimator.xi[slot] - before
+            assert moved == pytest.approx(SPEED_OF_LIGHT_M_S * 1e-3, abs=200.0)
+    assert [ukf_runs._refused(entry) for entry in live.entries] == [0] * 20

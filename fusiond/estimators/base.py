@@ -245,7 +245,8 @@ class ErrorStateFilter:
         z, h, r = rows
         threshold = gate_threshold(aid.gate, 1)
         offsets = self.model.slots_of(CLOCK_OFFSET)
-        ranges = h[:, offsets].any(axis=1)
+        # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
+        ranges = (np.abs(h[:, offsets]) > 0.5).any(axis=1)
         renew = bool(offsets) and bool(getattr(aid, "clock_reset", False))
         while True:
             if renew:
