@@ -147,6 +147,29 @@ def test_covariance_is_what_noise_does() -> None:
     assert abs(np.mean(nees) - 3.0) < 3.29 * math.sqrt(6.0 / 500.0)
 
 
+def test_velocity_covariance_is_what_noise_does() -> None:
+    """500 epochs with noise of the rates as stated: NEES of velocity within its 99.9 % interval."""
+    rng = np.random.default_rng(6)
+    model = _model()
+    quiet = single_point(model, EPOCH, HERE)
+    assert not isinstance(quiet, str)
+    sd = dict(zip(quiet.rows.satellites, np.sqrt(quiet.rows.rate_variance), strict=True))
+    nees = []
+    for _ in range(500):
+        signals = []
+        for s in EPOCH.signals:
+            assert s.range_rate_m_s is not None
+            error = sd[s.satellite] * rng.standard_normal()
+            signals.append(replace(s, range_rate_m_s=s.range_rate_m_s + error))
+        found = single_point(model, replace(EPOCH, signals=tuple(signals)), HERE)
+        assert not isinstance(found, str)
+        assert found.velocity is not None
+        assert found.velocity_covariance is not None
+        d = found.velocity - quiet.velocity
+        nees.append(d @ np.linalg.solve(found.velocity_covariance, d))
+    assert abs(np.mean(nees) - 3.0) < 3.29 * math.sqrt(6.0 / 500.0)
+
+
 def test_dops_of_one_system_are_those_of_rtklib() -> None:
     rows = _model().rows(EPOCH, HERE)
     gps = rows.system == SYSTEMS.index("G")

@@ -58,7 +58,8 @@ class Dops(NamedTuple):
 
 class SinglePoint(NamedTuple):
     """`position` (3,) ECEF m with `covariance` (3, 3) m^2; `clock_m` by system letter;
-    `ionosphere_sigmas` n; `velocity` (3,) ECEF m/s and `drift_m_s`, None without enough rates;
+    `ionosphere_sigmas` n; `velocity` (3,) ECEF m/s with `velocity_covariance` (3, 3) (m/s)^2 and
+    `drift_m_s`, None without enough rates;
     `rows` those used with `residual_m` (n,); `refused` pairs of satellite and reason;
     `statistic` of the residual test against `bound` with `redundancy` degrees of freedom."""
 
@@ -67,6 +68,7 @@ class SinglePoint(NamedTuple):
     clock_m: dict[str, float]
     ionosphere_sigmas: float
     velocity: Array | None
+    velocity_covariance: Array | None
     drift_m_s: float | None
     dops: Dops
     rows: Rows
@@ -140,13 +142,14 @@ def single_point(
     quality = dops(rows.line_of_sight, rows.system, position)
     if quality is None:
         return "geometry"
-    velocity, drift = _velocity(rows)
+    velocity, velocity_covariance, drift = _velocity(rows)
     return SinglePoint(
         position,
         fit.covariance[:3, :3],
         {SYSTEMS[s]: float(c) for s, c in zip(fit.systems, fit.clocks, strict=True)},
         fit.ionosphere,
         velocity,
+        velocity_covariance,
         drift,
         quality,
         rows,
@@ -184,16 +187,17 @@ def _fit(model: RangeModel, picked: Picked, position: Array, out: list[str]) -> 
     return "diverged"
 
 
-def _velocity(rows: Rows) -> tuple[Array | None, float | None]:
-    """Velocity (3,) ECEF m/s and drift m/s from the rows that have a rate."""
+def _velocity(rows: Rows) -> tuple[Array | None, Array | None, float | None]:
+    """Velocity (3,) ECEF m/s, its covariance and drift m/s from the rows that have a rate."""
     has = np.isfinite(rows.rate_m_s)
     if has.sum() < 4:
-        return None, None
+        return None, None, None
     los = rows.line_of_sight[has]
     h = np.column_stack([-los, np.ones(len(los))])
     if np.linalg.cond(h) > MAX_CONDITION:
-        return None, None
+        return None, None, None
     y = rows.rate_m_s[has] - np.einsum("ij,ij->i", los, rows.velocity[has])
     weight = 1.0 / rows.rate_variance[has]
-    x = np.linalg.solve(h.T @ (h * weight[:, None]), h.T @ (weight * y))
-    return x[:3], float(x[3])
+    covariance = np.asarray(np.linalg.inv(h.T @ (h * weight[:, None])), np.float64)
+    x = covariance @ (h.T @ (weight * y))
+    return x[:3], covariance[:3, :3], float(x[3])
