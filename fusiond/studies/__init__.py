@@ -14,6 +14,7 @@ STUDIES = {
     "multiscale": "fusiond.studies.multiscale",
     "federated": "fusiond.studies.federated",
     "ukf": "fusiond.studies.ukf",
+    "bds-tight": "fusiond.studies.bds_tight",
     "consistency": "fusiond.studies.consistency",
     "reduced-order": "fusiond.studies.reduced_order",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
