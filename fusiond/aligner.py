@@ -38,7 +38,7 @@ from fusiond.navigation.rotation import (
 )
 from fusiond.navigation.standstill import FEWEST_SAMPLES, Window
 from fusiond.saved_state import SavedState
-from fusiond.start import Place, Start, as_geodetic, build_start
+from fusiond.start import Place, Start, as_geodetic, build_start, velocity_of
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ COURSE_AGREEMENT_RAD = math.radians(45.0)
 MOTION_MAX_RATE_RAD_S = math.radians(5.0)
 MOTION_INTERVAL_NS = (800_000_000, 3_500_000_000)
 # One sigma of velocity (m/s) of a vehicle that stands.
-REST_VELOCITY_SD = 0.1
+REST_VELOCITY_SD = np.full(3, 0.1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,8 +322,7 @@ class Aligner:
             place,
             dcm_from_rpy(roll, pitch, yaw),
             sd,
-            self._velocity(velocity),
-            max(velocity.sd),
+            *velocity_of(velocity),
             "GNSS course" + (", backward" if backward else ""),
             bias=self._rest_bias(standing, at_rest, lat),
             levelled=True,
@@ -347,7 +346,7 @@ class Aligner:
             if np.abs(mean[:3]).max() > MOTION_MAX_RATE_RAD_S:
                 return None
             lat, _, height = (float(v) for v in place[1])
-            change = self._velocity(velocity) - self._velocity(earlier)
+            change = velocity_of(velocity)[0] - velocity_of(earlier)[0]
             roll, pitch = level_in_motion(
                 mean[3:], change / (interval * 1e-9), course, gravity(lat, height)
             )
@@ -357,23 +356,18 @@ class Aligner:
                 place,
                 dcm_from_rpy(roll, pitch, course),
                 sd,
-                self._velocity(velocity),
-                max(velocity.sd),
+                *velocity_of(velocity),
                 "GNSS course, on the move",
             )
         return None
 
     # ------------------------------------------------------------------ building the start
 
-    @staticmethod
-    def _velocity(aid: VelocityAid) -> Array:
-        return np.array([*aid.v_ned, 0.0][:3])
-
     def _place_of(self, p: PositionAid, velocity: VelocityAid | None = None) -> Place:
         """A fix's place; with a velocity, moved to the velocity's instant."""
         where = np.array([p.lat_rad, p.lon_rad, p.height_m or 0.0])
         if velocity is not None:
-            moved = self._velocity(velocity) * ((velocity.t_ns - p.t_ns) * 1e-9)
+            moved = velocity_of(velocity)[0] * ((velocity.t_ns - p.t_ns) * 1e-9)
             where += as_geodetic(moved, p.lat_rad)
         return p, where, max(p.sd[:2])
 

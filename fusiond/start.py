@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, meridian_radius, transverse_radius
@@ -23,6 +24,8 @@ LEVEL_SD_RAD = math.radians(0.1)
 MOTION_LEVEL_SD_RAD = math.radians(2.0)
 # One sigma of velocity (m/s) that no start claims to beat.
 LEAST_VELOCITY_SD = 0.05
+# One sigma of a road's slope: main roads are built to 3 to 6 %, streets in hills to 12 %.
+SLOPE_SD = 0.06
 
 Place = tuple[PositionAid | None, Array, float]
 """The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
@@ -32,6 +35,16 @@ def as_geodetic(metres: Array, lat: float) -> Array:
     """A short way north, east, down (3,) in m as latitude, longitude (rad) and height (m)."""
     n, e, d = metres
     return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
+
+
+def velocity_of(aid: VelocityAid) -> tuple[Array, Array]:
+    """Velocity NED (3,) and one sigma (3,). NMEA measures no vertical velocity: it is then 0, give
+    or take what a road's slope makes of the speed."""
+    if len(aid.v_ned) == 3:
+        return np.array(aid.v_ned), np.full(3, max(aid.sd))
+    sd = max(aid.sd)
+    climb = math.hypot(sd, SLOPE_SD * math.hypot(*aid.v_ned))
+    return np.array([*aid.v_ned, 0.0]), np.array([sd, sd, climb])
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,18 +65,17 @@ def build_start(
     dcm: Array,
     sd_yaw: float,
     velocity: Array,
-    sd_velocity: float,
+    sd_velocity: Array,
     how: str,
     *,
     bias: tuple[Array, float] | None = None,
     levelled: bool = False,
     compassed: bool = False,
 ) -> Start:
-    """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED.
+    """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
-    at
-    rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors.
+    at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors.
     """
     fix, where, sd_position = place
     lat, height = float(where[0]), float(where[2])
@@ -77,7 +89,7 @@ def build_start(
     tilt_sd = LEVEL_SD_RAD if levelled else MOTION_LEVEL_SD_RAD
     p[0, 0] = p[1, 1] = tilt_sd**2
     p[2, 2] = sd_yaw**2
-    p[3:6, 3:6] = np.eye(3) * max(sd_velocity, LEAST_VELOCITY_SD) ** 2
+    p[3:6, 3:6] = np.diag(np.maximum(sd_velocity, LEAST_VELOCITY_SD) ** 2)
     vertical = fix.sd[2] if fix is not None and fix.height_m is not None else sd_position
     p[6:9, 6:9] = np.diag([sd_position**2, sd_position**2, vertical**2])
     xi = np.zeros(model.size)

@@ -226,6 +226,26 @@ def test_already_moving(seed: int) -> None:
     _assert_started(story, truth, "GNSS course, on the move")
 
 
+@pytest.mark.parametrize("climb_deg", [4.0, -4.0])
+def test_already_moving_on_a_hill_with_a_receiver_that_says_no_vertical_velocity(
+    climb_deg: float,
+) -> None:
+    legs = [Leg(5), Leg(8, speed_m_s=15.0), Leg(4, climb_deg=climb_deg), Leg(60)]
+    truth = _truth(legs, 60.0)
+    fixes = [
+        replace(f, v_ned_m_s=(*f.v_ned_m_s[:2], None))
+        for f in _fixes(truth, 3)
+        if isinstance(f, PositionFix) and f.v_ned_m_s is not None
+    ]
+    story = _tell(truth, MEMS, fixes, from_s=20.0, heading=("gnss_course",))
+    _assert_started(story, truth, "GNSS course, on the move")
+    start = story.navigator.started
+    assert start is not None
+    true = runs.true_nav(truth, np.array([(start.t_ns - START_NS) * 1e-9]))[0]
+    assert abs(start.nav[5] - true[5]) == pytest.approx(15.0 * math.sin(math.radians(4.0)), abs=0.1)
+    assert abs(start.nav[5] - true[5]) < 2.0 * math.sqrt(start.covariance[5, 5])
+
+
 def test_saved_heading_is_void_once_the_vehicle_has_moved() -> None:
     """Pushed or driven before the first fix came: the saved heading says nothing any more."""
     legs = [Leg(0.5), Leg(4, speed_m_s=3.0), Leg(4, turn_deg=70.0), Leg(4, speed_m_s=0.0), Leg(20)]
