@@ -1,9 +1,12 @@
-"""What the daemon takes of a machine: `python benchmarks/daemon_load.py [--seconds S]` prints JSON.
+"""What the daemon takes of a machine, as JSON:
+
+    python benchmarks/daemon_load.py [--seconds S] [--filter kalman] [--raw]
 
 The daemon's own process serves a simulated vehicle in another: IMU 200 Hz, ticks 100 Hz, GNSS
-10 Hz, RDSS, `nav` 20 Hz to a Mosquitto that one client listens to. CPU and memory are the kernel's
-account of the process (/proc/PID/stat, /proc/PID/statm) over the time after alignment;
-`first_tick_s` counts from the start of the process, on a primed cache of compiled kernels.
+10 Hz (`--raw`: UBX of two systems as well, 10 Hz, fused tightly), RDSS, `nav` 20 Hz to a Mosquitto
+that one client listens to. CPU and memory are the kernel's account of the process (/proc/PID/stat,
+/proc/PID/statm) over the time after alignment; `first_tick_s` counts from the start of the process,
+on a primed cache of compiled kernels.
 
 The IMU is on `vcan0` where that interface is up, else on python-can's `udp_multicast`, whose frames
 cost more: UDP, msgpack and a Python object for each.
@@ -43,9 +46,10 @@ axes = ["+x", "-y", "-z"]
 rate_hz = {imu_hz}
 {imu}
 [sources.gnss]
-driver = "nmea"
+driver = "gnss"
 port = "{folder}/gnss"
 [aiding.gnss]
+kind = "{kind}"
 lever_arm_m = [0.0, 0.0, -1.0]
 [sources.rdss]
 driver = "rdss"
@@ -56,6 +60,8 @@ lever_arm_m = [0.0, 0.0, -1.0]
 [constraints.non_holonomic]
 enabled = true
 lever_arm_m = [-1.0, 0.0, 0.5]
+[estimator]
+filter = "{filter}"
 [scheduler]
 rate_hz = {tick_hz}
 [mqtt]
@@ -65,7 +71,7 @@ nav_rate_hz = {nav_hz}
 """
 
 
-def _vehicle(folder: str, interface: str, channel: str) -> None:
+def _vehicle(folder: str, interface: str, channel: str, raw: bool) -> None:
     scenario = SCENARIOS["drive"]
     vehicle = SimulatedVehicle(
         replace(
@@ -73,11 +79,13 @@ def _vehicle(folder: str, interface: str, channel: str) -> None:
             path=partial(drive, rest_s=REST_S),
             imu=scenario.imu.model_copy(update={"rate_hz": IMU_HZ}),
             gnss=replace(scenario.gnss, rate_hz=GNSS_HZ),
+            gnss_raw=replace(scenario.gnss_raw, rate_hz=GNSS_HZ),
         ),
         duration_s=600.0,
         can_imu=SIM_IMU_OPTIONS.model_copy(update={"interface": interface, "channel": channel}),
         gnss_link=Path(folder, "gnss"),
         rdss_link=Path(folder, "rdss"),
+        gnss_raw="ubx" if raw else None,
     )
     asyncio.run(vehicle.run())
 
@@ -98,7 +106,7 @@ def _bus() -> tuple[str, str]:
     return ("socketcan", "vcan0") if up.stdout else ("udp_multicast", "239.74.163.2")
 
 
-async def measure(folder: Path, seconds: float) -> dict[str, object]:
+async def measure(folder: Path, seconds: float, name: str, raw: bool) -> dict[str, object]:
     """Run both processes for `seconds` after alignment; the figures."""
     interface, channel = _bus()
     broker = Broker(folder)
@@ -111,10 +119,12 @@ async def measure(folder: Path, seconds: float) -> dict[str, object]:
             nav_hz=NAV_HZ,
             folder=folder,
             port=broker.port,
+            filter=name,
+            kind="raw" if raw else "gnss",
         )
     )
     vehicle = multiprocessing.get_context("spawn").Process(
-        target=_vehicle, args=(str(folder), interface, channel), daemon=True
+        target=_vehicle, args=(str(folder), interface, channel, raw), daemon=True
     )
     daemon = DaemonProcess(config)
     try:
@@ -141,6 +151,8 @@ async def measure(folder: Path, seconds: float) -> dict[str, object]:
         await daemon.kill()
         vehicle.kill()
     return {
+        "filter": name,
+        "raw": raw,
         "cpu_percent": round(100.0 * used_s / elapsed_s, 1),
         "resident_mb": round(resident_mb, 1),
         "first_tick_s": round(first_tick_s, 2),
@@ -158,10 +170,13 @@ async def measure(folder: Path, seconds: float) -> dict[str, object]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--filter", default="kalman")
+    parser.add_argument("--raw", action="store_true")
     args = parser.parse_args()
     subprocess.run([sys.executable, "-c", "import fusiond.daemon"], check=True)  # compiles
     with tempfile.TemporaryDirectory(prefix="fusiond-load-") as folder:
-        print(json.dumps(asyncio.run(measure(Path(folder), args.seconds)), indent=2))
+        figures = asyncio.run(measure(Path(folder), args.seconds, args.filter, args.raw))
+        print(json.dumps(figures, indent=2))
 
 
 if __name__ == "__main__":
