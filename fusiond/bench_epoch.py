@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
@@ -45,9 +46,11 @@ def raw_epoch(_: int) -> Callable[[], int]:
     sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [3.0] * 3
     estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sigma**2))
 
+    instants = count()
+
     def work() -> int:
         for _ in range(EPOCHS):
-            aid = raw.aid(epoch, 0, place)
+            aid = raw.aid(epoch, next(instants), place)
             assert not isinstance(aid, str)
             outcome = estimator.update(aid)
             assert outcome.name == "fused"

@@ -89,6 +89,7 @@ def screened_update(
                 s += h[a, columns[a, p]] * u[columns[a, p]]
             y[a] = innovation / np.sqrt(s)
             nis += y[a] * y[a]
+            # k = u / s; u is then u / sqrt(s), so that k k^T s = u u^T.
             hk, root = 0.0, np.sqrt(s)
             for i in range(n):
                 k[i] = u[i] / s
@@ -98,10 +99,10 @@ def screened_update(
                 hk += h[a, columns[a, p]] * k[columns[a, p]]
             # Joseph form of one row, as in fusiond.estimators.update; each product is the same to
             # the bit with i and j exchanged.
-            c = r[a] - (1.0 - hk) * s
+            c = (r[a] - (1.0 - hk) * s) / s - 1.0
             for i in range(n):
                 for j in range(n):
-                    cov_out[i, j] += c * (k[i] * k[j]) - u[i] * u[j]
+                    cov_out[i, j] += c * (u[i] * u[j])
         worst, greatest = -1, threshold
         for a in range(m):
             if codes[a] != KEPT:

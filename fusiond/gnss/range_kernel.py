@@ -102,7 +102,7 @@ def range_rows(
         x, y = xt, yt
         c, s = 1.0, 0.0
         distance = 0.0
-        for _ in range(3):  # each step a factor of 3e-6 closer
+        for _ in range(2):  # unturned 27 m off, then 0.2 mm, then less than a nanometre
             dx, dy, dz = x - rx, y - ry, z - rz
             distance = math.sqrt(dx * dx + dy * dy + dz * dz)
             angle = EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S
