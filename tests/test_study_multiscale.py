@@ -25,9 +25,9 @@ def test_keys_are_those_promised() -> None:
     found = result()
     assert STUDIES["multiscale"] == multiscale.__name__
     assert found["runs"] == 4
-    assert found["paper"].startswith("001")
+    assert "paper 001" in found["paper"]["source"]
     assert found["finding"].endswith(".")
-    assert found["paper_figures"]["federated"]["position_std_m"] == [6.0023, 5.2128]
+    assert found["paper"]["federated"]["position_std_m"] == [6.0023, 5.2128]
     for case in (found, found["variants"]["bias"]):
         names = {"multiscale", "federated", "centralised", "multiscale_n1", "multiscale_n4"}
         assert names <= set(case["filters"])

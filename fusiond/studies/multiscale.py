@@ -87,8 +87,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
             figures["time_ratio"] = spent[name] / spent[REFERENCE]
     return {
         "study": "multiscale",
-        "paper": "001, GPS/star tracker/SINS",
-        "paper_figures": PAPER_FIGURES,
+        "paper": {"source": "paper 001, GPS/star tracker/SINS", **PAPER_FIGURES},
         "runs": count,
         "seed": seed,
         "duration_s": DURATION_S,
@@ -210,7 +209,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
         found.append((f"{TITLES[case]}, {result['runs']} runs", ["", *COLUMNS], rows))
     rows = []
     for name in ("multiscale", "federated"):
-        printed = result["paper_figures"][name]
+        printed = result["paper"][name]
         values = (printed[f"{group}_std_{unit}"] for group, (unit, _) in UNITS.items())
         cells = [" / ".join(f"{v:g}" for v in value) for value in values]
         rows.append([name, *cells, f"{printed['time_per_step']:g}"])
