@@ -58,6 +58,14 @@ class GnssAiding(Aiding):
     one."""
     time_sd_s: NonNegativeFloat = 0.0
     """Timing error of the fix against the IMU; times the speed it adds to sigma."""
+    bias_sd_m: NonNegativeFloat = 0.0
+    """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east; 1.5 for a
+    receiver without corrections. RTK fixes have none. 0: none is estimated, and sigma shrinks as
+    if errors were white."""
+    bias_down_sd_m: PositiveFloat = 5.0
+    """The same downwards, where most of the ionosphere goes."""
+    bias_correlation_s: PositiveFloat = 1800.0
+    """Correlation time of that error."""
 
 
 class RawAiding(Aiding):

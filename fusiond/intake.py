@@ -60,6 +60,9 @@ ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
 # when the receiver sends no GST (typical: 0.5 m differential, 0.3 m float, 0.02 m fixed for 3 m
 # code).
 RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
+RTK = (4, 5)
+"""Quality of fixes by carrier phase against a base station."""
+FIX_BIAS = "gnss_bias"
 # A receiver's own velocity has no meaning below this sigma; none states less in practice.
 VERTICAL_VELOCITY_FACTOR = 1.5
 
@@ -111,12 +114,18 @@ class Intake:
         """What the aids need in the model beside its own blocks: errors that successive
         measurements share.
 
-        North and east of RDSS fixes (`BIAS_BLOCK`), which position compensation needs for what the
-        moved fix is wrong by; the misalignment of each star tracker and radar.
+        North, east and down of a receiver's fixes; north and east of RDSS fixes (`BIAS_BLOCK`),
+        which position compensation needs for what the moved fix is wrong by; the misalignment of
+        each star tracker and radar.
         """
         blocks: list[Block] = []
         for name, o in self._aiding.items():
             match o:
+                case GnssAiding() if o.bias_sd_m > 0.0:
+                    level, down = self._fix_bias(name, o)
+                    lasts_s = o.bias_correlation_s
+                    blocks.append(position_bias(level, o.bias_sd_m, lasts_s))
+                    blocks.append(position_bias(down, o.bias_down_sd_m, lasts_s, "d"))
                 case RdssAiding() if BIAS_BLOCK not in {b.name for b in blocks}:
                     if o.bias_sd_m > 0.0:
                         bias = o.bias_sd_m, o.bias_correlation_s
@@ -152,6 +161,16 @@ class Intake:
         if section.misalignment_sd_arcsec == 0.0:
             return ""
         block = STAR_BLOCK if isinstance(section, StarTrackerAiding) else SAR_BLOCK
+        return self._own(block, source, section)
+
+    def _fix_bias(self, source: str, section: GnssAiding) -> tuple[str, ...]:
+        """The blocks of the error that a receiver's fixes share; none where it is not estimated."""
+        if section.bias_sd_m == 0.0:
+            return ()
+        level = self._own(FIX_BIAS, source, section)
+        return level, f"{level}_down"
+
+    def _own(self, block: str, source: str, section: GnssAiding | Misaligned) -> str:
         own = self._aiding.get(source) is section and source != section.kind
         return f"{block}_{source}" if own else block
 
@@ -231,6 +250,7 @@ class Intake:
                 (n, e, d),
                 o.lever_arm_m,
                 sd_time,
+                () if m.quality in RTK else self._fix_bias(m.source, o),
             )
         ]
         if o.use_velocity and m.v_ned_m_s is not None:

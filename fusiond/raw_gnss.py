@@ -21,7 +21,7 @@ from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.config_aiding import RawAiding
 from fusiond.estimators.base import Outcome
-from fusiond.estimators.model import Block, clock_blocks
+from fusiond.estimators.model import Block, clock_blocks, position_bias
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
 from fusiond.gnss.ranges import RangeModel, RangeOptions, Rows
@@ -53,10 +53,9 @@ def raw_blocks(section: RawAiding) -> list[Block]:
     blocks = clock_blocks(section.systems, clock_noise(section))
     if section.bias_sd_m > 0.0:
         tau_s = section.bias_correlation_s
-        sds = (section.bias_sd_m, section.bias_down_sd_m)
-        for name, axes, sd in zip(RANGE_BIAS, (("n", "e"), ("d",)), sds, strict=True):
-            columns = (-1,) * len(axes)
-            blocks.append(Block(name, "m", axes, columns, sd, tau_s=tau_s, steady=sd))
+        level, down = RANGE_BIAS
+        blocks.append(position_bias(level, section.bias_sd_m, tau_s))
+        blocks.append(position_bias(down, section.bias_down_sd_m, tau_s, "d"))
     return blocks
 
 

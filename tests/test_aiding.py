@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 
 SOURCE = ("aid", 0, 0.99)
 LEVER = (1.3, -0.4, -2.1)
+FIX_BIAS = ("gnss_bias", "gnss_bias_down")
 RATE_SENSED = np.array([0.05, -0.03, 0.4])
 MODELS = ("ins15", "ins21", "planar15")
 VELOCITY = (12.0, -7.0, 0.8)
@@ -40,7 +41,12 @@ RPY = (0.08, -0.12, 2.3)
 
 
 def _model(name: str) -> Model:
-    return make_model(name, imu_noise(Imu()), position_bias(BIAS_BLOCK, 30.0, 600.0))
+    biases = (
+        position_bias(BIAS_BLOCK, 30.0, 600.0),
+        position_bias(FIX_BIAS[0], 1.5, 1800.0),
+        position_bias(FIX_BIAS[1], 5.0, 1800.0, "d"),
+    )
+    return make_model(name, imu_noise(Imu()), *biases)
 
 
 def _state(model: Model, nav: Array, xi: Array) -> State:
@@ -113,6 +119,8 @@ def _rdss(nav: Array, moved_s: float = 0.0) -> RdssPositionAid:
 AIDS: dict[str, Callable[[Array], Linearised]] = {
     "position": _position,
     "horizontal position": lambda nav: _position(nav, False),
+    "position with a shared error": lambda nav: replace(_position(nav), bias=FIX_BIAS),
+    "horizontal, shared error": lambda nav: replace(_position(nav, False), bias=FIX_BIAS),
     "rdss": _rdss,
     "rdss, moved by the delay": lambda nav: _rdss(nav, 1.5),
     "velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from drivers.measurements import Attitude, Bearing, MonotonicStamp
+from drivers.measurements import Attitude, Bearing, MonotonicStamp, PositionFix
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid
 from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
+from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import BIAS_BLOCK
 from fusiond.config import Config
-from fusiond.config_aiding import AnyAiding, AttitudeAiding, RdssAiding, SarAiding
+from fusiond.config_aiding import AnyAiding, AttitudeAiding, GnssAiding, RdssAiding, SarAiding
 from fusiond.config_aiding import StarTrackerAiding as Star
 from fusiond.intake import Intake
 from fusiond.navigator import Navigator
@@ -92,6 +94,33 @@ def test_blocks_of_the_model() -> None:
         assert one(aiding, attitude(source)).block == block
     assert one(aiding, bearing(sd_rad=None, point=(0.5, 1.9, 1.0))).block == SAR_BLOCK
     assert one(aiding, bearing("radar", point=(0.5, 1.9, 1.0))).block == SAR_BLOCK
+
+
+def test_fixes_share_an_error_unless_they_are_rtk() -> None:
+    aiding: dict[str, AnyAiding] = {
+        "gnss": GnssAiding(bias_sd_m=1.5, bias_down_sd_m=4.0, bias_correlation_s=900.0),
+        "front": GnssAiding(bias_sd_m=0.5),
+        "white": GnssAiding(),
+    }
+    intake = Intake(aiding)
+    blocks = {b.name: b for b in intake.extra_blocks()}
+    level, down = blocks["gnss_bias"], blocks["gnss_bias_down"]
+    assert (level.states, level.steady, level.tau_s) == (("n", "e"), 1.5, 900.0)
+    assert (down.states, down.steady, down.tau_s) == (("d",), 4.0, 900.0)
+    assert set(blocks) == {*(f"gnss_bias{n}" for n in ("", "_down", "_front", "_front_down"))}
+    fix = PositionFix("gnss", 0, MonotonicStamp(7), 0.5, 1.9, 10.0, sd_ned_m=(1.0, 1.0, 2.0))
+    for source, quality, names in (
+        ("gnss", 1, ("gnss_bias", "gnss_bias_down")),
+        ("gnss", 2, ("gnss_bias", "gnss_bias_down")),
+        ("gnss", 4, ()),
+        ("gnss", 5, ()),
+        ("front", 1, ("gnss_bias_front", "gnss_bias_front_down")),
+        ("other", 1, ("gnss_bias", "gnss_bias_down")),  # the section named after its kind
+        ("white", 1, ()),
+    ):
+        (aid,) = intake.aids(replace(fix, source=source, quality=quality), 7, 0.0)
+        assert isinstance(aid, PositionAid)
+        assert aid.bias == names, (source, quality)
 
 
 def test_the_navigators_model_has_the_states() -> None:

@@ -20,7 +20,7 @@ from fusiond.raw_gnss import raw_blocks
 from fusiond.studies import STUDIES, bds_tight
 from fusiond.studies import bds_tight_runs as runs
 
-FILTERS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose")
+FILTERS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white")
 
 
 @cache
@@ -85,13 +85,14 @@ def test_sigma_is_honest_where_errors_are_what_the_filter_takes_them_for() -> No
     assert low < found["tight_ekf"]["nees_mean"] < high
     assert low < found["receiver"]["nees_mean"] < high
     # Loose has no state for what its fixes share: orbit errors make it too sure.
-    loose = [entry["cases"]["open"]["loose"]["nees_mean"] for entry in (largest, none)]
-    assert loose[0] > result()["nees_interval"][1] > loose[1]
+    white = [entry["cases"]["open"]["loose_white"]["nees_mean"] for entry in (largest, none)]
+    assert white[0] > result()["nees_interval"][1] > white[1]
+    assert largest["cases"]["open"]["loose"]["nees_mean"] < result()["nees_interval"][1]
 
 
 def test_tables_and_picture(tmp_path: Path) -> None:
     every, few, orbits = bds_tight.tables(result())
-    assert [len(t[2]) for t in (every, few, orbits)] == [23, 18, 12]
+    assert [len(t[2]) for t in (every, few, orbits)] == [27, 21, 12]
     for _, header, rows in (every, few, orbits):
         assert {len(row) for row in rows} == {len(header)}
     pytest.importorskip("matplotlib")

@@ -1,10 +1,11 @@
 r"""Position of an antenna: GNSS fix (3-D) or BeiDou RDSS fix (horizontal).
 
-    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l
-      = dr + (C l) x phi + v
+    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l + b^
+      = dr + (C l) x phi - db + v
 
-l is the lever arm from the IMU to the antenna. A timing error of sigma s_t moves the antenna by
-v s_t, which adds (v_i s_t)^2 to the variance of each axis.
+l is the lever arm from the IMU to the antenna. b is an error that successive fixes share (orbits,
+ionosphere), where the model has states for it; b^ its estimate, db true minus estimated. A timing
+error of sigma s_t moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis.
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3.
 """
@@ -58,7 +59,10 @@ def _position(
 
 @dataclass(frozen=True, slots=True)
 class PositionAid(Aid):
-    """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None."""
+    """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
+
+    `bias`: the blocks whose states north, east, down are the error that the fixes share.
+    """
 
     lat_rad: float
     lon_rad: float
@@ -66,6 +70,7 @@ class PositionAid(Aid):
     sd: Vector3
     lever: Vector3
     sd_time_s: float = 0.0
+    bias: tuple[str, ...] = ()
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav = state.nav
@@ -73,6 +78,10 @@ class PositionAid(Aid):
         height = 0.0 if self.height_m is None else self.height_m
         z, h = np.empty(rows), np.zeros((rows, state.model.size))
         _position(nav, self.lat_rad, self.lon_rad, height, *self.lever, z, h)
+        shared = [slot for block in self.bias for slot in state.model.slots_of(block)]
+        for row, slot in zip(range(rows), shared, strict=False):
+            h[row, slot] = -1.0
+            z[row] += state.xi[slot]
         r = np.square(self.sd[:rows])
         if self.sd_time_s:
             r += np.square(nav[VN : VN + rows] * self.sd_time_s)

@@ -242,9 +242,10 @@ def _parameter(
     return Block(name, unit, tuple(axes), columns, initial, white, tau_s, steady)
 
 
-def position_bias(name: str, sd_m: float, tau_s: float) -> Block:
-    """A first-order Gauss-Markov error north and east (m) that an aid's fixes share."""
-    return Block(name, "m", ("n", "e"), (-1, -1), initial=sd_m, steady=sd_m, tau_s=tau_s)
+def position_bias(name: str, sd_m: float, tau_s: float, axes: str = "ne") -> Block:
+    """A first-order Gauss-Markov error (m) along some axes that an aid's measurements share."""
+    columns = (-1,) * len(axes)
+    return Block(name, "m", tuple(axes), columns, initial=sd_m, steady=sd_m, tau_s=tau_s)
 
 
 def clock_blocks(

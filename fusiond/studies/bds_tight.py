@@ -255,7 +255,8 @@ def _finding(
         f"{three['ratio'][first]:.2f} of what coasting does; unscented and extended filter agree "
         f"to {100.0 * differ:.1f} %; tight's sigma is {honest('tight_ekf')} (NEES of {DOF} in "
         f"{', '.join(CASES)}: {nees('tight_ekf')}; with sigma_scale 2: {scaled}), loose's "
-        f"{honest('loose')} ({nees('loose')}), for orbit errors last and are taken as white."
+        f"{honest('loose')} ({nees('loose')}; without states for what fixes share "
+        f"{nees('loose_white')}), for orbit errors last while rows are taken as white."
     )
 
 

@@ -7,7 +7,9 @@ IMU, observations and start every row of a case makes its own solution:
 
 `tight_ekf`, `tight_ukf`   the daemon's raw aid in its filters `kalman` and `unscented`
 `tight_scaled`  `tight_ekf` with `sigma_scale = 2`: twice the sigma of every range and rate
-`loose`      `kalman`, aided by position and velocity of the receiver's fix as the daemon takes them
+`loose`      `kalman`, aided by position and velocity of the receiver's fix as the daemon takes
+             them, with states for the error that fixes share (`bias_sd_m` as the raw aid has)
+`loose_white`  the same without those states, as is the daemon's default
 `coasting`   `tight_ekf` without any observation in the stretch
 `receiver`   least squares of each epoch alone (`fusiond.gnss.single_point`)
 
@@ -47,7 +49,6 @@ from fusiond.gnss.ranges import SIGNAL_IN_SPACE_M, RangeModel, RangeOptions
 from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore
 from fusiond.intake import Intake
-from fusiond.raw_gnss import RawGnss, raw_blocks
 from fusiond.settings import DEG, imu_noise
 from fusiond.simulation.gnss_masks import canyon
 from fusiond.simulation.gnss_raw import START, GnssRaw, GnssRawOptions
@@ -77,7 +78,7 @@ START_SD = (10.0, 15.0, 0.2, 0.2, 2.0)
 """One sigma of the start: horizontal position and height (m) as of a first fix, velocity (m/s),
 tilt and heading (deg) as of a levelling and a compass."""
 RAW = RawAiding(systems=("C",), lever_arm_m=LEVER)
-LOOSE = GnssAiding(lever_arm_m=LEVER)
+LOOSE = GnssAiding(lever_arm_m=LEVER, bias_sd_m=RAW.bias_sd_m, bias_down_sd_m=RAW.bias_down_sd_m)
 OPTIONS = GnssRawOptions(
     rate_hz=1.0,
     signals=(("C", "2I"),),
@@ -98,8 +99,8 @@ ORBIT_ERRORS_M = (SIGNAL_IN_SPACE_M["C"], 0.5, 0.0)
 default and none."""
 MOST_PDOP = 25.0
 """A fix of a worse geometry is none: default of u-blox receivers (CFG-NAVSPG-OUTFIL_PDOP)."""
-ROWS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "receiver", "coasting")
-COMPARED = ("tight_ekf", "loose", "receiver")
+ROWS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white", "receiver", "coasting")
+COMPARED = ("tight_ekf", "loose", "loose_white", "receiver")
 """Rows of the smaller orbit errors."""
 
 
@@ -130,7 +131,7 @@ class _Row:
     """How a filter row is fed."""
 
     make: Callable[[Model, float], KalmanEstimator]
-    raw: RawAiding | None
+    aiding: RawAiding | GnssAiding
     coasts: bool = False
 
 
@@ -138,7 +139,8 @@ _FILTERS = {
     "tight_ekf": _Row(KalmanEstimator, RAW),
     "tight_ukf": _Row(UnscentedEstimator, RAW),
     "tight_scaled": _Row(KalmanEstimator, RAW.model_copy(update={"sigma_scale": 2.0})),
-    "loose": _Row(KalmanEstimator, None),
+    "loose": _Row(KalmanEstimator, LOOSE),
+    "loose_white": _Row(KalmanEstimator, GnssAiding(lever_arm_m=LEVER)),
     "coasting": _Row(KalmanEstimator, RAW, coasts=True),
 }
 
@@ -287,7 +289,8 @@ def _filter_trace(
     unit_error: Array,
 ) -> Trace:
     """One filter, live: its error after each epoch."""
-    model = make_model("ins15", imu_noise(IMU), *(raw_blocks(row.raw) if row.raw else ()))
+    intake = Intake({row.aiding.kind: row.aiding})
+    model = make_model("ins15", imu_noise(IMU), *intake.extra_blocks())
     horizontal, height, velocity, tilt, heading = START_SD
     sd = model.initial.copy()
     sd[:9] = [tilt * DEG, tilt * DEG, heading * DEG, *[velocity] * 3, *[horizontal] * 2, height]
@@ -295,11 +298,10 @@ def _filter_trace(
     start = with_error(nav[0], unit_error * sd[:9])
     live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, start, sd)
     estimator = live.estimator
-    raw = RawGnss("raw", row.raw) if row.raw else None
+    raw = intake.raw_receiver("raw")
     if raw is not None:
         for message in broadcast(simulated):
             raw.learn(message)
-    intake = Intake({"gnss": LOOSE})
     t_s = epochs()
     away = in_stretch(t_s) & row.coasts
     trace = _empty(len(t_s))
