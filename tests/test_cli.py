@@ -197,9 +197,9 @@ def test_process_names_what_it_rejected(tmp_path: Path) -> None:
 def test_interrupt_exits_130(tmp_path: Path) -> None:
     fifo = tmp_path / "truth.csv"
     os.mkfifo(fifo)
-    process = subprocess.Popen(
-        [FUSIOND, "compare", fifo, fifo], stderr=subprocess.PIPE, text=True, cwd=ROOT
-    )
+    # A suite that runs in the background ignores SIGINT, and hands that on.
+    command = ["env", "--default-signal=INT", FUSIOND, "compare", fifo, fifo]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     writer = os.open(fifo, os.O_WRONLY)  # returns once the command waits for the file
     try:
         process.send_signal(signal.SIGINT)
