@@ -98,7 +98,7 @@ ORBIT_ERRORS_M = (SIGNAL_IN_SPACE_M["C"], 0.5, 0.0)
 """What the study is made with, and two smaller ones that show what makes NEES: the simulator's
 default and none."""
 MOST_PDOP = 25.0
-"""A fix of a worse geometry is none: default of u-blox receivers (CFG-NAVSPG-OUTFIL_PDOP)."""
+"""A fix of a worse geometry is none: an output mask as receivers have, chosen for this study."""
 ROWS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white", "receiver", "coasting")
 COMPARED = ("tight_ekf", "loose", "loose_white", "receiver")
 """Rows of the smaller orbit errors."""
