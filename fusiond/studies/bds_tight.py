@@ -48,8 +48,8 @@ Booleans = NDArray[np.bool_]
 DEFAULT_RUNS = 50
 DOF, NAV_DOF = 3, 9
 LIMIT_M = 10.0
-"""Horizontal accuracy, 95 %, that BeiDou's open service promises (BDS-OS-PS-1.0, of paper 003's
-time): a solution that does not claim it for itself is there, but is not what BeiDou stands for."""
+"""Horizontal accuracy, 95 %, that counts as available, chosen for this study: a solution that does
+not claim it for itself is there, but of little use on a road."""
 GROWTH_S = (30.0, 60.0, STRETCH_S[1] - STRETCH_S[0])
 """The first is the time for which the claim on three satellites is made."""
 CLAIM = 1.0 / 3.0
