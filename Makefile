@@ -41,11 +41,11 @@ lint: $(STAMP) ## ruff and mypy
 
 unit: $(STAMP) test-packages ## unit and property tests, on every core
 	@echo "compiling the kernels once, before the tests share them"
-	$(BIN)/python -c 'import fusiond.daemon, fusiond.offline, fusiond.simulation.vehicle'
-	$(BIN)/pytest -n auto --ignore tests/test_hil.py $(ARGS)
+	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle'
+	$(BIN)/pytest -n auto --ignore tests/hil/test_hil.py $(ARGS)
 
 hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
-	$(BIN)/pytest tests/test_hil.py
+	$(BIN)/pytest tests/hil/test_hil.py
 
 test-packages:
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh test

@@ -29,7 +29,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fusiond.simulation.can_imu import SIM_IMU as SIM_IMU_OPTIONS
+from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -173,7 +173,7 @@ def main() -> None:
     parser.add_argument("--filter", default="kalman")
     parser.add_argument("--raw", action="store_true")
     args = parser.parse_args()
-    subprocess.run([sys.executable, "-c", "import fusiond.daemon"], check=True)  # compiles
+    subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
     with tempfile.TemporaryDirectory(prefix="fusiond-load-") as folder:
         figures = asyncio.run(measure(Path(folder), args.seconds, args.filter, args.raw))
         print(json.dumps(figures, indent=2))

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.config import Imu
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.model import Model, make_model
-from fusiond.imu_buffer import ImuBuffer
+from fusiond.models.model import Model, make_model
 from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import (
     dcm_from_quaternion,
     quaternion_from_rpy,
     rotate_quaternion,
     rotation_vector_from_dcm,
 )
-from fusiond.settings import imu_noise
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow

@@ -18,8 +18,8 @@ from datetime import date
 from typing import Protocol
 
 from drivers.measurements import UtcStamp
-from drivers.nmea_decoder import BUILD_DATE
-from drivers.nmea_framing import Frame, StreamSplitter
+from drivers.nmea.decoder import BUILD_DATE
+from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.raw.beidou_words import GEO
 from drivers.raw.d1 import D1Decoder
 from drivers.raw.d2 import D2Decoder

@@ -7,10 +7,10 @@ from typing import ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
 from drivers.measurements import Measurement, PositionFix, TimeReport, UtcStamp
-from drivers.nmea import REFUSALS, NmeaOptions
-from drivers.nmea_decoder import NmeaDecoder, NmeaDecoding
-from drivers.nmea_framing import Item, Sentence, StreamSplitter
-from drivers.nmea_time import TimeTrust
+from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
+from drivers.nmea.driver import REFUSALS, NmeaOptions
+from drivers.nmea.framing import Item, Sentence, StreamSplitter
+from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import RawEvent, RawGnssEpoch
 from drivers.raw.rtcm import load_pyrtcm

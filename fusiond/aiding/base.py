@@ -15,7 +15,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.model import Model
+from fusiond.models.model import Model
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import Q0, VE, VN
 

@@ -43,8 +43,8 @@ from fusiond.aiding.base import (
     Vector3,
     misaligned_axes,
 )
-from fusiond.estimators.model import SAR_MISALIGNMENT
 from fusiond.gnss.ecef import ned_axes, to_ecef
+from fusiond.models.model import SAR_MISALIGNMENT
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew, wrap_angle
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from fusiond.aiding.base import Innovation, Linearised, State
-from fusiond.estimators.model import CLOCK_OFFSET, Model
 from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back
-from fusiond.imu_buffer import ImuBuffer
+from fusiond.models.model import CLOCK_OFFSET, Model
+from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
 

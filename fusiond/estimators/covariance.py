@@ -21,7 +21,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.model import PLAIN, SCALE
+from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import (
     CORE_SIZE,

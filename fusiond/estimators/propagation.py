@@ -21,7 +21,7 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
-from fusiond.estimators.model import PLAIN, SCALE
+from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
 from fusiond.navigation.strapdown import (

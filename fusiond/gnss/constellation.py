@@ -150,7 +150,7 @@ def slots(systems: Sequence[System] = ("C", "G")) -> tuple[Slot, ...]:
 def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
     """What the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest one.
 
-    Unquantised: `fusiond.simulation.nav_fields.quantised` rounds to what a message can carry.
+    Unquantised: `fusiond.simulation.gnss.nav_fields.quantised` rounds to what a message can carry.
     """
     system = slot.system
     beidou = system == "C"

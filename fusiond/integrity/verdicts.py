@@ -18,8 +18,8 @@ from fusiond.integrity.consistency import (
     Verdict,
 )
 from fusiond.integrity.monitor import ConsistencyMonitor
-from fusiond.raw_gnss import per_system
-from fusiond.timeline import Entry
+from fusiond.navigator.raw_gnss import per_system
+from fusiond.navigator.timeline import Entry
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ import ssl
 from collections.abc import Mapping
 from pathlib import Path
 
-from fusiond.config import Mqtt
-from fusiond.load_config import ConfigError
+from fusiond.configuration.load import ConfigError
+from fusiond.configuration.schema import Mqtt
 
 PASSWORD_VARIABLE = "FUSIOND_MQTT_PASSWORD"
 

@@ -16,11 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic.json_schema import models_json_schema
 
 from drivers.base import State
-from fusiond.clock import ClockStatus
+from fusiond.clock.clock import ClockStatus
 from fusiond.integrity.consistency import Consistency, Verdict
+from fusiond.live.scheduler import SchedulerStatus
+from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.commands import COMMANDS
-from fusiond.scheduler import SchedulerStatus
-from fusiond.solution import Mode, Solution
 
 Number = float | None
 Count = Annotated[int, Field(ge=0)]

@@ -18,7 +18,7 @@ from collections.abc import Callable
 import aiomqtt
 
 from drivers.base import Backoff, DriverStatus
-from fusiond.config import Mqtt
+from fusiond.configuration.schema import Mqtt
 from fusiond.outputs import broker_access
 from fusiond.outputs.commands import (
     COMMANDS,

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fusiond.configuration.settings import ARCSEC
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
-from fusiond.settings import ARCSEC
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import gauss_markov
 from fusiond.simulation.trajectories import dcm_from_rpy

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.fixed_decimal import MAX_CELL, format_rows
+from fusiond.files.fixed_decimal import MAX_CELL, format_rows
 from fusiond.simulation.aid_sensors import aid_tables
-from fusiond.simulation.gnss_raw import GnssRaw
-from fusiond.simulation.gnss_raw_stream import GnssRawStream, RawFormat
-from fusiond.simulation.gnss_receiver import GnssReceiver
+from fusiond.simulation.gnss.raw import GnssRaw
+from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
+from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.rdss_centre import RdssCentre
+from fusiond.simulation.rdss.centre import RdssCentre
 from fusiond.simulation.scenarios import Scenario, random_streams
 
 Array = NDArray[np.float64]

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fusiond.config import Config, Imu
-from fusiond.config_aiding import GnssAiding, RawAiding, RdssAiding, SarAiding
+from fusiond.configuration.aiding import GnssAiding, RawAiding, RdssAiding, SarAiding
+from fusiond.configuration.schema import Config, Imu
 from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
-from fusiond.simulation.gnss_masks import Mask
-from fusiond.simulation.gnss_raw import GnssRawOptions
-from fusiond.simulation.gnss_receiver import GnssOptions
+from fusiond.simulation.gnss.masks import Mask
+from fusiond.simulation.gnss.raw import GnssRawOptions
+from fusiond.simulation.gnss.receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.rdss_centre import RdssOptions
+from fusiond.simulation.rdss.centre import RdssOptions
 from fusiond.simulation.sensor_errors import ImuOutput, Vibration, imu_output
 from fusiond.simulation.trajectories import Path, drive, flight, static
 

@@ -7,8 +7,8 @@ r"""Errors of inertial sensors and aids, as the configuration's error model stat
     s   constant, N(0, sigma_s)                                scale factor of each axis
     m   engine vibration, a sine of random phase, averaged over the sample interval
 
-which is what the filter assumes of `fusiond.config.Imu`: sigma_0 its initial bias, sigma_b its bias
-instability, T its `bias_correlation_s`. Errors act in sensor axes.
+which is what the filter assumes of `fusiond.configuration.schema.Imu`: sigma_0 its initial bias,
+sigma_b its bias instability, T its `bias_correlation_s`. Errors act in sensor axes.
 
 Source: Groves, 2nd ed., sections 4.4 and 14.2.6; IEEE Std 952-1997 annex B for the noise units.
 """
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from fusiond.config import Imu
-from fusiond.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 
 Array = NDArray[np.float64]
 

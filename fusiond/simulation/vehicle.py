@@ -28,19 +28,19 @@ from typing import Literal, get_args
 import can
 import numpy as np
 
-from drivers.can_signals import CanImuOptions
-from fusiond.gps_time import utc_ns_to_gps
-from fusiond.load_config import load_config
-from fusiond.simulation.can_aids import CanAid, can_aids
-from fusiond.simulation.can_imu import SIM_IMU, CanImu
+from drivers.can.imu import CanImuOptions
+from fusiond.configuration.load import load_config
+from fusiond.navigation.gps_time import utc_ns_to_gps
+from fusiond.simulation.can.aids import CanAid, can_aids
+from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.files import write_truth
-from fusiond.simulation.gnss_masks import parse_mask
-from fusiond.simulation.gnss_raw import GnssRaw
-from fusiond.simulation.gnss_raw_stream import GnssRawStream, RawFormat
-from fusiond.simulation.gnss_receiver import GnssReceiver
+from fusiond.simulation.gnss.masks import parse_mask
+from fusiond.simulation.gnss.raw import GnssRaw
+from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
+from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import States
 from fusiond.simulation.pty_line import PtyLine
-from fusiond.simulation.rdss_terminal import RdssTerminal
+from fusiond.simulation.rdss.terminal import RdssTerminal
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
 from fusiond.simulation.trajectories import drive
 

@@ -7,15 +7,15 @@ A study module has `run(runs, seed, progress) -> dict` and `plot(result, path)`;
 from __future__ import annotations
 
 STUDIES = {
-    "rdss-static": "fusiond.studies.rdss_static",
-    "rdss-dynamic": "fusiond.studies.rdss_dynamic",
-    "rdss-correlated": "fusiond.studies.rdss_correlated",
-    "rdss-map": "fusiond.studies.rdss_map",
-    "multiscale": "fusiond.studies.multiscale",
-    "federated": "fusiond.studies.federated",
-    "ukf": "fusiond.studies.ukf",
-    "bds-tight": "fusiond.studies.bds_tight",
+    "rdss-static": "fusiond.studies.rdss.static",
+    "rdss-dynamic": "fusiond.studies.rdss.dynamic",
+    "rdss-correlated": "fusiond.studies.rdss.correlated",
+    "rdss-map": "fusiond.studies.rdss.map",
+    "multiscale": "fusiond.studies.multiscale.study",
+    "federated": "fusiond.studies.federated.study",
+    "ukf": "fusiond.studies.ukf.study",
+    "bds-tight": "fusiond.studies.bds_tight.study",
     "consistency": "fusiond.studies.consistency",
-    "reduced-order": "fusiond.studies.reduced_order",
+    "reduced-order": "fusiond.studies.reduced_order.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
 }

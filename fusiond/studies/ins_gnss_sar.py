@@ -2,10 +2,10 @@ r"""Study `ins-gnss-sar`: the flight of paper 002 flown, 23 states against 17, f
 against all.
 
 The paper computes covariances; here the daemon's filter flies on its timeline through drawn errors
-of IMU, clock, radar and start (`fusiond.studies.reduced_runs`), with the best four BeiDou
-satellites by GDOP or with all in view (`fusiond.studies.reduced_flight`), both on the same draws.
-A radar sees a point for a while only: points lie every 45 km, 30 km to both sides in turn, and the
-one that is abeam next or was last is measured, each for 150 s.
+of IMU, clock, radar and start (`fusiond.studies.reduced_order.runs`), with the best four BeiDou
+satellites by GDOP or with all in view (`fusiond.studies.reduced_order.flight`), both on the same
+draws. A radar sees a point for a while only: points lie every 45 km, 30 km to both sides in turn,
+and the one that is abeam next or was last is measured, each for 150 s.
 
 `*_std_*`: root mean square of the error, which has no mean but the one drawn, over all runs and the
 last quarter of the flight; axes east, north, up. `believed_*`: sigma of the filter's mean
@@ -28,14 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import State
-from fusiond.estimators.model import Model
+from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.navigation.strapdown import STEP_SIZE
-from fusiond.studies import reduced_flight as flight
-from fusiond.studies.rdss import nees_interval
-from fusiond.studies.rdss_runs import nav_error
-from fusiond.studies.reduced_cost import IMU_RATE_HZ, Cost, costs
-from fusiond.studies.reduced_report import (
+from fusiond.studies.rdss.runs import nav_error
+from fusiond.studies.rdss.study import nees_interval
+from fusiond.studies.reduced_order import flight
+from fusiond.studies.reduced_order.cost import IMU_RATE_HZ, Cost, costs
+from fusiond.studies.reduced_order.report import (
     BELIEVED,
     HEADER,
     PAPER,
@@ -46,7 +46,7 @@ from fusiond.studies.reduced_report import (
     sigma_cells,
     sigmas,
 )
-from fusiond.studies.reduced_runs import Flown, live, monte_carlo, nees, started
+from fusiond.studies.reduced_order.runs import Flown, live, monte_carlo, nees, started
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]

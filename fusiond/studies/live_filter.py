@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
-from fusiond.config import Imu
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import DEG
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.imu_buffer import ImuBuffer
-from fusiond.settings import DEG
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import drive
-from fusiond.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
 

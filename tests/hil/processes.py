@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.files import read_truth
+from fusiond.files.tables import read_truth
 from tests.broker import Listener
+from tests.places import REPOSITORY
 from tests.runs import metres
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 FUSIOND = Path(sys.executable).with_name("fusiond")
 PATIENCE_S = 240.0
 """Only bounds a broken run; nothing passes or fails by its length."""

@@ -60,7 +60,7 @@ port = {port}
 nav_rate_hz = 10.0
 """
 # What no error may exceed whatever the stated sigma: the receiver's white noise is 0.8 m and 1.5 m
-# (fusiond.simulation.gnss_receiver).
+# (fusiond.simulation.gnss.receiver).
 BOUNDS = {"m": 4.0, "m_s": 1.0, "deg": 5.0}
 
 

@@ -26,12 +26,12 @@ import can
 import numpy as np
 import pytest
 
-from fusiond.files import read_solution
-from fusiond.load_config import load_config
-from fusiond.offline import process
-from fusiond.simulation.can_imu import SIM_IMU as SIM_IMU_OPTIONS
-from fusiond.simulation.can_imu import CanImu
-from fusiond.simulation.gnss_receiver import KNOT_M_S, latitude, longitude, sentence
+from fusiond.configuration.load import load_config
+from fusiond.files.tables import read_solution
+from fusiond.offline.process import process
+from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
+from fusiond.simulation.can.imu import CanImu
+from fusiond.simulation.gnss.receiver import KNOT_M_S, latitude, longitude, sentence
 from fusiond.simulation.pty_line import PtyLine
 from tests.broker import Broker, listening
 from tests.hil.processes import REPOSITORY, SIM_IMU, DaemonProcess, Heard

@@ -1,0 +1,1 @@
+"""Devices on a CAN bus, described by DBC files."""

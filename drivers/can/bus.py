@@ -1,0 +1,368 @@
+"""A CAN bus under asyncio that is there when the interface is, and comes back when it comes back.
+
+python-can opens and filters the bus; reading is ours, because its `Notifier` goes on polling a dead
+descriptor and its `AsyncBufferedReader` has no bound. A bus with a file descriptor (`socketcan`,
+`udp_multicast`) is read in a callback of the loop, at most `FRAMES_PER_WAKEUP` frames a turn. A bus
+without one (`virtual`) is read by a thread into a ring of `RING_FRAMES`.
+
+Frame layout: `struct can_frame` and `struct canfd_frame` of Linux `include/uapi/linux/can.h`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import socket
+import struct
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Literal, NamedTuple, TypedDict
+
+import can
+
+from drivers.base import Backoff, Now, monotonic_ns
+from drivers.can.errors import ControllerState, controller_state, error_names
+
+FRAMES_PER_WAKEUP = 64
+"""Most frames handled in one turn of the loop: 2 ms of work, 15 ms of a full 500 kbit/s bus."""
+RING_FRAMES = 1024
+"""Most frames a thread may hold for the loop: 1.7 s of an IMU of 600 frames/s."""
+CHECK_S = 1.0
+"""How often the kernel is asked how many frames it dropped for want of room in the socket."""
+LONGEST_WAIT_S = 1.0
+"""Longest wait between attempts to open: trying costs three system calls, so try often."""
+
+Interface = Literal["socketcan", "virtual", "udp_multicast"]
+
+EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 0x8000_0000, 0x4000_0000, 0x2000_0000
+_FRAME = struct.Struct("=IB3x")
+_TIMESPEC = struct.Struct("@ll")
+_CANFD_MTU = 72
+_SO_TIMESTAMPNS = 35
+_SO_MEMINFO, _SK_MEMINFO_DROPS = 55, 8
+
+
+class CanFilter(TypedDict):
+    """A filter as python-can takes it: a frame passes when `id & can_mask == can_id & can_mask`."""
+
+    can_id: int
+    can_mask: int
+    extended: bool
+
+
+class CanFrame(NamedTuple):
+    """A frame as received; for an error frame `can_id` holds the error classes.
+
+    `t_seen_ns` is monotonic, at reading; `realtime_ns` is the stamp of the bus (CLOCK_REALTIME),
+    None where it gives none.
+    """
+
+    can_id: int
+    extended: bool
+    data: bytes
+    t_seen_ns: int
+    realtime_ns: int | None = None
+    remote: bool = False
+    error: bool = False
+
+
+class _BusFaultError(Exception):
+    """The bus cannot be read any more; the text says why."""
+
+
+Read = Callable[[], CanFrame | None]
+
+
+class CanBus:
+    """One CAN bus, reopened for ever. It only listens.
+
+    `counters`: `bus_opened`, `bus_closed`, `bus_open_failed`, `frames`, `remote_frames`,
+    `error_frames`, `error_<class>`, `error_overflow` (controller lost frames), `socket_overflow`
+    (kernel dropped frames that were not read in time), `ring_overflow`, `bad_datagrams`.
+    """
+
+    def __init__(
+        self,
+        interface: Interface,
+        channel: str,
+        filters: Sequence[CanFilter] = (),
+        counters: Counter[str] | None = None,
+        *,
+        now_ns: Now = monotonic_ns,
+    ) -> None:
+        self.interface = interface
+        self.channel = channel
+        self.controller: ControllerState = "active"
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._filters = list(filters)
+        self._now_ns = now_ns
+        self._backoff = Backoff(longest_s=LONGEST_WAIT_S)
+        self._on_frame: Callable[[CanFrame], None] = lambda frame: None
+        self._on_controller: Callable[[ControllerState], None] = lambda state: None
+        self._drops_seen = 0
+
+    async def run(
+        self,
+        on_frame: Callable[[CanFrame], None],
+        on_link: Callable[[bool, str], None],
+        on_controller: Callable[[ControllerState], None],
+    ) -> None:
+        """Listen until cancelled.
+
+        `on_frame` gets every data frame. `on_link(up, why)` is called when the bus opens, when it
+        goes away, and when it cannot be opened (again only if the reason changes).
+        `on_controller(state)` is called when error frames tell a new state of the controller. An
+        exception of a callback is a defect of the caller: it closes the bus and leaves here.
+        """
+        self._on_frame, self._on_controller = on_frame, on_controller
+        told = ""
+        while True:
+            try:
+                bus = self._open()
+            except (OSError, can.CanError, ValueError) as error:
+                self.counters["bus_open_failed"] += 1
+                why = self._explain(error)
+                if why != told:
+                    on_link(False, why)
+                    told = why
+                await asyncio.sleep(self._backoff.next())
+                continue
+            self.counters["bus_opened"] += 1
+            self.controller = "active"
+            self._drops_seen = 0
+            try:
+                on_link(True, "")
+                told = await self._serve(bus)
+            finally:
+                with contextlib.suppress(OSError, can.CanError):
+                    bus.shutdown()
+                self.counters["bus_closed"] += 1
+            on_link(False, told)
+            await asyncio.sleep(self._backoff.next())
+
+    # ----------------------------------------------------------------- opening
+
+    def _open(self) -> can.BusABC:
+        """Open; OSError or CanError when the interface is absent or down."""
+        if self.interface != "socketcan":
+            return can.Bus(interface=self.interface, channel=self.channel, ignore_config=True)
+        socket.if_nametoindex(self.channel)
+        bus = can.Bus(
+            interface="socketcan",
+            channel=self.channel,
+            ignore_config=True,
+            fd=True,  # a classic interface is served all the same
+            can_filters=self._filters or None,
+            ignore_rx_error_frames=False,
+        )
+        # A bind to an interface that is down succeeds and leaves ENETDOWN behind (net/can/raw.c).
+        sock: socket.socket = getattr(bus, "socket")  # noqa: B009 (SocketcanBus has one)
+        pending = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if pending:
+            bus.shutdown()
+            raise OSError(pending, os.strerror(pending))
+        return bus
+
+    def _explain(self, error: Exception) -> str:
+        code = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
+        if self.interface == "socketcan":
+            if code == errno.ENETDOWN:
+                return f"{self.channel} is down (ip link set {self.channel} up)"
+            if code in (errno.ENODEV, errno.ENXIO) or "no interface" in str(error):
+                return f"there is no interface {self.channel}"
+            if code == errno.EAFNOSUPPORT:
+                return "this kernel has no CAN (modprobe can_raw)"
+        return f"{self.interface} {self.channel}: {error}"
+
+    # ----------------------------------------------------------------- reading
+
+    async def _serve(self, bus: can.BusABC) -> str:
+        """Read until the bus goes away; returns why."""
+        loop = asyncio.get_running_loop()
+        gone: asyncio.Future[str] = loop.create_future()
+        try:
+            fd = bus.fileno()
+        except NotImplementedError:
+            fd = -1
+        if fd < 0:
+            return await _ThreadReader(self, bus, gone).run()
+        sock: socket.socket | None = getattr(bus, "socket", None)
+        read = partial(self._read_socket, sock) if sock else partial(self.read_message, bus, 0.0)
+        loop.add_reader(fd, self._readable, fd, read, gone)
+        try:
+            while not gone.done():
+                await asyncio.wait([gone], timeout=CHECK_S)
+                if sock is not None:
+                    self._count_drops(sock)
+            return gone.result()
+        finally:
+            loop.remove_reader(fd)
+
+    def _readable(self, fd: int, read: Read, gone: asyncio.Future[str]) -> None:
+        """Callback of the loop: drain the socket, bounded; a fault ends the watch at once."""
+        try:
+            for _ in range(FRAMES_PER_WAKEUP):
+                frame = read()
+                if frame is None:
+                    return
+                self.deliver(frame)
+        except _BusFaultError as fault:
+            asyncio.get_running_loop().remove_reader(fd)
+            gone.set_result(str(fault))
+        except Exception as defect:
+            asyncio.get_running_loop().remove_reader(fd)
+            gone.set_exception(defect)
+
+    def _read_socket(self, sock: socket.socket) -> CanFrame | None:
+        """One frame off a raw CAN socket with its kernel stamp, None when there is none.
+
+        A quarter of the cost of `bus.recv(0)`, and the stamp keeps its nanoseconds.
+        """
+        try:
+            raw, control, _, _ = sock.recvmsg(_CANFD_MTU, 64, socket.MSG_DONTWAIT)
+        except (BlockingIOError, InterruptedError):
+            return None
+        except OSError as error:
+            raise _BusFaultError(self._explain(error)) from error
+        realtime_ns = None
+        for level, kind, value in control:
+            if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack_from(value)
+                realtime_ns = seconds * 1_000_000_000 + nanoseconds
+        can_id, length = _FRAME.unpack_from(raw)
+        extended = bool(can_id & EXTENDED_FLAG)
+        return CanFrame(
+            can_id & (0x1FFF_FFFF if extended or can_id & ERROR_FLAG else 0x7FF),
+            extended,
+            raw[_FRAME.size : _FRAME.size + length],
+            self._now_ns(),
+            realtime_ns,
+            bool(can_id & REMOTE_FLAG),
+            bool(can_id & ERROR_FLAG),
+        )
+
+    def read_message(self, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
+        """One frame by python-can, None when there is none.
+
+        A datagram on `udp_multicast` that is no CAN frame is counted and passed over.
+        """
+        try:
+            message = bus.recv(timeout_s)
+        except OSError as error:
+            raise _BusFaultError(self._explain(error)) from error
+        except can.CanError as error:
+            cause = error.__cause__
+            if self.interface != "udp_multicast" or cause is None or isinstance(cause, OSError):
+                raise _BusFaultError(self._explain(error)) from error
+            self.counters["bad_datagrams"] += 1
+            return None
+        if message is None:
+            return None
+        return CanFrame(
+            message.arbitration_id,
+            message.is_extended_id,
+            bytes(message.data),
+            self._now_ns(),
+            round(message.timestamp * 1e9) if message.timestamp > 0.0 else None,
+            message.is_remote_frame,
+            message.is_error_frame,
+        )
+
+    def _count_drops(self, sock: socket.socket) -> None:
+        """Add what the kernel dropped since the last look (SK_MEMINFO_DROPS, since Linux 4.12)."""
+        with contextlib.suppress(OSError, struct.error):
+            info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_SK_MEMINFO_DROPS + 1))
+            (drops,) = struct.unpack_from("@I", info, 4 * _SK_MEMINFO_DROPS)
+            if drops > self._drops_seen:
+                self.counters["socket_overflow"] += drops - self._drops_seen
+                self._drops_seen = drops
+
+    # ----------------------------------------------------------------- handing over
+
+    def deliver(self, frame: CanFrame) -> None:
+        """Sort one frame: data to `on_frame`, error frames into the controller's state."""
+        if frame.error:
+            self.counters["error_frames"] += 1
+            for name in error_names(frame.can_id, frame.data):
+                self.counters[f"error_{name}"] += 1
+            self._controller_is(controller_state(frame.can_id, frame.data))
+            return
+        if frame.remote:
+            self.counters["remote_frames"] += 1
+            return
+        self.counters["frames"] += 1
+        self._backoff.reset()
+        if self.controller == "bus_off":
+            self._controller_is("active")  # a controller that is off the bus hears nothing
+        self._on_frame(frame)
+
+    def _controller_is(self, state: ControllerState | None) -> None:
+        if state is not None and state != self.controller:
+            self.controller = state
+            self._on_controller(state)
+
+
+class _ThreadReader:
+    """Reads a bus without a descriptor in a daemon thread, through a bounded ring."""
+
+    POLL_S = 0.1
+    """Longest wait in the thread, hence the longest it outlives its bus."""
+
+    def __init__(self, owner: CanBus, bus: can.BusABC, gone: asyncio.Future[str]) -> None:
+        self._owner = owner
+        self._bus = bus
+        self._gone = gone
+        self._loop = gone.get_loop()
+        self._ring: deque[CanFrame] = deque(maxlen=RING_FRAMES)
+        self._scheduled = False
+        self._stop = threading.Event()
+
+    async def run(self) -> str:
+        name = f"can-{self._owner.channel}"
+        threading.Thread(target=self._pump, name=name, daemon=True).start()
+        try:
+            return await self._gone
+        finally:
+            self._stop.set()
+
+    def _pump(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            try:
+                while not self._stop.is_set():
+                    frame = self._owner.read_message(self._bus, self.POLL_S)
+                    if frame is not None:
+                        self._push(frame)
+            except _BusFaultError as fault:
+                self._loop.call_soon_threadsafe(self._end, str(fault))
+
+    def _push(self, frame: CanFrame) -> None:
+        if len(self._ring) == RING_FRAMES:
+            self._owner.counters["ring_overflow"] += 1
+        self._ring.append(frame)
+        if not self._scheduled:
+            self._scheduled = True
+            self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        """Callback of the loop; clears the flag first, so that no frame is left behind."""
+        self._scheduled = False
+        try:
+            for _ in range(FRAMES_PER_WAKEUP):
+                if self._stop.is_set() or not self._ring:
+                    return
+                self._owner.deliver(self._ring.popleft())
+        except Exception as defect:
+            self._stop.set()
+            if not self._gone.done():
+                self._gone.set_exception(defect)
+            return
+        self._scheduled = True
+        self._loop.call_soon(self._drain)
+
+    def _end(self, why: str) -> None:
+        if not self._gone.done():
+            self._gone.set_result(why)

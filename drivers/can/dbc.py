@@ -1,0 +1,247 @@
+"""From a DBC file and a mapping of axes to a plan of decoding; no I/O once the file is loaded.
+
+A signal is named `Message.Signal`. Physical value = raw * scale + offset (DBC), in the signal's
+unit; the plan folds sign and unit into scale and offset, so that an axis costs one multiplication
+and comes out in rad/s or m/s^2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cantools
+from cantools.database.can import Database, Message
+from cantools.database.can.signal import Signal
+
+from drivers.base import PermanentDriverError
+
+SHIPPED = Path(__file__).resolve().parents[2] / "config" / "dbc"
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+"""Standard acceleration of gravity: 3rd CGPM (1901), the `g` of every data sheet."""
+
+RATE_UNITS = {
+    "rad/s": 1.0,
+    "mrad/s": 1e-3,
+    "deg/s": math.pi / 180.0,
+    "°/s": math.pi / 180.0,
+    "dps": math.pi / 180.0,
+    "mdps": math.pi / 180e3,
+    "deg/h": math.pi / 648e3,
+}
+FORCE_UNITS = {
+    "m/s^2": 1.0,
+    "m/s²": 1.0,
+    "m/s2": 1.0,
+    "m/s/s": 1.0,
+    "g": STANDARD_GRAVITY_M_S2,
+    "mg": STANDARD_GRAVITY_M_S2 * 1e-3,
+}
+MOST_RAD_S, MOST_M_S2 = 175.0, 10_000.0
+"""Beyond any inertial sensor: 10,000 deg/s and 1,000 g; only a damaged float says more."""
+ANGLE_UNITS = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": math.pi / 180.0,
+    "°": math.pi / 180.0,
+    "mdeg": math.pi / 180e3,
+    "arcmin": math.pi / 10_800.0,
+    "arcsec": math.pi / 648e3,
+}
+NO_UNITS = {"": 1.0, "1": 1.0}
+TIME_UNITS = {"s": Fraction(1), "ms": Fraction(1, 1000), "us": Fraction(1, 10**6)} | {
+    "µs": Fraction(1, 10**6),
+    "ns": Fraction(1, 10**9),
+}
+
+J1939_PDU2 = 240
+"""SAE J1939-21: from this PDU format on, the PDU specific byte belongs to the PGN."""
+
+
+class RefusedFrameError(Exception):
+    """A frame that cannot be a sample; the text is the name of the counter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """One value out of one signal: SI value = raw * scale + offset, believed within low..high."""
+
+    slot: int
+    signal: str
+    scale: float
+    offset: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """A counter or a device's time: raw unsigned integer that wraps at `modulus`."""
+
+    signal: str
+    modulus: int
+    tick_ns: Fraction = Fraction(0)
+
+
+@dataclass(slots=True)
+class Part:
+    """What one frame contributes: values by slot (IMU: 0..2 gyro, 3..5 accelerometer), stamps."""
+
+    values: list[tuple[int, float]]
+    counter: int | None
+    ticks: int | None
+
+
+@dataclass(slots=True)
+class MessagePlan:
+    """What is taken out of one message."""
+
+    message: Message
+    axes: list[Axis] = field(default_factory=list)
+    counter: Stamp | None = None
+    time: Stamp | None = None
+
+    def decode(self, data: bytes) -> Part:
+        """Decode one frame's data.
+
+        RefusedFrameError: `wrong_length` (shorter than the DBC says; padding is accepted),
+        `undecodable`, `not_finite` (NaN or infinite float), `out_of_range` (beyond any sensor, or
+        outside the DBC's minimum and maximum: SAE J1939-71 says "not available" so).
+        """
+        if len(data) < self.message.length:
+            raise RefusedFrameError("wrong_length")
+        try:
+            raw: Any = self.message.decode(data, decode_choices=False, scaling=False)
+            values = [
+                (a.slot, raw[a.signal] * a.scale + a.offset, a.low, a.high) for a in self.axes
+            ]
+            counter = None if self.counter is None else raw[self.counter.signal]
+            ticks = None if self.time is None else raw[self.time.signal]
+        except (cantools.Error, KeyError, ValueError, ArithmeticError) as error:
+            raise RefusedFrameError("undecodable") from error
+        for _, value, low, high in values:
+            if not math.isfinite(value):
+                raise RefusedFrameError("not_finite")
+            if not low <= value <= high:
+                raise RefusedFrameError("out_of_range")
+        return Part([(slot, value) for slot, value, _, _ in values], counter, ticks)
+
+
+def find_dbc(name: str) -> Path:
+    """The DBC file of this path, else the shipped one of this name."""
+    for path in (Path(name), SHIPPED / name, SHIPPED / f"{name}.dbc"):
+        if path.is_file():
+            return path
+    shipped = sorted(path.stem for path in SHIPPED.glob("*.dbc"))
+    raise PermanentDriverError(
+        f"dbc: there is no file {name!r}, neither here ({Path.cwd()}) nor among the shipped ones: "
+        f"{', '.join(shipped)}"
+    )
+
+
+def load_dbc(name: str) -> Database:
+    """Load a DBC file; PermanentDriverError when there is none or it cannot be read."""
+    path = find_dbc(name)
+    try:
+        database = cantools.database.load_file(path, database_format="dbc", strict=False)
+    except (OSError, ValueError, cantools.Error) as error:
+        raise PermanentDriverError(f"dbc: {path}: {error}") from error
+    if not isinstance(database, Database):
+        raise PermanentDriverError(f"dbc: {path} is no CAN database")
+    return database
+
+
+def find_signal(database: Database, name: str, what: str) -> tuple[Message, Signal]:
+    """The signal `Message.Signal`; PermanentDriverError lists what there is."""
+    message_name, dot, signal_name = name.partition(".")
+    messages = {message.name: message for message in database.messages}
+    if not dot or message_name not in messages:
+        names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
+        raise _unknown(what, name, "Message.Signal", names)
+    signals = {signal.name: signal for signal in messages[message_name].signals}
+    if signal_name not in signals:
+        raise _unknown(what, signal_name, f"signal of {message_name}", list(signals))
+    return messages[message_name], signals[signal_name]
+
+
+def _unknown(what: str, name: str, kind: str, names: Sequence[str]) -> PermanentDriverError:
+    close = get_close_matches(name, names, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(close)}? " if close else ""
+    return PermanentDriverError(
+        f"{what}: {name!r} is no {kind} of the DBC file; {hint}there are: {', '.join(names)}"
+    )
+
+
+def _unit(units: Mapping[str, Any], signal: Signal, override: str | None, what: str) -> Any:
+    unit = override if override is not None else (signal.unit or "").replace("Â", "").strip()
+    if unit not in units:
+        raise PermanentDriverError(
+            f"{what}: the unit of {signal.name} is {unit!r}; known are {', '.join(units)}"
+        )
+    return units[unit]
+
+
+def plan_axis(
+    slot: int, signal: Signal, negative: bool, units: Mapping[str, float], override: str | None
+) -> Axis:
+    """The plan of one axis of an IMU, slots 0 to 2 gyro, 3 to 5 accelerometer."""
+    what, most = ("gyro", MOST_RAD_S) if slot < 3 else ("accel", MOST_M_S2)
+    factor = _unit(units, signal, override, what)
+    return plan_value(slot, signal, -factor if negative else factor, -most, most)
+
+
+def plan_value(slot: int, signal: Signal, factor: float, low: float, high: float) -> Axis:
+    """The plan of one value: physical value of the DBC times `factor`, believed within low..high.
+
+    Minimum and maximum of the DBC are believed where they differ, widened by half a step for
+    rounding.
+    """
+    least, most = signal.minimum, signal.maximum
+    if least is not None and most is not None and least < most:
+        slack = 0.5 * abs(signal.scale)
+        ends = sorted(((least - slack) * factor, (most + slack) * factor))
+        low, high = max(low, ends[0]), min(high, ends[1])
+    return Axis(slot, signal.name, signal.scale * factor, signal.offset * factor, low, high)
+
+
+def plan_angle(slot: int, signal: Signal, what: str, low: float, high: float) -> Axis:
+    """An angle within low..high (rad), in the unit that the DBC states."""
+    return plan_value(slot, signal, _unit(ANGLE_UNITS, signal, None, what), low, high)
+
+
+def plan_number(slot: int, signal: Signal, what: str) -> Axis:
+    """A whole number without unit: a flag, or what names something."""
+    if signal.is_float or float(signal.scale) != 1.0 or float(signal.offset) % 1.0:
+        raise PermanentDriverError(f"{what}: {signal.name} must be an integer, one a step")
+    factor = _unit(NO_UNITS, signal, None, what)
+    return plan_value(slot, signal, factor, -math.inf, math.inf)
+
+
+def plan_counter(signal: Signal) -> Stamp:
+    """A counter of samples; wraps by the signal's length."""
+    if signal.is_float or signal.is_signed:
+        raise PermanentDriverError(f"counter: {signal.name} must be an unsigned integer")
+    return Stamp(signal.name, 1 << signal.length)
+
+
+def plan_time(signal: Signal) -> Stamp:
+    """The device's free-running time; wraps by the signal's length, unit and scale of the DBC."""
+    if signal.is_float or signal.is_signed:
+        raise PermanentDriverError(f"device_time: {signal.name} must be an unsigned integer")
+    unit: Fraction = _unit(TIME_UNITS, signal, None, "device_time")
+    tick_ns = Fraction(str(signal.scale)) * unit * 10**9
+    if tick_ns <= 0:
+        raise PermanentDriverError(f"device_time: the scale of {signal.name} must be positive")
+    return Stamp(signal.name, 1 << signal.length, tick_ns)
+
+
+def parameter_group(can_id: int) -> int:
+    """PGN of a 29-bit identifier, data page included (SAE J1939-21)."""
+    pgn = (can_id >> 8) & 0x3FFFF
+    return pgn if (pgn >> 8) & 0xFF >= J1939_PDU2 else pgn & 0x3FF00

@@ -1,0 +1,282 @@
+"""Frames that belong to one instant of an IMU, put together; what is missing, counted. No I/O.
+
+An IMU spreads a sample over several messages. Two frames belong together when
+
+* both carry the device's counter, or its time, and it is the same; or else
+* the second came less than half a sample interval after the first, and its message is still
+  missing. A message that carries only counter or time (Xsens 0x005/0x006, SBG 0x120) joins so too
+  and lends its stamp to the whole sample.
+
+The interval T is the median distance of one message's frames, by the device's time where there is
+one, else by arrival. Lost samples: with a counter of
+modulus M that advanced by c, the n = c (mod M) nearest to dt/T, minus one; without, the excess of
+dt over T, rounded once a sample is on time again, so that jitter makes no losses.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from statistics import median
+
+from drivers.can.dbc import MessagePlan, Part
+
+INTERVALS = 31
+"""Distances of frames the median is taken of: outlives a burst of fifteen late frames."""
+INTERVALS_NEEDED = 4
+"""Fewer say nothing about the interval; unstamped frames are not paired before (`unpaired`)."""
+OPEN_GROUPS = 4
+"""Most samples whose frames are awaited at once; a device queues a sample or two, not more."""
+RESTART_S = 1.0
+"""Device time and arrival may differ by this between two samples before the device must have
+restarted: more than a stalled reader with a full socket buffer makes, less than any boot."""
+DEVICE_DRIFT = 1e-3
+"""Bound of the rate error of a device's clock; crystals have 100 ppm at worst, RC oscillators ten
+times that."""
+
+
+class DeviceTime:
+    """Unwraps a device's time; `restarts` counts how often it began anew.
+
+    The number of wraps is the one that fits the arrivals best, so a pause may last longer than the
+    counter's period.
+    """
+
+    def __init__(self, modulus: int, tick_ns: Fraction) -> None:
+        self.restarts = 0
+        self._modulus = modulus
+        self._tick_ns = tick_ns
+        self._ticks: int | None = None
+        self._arrivals_ns: tuple[int, int] = (0, 0)
+
+    def unwrap(self, raw: int, arrivals_ns: tuple[int, int]) -> int | None:
+        """Ticks in ns since the clock's own zero; None for a time that did not advance.
+
+        `arrivals_ns`: instant of arrival on two clocks (kernel stamp, monotonic); the device has
+        restarted only if it disagrees with both, for the one can be set and the other can stall.
+        """
+        if self._ticks is None:
+            self._ticks, self._arrivals_ns = raw, arrivals_ns
+            return self._ns()
+        step = (raw - self._ticks) % self._modulus
+        best: tuple[float, int] | None = None
+        for now, before in zip(arrivals_ns, self._arrivals_ns, strict=True):
+            elapsed = (now - before) / float(self._tick_ns)
+            advance = step + self._modulus * round((elapsed - step) / self._modulus)
+            allowed = RESTART_S * 1e9 / float(self._tick_ns) + DEVICE_DRIFT * abs(elapsed)
+            miss = abs(advance - elapsed) / allowed
+            if best is None or miss < best[0]:
+                best = miss, advance
+        assert best is not None
+        miss, advance = best
+        if miss > 1.0:
+            self.restarts += 1
+            self._ticks, self._arrivals_ns = raw, arrivals_ns
+            return self._ns()
+        if advance <= 0:
+            return None
+        self._ticks, self._arrivals_ns = self._ticks + advance, arrivals_ns
+        return self._ns()
+
+    def _ns(self) -> int:
+        assert self._ticks is not None
+        return self._ticks * self._tick_ns.numerator // self._tick_ns.denominator
+
+
+@dataclass(slots=True)
+class Group:
+    """The frames of one sample; `realtime_ns` and `first_ns` are of the first frame."""
+
+    realtime_ns: int | None
+    first_ns: int
+    """Arrival on the clock that pairs: the kernel's stamp, else the monotonic clock."""
+    last_ns: int
+    t_seen_ns: int
+    values: list[float]
+    missing: set[int]
+    counter: int | None = None
+    ticks: int | None = None
+    ticks_ns: int | None = None
+    key: int | None = None
+    frames: int = 0
+
+
+@dataclass(slots=True)
+class _Last:
+    """The last frame of a message, to know a duplicate by."""
+
+    data: bytes = b""
+    arrival_ns: int = 0
+    ticks: int | None = None
+    seen: bool = False
+
+
+@dataclass(slots=True)
+class _Losses:
+    """What the last sample handed out leaves for counting losses."""
+
+    at_ns: int | None = None
+    counter: int | None = None
+    excess: float = 0.0
+
+
+class Pairing:
+    """Puts the parts of samples together.
+
+    `counters`: `lost_samples`, `unpaired` (frames whose partners never came), `duplicates`,
+    `time_backward` (device time that stood still or went back), `device_restarts`.
+    """
+
+    def __init__(
+        self,
+        plans: Sequence[MessagePlan],
+        constants: Sequence[float],
+        counters: Counter[str],
+    ) -> None:
+        self._plans = list(plans)
+        self._constants = list(constants)
+        self._counters = counters
+        self._by_counter = sum(plan.counter is not None for plan in plans) > 1
+        self._by_time = not self._by_counter and sum(p.time is not None for p in plans) > 1
+        timed = [i for i, plan in enumerate(plans) if plan.time]
+        self._lead = timed[0] if timed else next(i for i, p in enumerate(plans) if p.axes)
+        self._counter_modulus = next((p.counter.modulus for p in plans if p.counter), 0)
+        time = next((p.time for p in plans if p.time), None)
+        self.device_time = DeviceTime(time.modulus, time.tick_ns) if time else None
+        self.interval_ns: int | None = None
+        self._intervals_ns: deque[int] = deque(maxlen=INTERVALS)
+        self._open: list[Group] = []
+        self._last = [_Last() for _ in self._plans]
+        self._losses = _Losses()
+
+    def reset(self) -> None:
+        """Give up the open groups: what comes next follows a pause."""
+        self._make_room(0)
+
+    def feed(
+        self, index: int, part: Part, data: bytes, t_seen_ns: int, realtime_ns: int | None
+    ) -> Group | None:
+        """Take the part that message `index` contributes; the sample it completes, if any."""
+        arrival_ns = t_seen_ns if realtime_ns is None else realtime_ns
+        key = self._key(part)
+        if self._is_duplicate(index, data, arrival_ns):
+            self._counters["duplicates"] += 1
+            return None
+        if index == self._lead:
+            self._learn_interval(index, part.ticks, arrival_ns)
+        self._last[index] = _Last(data, arrival_ns, part.ticks, True)
+        group = self._group(index, key, arrival_ns)
+        if group is None:
+            missing = set(range(len(self._plans)))
+            group = Group(
+                realtime_ns, arrival_ns, arrival_ns, t_seen_ns, self._constants.copy(), missing
+            )
+            self._make_room(OPEN_GROUPS - 1 if key is not None else 0)
+            self._open.append(group)
+        group.key = key if key is not None else group.key
+        for slot, value in part.values:
+            group.values[slot] = value
+        group.counter = part.counter if part.counter is not None else group.counter
+        group.ticks = part.ticks if part.ticks is not None else group.ticks
+        group.missing.discard(index)
+        group.last_ns, group.t_seen_ns = arrival_ns, t_seen_ns
+        group.frames += 1
+        return self._finish(group) if not group.missing else None
+
+    # ----------------------------------------------------------------- which group
+
+    def _key(self, part: Part) -> int | None:
+        """The stamp to pair by, where several messages carry one each."""
+        if self._by_counter:
+            return part.counter
+        return part.ticks if self._by_time else None
+
+    def _is_duplicate(self, index: int, data: bytes, arrival_ns: int) -> bool:
+        """The same content again: with the same stamp inside, or too early to be a new sample."""
+        last, plan = self._last[index], self._plans[index]
+        if not last.seen or data != last.data:
+            return False
+        if plan.counter is not None or plan.time is not None:
+            return True
+        interval_ns = self.interval_ns
+        return interval_ns is not None and abs(arrival_ns - last.arrival_ns) < interval_ns / 2
+
+    def _learn_interval(self, index: int, ticks: int | None, arrival_ns: int) -> None:
+        last, time = self._last[index], self._plans[index].time
+        distance_ns = arrival_ns - last.arrival_ns
+        if time is not None and ticks is not None and last.ticks is not None:
+            distance_ns = int((ticks - last.ticks) % time.modulus * time.tick_ns)
+        if last.seen and distance_ns > 0:
+            self._intervals_ns.append(distance_ns)
+            if len(self._intervals_ns) >= INTERVALS_NEEDED:
+                self.interval_ns = int(median(self._intervals_ns))
+
+    def _group(self, index: int, key: int | None, arrival_ns: int) -> Group | None:
+        for group in reversed(self._open):
+            if index not in group.missing:
+                continue
+            if key is not None and group.key is not None:
+                if key == group.key:
+                    return group
+            elif self._near(group, arrival_ns):
+                return group
+        return None
+
+    def _near(self, group: Group, arrival_ns: int) -> bool:
+        """Less than half an interval after the group's last frame.
+
+        While the interval is not known, a stamp that came ahead holds the group together.
+        """
+        if self.interval_ns is None:
+            return group.counter is not None or group.ticks is not None
+        return abs(arrival_ns - group.last_ns) < self.interval_ns / 2
+
+    def _make_room(self, keep: int) -> None:
+        """Give up the oldest open groups: one stays open at a time unless keys tell them apart."""
+        while len(self._open) > keep:
+            self._counters["unpaired"] += self._open.pop(0).frames
+
+    # ----------------------------------------------------------------- complete
+
+    def _finish(self, group: Group) -> Group | None:
+        position = self._open.index(group)
+        for older in self._open[:position]:
+            self._counters["unpaired"] += older.frames
+        del self._open[: position + 1]
+        at_ns = group.first_ns
+        if self.device_time is not None and group.ticks is not None:
+            restarts = self.device_time.restarts
+            arrivals_ns = group.first_ns, group.t_seen_ns
+            ticks_ns = self.device_time.unwrap(group.ticks, arrivals_ns)
+            if ticks_ns is None:
+                self._counters["time_backward"] += 1
+                return None
+            if self.device_time.restarts != restarts:
+                self._counters["device_restarts"] += 1
+                self._losses.at_ns = None
+            group.ticks_ns = at_ns = ticks_ns
+        self._count_losses(group, at_ns)
+        return group
+
+    def _count_losses(self, group: Group, at_ns: int) -> None:
+        losses, interval_ns = self._losses, self.interval_ns
+        before_ns, losses.at_ns = losses.at_ns, at_ns
+        counter, losses.counter = losses.counter, group.counter
+        if before_ns is None:
+            losses.excess = 0.0
+            return
+        steps = (at_ns - before_ns) / interval_ns if interval_ns else 1.0
+        if counter is not None and group.counter is not None:
+            advance = (group.counter - counter) % self._counter_modulus
+            wraps = max(0, round((steps - advance) / self._counter_modulus))
+            lost = advance + wraps * self._counter_modulus - 1
+            self._counters["lost_samples"] += max(0, lost)
+            return
+        losses.excess += steps - 1.0
+        if 0.5 <= steps <= 1.5:
+            self._counters["lost_samples"] += max(0, round(losses.excess))
+            losses.excess = 0.0
+        elif steps <= 0.0:
+            losses.excess = 0.0  # the clock of the stamps was set

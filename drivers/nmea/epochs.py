@@ -1,0 +1,272 @@
+"""One epoch of a GNSS receiver, put together from its sentences: no I/O, no clock.
+
+pynmeagps turns a sentence into typed fields; an `Epoch` takes those that matter. A sentence with a
+field that cannot be true is refused whole (`BadFieldError`) and leaves the epoch as it was. Empty
+fields are normal and become None.
+
+Quality comes from GGA. Where only GNS is sent it comes from its mode string, one letter a system:
+the worst letter of the systems in use counts, in the order A (1), D (2), P (3), F (5), R (4), and
+E, M or S in any of them marks the whole epoch as estimated, manual or simulated.
+Source: NMEA 0183 4.11; u-blox ZED-F9P interface description, "Position fix flags in NMEA".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import date
+
+from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError
+from pynmeagps.nmeamessage import NMEAMessage
+from pynmeagps.nmeareader import NMEAReader
+
+from drivers.measurements import Vector3
+from drivers.nmea.framing import Sentence
+from drivers.nmea.time import parse_time_of_day
+
+TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GQ"})
+MAX_CYCLE = 24
+"""Sentences that one epoch may hold; a receiver sends at most nine formatters and some GSA."""
+
+KNOT_M_S = 1852.0 / 3600.0
+KM_H_M_S = 1.0 / 3.6
+STANDSTILL_M_S = 0.05
+"""Below it an absent course means standing still: the Doppler velocity noise of a receiver
+(u-blox ZED-F9P data sheet: 0.05 m/s)."""
+NO_DOP = 99.0
+"""Receivers without a solution print 99.99."""
+
+_MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
+_PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
+_NO_TIME = frozenset({"GSA", "VTG", "HDT", "THS"})
+
+
+class BadFieldError(ValueError):
+    """A sentence verified, but a field of it cannot be true."""
+
+
+@dataclass(slots=True)
+class Epoch:
+    """What the sentences of one instant said; None where none did. Degrees as printed, SI else."""
+
+    time_of_day_ns: int | None = None
+    t_seen_ns: int = 0
+    """When the last sentence that counts came in."""
+    cycle: list[str] = field(default_factory=list)
+    """Formatters in the order they came."""
+    addresses: set[str] = field(default_factory=set)
+    """The same with their talkers."""
+    day: date | None = None
+    t_day_seen_ns: int = 0
+    rmc_valid: bool | None = None
+    lat_deg: float | None = None
+    lon_deg: float | None = None
+    altitude_m: float | None = None
+    separation_m: float | None = None
+    quality: int | None = None
+    modes: set[str] = field(default_factory=set)
+    """Mode letters of RMC, VTG and the systems in use in GNS."""
+    satellites: int | None = None
+    hdop: float | None = None
+    vdop: float | None = None
+    two_dimensional: bool = False
+    sd_ned_m: Vector3 | None = None
+    speed_m_s: float | None = None
+    course_deg: float | None = None
+    heading_deg: float | None = None
+    heading_mode: str | None = None
+
+    def take(self, sentence: Sentence, t_seen_ns: int) -> None:
+        """Add a sentence of `FORMATTERS`. BadFieldError when a field of it cannot be true."""
+        message = _parse(sentence)
+        FORMATTERS[sentence.formatter](self, message)
+        self.t_seen_ns = t_seen_ns
+        if sentence.formatter in ("RMC", "ZDA") and not self.t_day_seen_ns:
+            self.t_day_seen_ns = t_seen_ns
+        self.cycle.append(sentence.formatter)
+        self.addresses.add(sentence.address)
+
+    def position(self) -> tuple[float, float, int] | None:
+        """Latitude, longitude (deg) and quality, where the epoch has them."""
+        if self.lat_deg is None or self.lon_deg is None or self.quality is None:
+            return None
+        return self.lat_deg, self.lon_deg, self.quality
+
+    def v_ned_m_s(self) -> tuple[float, float, None] | None:
+        """Horizontal velocity; None when the receiver gives no course though it moves."""
+        if self.speed_m_s is None:
+            return None
+        if self.course_deg is None:
+            return (0.0, 0.0, None) if self.speed_m_s < STANDSTILL_M_S else None
+        course = math.radians(self.course_deg)
+        return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
+
+
+def time_of_day_ns(sentence: Sentence) -> int | None:
+    """Its time of day; None where this kind has none or the field is empty. BadFieldError."""
+    if sentence.formatter in _NO_TIME or not sentence.fields:
+        return None
+    try:
+        return parse_time_of_day(sentence.fields[0])
+    except ValueError as error:
+        raise BadFieldError(str(error)) from None
+
+
+# --------------------------------------------------------------------------- fields
+
+
+def _parse(sentence: Sentence) -> NMEAMessage:
+    try:
+        message = NMEAReader.parse(sentence.raw, validate=0)  # the splitter verified it
+    except (NMEAMessageError, NMEAParseError, NMEATypeError) as error:
+        raise BadFieldError(str(error)) from None
+    if message is None:
+        raise BadFieldError(f"{sentence.address} is not understood")
+    return message
+
+
+def _number(message: NMEAMessage, name: str, least: float = -math.inf) -> float | None:
+    value = getattr(message, name, "")
+    if not isinstance(value, float | int):
+        return None
+    if not math.isfinite(value) or value < least:
+        raise BadFieldError(f"{name} = {value}")
+    return float(value)
+
+
+def _count(message: NMEAMessage, name: str) -> int | None:
+    number = _number(message, name, 0.0)
+    return None if number is None else int(number)
+
+
+def _letter(message: NMEAMessage, name: str) -> str:
+    return str(getattr(message, name, ""))
+
+
+def _dop(message: NMEAMessage, name: str) -> float | None:
+    dop = _number(message, name, 0.0)
+    return dop if dop is not None and 0.0 < dop < NO_DOP else None
+
+
+def _angle(message: NMEAMessage, name: str) -> float | None:
+    angle = _number(message, name, 0.0)
+    if angle is not None and angle > 360.0:
+        raise BadFieldError(f"{name} = {angle} deg")
+    return angle
+
+
+def _position(message: NMEAMessage) -> tuple[float | None, float | None]:
+    """Signed degrees from the fields `lat`, `NS`, `lon`, `EW`, the second to fifth of GGA, GNS."""
+    lat, lon = _number(message, "lat"), _number(message, "lon")
+    if lat is None or lon is None:
+        return None, None
+    printed = ",".join(message.payload[1:5])
+    if not _PRINTED_POSITION.match(printed):  # no hemisphere, 60 minutes, signs
+        raise BadFieldError(f"not a position: {printed}")
+    if abs(lat) > 90.0 or abs(lon) > 180.0:
+        raise BadFieldError(f"no such place: {lat} {lon}")
+    return lat, lon
+
+
+def _take_gga(epoch: Epoch, message: NMEAMessage) -> None:
+    lat, lon = _position(message)
+    quality, satellites = _count(message, "quality"), _count(message, "numSV")
+    hdop = _dop(message, "HDOP")
+    altitude, separation = _number(message, "alt"), _number(message, "sep")
+    epoch.lat_deg, epoch.lon_deg, epoch.quality = lat, lon, quality or 0
+    epoch.altitude_m, epoch.separation_m = altitude, separation
+    epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
+
+
+def _take_gns(epoch: Epoch, message: NMEAMessage) -> None:
+    lat, lon = _position(message)
+    satellites, hdop = _count(message, "numSV"), _dop(message, "HDOP")
+    altitude, separation = _number(message, "alt"), _number(message, "sep")
+    used = set(_letter(message, "posMode")) - {"N"}
+    epoch.modes |= used
+    if "GGA" in epoch.cycle:
+        return
+    epoch.lat_deg, epoch.lon_deg = lat, lon
+    worst = [quality for mode, quality in _MODE_QUALITY.items() if mode in used]
+    epoch.quality = worst[0] if worst else 0
+    epoch.altitude_m, epoch.separation_m = altitude, separation
+    epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
+
+
+def _take_rmc(epoch: Epoch, message: NMEAMessage) -> None:
+    speed, course = _number(message, "spd", 0.0), _angle(message, "cog")
+    status = _letter(message, "status")
+    epoch.rmc_valid = status == "A"
+    epoch.modes |= set(_letter(message, "posMode"))
+    day = getattr(message, "date", "")
+    if isinstance(day, date):
+        epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
+    if speed is not None and status == "A":
+        epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course
+
+
+def _take_vtg(epoch: Epoch, message: NMEAMessage) -> None:
+    course = _angle(message, "cogt")
+    knots, km_h = _number(message, "sogn", 0.0), _number(message, "sogk", 0.0)
+    mode = _letter(message, "posMode")
+    epoch.modes |= set(mode)
+    if mode == "N":
+        return
+    if epoch.speed_m_s is not None:
+        epoch.course_deg = course if epoch.course_deg is None else epoch.course_deg
+    elif knots is not None:
+        epoch.speed_m_s, epoch.course_deg = knots * KNOT_M_S, course
+    elif km_h is not None:
+        epoch.speed_m_s, epoch.course_deg = km_h * KM_H_M_S, course
+
+
+def _take_gsa(epoch: Epoch, message: NMEAMessage) -> None:
+    hdop, vdop = _dop(message, "HDOP"), _dop(message, "VDOP")
+    epoch.two_dimensional |= _count(message, "navMode") == 2
+    epoch.hdop = epoch.hdop if epoch.hdop is not None else hdop
+    epoch.vdop = epoch.vdop if epoch.vdop is not None else vdop
+
+
+def _take_gst(epoch: Epoch, message: NMEAMessage) -> None:
+    north, east = _number(message, "stdLat", 0.0), _number(message, "stdLong", 0.0)
+    down = _number(message, "stdAlt", 0.0)
+    if north and east and down:  # a sigma of zero is none
+        epoch.sd_ned_m = (north, east, down)
+
+
+def _take_zda(epoch: Epoch, message: NMEAMessage) -> None:
+    parts = [_count(message, name) for name in ("year", "month", "day")]
+    if parts[0] is None or parts[1] is None or parts[2] is None:
+        return
+    try:
+        day = date(parts[0], parts[1], parts[2])
+    except (ValueError, OverflowError) as error:
+        raise BadFieldError(str(error)) from None
+    epoch.day = epoch.day or day
+
+
+def _take_hdt(epoch: Epoch, message: NMEAMessage) -> None:
+    heading = _angle(message, "headingT")
+    if epoch.heading_deg is None:
+        epoch.heading_deg = heading
+
+
+def _take_ths(epoch: Epoch, message: NMEAMessage) -> None:
+    heading, mode = _angle(message, "headt"), _letter(message, "mi")
+    epoch.heading_deg, epoch.heading_mode = heading, mode
+
+
+FORMATTERS: dict[str, Callable[[Epoch, NMEAMessage], None]] = {
+    "GGA": _take_gga,
+    "GNS": _take_gns,
+    "RMC": _take_rmc,
+    "VTG": _take_vtg,
+    "GSA": _take_gsa,
+    "GST": _take_gst,
+    "ZDA": _take_zda,
+    "HDT": _take_hdt,
+    "THS": _take_ths,
+}
+"""The sentences that count, and how an epoch takes them."""

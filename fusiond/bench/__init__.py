@@ -1,0 +1,1 @@
+"""What the numerics cost, as ratios to one numpy product."""

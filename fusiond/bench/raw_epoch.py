@@ -1,0 +1,87 @@
+"""What an epoch of raw GNSS data costs: 40 satellites, a range and a rate of each.
+
+From the decoded epoch to the filter that has used it: signals chosen, satellites and corrections
+computed, 80 rows linearised, gated one by one, folded in and tested by their residuals, the
+solution corrected; then what `health` and the verdicts keep. The same epoch comes again and again,
+so the choice of signals and ephemerides holds, as it does for up to 10 s in the daemon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+
+from drivers.raw.messages import RawGnssEpoch, System
+from fusiond.configuration.aiding import RawAiding
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.gnss.orbit import is_beidou_geo
+from fusiond.models.model import make_model
+from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
+from fusiond.simulation.scenarios import SCENARIOS
+
+SATELLITES = 40
+EPOCHS = 100
+
+
+def raw_epoch(_: int) -> Callable[[], int]:
+    """Work of `EPOCHS` epochs, each with all that the daemon does with one."""
+    truth = SCENARIOS["drive"].truth(10.0)
+    receiver = GnssRaw(truth, GnssRawOptions(), np.random.default_rng(1))
+    section = RawAiding(systems=("G", "C"))
+    raw = RawGnss("gnss", section)
+    epoch = _crowded(receiver, raw)
+    start = truth.at(np.array([epoch.tow_s - receiver.start[1]]))
+    imu = Imu()
+    model = make_model("ins21", imu_noise(imu), *raw_blocks(section))
+    estimator = KalmanEstimator(model, imu.gap_s)
+    place = start.position[0]
+    nav = np.array([*place, *start.v_ned[0], 1.0, 0.0, 0.0, 0.0])
+    sigma = model.initial.copy()
+    sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [3.0] * 3
+    estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sigma**2))
+
+    instants = count()
+
+    def work() -> int:
+        for _ in range(EPOCHS):
+            aid = raw.aid(epoch, next(instants), place)
+            assert not isinstance(aid, str)
+            outcome = estimator.update(aid)
+            assert outcome.name == "fused"
+            assert len(outcome.rows) == 2 * SATELLITES
+            raw.judged(aid, outcome)
+            per_system(aid, outcome)
+        return EPOCHS
+
+    work()
+    return work
+
+
+def _crowded(receiver: GnssRaw, raw: RawGnss) -> RawGnssEpoch:
+    """An epoch of 40 satellites; `raw` knows their ephemerides.
+
+    Half of them are doubles under numbers that the simulated constellations leave free, BeiDou's of
+    the same kind of orbit.
+    """
+    for model in receiver.ionosphere:
+        raw.learn(model)
+    epoch = receiver.epoch(10)
+    geostationary, others = iter(range(1, 6)), iter(range(6, 23))
+    gps = iter(range(33, 64))
+    doubles: dict[tuple[System, int], int] = {}
+    for s in epoch.signals:
+        free = gps if s.system == "G" else others
+        if is_beidou_geo(s.system, s.prn):
+            free = geostationary
+        doubles[s.system, s.prn] = next(free)
+    for e in receiver.broadcast(float(receiver.t_s[10]), set(doubles)):
+        raw.learn(e)
+        raw.learn(replace(e, prn=doubles[e.system, e.prn]))
+    copied = [replace(s, prn=doubles[s.system, s.prn]) for s in epoch.signals]
+    return replace(epoch, signals=(*epoch.signals, *copied)[:SATELLITES])

@@ -1,0 +1,1 @@
+"""One clock: stamps of devices, buses and satellites become instants of monotonic time."""

@@ -1,0 +1,342 @@
+"""The configuration of a vehicle: one TOML file, in the units that data sheets print.
+
+Every section is a frozen pydantic model that refuses unknown keys. Units stand in the names;
+nothing else in the project converts them: `fusiond.configuration.settings` turns this into SI once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
+
+from fusiond.configuration.aiding import (
+    AIDING_KINDS,
+    AnyAiding,
+    Probability,
+    RawAiding,
+    Section,
+    Vector,
+)
+from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
+
+
+def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
+    letters = [a[-1] for a in axes]
+    if sorted(letters) != ["x", "y", "z"]:
+        raise ValueError("each of x, y and z once, such as ['-x', '+y', '-z']")
+    even = letters in (["x", "y", "z"], ["y", "z", "x"], ["z", "x", "y"])
+    negative = sum(a.startswith("-") for a in axes)
+    if (negative % 2 == 0) != even:
+        raise ValueError("these axes are left-handed: change one sign")
+    return axes
+
+
+Axis = Annotated[str, Field(pattern=r"^[+-]?[xyz]$")]
+Axes = Annotated[tuple[Axis, Axis, Axis], AfterValidator(_right_handed)]
+
+
+class Imu(Section):
+    """Inertial sensor: mounting and error model.
+
+    `axes` names the sensor axis that points along body forward, right and down;
+    `mounting_deg` is the small rest, roll, pitch, yaw from body to those nominal axes.
+    """
+
+    axes: Axes = ("+x", "+y", "+z")
+    """Sensor axes along body forward, right and down."""
+    mounting_deg: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the nominal sensor frame against the body."""
+    time_offset_s: float = 0.0
+    """Added to the sensor's stamps; negative where they are late."""
+    rate_hz: PositiveFloat = 100.0
+    gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
+    """Angle random walk."""
+    accel_noise_m_s_sqrt_h: PositiveFloat = 0.1
+    """Velocity random walk."""
+    gyro_bias_instability_deg_h: PositiveFloat = 10.0
+    """One sigma of the drifting part of the bias."""
+    accel_bias_instability_mg: PositiveFloat = 0.1
+    """One sigma of the drifting part of the bias."""
+    bias_correlation_s: PositiveFloat = 3600.0
+    """Correlation time of that drift."""
+    gyro_bias_initial_deg_h: PositiveFloat = 360.0
+    """One sigma of the bias at switch-on."""
+    accel_bias_initial_mg: PositiveFloat = 10.0
+    """One sigma of the bias at switch-on."""
+    gyro_scale_ppm: PositiveFloat = 2000.0
+    """One sigma of the scale factors' errors."""
+    accel_scale_ppm: PositiveFloat = 2000.0
+    """One sigma of the scale factors' errors."""
+    gap_s: PositiveFloat = 0.5
+    """A pause longer than this is a gap: the solution says so and the covariance grows for it."""
+
+
+class ZeroVelocity(Section):
+    """Stationary detector: zero velocity and zero rate while the sensor is quiet."""
+
+    enabled: bool = True
+    window_s: PositiveFloat = 1.0
+    """Samples judged together, on a fixed grid of time."""
+    gyro_sd_deg_s: PositiveFloat = 0.5
+    """Quiet below this standard deviation on every axis; twice what standing with the engine
+    on shows."""
+    accel_sd_m_s2: PositiveFloat = 0.15
+    """The same for specific force."""
+    max_rate_deg_s: PositiveFloat = 2.0
+    """Quiet below this mean rate."""
+    max_speed_m_s: PositiveFloat = 0.5
+    """A quiet sensor means standstill only below this computed speed."""
+    velocity_sd_m_s: PositiveFloat = 0.05
+    """One sigma of the velocity at rest."""
+    rate_sd_deg_s: PositiveFloat = 0.1
+    """What the standing vehicle may turn."""
+    interval_s: PositiveFloat = 0.5
+
+
+class NonHolonomic(Section):
+    """A wheeled vehicle does not slide sideways nor jump: v_right = v_down = 0 at a point."""
+
+    enabled: bool = False
+    sd_m_s: PositiveFloat = 0.2
+    min_speed_m_s: NonNegativeFloat = 2.0
+    interval_s: PositiveFloat = 0.1
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """From the IMU to the point that does not slide (the rear axle)."""
+
+
+class Constraints(Section):
+    zero_velocity: ZeroVelocity = ZeroVelocity()
+    non_holonomic: NonHolonomic = NonHolonomic()
+
+
+class Alignment(Section):
+    """How attitude and position are found before navigation starts.
+
+    `heading` lists the allowed sources of the first heading in order of preference.
+    """
+
+    heading: tuple[
+        Literal["saved", "config", "dual_antenna", "gyrocompass", "gnss_course"], ...
+    ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course")
+    """Allowed sources of the first heading, in order of preference."""
+    heading_deg: float | None = None
+    """For `config`: true heading at the start."""
+    heading_sd_deg: PositiveFloat = 5.0
+    """One sigma of it."""
+    position_deg_m: Vector | None = None
+    """Latitude, longitude, height where the vehicle starts, if no aid will say it."""
+    position_sd_m: PositiveFloat = 100.0
+    """One sigma of it."""
+    levelling_s: PositiveFloat = 2.0
+    """Rest needed to level by gravity."""
+    course_speed_m_s: PositiveFloat = 3.0
+    """Speed from which the GNSS course is taken for the heading."""
+    course_sd_deg: PositiveFloat = 5.0
+    """One sigma of that (side slip, mounting)."""
+    gyrocompass_s: PositiveFloat = 120.0
+    """Rest needed to gyrocompass."""
+    gyrocompass_max_sd_deg: PositiveFloat = 5.0
+    """Gyrocompassing is used only if bias and noise allow this heading sigma."""
+    saved_max_age_s: PositiveFloat = 86400.0
+    """A saved state older than this is not used."""
+
+    @model_validator(mode="after")
+    def _heading_given(self) -> Alignment:
+        if "config" in self.heading and self.heading_deg is None:
+            raise ValueError("heading lists 'config': set heading_deg too")
+        return self
+
+
+def _orthonormal(wavelet: str) -> str:
+    wavelet_matrix(wavelet, 1)  # ValueError, with those that would do
+    return wavelet
+
+
+class Multiscale(Section):
+    """The filter `multiscale`; see `docs/estimators.md`."""
+
+    scales: Annotated[int, Field(ge=1, le=MOST_SCALES)] = 2
+    """N: blocks of 2^(N-1) epochs. 1 is the filter `kalman`."""
+    wavelet: Annotated[str, AfterValidator(_orthonormal)] = "haar"
+    """Any orthonormal wavelet, by its PyWavelets name."""
+
+
+class Federated(Section):
+    """The federated filter, where `filter = "federated"`; see `docs/estimators.md`."""
+
+    sources: tuple[str, ...] = ()
+    """Which `[aiding.NAME]` have a local filter; empty: all of them."""
+    mode: Literal["no_reset", "fusion_reset", "zero_reset", "rescale"] = "no_reset"
+    """What becomes of the local filters after a fusion; only `no_reset` keeps a fault in its own
+    filter."""
+    sharing: Literal["fixed", "adaptive"] = "fixed"
+    """Whether the sharing factors stay or follow the local covariances."""
+    shares: dict[str, PositiveFloat] = Field(default_factory=dict)
+    """Relative factors by local filter, brought to a sum of 1; empty: all equal."""
+    master_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Of the process noise, for the master's own estimate in `rescale`."""
+    retained: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Of its information, what an updated local filter keeps in `rescale`."""
+    fault_detection: bool = True
+    """Whether a local filter that fails its tests is left out."""
+    false_alarm_probability: Probability = 1e-6
+    """Of one innovation or difference test."""
+    window: Annotated[int, Field(ge=2, le=100)] = 10
+    """Innovations judged together."""
+    readmit_after: PositiveInt = 20
+    """Innovations in a row that must fit the master before a source is taken back."""
+
+
+class Unscented(Section):
+    """The filter `unscented`."""
+
+    spread: Annotated[float, Field(ge=0.1, le=5.0)] = 1.7320508
+    """Sigmas from the mean to a sigma point: sqrt(3) by the fourth moment of a Gaussian."""
+    propagation: bool = False
+    """Sigma points in the propagation too: dearer, honest for large attitude errors."""
+
+
+class Estimator(Section):
+    filter: Literal["kalman", "unscented", "federated", "multiscale"] = "kalman"
+    """Which estimator; see `docs/estimators.md`."""
+    model: Literal["ins15", "ins21", "ins17", "ins23", "planar10", "planar15"] = "ins21"
+    """Error state; see `docs/navigation.md`."""
+    buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
+    """History that late measurements may rewind into; at least 10 s."""
+    checkpoint_s: PositiveFloat = 0.5
+    """Spacing of the points that a rewind starts from."""
+    coast_after_s: PositiveFloat = 10.0
+    """Without a fused position for longer the mode is `coasting`."""
+    invalid_sd_m: PositiveFloat = 5000.0
+    """Horizontal sigma beyond which the mode is `invalid`."""
+    federated: Federated = Federated()
+    """The section of that name below."""
+    multiscale: Multiscale = Multiscale()
+    unscented: Unscented = Unscented()
+
+
+class ConsistencyTest(Section):
+    """The verdict on a source's innovations; see `docs/consistency.md`."""
+
+    window: Annotated[int, Field(ge=20, le=10000)] = 100
+    """Epochs judged together. RDSS sources, asked once a minute, use half of it."""
+    alpha: Probability = 0.01
+    """Share of windows of a matched filter that are found wrong by chance."""
+
+
+class Scheduler(Section):
+    rate_hz: Annotated[float, Field(ge=1.0, le=1000.0)] = 100.0
+
+
+class ClockOptions(Section):
+    """Where UTC comes from.
+
+    `gnss`: the receiver's time, as the lower envelope of arrival minus `serial_latency_s`, and the
+    system clock until that is known. `system`: always CLOCK_REALTIME (NTP or PPS keeps it).
+    """
+
+    utc: Literal["gnss", "system"] = "gnss"
+    serial_latency_s: NonNegativeFloat = 0.05
+    """Least time between a receiver's epoch and the last byte of its sentences."""
+    rdss_latency_s: PositiveFloat = 0.8
+    """Assumed age of an RDSS fix whose time of day fits no candidate."""
+    max_clock_drift_ppm: PositiveFloat = 100.0
+
+
+class Mqtt(Section):
+    """Broker. Passwords come from FUSIOND_MQTT_PASSWORD or from `password_file`, never from
+    here."""
+
+    enabled: bool = True
+    host: str = "localhost"
+    port: Annotated[int, Field(ge=1, le=65535)] = 1883
+    client_id: str | None = None
+    username: str | None = None
+    password_file: Path | None = None
+    tls: bool = False
+    ca_file: Path | None = None
+    cert_file: Path | None = None
+    key_file: Path | None = None
+    keepalive_s: PositiveInt = 20
+    nav_rate_hz: Annotated[float, Field(ge=1.0, le=100.0)] = 10.0
+    health_rate_hz: Annotated[float, Field(ge=0.1, le=10.0)] = 1.0
+    queue: Annotated[int, Field(ge=1, le=10000)] = 64
+    """Messages that may wait for the broker; beyond it the oldest is dropped and counted."""
+    commands: tuple[Literal["set_position", "request_fix", "reset_filter"], ...] = ()
+    """Commands accepted on `cmd/<name>`; none by default."""
+
+
+class Source(BaseModel):
+    """A device: which driver serves it; the other keys are that driver's options."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    driver: str
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return dict(self.model_extra or {})
+
+
+class Config(Section):
+    """A vehicle. `sources` are devices, `aiding` says how the filter uses what they send."""
+
+    vehicle: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")] = "vehicle"
+    state_file: Path | None = None
+    """Where the last solution is kept for the next start; the unit's state directory by default."""
+    imu: Imu = Imu()
+    sources: dict[str, Source] = Field(default_factory=dict)
+    aiding: dict[str, AnyAiding] = Field(default_factory=dict)
+    constraints: Constraints = Constraints()
+    alignment: Alignment = Alignment()
+    estimator: Estimator = Estimator()
+    consistency: ConsistencyTest = ConsistencyTest()
+    scheduler: Scheduler = Scheduler()
+    clock: ClockOptions = ClockOptions()
+    mqtt: Mqtt = Mqtt()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _kind_from_name(cls, data: Any) -> Any:
+        """`[aiding.gnss]` needs no `kind`: the name says it."""
+        if isinstance(data, dict) and isinstance(data.get("aiding"), dict):
+            aiding = {
+                name: {"kind": name, **value}
+                if isinstance(value, dict) and name in AIDING_KINDS
+                else value
+                for name, value in data["aiding"].items()
+            }
+            data = {**data, "aiding": aiding}
+        return data
+
+    @model_validator(mode="after")
+    def _one_raw_receiver(self) -> Config:
+        raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
+        if len(raw) > 1:
+            raise ValueError(f"{' and '.join(raw)}: one receiver's raw data at most, one clock")
+        return self
+
+    @model_validator(mode="after")
+    def _local_filters_exist(self) -> Config:
+        if self.estimator.filter != "federated":
+            return self
+        federated = self.estimator.federated
+        names = federated.sources or tuple(self.aiding)
+        if not names:
+            raise ValueError("estimator.filter 'federated' needs a section [aiding.NAME] a source")
+        unknown = [name for name in names if name not in self.aiding]
+        if unknown:
+            raise ValueError(f"estimator.federated.sources: no [aiding.{unknown[0]}]")
+        if federated.shares and set(federated.shares) != set(names):
+            raise ValueError("estimator.federated.shares must name every local filter, no other")
+        return self

@@ -1,0 +1,300 @@
+"""`fusiond demo`: the real daemon against a simulated car, with a broker of its own.
+
+The car stands for 8 s (levelling), drives off (heading from the GNSS course), and loses its GNSS
+receiver for 12 s of every minute: somebody pulls the plug; RDSS and inertial navigation carry on.
+What is shown comes out of the broker, as a dashboard would see it, with the true error beside it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain, cycle
+from pathlib import Path
+from typing import Any, Protocol
+
+import aiomqtt
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.configuration.load import load_config
+from fusiond.configuration.schema import Config, Source
+from fusiond.demo.broker import DemoBroker, DemoError
+from fusiond.demo.view import HeadlessView, Live, LiveView
+from fusiond.live.daemon import Daemon
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.scenarios import SCENARIOS, Scenario
+from fusiond.simulation.trajectories import Leg, follow
+from fusiond.simulation.trajectories import Path as Motion
+from fusiond.simulation.vehicle import SimulatedVehicle
+
+Array = NDArray[np.float64]
+
+CONFIG = Path(__file__).resolve().parents[2] / "config" / "vehicle.toml"
+VEHICLE = "demo"
+REST_S = 8.0
+OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S = 18.0, 12.0, 60.0
+SERVICE_FREQUENCY_S = 5
+"""Of the simulated RDSS card: several fixes in an outage (a civil card has 60 s)."""
+_SCORE_NS = 100_000_000
+"""Spacing of the solutions that the summary compares with the truth."""
+_TOWN = (
+    Leg(9, speed_m_s=14.0),
+    Leg(3),
+    Leg(6, turn_deg=60.0),
+    Leg(6, speed_m_s=9.0),
+    Leg(6, turn_deg=-90.0),
+    Leg(8, speed_m_s=18.0),
+    Leg(8, turn_deg=30.0, climb_deg=2.0),
+    Leg(6, climb_deg=0.0),
+    Leg(8, speed_m_s=0.0),
+    Leg(5),
+)
+
+
+def demo(duration_s: float, headless: bool) -> dict[str, Any]:
+    """Run for `duration_s`, or until Ctrl-C; the summary.
+
+    `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
+    truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
+    full 2x2 covariance: two degrees of freedom, 2 when sigma is honest (errors of one short run
+    are correlated, so 0.5 to 5 is common). All three are None where nothing was navigated. `fused`
+    and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if
+    something is not installed.
+    """
+    if not CONFIG.is_file():
+        raise DemoError(f"{CONFIG} is not there: run the demo from a checkout (make demo)")
+    with (
+        DemoBroker() as broker,
+        tempfile.TemporaryDirectory(prefix="fusiond-demo-") as folder,
+        _log_kept_out(headless),
+    ):
+        run = _Run(duration_s, headless, broker.port, Path(folder))
+        return asyncio.run(run.run())
+
+
+def drive(duration_s: float) -> Motion:
+    """A short rest, then town streets over and over."""
+    return follow(chain([Leg(REST_S)], cycle(_TOWN)), duration_s, course_deg=40.0, bank_ratio=-0.08)
+
+
+def demo_config(port: int, gnss_link: Path, rdss_link: Path) -> Config:
+    """The shipped car, its devices and broker replaced by the demo's."""
+    config = load_config(CONFIG)
+    sources = {
+        "imu": Source(driver="can_imu", **SIM_IMU.model_dump()),
+        "gnss": Source.model_validate({"driver": "nmea", "port": str(gnss_link)}),
+        "rdss": Source.model_validate({"driver": "rdss", "port": str(rdss_link)}),
+    }
+    mqtt = config.mqtt.model_copy(update={"host": "127.0.0.1", "port": port})
+    return config.model_copy(update={"vehicle": VEHICLE, "sources": sources, "mqtt": mqtt})
+
+
+def demo_scenario(config: Config) -> Scenario:
+    """The demo's drive with the sensors of `config`."""
+    scenario = replace(SCENARIOS["drive"].fitted(config), path=drive)
+    rdss = replace(scenario.rdss, service_frequency_s=SERVICE_FREQUENCY_S)
+    return replace(scenario, rdss=rdss)
+
+
+class View(Protocol):
+    """Shows what has come out of the broker."""
+
+    async def run(self, live: Live) -> None:
+        """Show until cancelled."""
+
+
+class _Run:
+    def __init__(self, duration_s: float, headless: bool, port: int, folder: Path) -> None:
+        self._duration_s = duration_s
+        self._port = port
+        links = folder / "gnss", folder / "rdss"
+        config = demo_config(port, *links)
+        self._vehicle = SimulatedVehicle(
+            demo_scenario(config),
+            duration_s=duration_s + 10.0,
+            gnss_link=links[0],
+            rdss_link=links[1],
+        )
+        self._score = Score()
+        self._daemon = Daemon(config, on_solution=self._on_solution)
+        self._live = Live(duration_s, port, VEHICLE)
+        self._view: View = HeadlessView(sys.stderr) if headless else LiveView()
+
+    async def run(self) -> dict[str, Any]:
+        """Drive until the end, Ctrl-C or SIGTERM; then the summary."""
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+        started = time.monotonic()
+        daemon = asyncio.create_task(self._daemon.run(stop), name="daemon")
+        others = [
+            asyncio.create_task(self._vehicle.run(), name="vehicle"),
+            asyncio.create_task(self._subscribe(), name="subscriber"),
+            asyncio.create_task(self._outages(), name="outages"),
+            asyncio.create_task(self._view.run(self._live), name="view"),
+        ]
+        ended = asyncio.create_task(stop.wait())
+        try:
+            done, _ = await asyncio.wait(
+                [daemon, *others, ended],
+                timeout=self._duration_s,
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+            duration_s = time.monotonic() - started
+            for task in done:
+                task.result()
+        finally:
+            stop.set()
+            for task in (*others, ended):
+                task.cancel()
+            await asyncio.gather(*others, ended, return_exceptions=True)
+            await asyncio.wait([daemon])
+        daemon.result()
+        return self._summary(duration_s)
+
+    def _on_solution(self, solution: Solution) -> None:
+        self._score.take(solution, self._daemon.navigator.estimator.covariance)
+
+    async def _subscribe(self) -> None:
+        """Listen as a dashboard does."""
+        base = f"fusiond/{VEHICLE}/"
+        async with aiomqtt.Client(
+            "127.0.0.1", self._port, identifier="fusiond-demo-view"
+        ) as client:
+            await client.subscribe(base + "#")
+            async for message in client.messages:
+                if isinstance(message.payload, bytes):
+                    topic = message.topic.value.removeprefix(base)
+                    self._live.message(topic, message.payload)
+                    if topic == "nav":
+                        self._compare()
+
+    def _compare(self) -> None:
+        """The true error of the last `nav`, at the UTC instant that it states."""
+        nav = self._live.nav
+        if nav.get("t_ms") is None or nav.get("lat_deg") is None:
+            return
+        truth = self._vehicle.truth.at(
+            np.array([nav["t_ms"] * 1e-3 - self._vehicle.utc_start_ns * 1e-9])
+        )
+        position = np.radians([[nav["lat_deg"], nav["lon_deg"], 0.0]])
+        position[:, 2] = nav["height_m"]
+        rpy = np.radians([nav["roll_deg"], nav["pitch_deg"], nav["yaw_deg"]]) - truth.rpy[0]
+        velocity = np.array([nav["v_n_m_s"], nav["v_e_m_s"], nav["v_d_m_s"]]) - truth.v_ned[0]
+        self._live.errors = [
+            *ned_error(position, truth.position)[0],
+            *velocity,
+            *np.degrees(wrapped(rpy)),
+        ]
+
+    async def _outages(self) -> None:
+        """Pull the receiver's plug, and put it back."""
+        loop = asyncio.get_running_loop()
+        started = loop.time()
+        for number in range(math.ceil(self._duration_s / OUTAGE_EVERY_S)):
+            start = started + number * OUTAGE_EVERY_S + OUTAGE_START_S
+            await asyncio.sleep(start - loop.time())
+            self._vehicle.unplug("gnss")
+            self._live.outage_until = time.monotonic() + OUTAGE_S
+            await asyncio.sleep(start + OUTAGE_S - loop.time())
+            self._vehicle.plug("gnss")
+            self._live.outage_until = None
+        await asyncio.Event().wait()
+
+    def _summary(self, duration_s: float) -> dict[str, Any]:
+        daemon = self._daemon
+        assert daemon.mqtt is not None
+        scheduler = daemon.scheduler.status()
+        health = daemon.sources.health(daemon.clock.now_ns())
+        return {
+            "duration_s": round(duration_s, 3),
+            "ticks": scheduler.ticks,
+            "overruns": scheduler.overruns,
+            "lateness_p99_ms": round(scheduler.lateness_p99_ms, 3),
+            **self._score.against(self._vehicle),
+            "mqtt_published": daemon.mqtt.counters["mqtt_published"],
+            "mqtt_dropped": daemon.mqtt.counters["mqtt_dropped"],
+            "fused": sum(s.fused for n, s in health.items() if n != "imu"),
+            "rejected": sum(sum(s.rejected.values()) for s in health.values()),
+            "fused_by_source": {name: source.fused for name, source in health.items()},
+            "rejected_by_source": {name: source.rejected for name, source in health.items()},
+        }
+
+
+class Score:
+    """Solutions of the running daemon, ten a second, to compare with the truth at the end."""
+
+    def __init__(self) -> None:
+        self._last = 0
+        self._rows: list[tuple[float, ...]] = []
+
+    def take(self, s: Solution, covariance: Array) -> None:
+        """A solution, and P (n, n) with position n, e at 6 and 7."""
+        if s.mode not in (Mode.NAVIGATING, Mode.COASTING) or s.t_ns // _SCORE_NS == self._last:
+            return
+        self._last = s.t_ns // _SCORE_NS
+        p = covariance
+        cov = float(p[6, 6]), float(p[6, 7]), float(p[7, 7])
+        self._rows.append((s.t_ns, s.lat_rad, s.lon_rad, s.height_m, s.rpy_rad[2], *cov))
+
+    def against(self, vehicle: SimulatedVehicle) -> dict[str, float | None]:
+        """`horizontal_rms_m`, `yaw_rms_deg`, `nees`."""
+        if not self._rows:
+            return {"horizontal_rms_m": None, "yaw_rms_deg": None, "nees": None}
+        rows = np.array([r[1:] for r in self._rows])
+        t_s = np.array([r[0] - vehicle.start_ns for r in self._rows]) * 1e-9
+        truth = vehicle.truth.at(t_s)
+        north, east = ned_error(rows[:, :3], truth.position)[:, :2].T
+        yaw = wrapped(rows[:, 3] - truth.rpy[:, 2])
+        a, b, c = rows[:, 4:].T
+        nees = (c * north**2 - 2.0 * b * north * east + a * east**2) / (a * c - b * b)
+        return {
+            "horizontal_rms_m": round(float(np.sqrt(np.mean(north**2 + east**2))), 4),
+            "yaw_rms_deg": round(float(np.degrees(np.sqrt(np.mean(yaw**2)))), 4),
+            "nees": round(float(np.mean(nees)), 4),
+        }
+
+
+def ned_error(position: Array, truth: Array) -> Array:
+    """Position minus truth, (n, 3) rad, rad, m each, in m north, east, down."""
+    error = np.empty_like(position)
+    for row, (p, t) in enumerate(zip(position, truth, strict=True)):
+        lat, height = float(t[0]), float(t[2])
+        error[row] = (
+            (p[0] - lat) * (meridian_radius(lat) + height),
+            wrapped(p[1] - t[1]) * (transverse_radius(lat) + height) * math.cos(lat),
+            height - p[2],
+        )
+    return error
+
+
+def wrapped(angle: Array) -> Array:
+    """Into [-pi, pi)."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@contextlib.contextmanager
+def _log_kept_out(headless: bool) -> Iterator[None]:
+    """Events are in the view; only errors go to the terminal, and none while it shows the view."""
+    log = logging.getLogger("fusiond")
+    handler = logging.StreamHandler(sys.stderr) if headless else logging.NullHandler()
+    handler.setLevel(logging.ERROR)
+    propagate, log.propagate = log.propagate, False
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.propagate = propagate

@@ -1,0 +1,307 @@
+"""`fusiond doctor`: opens every port through its own driver for some seconds; what is wrong.
+
+Each finding names the symptom and what would do; the exit status is 0 when there is none. Nothing
+is sent but what the daemon itself would send (an RDSS terminal is asked who it is, and for fixes).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Any, TextIO
+
+import aiomqtt
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import Driver, Emitted
+from drivers.measurements import DeviceEvent, ImuSample, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar
+from fusiond.clock.clock import Clock
+from fusiond.configuration.load import ConfigError, driver_entry_points
+from fusiond.configuration.schema import Config
+from fusiond.configuration.settings import quiet_limits, sensor_to_body
+from fusiond.doctor.devices import device_name, open_findings
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.outputs import broker_access
+
+Array = NDArray[np.float64]
+
+KEPT = 20_000
+"""Measurements of a kind remembered for rate and age: 20 s of an IMU at 1 kHz."""
+BURST_S = 0.1
+"""What comes within one read of a line, such as all ephemerides, has no rate."""
+MAX_TILT_DEG = 30.0
+"""No vehicle is parked on a steeper slope; a wrong axis is 90 or 180 degrees off."""
+GRAVITY_TOLERANCE = 0.05
+"""Share of g: 50 mg is the turn-on bias of the coarsest automotive accelerometers."""
+RATE_TOLERANCE = 0.2
+"""Share of the configured IMU rate beyond which buffer and noise are those of another setting."""
+DAMAGED_SHARE = 0.001
+"""A sound line damages less than one item in a thousand."""
+SYSTEM_CLOCK_S = 1.0
+"""System clock against GNSS: beyond it logs and file dates mislead."""
+OLD_FIX_S = 1.0
+"""Receivers send within 0.3 s of the epoch; older means a line too slow for its sentences."""
+_BROKER_S = 5.0
+_SHOWN_EVENTS = 6
+
+
+@dataclass(slots=True)
+class Kind:
+    """Arrivals of one kind of measurement: monotonic ns, and s from validity to arrival."""
+
+    seen_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
+    age_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
+    count: int = 0
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate between the first and the last arrival that are remembered; a burst has
+        none."""
+        span_s = (self.seen_ns[-1] - self.seen_ns[0]) * 1e-9
+        return (len(self.seen_ns) - 1) / span_s if span_s > BURST_S else None
+
+
+class Heard:
+    """One source while it is listened to."""
+
+    def __init__(self, name: str, driver_name: str, options: Any, clock: Clock) -> None:
+        self.name = name
+        self.driver_name = driver_name
+        self.options = options
+        self._clock = clock
+        make = driver_entry_points()[driver_name].load()
+        self.driver: Driver = make(name, options, self._emit, clock.now_ns)
+        self.kinds: dict[str, Kind] = {}
+        self.imu: deque[tuple[float, ...]] = deque(maxlen=KEPT)
+        self.events: list[str] = []
+
+    def _emit(self, item: Emitted) -> None:
+        if isinstance(item, DeviceEvent):
+            self.events.append(f"{item.code}: {item.text}")
+            return
+        kind = self.kinds.setdefault(type(item).__name__, Kind())
+        kind.count += 1
+        kind.seen_ns.append(item.t_seen_ns)
+        if isinstance(item, TimeReport):
+            self._clock.report(item)
+            return
+        if isinstance(item, Ephemeris | Klobuchar):
+            return  # they have no instant
+        instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
+        kind.age_s.append((item.t_seen_ns - instant.t_valid_ns) * 1e-9)
+        if isinstance(item, ImuSample):
+            self.imu.append((*item.gyro_rad_s, *item.accel_m_s2))
+
+
+@dataclass(slots=True)
+class Report:
+    """What to print of one thing: its headline, facts, and findings."""
+
+    title: str
+    facts: list[str] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+
+
+def doctor(config: Config, seconds: float) -> int:
+    """Listen for `seconds`, print the report; 0 when all is well, 1 otherwise."""
+    return asyncio.run(examine(config, seconds, sys.stdout))
+
+
+async def examine(config: Config, seconds: float, out: TextIO) -> int:
+    """`doctor` inside a running loop."""
+    clock = Clock(config.clock)
+    sources: list[Heard] = []
+    for name, section in config.sources.items():
+        options = driver_entry_points()[section.driver].load().Options(**section.options)
+        sources.append(Heard(name, section.driver, options, clock))
+    broker = asyncio.create_task(_broker(config))
+    tasks = [asyncio.create_task(s.driver.run(), name=s.name) for s in sources]
+    await asyncio.sleep(seconds)
+    # Judged while the ports are open: closing them changes the states.
+    reports = [_source(s, t, config, seconds) for s, t in zip(sources, tasks, strict=True)]
+    reports.append(_clock(clock, config))
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    reports.append(await broker)
+    if not sources:
+        reports.insert(0, Report("sources", findings=["none: add a [sources.NAME] section"]))
+
+    for report in reports:
+        print(report.title, file=out)
+        for fact in report.facts:
+            print(f"    {fact}", file=out)
+        for finding in report.findings:
+            print(f"  ! {finding}", file=out)
+    found = sum(len(report.findings) for report in reports)
+    print(f"{found} finding{'s' * (found > 1)}" if found else "all is well", file=out)
+    return 1 if found else 0
+
+
+# --------------------------------------------------------------------------- a source
+
+
+def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: float) -> Report:
+    status = heard.driver.status
+    title = f"{heard.name}: {heard.driver_name} on {device_name(heard.options)}: {status.state}"
+    report = Report(title + (f" ({status.detail})" if status.detail else ""))
+    for name, kind in heard.kinds.items():
+        report.facts.append(_kind_line(name, kind))
+    report.facts += list(dict.fromkeys(heard.events))[-_SHOWN_EVENTS:]
+    counters = {name: count for name, count in heard.driver.counters.items() if count}
+    if counters:
+        report.facts.append(", ".join(f"{name} {count}" for name, count in counters.items()))
+    if task.done() and not task.cancelled():
+        report.findings.append(f"the driver ended: {task.exception()!r}: please report this")
+    report.findings += open_findings(heard.name, heard.driver, heard.options, seconds)
+    report.findings += _damage(heard.driver.counters)
+    if "ImuSample" in heard.kinds:
+        _imu(heard, config, report)
+    elif "PositionFix" in heard.kinds:
+        oldest = max(heard.kinds["PositionFix"].age_s)
+        if oldest > OLD_FIX_S:
+            report.findings.append(
+                f"fixes are up to {oldest:.1f} s old on arrival: raise the baud rate or switch off "
+                "sentences that are not needed (GSV)"
+            )
+    elif heard.driver_name == "nmea" and status.state == "running" and not status.detail:
+        report.findings.append(
+            "sentences arrive but no fix: give the antenna a free sky and wait, or switch on GGA"
+        )
+    return report
+
+
+def _kind_line(name: str, kind: Kind) -> str:
+    rate = "" if kind.rate_hz is None else f", {kind.rate_hz:.2f} Hz"
+    age = ""
+    if kind.age_s:
+        ages = np.array(kind.age_s) * 1e3
+        age = f", age {np.median(ages):.1f} ms (at most {ages.max():.1f})"
+    return f"{name}: {kind.count}{rate}{age}"
+
+
+def _damage(counters: Counter[str]) -> list[str]:
+    """What arrived broken or not at all, where it is more than a sound line has."""
+    findings = []
+    lost, samples = counters["lost_samples"], counters["samples"]
+    if lost > DAMAGED_SHARE * max(1, samples):
+        findings.append(
+            f"{lost} of {samples + lost} IMU samples lost: look at the bus load (canbusload), at "
+            "`ip -s -d link show`, and at what else keeps this computer busy"
+        )
+    if counters["error_frames"]:
+        findings.append(
+            f"{counters['error_frames']} CAN error frames: check bit rate, wiring and the two "
+            "120 ohm terminators"
+        )
+    bad = counters["checksum_bad"] + counters["bad_checksum"]
+    good = counters["sentences"] + counters["frames"]
+    if bad > max(1, DAMAGED_SHARE * good):
+        findings.append(
+            f"{bad} wrong checksums against {good} sound: check ground, cable length and that "
+            "nobody else reads this port"
+        )
+    overflow = counters["socket_overflow"] + counters["ring_overflow"] + counters["error_overflow"]
+    if overflow:
+        findings.append(f"{overflow} CAN frames overflowed: this computer was busy")
+    return findings
+
+
+def _imu(heard: Heard, config: Config, report: Report) -> None:
+    """Rate, gravity, axes and turn rate, the latter three only at rest."""
+    rate = heard.kinds["ImuSample"].rate_hz
+    wanted = config.imu.rate_hz
+    if rate is not None and abs(rate - wanted) > RATE_TOLERANCE * wanted:
+        report.findings.append(
+            f"{rate:.1f} samples a second, but [imu] rate_hz = {wanted:g}: correct one of them"
+        )
+    values = np.array(heard.imu)
+    mean, limits = values.mean(axis=0), quiet_limits(config.constraints.zero_velocity)
+    sd = values.std(axis=0)
+    force = float(np.linalg.norm(mean[3:]))
+    turn = float(np.degrees(np.linalg.norm(mean[:3])))
+    # A wrong unit makes the noise larger too.
+    quiet_force = limits.force_sd * max(1.0, force / STANDARD_GRAVITY_M_S2)
+    if sd[:3].max() > limits.rate_sd or sd[3:].max() > quiet_force:
+        report.facts.append("not at rest: gravity and axes are not judged; repeat it at rest")
+        return
+    body = sensor_to_body(config.imu) @ mean[3:]
+    tilt = float(np.degrees(np.arccos(np.clip(-body[2] / max(force, 1e-9), -1.0, 1.0))))
+    report.facts.append(
+        f"at rest: specific force {force:.3f} m/s2, {tilt:.1f} deg from up; rate {turn:.3f} deg/s"
+    )
+    if abs(force / STANDARD_GRAVITY_M_S2 - 1.0) > GRAVITY_TOLERANCE:
+        report.findings.append(
+            f"specific force at rest is {force:.3f} m/s2 instead of {STANDARD_GRAVITY_M_S2:.2f}: "
+            f"is the accelerometer's unit right (accel_unit of [sources.{heard.name}], or the DBC)?"
+        )
+    elif tilt > MAX_TILT_DEG:
+        up = int(np.argmax(np.abs(mean[3:])))
+        down = ("-" if mean[3 + up] > 0.0 else "+") + "xyz"[up]
+        report.findings.append(
+            f"gravity lies {tilt:.0f} deg off the body's down axis: the sensor axis that points "
+            f"down is {down}, so [imu] axes must end with {down!r} (now {config.imu.axes[2]!r})"
+        )
+    if turn > config.constraints.zero_velocity.max_rate_deg_s:
+        report.findings.append(
+            f"it says {turn:.2f} deg/s at rest: is the gyro's unit right (gyro_unit of "
+            f"[sources.{heard.name}], or the DBC), and is the unit warm?"
+        )
+
+
+# --------------------------------------------------------------------------- clock and broker
+
+
+def _clock(clock: Clock, config: Config) -> Report:
+    status = clock.status()
+    report = Report(f"clock: UTC from {status.utc_source}")
+    if status.system_error_s is not None:
+        error = status.system_error_s
+        report.facts.append(f"system clock minus GNSS: {error:+.3f} s")
+        if abs(error) > SYSTEM_CLOCK_S:
+            report.findings.append(
+                f"the system clock is {error:+.1f} s off GNSS: timedatectl set-ntp true, or chrony "
+                "with gpsd; navigation does not need it, logs and other programs do"
+            )
+    elif status.utc_source == "none":
+        report.findings.append(
+            "UTC is not known: the system clock is not set and no receiver has told the time"
+        )
+    elif config.clock.utc == "gnss":
+        report.facts.append("no receiver has told the time: the system clock serves")
+    return report
+
+
+async def _broker(config: Config) -> Report:
+    """Connect as the daemon would, under another name, so that a running one is not thrown off."""
+    m = config.mqtt
+    if not m.enabled:
+        return Report("mqtt: not enabled")
+    where = f"{m.host}:{m.port}"
+    report = Report(f"mqtt: {where}")
+    try:
+        client = aiomqtt.Client(
+            m.host,
+            m.port,
+            username=m.username,
+            password=broker_access.password(m),
+            identifier=f"fusiond-{config.vehicle}-doctor",
+            timeout=_BROKER_S,
+            tls_context=broker_access.tls_context(m),
+        )
+        async with asyncio.timeout(_BROKER_S + 1.0), client:
+            report.facts.append("connected")
+    except ConfigError as error:
+        report.findings.append(str(error))
+    except (aiomqtt.MqttError, TimeoutError) as error:
+        why = str(error) or "no answer"
+        if isinstance(error, aiomqtt.MqttCodeError):
+            advice = "[mqtt] username and the password (FUSIOND_MQTT_PASSWORD or password_file)"
+        else:
+            advice = f"is a broker running there (systemctl status mosquitto), is {where} right?"
+        report.findings.append(f"{why}: {advice}")
+    return report

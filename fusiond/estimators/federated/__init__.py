@@ -1,0 +1,1 @@
+"""The federated filter: local filters by source, fault detection, fusion."""

@@ -1,0 +1,313 @@
+r"""Federated filter: a local filter for each source of aids, a master, fault isolation.
+
+Every local filter estimates the whole error state of the one common navigation state from its own
+source's aids; the master fuses the estimates and feeds the result back. What all share, the initial
+estimate, the process noise and aids of no source of its own (standstill, an operator), is split by
+the sharing factors beta_i, sum beta_i = 1:
+
+    P_i(0) = P(0) / beta_i,   Q_i = Q / beta_i,   R_i = R / beta_i of a common aid
+
+so that the sum of the information is that of one filter. P_i is then an upper bound that makes the
+estimates as good as uncorrelated (Carlson, 1990, section III), and P_g = (sum P_i^-1)^-1 one of the
+fused estimate: its very covariance where the parts are put together at once, more where local
+filters go on alone, as (sum (P_i + Q / beta_i)^-1)^-1 >= (sum P_i^-1)^-1 + Q.
+
+What becomes of the local filters after a fusion, which is after every update:
+
+`no_reset`      nothing; x_i <- x_i - x_g as the navigation state is corrected. Nothing comes from
+                one local filter into another.
+`fusion_reset`  x_i <- x_g, P_i <- P_g / beta_i. Equal to the centralised filter.
+`zero_reset`    the master keeps all, a local filter starts its next update with no information:
+                beta_i = 0, the master's own part is 1. Equal to the centralised filter too.
+`rescale`       a local filter that was updated keeps the part `retained` of its information and
+                hands the rest to the master's own estimate: P_i <- P_i / retained.
+
+The first and the last are in fusiond.estimators.federated.standing, those with a reset in
+fusiond.estimators.federated.reset; here is what they share.
+
+Source: Carlson, IEEE Trans. AES 26 (1990), 517; Carlson and Berarducci, NAVIGATION 41 (1994), 297;
+paper 004, section 3. Tests and isolation: fusiond.estimators.federated.isolation.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable
+from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.federated.bank import combine
+from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection
+from fusiond.estimators.federated.options import FederatedOptions, local_of
+from fusiond.estimators.screening import KEPT
+from fusiond.estimators.update import normalised_innovation_squared, update
+from fusiond.models.model import CLOCK_OFFSET, Model
+
+Array = NDArray[np.float64]
+
+# No adaptive factor falls below this part of an equal one: a filter that starves cannot come back.
+LEAST_PART = 0.1
+
+
+class FederatedFilter(ErrorStateFilter):
+    """What the modes share; `names` are the local filters.
+
+    `_bank` (k, width, width) and `_bank_dxs` (k, n) are estimates to be fused, `_factors` (N,) the
+    sharing factors of the local filters.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        gap_s: float,
+        names: tuple[str, ...],
+        options: FederatedOptions,
+        estimates: int,
+    ) -> None:
+        super().__init__(model, gap_s)
+        if not names:
+            raise ValueError("a federated filter needs at least one local filter")
+        if options.shares and (len(options.shares) != len(names) or not min(options.shares) > 0.0):
+            raise ValueError("one positive share for each local filter")
+        self.options, self.names = options, names
+        relative = np.array(options.shares) if options.shares else np.ones(len(names))
+        self._nominal: Array = relative / relative.sum()
+        self._factors: Array = np.zeros(len(names))
+        self._faults = FaultDetection(
+            len(names), options.false_alarm, options.window, options.readmit_after
+        )
+        self._local_of: dict[str, int | None] = {}
+        self._bank: Array = np.zeros((estimates, model.width, model.width))
+        self._bank_dxs: Array = np.zeros((estimates, model.size))
+        self._weight: Array = np.zeros(estimates)
+        self._arrange(model.active)
+        self._share_out(self._nominal)
+
+    def _arrange(self, used: NDArray[np.bool_]) -> None:
+        """Lay out the work space: the used states, position and velocity last."""
+        slots = np.flatnonzero(used)
+        tested = (slots >= 3) & (slots < 9)
+        self._order = np.concatenate([slots[~tested], slots[tested]]).astype(np.int64)
+        self._tested = int(tested.sum())
+        k, a = len(self._weight), len(slots)
+        self._infos: Array = np.zeros((k + 1, a, a))
+        self._vectors: Array = np.zeros((k + 1, a))
+        self._scale: Array = np.ones(a)
+        self._fused: Array = np.zeros((a, a))
+        self._estimate: Array = np.zeros(a)
+        self._trace: Array = np.zeros(k)
+
+    @property
+    def isolated(self) -> dict[str, str]:
+        """Sources that a fault detection keeps out of the solution, and why."""
+        records = zip(self.names, self._faults.records, strict=True)
+        return {name: record.reason for name, record in records if record.reason}
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The sharing factors of the local filters."""
+        return dict(zip(self.names, self._factors.tolist(), strict=True))
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+        super().initialise(t_ns, sample, nav, xi, covariance)
+        # A state that is known exactly and stays so has no information matrix.
+        known = (np.diag(covariance) <= 0.0) & (self.model.noise[1:] <= 0.0).all(axis=0)
+        self._arrange(self.model.active & ~known)
+        self._faults.reset()
+        self._share_out(self._nominal)
+
+    # ------------------------------------------------------------------ update
+
+    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
+        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes.
+
+        NIS and whitened innovation of the outcome are those of what is published; those of a
+        screened aid are of the filter that judges its rows.
+        """
+        i = aid.innovation(self.state)
+        if isinstance(i, NotApplicable):
+            return Outcome(i.outcome)
+        if aid.source not in self._local_of:
+            self._local_of[aid.source] = local_of(aid.source, self.names)
+        local = self._local_of[aid.source]
+        isolated = local is not None and self._faults.is_isolated(local)
+        self._bring_up()
+        judge = None if isolated else local
+        cov, dx = self._judge(judge)
+        if aid.screened:
+            return self._update_by_rows(aid, i, local, cov, dx, inflate)
+        degrees = i.z.shape[0]
+        threshold = gate_threshold(aid.gate, degrees)
+        y = np.zeros(degrees)
+        nis = published = normalised_innovation_squared(cov, i.z - i.h @ dx, i.h, i.r, y)
+        if judge is not None and self.options.mode == "no_reset":
+            z = i.z - i.h @ self._dxs[0]
+            published = normalised_innovation_squared(self._covs[0], z, i.h, i.r, y)
+        if not (math.isfinite(nis) and math.isfinite(published)):
+            return Outcome("not_finite", nis, degrees)
+        whitened = tuple(y.tolist()) if published <= threshold else ()
+        if not self._believes(local, nis, degrees, threshold):
+            return Outcome("isolated", published, degrees, whitened)
+        if nis > threshold:
+            if not inflate:
+                return Outcome("gated", published, degrees)
+            self._doubt(local, i)
+        return Outcome(self._fold(local, i), published, degrees, whitened)
+
+    def _update_by_rows(
+        self,
+        aid: Linearised,
+        rows: Innovation,
+        local: int | None,
+        cov: Array,
+        dx: Array,
+        inflate: bool,
+    ) -> Outcome:
+        """Rows that pass are folded in; none, or with `inflate` as many as a wider P lets.
+
+        For the innovation test an epoch counts with the rows that pass, or as failed where most do
+        not: single bad satellites are the screening's business.
+        """
+        trial = cov.copy()
+        s = self._screen(aid, rows, trial, dx)
+        kept = s.codes == KEPT
+        count, most = int(kept.sum()), 2 * int(kept.sum()) >= len(kept)
+        degrees = count if most else len(kept)
+        nis = s.nis if most else math.inf
+        codes = tuple(s.codes.tolist())
+        if not self._believes(local, nis, degrees, gate_threshold(aid.gate, degrees)):
+            return Outcome("isolated", s.nis, count, (), codes)
+        if inflate and not most:
+            self._doubt(local, rows)
+            trial = cov.copy()
+            s = self._screen(aid, rows, trial, dx)
+            kept, codes = s.codes == KEPT, tuple(s.codes.tolist())
+        if not kept.any():
+            return Outcome("gated", s.nis, 0, (), codes)
+        offsets = self.model.slots_of(CLOCK_OFFSET)
+        if not np.array_equal(trial[offsets], cov[offsets]):
+            self._forget_clock(offsets)
+        name = self._fold(local, Innovation(rows.z[kept], rows.h[kept], rows.r[kept]))
+        return Outcome(name, s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
+
+    def _believes(self, local: int | None, nis: float, degrees: int, threshold: float) -> bool:
+        """Take an innovation into the tests; whether its filter is believed after it."""
+        if local is None:
+            return True
+        if self._faults.is_isolated(local):
+            if self._faults.behaves(local, nis, degrees, threshold):
+                self._take_back(local)
+            return False
+        sound = self._faults.innovation(local, nis, degrees, threshold)
+        return sound or not self._isolate(local, INNOVATION)
+
+    def _forget_clock(self, offsets: list[int]) -> None:
+        """The receiver has set its clock: nobody knows the offset."""
+        initial = self.model.initial[offsets] ** 2
+        for cov, share in self._kept():
+            cov[offsets] = 0.0
+            cov[:, offsets] = 0.0
+            cov[offsets, offsets] = initial / share
+
+    # ------------------------------------------------------------------ what a mode says
+
+    def _bring_up(self) -> None:
+        """Make the bank ready for an update."""
+
+    def _judge(self, local: int | None) -> tuple[Array, Array]:
+        """Covariance and error estimate by which an aid is gated."""
+        return self._covs[0], self._dxs[0]
+
+    def _kept(self) -> list[tuple[Array, float]]:
+        """The covariances that are kept between updates, with their shares."""
+        return [(self._covs[0], 1.0)]
+
+    def _doubt(self, local: int | None, i: Innovation) -> None:
+        """Open what an innovation has to pass, and go on."""
+        raise NotImplementedError
+
+    def _fold(self, local: int | None, i: Innovation) -> str:
+        """Take an innovation that has passed in, of a local filter or of all; its outcome."""
+        raise NotImplementedError
+
+    def _take_back(self, local: int) -> None:
+        """Start a local filter that is believed again from the master."""
+        raise NotImplementedError
+
+    def _leave_out(self, local: int) -> None:
+        """Take what an isolated local filter knows out of the master."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------ parts of an update
+
+    def _widen_by(self, cov: Array, dx: Array, i: Innovation) -> None:
+        """Open a filter for an innovation that it refuses."""
+        self._widen(cov, i.z - i.h @ dx, i.h)
+
+    @staticmethod
+    def _fuse_into(cov: Array, dx: Array, i: Innovation, share: float = 1.0) -> None:
+        """Fold the share of an innovation into an estimate, without gate and feedback."""
+        update(cov, dx, i.z, i.h, i.r / share)
+
+    def _combine(self) -> bool:
+        """Fuse the bank's estimates with `_weight` into the work space."""
+        return combine(
+            self._bank,
+            self._bank_dxs,
+            self._weight,
+            self._order,
+            self._infos,
+            self._vectors,
+            self._scale,
+            self._fused,
+            self._estimate,
+            self._trace,
+        )
+
+    def _isolate(self, local: int, reason: str) -> bool:
+        """Leave a local filter out, if the others can do without it; whether that was done."""
+        if not (self.options.fault_detection and self._faults.may_isolate(local, self.t_ns)):
+            return False
+        self._faults.isolate(local, reason)
+        self._share_out(self._nominal)
+        self._leave_out(local)
+        return True
+
+    def _believed(self) -> list[int]:
+        return [i for i in range(len(self.names)) if not self._faults.is_isolated(i)]
+
+    def _share_out(self, parts: Array) -> None:
+        """Set the factors from `parts` (N,): those of the believed filters sum to 1."""
+        believed = self._believed()
+        self._factors[:] = parts
+        self._factors[believed] /= parts[believed].sum()
+
+    def _adapt(self, trace: Array) -> None:
+        """Factors proportional to 1 / `trace` (N,), scaled traces of the local covariances."""
+        part = np.divide(1.0, trace, out=np.zeros_like(trace), where=trace > 0.0)
+        self._share_out(np.maximum(part / part.sum(), LEAST_PART / len(part)))
+
+    # ------------------------------------------------------------------ feedback
+
+    def _feed_back_published(self) -> None:
+        """Take the published estimate out of the navigation state, unless it is to be carried."""
+        if self._holding:
+            return
+        self._feed_back(self._dxs[0])
+        self._shift(self._dxs[0])
+        self._dxs[0] = 0.0
+
+    def _shift(self, x: Array) -> None:
+        """The navigation state has been corrected by `x` (n,): so are estimates of its error."""
+
+    def hold(self) -> None:
+        """From now on estimate without feedback: errors are carried along with the state."""
+        self._holding = True
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        self._holding = False
+        self._feed_back_published()

@@ -1,0 +1,139 @@
+r"""Unscented Kalman filter on the error state, closed loop: sigma points instead of Jacobians.
+
+Measurements: the transform is taken over the states that the aid depends on (the columns of its H
+that are not zero), each point through the aid's own innovation at the true state that its error
+would mean. What comes of it is linear in the error state again
+(fusiond.estimators.unscented.sigma_points), so gate, update and feedback are those of the extended
+filter. All other states follow through their correlation, as in a full transform.
+
+Propagation: the extended filter's covariance, or with `propagation` sigma points through the
+strapdown equations and a covariance that turns with a large correction of the attitude
+(fusiond.estimators.unscented.propagation). That is dearer and pays where errors of the attitude are
+large.
+
+Source: Julier, Uhlmann, Unscented Filtering and Nonlinear Estimation, Proc. IEEE 92 (2004).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
+from fusiond.estimators.base import Outcome
+from fusiond.estimators.covariance import work_size
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.unscented.propagation import propagate_points, turn_attitude
+from fusiond.estimators.unscented.sigma_points import factor, linear_form, spread_states
+from fusiond.models.model import Model
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
+
+Array = NDArray[np.float64]
+
+SPREAD = math.sqrt(3.0)
+"""Sigmas from the mean to a point: the fourth moment of a Gaussian (Julier, Uhlmann, eq. 20)."""
+
+
+class UnscentedEstimator(KalmanEstimator):
+    """The centralised unscented filter (`fusiond.estimators.base.Estimator`).
+
+    `spread`: sigmas from the mean to a sigma point. `propagation`: sigma points there too.
+    """
+
+    def __init__(
+        self, model: Model, gap_s: float, spread: float = SPREAD, propagation: bool = False
+    ) -> None:
+        super().__init__(model, gap_s)
+        self.spread = spread
+        self.propagation = propagation
+
+    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
+        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes."""
+        before = self.nav.copy()
+        outcome = super().update(aid, inflate)
+        if self.propagation and outcome.name == "fused" and not self._holding:
+            turn_attitude(self._covs[0], before, self.nav)
+        return outcome
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        before = self.nav.copy()
+        super().release()
+        if self.propagation:
+            turn_attitude(self._covs[0], before, self.nav)
+
+    def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
+        """The aid's innovation over the sigma points, linear in the error state.
+
+        Where the aid does not hold at a point, its pair goes by the Jacobian at the centre.
+        """
+        state = self.state
+        central = aid.innovation(state)
+        if isinstance(central, NotApplicable):
+            return central
+        model = self.model
+        rows = central.z.shape[0]
+        slots = np.flatnonzero(central.h.any(axis=0) & model.active)
+        m = slots.shape[0]
+        root = np.empty((m, m))
+        factor(self._covs[0], slots, root)
+        count = 2 * m + 1
+        navs, steps = np.empty((count, NAV_SIZE)), np.empty((count, STEP_SIZE))
+        xis = np.empty((count, model.size))
+        dx = self._dxs[0]
+        terms = model.sensor_terms
+        spread_states(
+            self.nav, self.xi, self.step, dx, slots, terms, root, self.spread, navs, xis, steps
+        )
+        points = np.full((count, rows), np.nan)
+        for p in range(count):
+            found: Innovation | NotApplicable = central
+            if p > 0 or self._holding:
+                found = aid.innovation(State(navs[p], xis[p], steps[p], model))
+            if isinstance(found, Innovation) and found.z.shape[0] == rows:
+                points[p] = found.z
+        if not np.isfinite(points[0]).all():
+            points[0] = central.z - central.h @ dx
+        if math.isfinite(aid.period):
+            points -= aid.period * np.nan_to_num(np.round((points - points[0]) / aid.period))
+        z, h, r = np.empty(rows), np.empty((rows, model.size)), np.empty(rows)
+        linear_form(
+            points, central.h, central.r, dx, slots, root, self.spread, aid.screened, z, h, r
+        )
+        return Innovation(z, h, r)
+
+    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+        if not self.propagation:
+            super().propagate(imu, target_ns, record)
+            return
+        model = self.model
+        first, self.t_ns = propagate_points(
+            self.nav,
+            self.xi,
+            self._covs[0],
+            self._dxs[0],
+            self.step,
+            self.spread,
+            model.hold_height,
+            model.active,
+            model.sensor_terms,
+            model.rate_terms,
+            model.noise,
+            imu.times,
+            imu.samples,
+            self.sample - imu.start,
+            imu.end,
+            self.t_ns,
+            target_ns,
+            self.gap_ns,
+            record,
+            imu.nav,
+            imu.sigmas,
+            self._holding,
+            self._scratch[-work_size(model.width) :],
+        )
+        self.sample = first + imu.start

@@ -1,0 +1,343 @@
+"""Numeric CSV tables with a header row: read fast, and name every row that cannot be true.
+
+Plain decimals are read by a compiled reader, other numbers by numpy's. Where both stumble (an empty
+cell, a word, a cut line, a blank line), each row is read with care instead, so that what is refused
+carries its line and the reason.
+
+Reasons: `columns` (more or fewer cells than the header), `unreadable` (not a number), `missing`
+(empty where the value must be known), `not_finite` (nan or inf), `out_of_range`,
+`sd_not_positive`, `time_backwards`, `time_repeated`, `time_ahead` (a stamp later than those of the
+rows that follow it), and those of a table's own rules.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.files.fixed_decimal import parse_rows
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_TEXT_DTYPE = "U64"
+_MAX_TIME_S = 9e9
+"""Seconds beyond which nanoseconds leave a 64-bit integer."""
+
+
+class TableError(Exception):
+    """A file that cannot be read as the table it should be; the text names file and reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """A row that is not used: line in the file (the header is 1), reason's name, what was seen."""
+
+    line: int
+    reason: str
+    detail: str
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.reason}: {self.detail}"
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A numeric column: its header, whether it must be there and filled, and its allowed range.
+
+    With `required` False the column may be absent and its cells empty; both read as NaN.
+    A `positive` column (a standard deviation) must be above zero.
+    """
+
+    name: str
+    required: bool = True
+    low: float = -inf
+    high: float = inf
+    positive: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A condition between columns that no true row meets: `impossible(columns)` flags rows (n,)."""
+
+    reason: str
+    detail: str
+    impossible: Callable[[dict[str, Floats]], Flags]
+
+
+TIME = Column("t_s", low=-_MAX_TIME_S, high=_MAX_TIME_S)
+
+
+@dataclass(frozen=True, slots=True)
+class RawTable:
+    """The rows that may be true, by column name (n,), and those that may not, in file order."""
+
+    columns: dict[str, Floats]
+    text: dict[str, list[str]]
+    rejected: list[Rejection]
+
+
+def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
+    """How many rows were rejected for each reason."""
+    return dict(Counter(r.reason for r in rejected))
+
+
+def file_report(rows: int, rejected: Sequence[Rejection], first: int = 5) -> dict[str, Any]:
+    """What a summary says of a file: rows used, rejected by reason, the first of them in words."""
+    return {
+        "rows": rows,
+        "rejected": counts(rejected),
+        "first_rejected": [str(rejection) for rejection in rejected[:first]],
+    }
+
+
+def read_table(
+    path: Path | str,
+    columns: Sequence[Column],
+    rules: Sequence[Rule] = (),
+    text: Sequence[str] = (),
+) -> RawTable:
+    """Read a table whose first column is time `t_s`, strictly increasing.
+
+    Columns may stand in any order; those not named in `columns` or `text` are ignored. Raises
+    `TableError` when the file cannot be opened, has no header, or lacks a required column.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8-sig") as stream:
+            header = [cell.strip() for cell in stream.readline().split(",")]
+            _check_header(path, header, columns)
+            parsed = None if text else _read_plain(path, header)
+            if parsed is None:
+                parsed = _read_clean(path, header, text)
+            if parsed is None:
+                parsed = _read_with_care(stream, header, columns, text)
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise TableError(f"{path}: not a text file ({error.reason})") from error
+    values, words, lines, rejected = parsed
+
+    n = len(lines)
+    named = {c.name: values[c.name] if c.name in values else np.full(n, nan) for c in columns}
+    keep = np.ones(n, dtype=np.bool_)
+    for rule in _column_rules(columns):
+        _apply(rule, named, lines, keep, rejected)
+    for rule in rules:
+        _apply(rule, named, lines, keep, rejected)
+    _apply_time_order(named["t_s"], lines, keep, rejected)
+    if not keep.all():
+        named = {name: column[keep] for name, column in named.items()}
+        chosen = np.flatnonzero(keep)
+        words = {name: [cells[i] for i in chosen] for name, cells in words.items()}
+    rejected.sort(key=lambda r: r.line)
+    return RawTable(named, words, rejected)
+
+
+# --------------------------------------------------------------------------- parsing
+
+_Parsed = tuple[dict[str, Floats], dict[str, list[str]], NDArray[np.int64], list[Rejection]]
+
+
+def _check_header(path: Path, header: list[str], columns: Sequence[Column]) -> None:
+    if header == [""]:
+        raise TableError(f"{path}: empty; a header row with column names is expected")
+    twice = [name for name, n in Counter(header).items() if n > 1]
+    if twice:
+        raise TableError(f"{path}, line 1: column {twice[0]!r} occurs twice")
+    lacking = [c.name for c in columns if c.required and c.name not in header]
+    if lacking:
+        raise TableError(f"{path}, line 1: lacks {', '.join(lacking)}; it has {', '.join(header)}")
+
+
+def _read_plain(path: Path, header: list[str]) -> _Parsed | None:
+    """A file of plain decimals, such as this project writes; None if there is anything else."""
+    data = bytearray(path.read_bytes())
+    start = data.find(b"\n") + 1
+    rows = data.count(b"\n", start) + (not data.endswith(b"\n"))
+    if not start or start == len(data):
+        return None
+    values = np.empty((len(header), rows))
+    if not parse_rows(np.frombuffer(data, dtype=np.uint8), start, values):
+        return None
+    lines = np.arange(2, rows + 2, dtype=np.int64)
+    return dict(zip(header, values, strict=True)), {}, lines, []
+
+
+def _read_clean(path: Path, header: list[str], text: Sequence[str]) -> _Parsed | None:
+    """The whole file through numpy's C reader; None if anything in it asks for a closer look."""
+    with path.open("rb") as raw:
+        newlines, last = 0, b"\n"
+        while block := raw.read(1 << 20):
+            newlines += block.count(b"\n")
+            last = block[-1:]
+    rows = newlines - 1 + (last != b"\n")
+    if rows <= 0:
+        return None
+    with path.open(encoding="utf-8-sig") as stream:
+        stream.readline()
+        try:
+            if text:
+                dtype = np.dtype([(h, _TEXT_DTYPE if h in text else "f8") for h in header])
+                table = np.loadtxt(stream, dtype, delimiter=",", comments=None, ndmin=1)
+                values = {h: np.ascontiguousarray(table[h]) for h in header if h not in text}
+                words = {h: [str(w) for w in table[h]] for h in header if h in text}
+            else:
+                matrix = np.loadtxt(stream, delimiter=",", comments=None, ndmin=2)
+                if matrix.shape[1] != len(header):
+                    return None
+                values = dict(zip(header, np.ascontiguousarray(matrix.T), strict=True))
+                words = {}
+        except ValueError:
+            return None
+    if any(len(v) != rows or not np.isfinite(v).all() for v in values.values()):
+        return None
+    return values, words, np.arange(2, rows + 2, dtype=np.int64), []
+
+
+def _number(cell: str) -> float:
+    if "_" in cell:  # Python's float takes 1_000; no other reader does
+        raise ValueError(cell)
+    return float(cell)
+
+
+def _read_with_care(
+    stream: Iterable[str], header: list[str], columns: Sequence[Column], text: Sequence[str]
+) -> _Parsed:
+    """Row by row: what cannot be parsed is rejected, what is empty and may be so becomes NaN."""
+    present = [(header.index(c.name), c) for c in columns if c.name in header]
+    places = [(header.index(name), name) for name in text if name in header]
+    rejected: list[Rejection] = []
+    rows: list[list[float]] = []
+    words: dict[str, list[str]] = {name: [] for _, name in places}
+    lines: list[int] = []
+    for line, row in enumerate(stream, start=2):
+        cells = row.strip().split(",")
+        if cells == [""]:
+            continue
+        fault = None
+        numbers = []
+        if len(cells) != len(header):
+            fault = ("columns", f"{len(cells)} cells, the header has {len(header)}")
+        else:
+            for index, column in present:
+                cell = cells[index].strip()
+                if not cell:
+                    if column.required:
+                        fault = ("missing", f"{column.name} is empty")
+                        break
+                    numbers.append(nan)
+                    continue
+                try:
+                    number = _number(cell)
+                except ValueError:
+                    fault = ("unreadable", f"{column.name} = {cell[:40]!r} is not a number")
+                    break
+                if not isfinite(number):
+                    fault = ("not_finite", f"{column.name} = {cell[:40]}")
+                    break
+                numbers.append(number)
+        if fault:
+            rejected.append(Rejection(line, *fault))
+            continue
+        rows.append(numbers)
+        lines.append(line)
+        for index, name in places:
+            words[name].append(cells[index].strip())
+    matrix = np.array(rows, dtype=np.float64).reshape(len(rows), len(present))
+    values = {c.name: matrix[:, k].copy() for k, (_, c) in enumerate(present)}
+    return values, words, np.array(lines, dtype=np.int64), rejected
+
+
+# --------------------------------------------------------------------------- validation
+
+
+def _column_rules(columns: Sequence[Column]) -> list[Rule]:
+    rules = []
+    for c in columns:
+        if c.positive:
+            rules.append(Rule("sd_not_positive", f"{c.name} = {{{c.name}:g}}", _not_positive(c)))
+        if isfinite(c.low) or isfinite(c.high):
+            detail = f"{c.name} = {{{c.name}:.10g}}, allowed {c.low:g} to {c.high:g}"
+            rules.append(Rule("out_of_range", detail, _outside(c)))
+    return rules
+
+
+def _not_positive(c: Column) -> Callable[[dict[str, Floats]], Flags]:
+    return lambda named: named[c.name] <= 0.0
+
+
+def _outside(c: Column) -> Callable[[dict[str, Floats]], Flags]:
+    return lambda named: (named[c.name] < c.low) | (named[c.name] > c.high)
+
+
+def _apply(
+    rule: Rule,
+    named: dict[str, Floats],
+    lines: NDArray[np.int64],
+    keep: Flags,
+    rejected: list[Rejection],
+) -> None:
+    """Take the rows that a rule calls impossible out of `keep`; the first reason stands."""
+    for i in np.flatnonzero(rule.impossible(named) & keep):
+        row = {name: float(column[i]) for name, column in named.items()}
+        rejected.append(Rejection(int(lines[i]), rule.reason, rule.detail.format(**row)))
+        keep[i] = False
+
+
+def _apply_time_order(
+    t: Floats, lines: NDArray[np.int64], keep: Flags, rejected: list[Rejection]
+) -> None:
+    """Keep the largest set of rows whose time strictly increases (the earlier rows on a tie).
+
+    A single stamp far in the future thus costs its own row, not all that follow.
+    """
+    chosen = np.flatnonzero(keep)
+    times = t[chosen]
+    if len(times) < 2 or bool((np.diff(times) > 0.0).all()):
+        return
+    in_order = np.zeros(len(t), dtype=np.bool_)
+    in_order[chosen[_longest_increasing(times)]] = True
+    newest = -inf
+    for i in chosen:
+        if in_order[i]:
+            newest = float(t[i])
+            continue
+        if t[i] == newest:
+            reason = "time_repeated"
+        elif t[i] < newest:
+            reason = "time_backwards"
+        else:
+            reason = "time_ahead"
+        rejected.append(Rejection(int(lines[i]), reason, f"t_s = {t[i]:.6f} after {newest:.6f}"))
+    keep &= in_order
+
+
+def _longest_increasing(times: Floats) -> list[int]:
+    """Indices of a longest strictly increasing subsequence (patience sorting, from the end)."""
+    tails: list[float] = []  # of decreasing sequences in reversed order, negated to ascend
+    ends: list[int] = []
+    follower = [-1] * len(times)
+    for i in range(len(times) - 1, -1, -1):
+        k = bisect_left(tails, -float(times[i]))
+        if k == len(tails):
+            tails.append(-float(times[i]))
+            ends.append(i)
+        else:
+            tails[k] = -float(times[i])
+            ends[k] = i
+        follower[i] = ends[k - 1] if k else -1
+    sequence = []
+    i = ends[-1]
+    while i >= 0:
+        sequence.append(i)
+        i = follower[i]
+    return sequence

@@ -1,0 +1,1 @@
+"""The daemon: devices, tick and outputs put together."""

@@ -1,0 +1,214 @@
+"""The daemon's devices: one supervised task a driver, and what `health` says of each.
+
+A driver's exception restarts that driver, never the daemon. What a driver emits is settled here: a
+stamp becomes an instant, an IMU sample waits for the next tick, a time report goes to the clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import Backoff, Driver, Emitted
+from drivers.measurements import DeviceEvent, ImuSample, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar
+from fusiond.clock.clock import Clock
+from fusiond.configuration.load import driver_entry_points
+from fusiond.configuration.schema import Config
+from fusiond.navigator.navigator import Navigator
+from fusiond.outputs.messages import SkyHealth, SourceHealth
+
+Array = NDArray[np.float64]
+EventSink = Callable[[str, str, str], None]
+
+log = logging.getLogger("fusiond")
+
+# Samples that may wait for a tick: 2 s at 1 kHz. A tick comes every 10 ms; a full queue means that
+# the loop stood still, and the newest samples are the ones worth keeping.
+IMU_QUEUE = 2000
+
+
+class Source:
+    """One device: its driver and what came of its measurements."""
+
+    def __init__(self, name: str, driver: Any) -> None:
+        self.name = name
+        self.driver: Driver = driver
+        self.received = 0
+        self.faults = 0
+        self.last_seen_ns: int | None = None
+        self.latency_s: float | None = None
+
+
+class Sources:
+    """All devices of a configuration. `on_event(source, code, text)` hears what they report."""
+
+    def __init__(
+        self, config: Config, clock: Clock, navigator: Navigator, on_event: EventSink
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._navigator = navigator
+        self._on_event = on_event
+        self._imu: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=IMU_QUEUE)
+        self._imu_source: str | None = None
+        self.counters: Counter[str] = Counter()
+        self.all: dict[str, Source] = {}
+        points = driver_entry_points()
+        for name, section in config.sources.items():
+            make = points[section.driver].load()
+            driver = make(name, make.Options(**section.options), self._emit, clock.now_ns)
+            self.all[name] = Source(name, driver)
+
+    async def run(self) -> None:
+        """Serve every device until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for source in self.all.values():
+                group.create_task(self._supervise(source), name=f"driver {source.name}")
+
+    async def _supervise(self, source: Source) -> None:
+        backoff = Backoff()
+        while True:
+            try:
+                await source.driver.run()
+                reason = "it ended by itself"
+            except Exception as error:
+                log.exception("driver %s failed", source.name)
+                reason = repr(error)
+            source.faults += 1
+            self._on_event(source.name, "driver_fault", f"{reason}: restarting it")
+            await asyncio.sleep(backoff.next())
+
+    # ------------------------------------------------------------------ arrivals
+
+    def _emit(self, item: Emitted) -> None:
+        if isinstance(item, DeviceEvent):
+            self._on_event(item.source, item.code, item.text)
+            return
+        source = self.all[item.source]
+        if isinstance(item, TimeReport):
+            self._clock.report(item)
+            return
+        if isinstance(item, Ephemeris | Klobuchar):
+            self._navigator.learn(item)
+            return
+        source.received += 1
+        source.last_seen_ns = item.t_seen_ns
+        instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
+        source.latency_s = (item.t_seen_ns - instant.t_valid_ns) * 1e-9
+        if isinstance(item, ImuSample):
+            self._imu_source = self._imu_source or item.source
+            if item.source != self._imu_source:
+                self.counters["second_imu"] += 1
+                return
+            self.counters["imu_queue_overflow"] += len(self._imu) == IMU_QUEUE
+            self._imu.append((instant.t_valid_ns, (*item.gyro_rad_s, *item.accel_m_s2)))
+            return
+        self._navigator.add(item, instant.t_valid_ns, instant.sd_s, item.t_seen_ns)
+
+    def take_imu(self) -> tuple[NDArray[np.int64], Array] | None:
+        """The samples since the last call, (m,) ns and (m, 6); None if there are none."""
+        if not self._imu:
+            return None
+        times = np.array([t for t, _ in self._imu], dtype=np.int64)
+        samples = np.array([s for _, s in self._imu], dtype=np.float64)
+        self._imu.clear()
+        return times, samples
+
+    # ------------------------------------------------------------------ state
+
+    @property
+    def all_running(self) -> bool:
+        """Whether every device sends."""
+        return all(s.driver.status.state == "running" for s in self.all.values())
+
+    def height_hint(self, height_m: float, sd_m: float) -> None:
+        """Tell the terminals that can use it the height of their antenna by the solution.
+
+        Of the lever arm only its upward part counts: tilt moves a roof antenna by centimetres.
+        """
+        for name, source in self.all.items():
+            hint = getattr(source.driver, "height_hint", None)
+            if hint is not None:
+                section = self._config.aiding.get(name)
+                down = section.lever_arm_m[2] if section is not None else 0.0
+                hint(height_m - down, sd_m)
+
+    def request_fix(self) -> list[str]:
+        """Ask every terminal for a fix; what each said. Empty if there is no terminal."""
+        asks = (getattr(s.driver, "request_now", None) for s in self.all.values())
+        return [ask() for ask in asks if ask is not None]
+
+    def health(self, now_ns: int) -> dict[str, SourceHealth]:
+        """`health` by source; what the filter makes by itself (`zero_velocity`) has its own
+        line."""
+        navigator = self._navigator
+        outcomes = navigator.timeline.counters.outcomes
+        health: dict[str, SourceHealth] = {}
+        for name in dict.fromkeys((*self.all, *outcomes, *navigator.refused)):
+            ended = outcomes.get(name, Counter())
+            rejected = {n: c for n, c in ended.items() if n != "fused" and c > 0}
+            for reason, count in navigator.refused.get(name, Counter()).items():
+                rejected[reason] = rejected.get(reason, 0) + count
+            fused_ns = navigator.last_fused_ns.get(name)
+            fused_age = None if fused_ns is None else round((now_ns - fused_ns) * 1e-9, 3)
+            source = self.all.get(name)
+            if source is None:
+                health[name] = SourceHealth(
+                    state="running",
+                    detail="made by the filter or part of another source",
+                    received=ended.total(),
+                    fused=ended["fused"],
+                    rejected=rejected,
+                    fused_age_s=fused_age,
+                    isolated=navigator.isolated(name),
+                    verdict=navigator.verdicts.verdict(name),
+                )
+                continue
+            counters = {k: int(v) for k, v in source.driver.counters.items() if v}
+            if name in navigator.raw:
+                counters |= dict(navigator.raw[name].refused)
+            fused = ended["fused"]
+            if name == self._imu_source:
+                counters |= {k: int(v) for k, v in self.counters.items() if v}
+                rejected |= {k: int(v) for k, v in navigator.imu.counters.items() if v}
+                gaps = rejected.pop("gap", 0)
+                counters["gap"] = gaps
+                fused = navigator.imu.next_sample
+                if navigator.imu.end:
+                    fused_age = round((now_ns - navigator.imu.latest_ns) * 1e-9, 3)
+            if source.faults:
+                counters["driver_fault"] = source.faults
+            seen = source.last_seen_ns
+            health[name] = SourceHealth(
+                state=source.driver.status.state,
+                detail=source.driver.status.detail,
+                received=source.received,
+                fused=fused,
+                rejected=rejected,
+                age_s=None if seen is None else round((now_ns - seen) * 1e-9, 3),
+                fused_age_s=fused_age,
+                latency_s=None if source.latency_s is None else round(source.latency_s, 4),
+                counters=counters,
+                isolated=navigator.isolated(name),
+                verdict=navigator.verdicts.verdict(name),
+                sky=self._sky(name),
+            )
+        return health
+
+    def _sky(self, name: str) -> SkyHealth | None:
+        receiver = self._navigator.raw.get(name)
+        if receiver is None:
+            return None
+        sky = receiver.sky()
+        figures: dict[str, float | None] = {"innovation_rms": sky.innovation_rms}
+        if sky.dops is not None:
+            figures |= sky.dops._asdict()
+        rounded = {k: None if v is None else round(v, 2) for k, v in figures.items()}
+        return SkyHealth(used=sky.used, refused=sky.refused, **rounded)

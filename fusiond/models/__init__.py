@@ -1,0 +1,1 @@
+"""The error state: blocks, and models as lists of blocks."""

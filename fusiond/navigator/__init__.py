@@ -1,0 +1,1 @@
+"""Samples and measurements in, solution out: intake, alignment, timeline."""

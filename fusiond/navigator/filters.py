@@ -1,0 +1,75 @@
+"""From a vehicle's configuration to its error-state model and its estimator.
+
+A new estimator is one module in `fusiond.estimators` and one case here; nothing else knows which
+one runs.
+"""
+
+from __future__ import annotations
+
+from fusiond.configuration.load import ConfigError
+from fusiond.configuration.schema import Config
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.base import Estimator
+from fusiond.estimators.federated.filter import FederatedFilter
+from fusiond.estimators.federated.options import FederatedOptions
+from fusiond.estimators.federated.reset import ResetFilter
+from fusiond.estimators.federated.standing import StandingFilter
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.multiscale.filter import MultiscaleEstimator
+from fusiond.estimators.unscented.filter import UnscentedEstimator
+from fusiond.models.model import Block, Model, TooManyStatesError, make_model
+
+
+def model_of(config: Config, *extra: Block) -> Model:
+    """The error-state model of a configuration, with the blocks that its aids need.
+
+    Raises `ConfigError` where those are more states than the kernels hold.
+    """
+    try:
+        return make_model(config.estimator.model, imu_noise(config.imu), *extra)
+    except TooManyStatesError as error:
+        names = ", ".join(block.name for block in extra)
+        raise ConfigError(
+            f"estimator.model: {error}; the aids add {names}: choose a smaller model, such as"
+            " 'ins15', or fewer aids"
+        ) from error
+
+
+def estimator_of(config: Config, model: Model) -> Estimator:
+    """The estimator that `[estimator] filter` names."""
+    match config.estimator.filter:
+        case "kalman":
+            return KalmanEstimator(model, config.imu.gap_s)
+        case "multiscale":
+            m = config.estimator.multiscale
+            return MultiscaleEstimator(model, config.imu.gap_s, m.scales, m.wavelet)
+        case "unscented":
+            u = config.estimator.unscented
+            return UnscentedEstimator(model, config.imu.gap_s, u.spread, u.propagation)
+        case "federated":
+            return _federated(config, model)
+
+
+def federated(
+    model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
+) -> FederatedFilter:
+    """The federated filter of a mode."""
+    resets = options.mode in ("fusion_reset", "zero_reset")
+    return (ResetFilter if resets else StandingFilter)(model, gap_s, names, options)
+
+
+def _federated(config: Config, model: Model) -> FederatedFilter:
+    o = config.estimator.federated
+    names = o.sources or tuple(config.aiding)
+    options = FederatedOptions(
+        mode=o.mode,
+        shares=tuple(o.shares[name] for name in names) if o.shares else (),
+        adaptive=o.sharing == "adaptive",
+        master_share=o.master_share,
+        retained=o.retained,
+        fault_detection=o.fault_detection,
+        false_alarm=o.false_alarm_probability,
+        window=o.window,
+        readmit_after=o.readmit_after,
+    )
+    return federated(model, config.imu.gap_s, names, options)

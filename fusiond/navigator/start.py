@@ -1,0 +1,133 @@
+"""The filter's first state: what alignment found, as navigation state, parameters and
+covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.models.model import Model
+from fusiond.navigation.alignment import levelling_jacobian
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, meridian_radius, transverse_radius
+from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm
+
+Array = NDArray[np.float64]
+
+# One sigma of tilt (rad) of a vehicle that stands with its engine on.
+LEVEL_SD_RAD = math.radians(0.1)
+# The same (rad) after levelling in motion.
+MOTION_LEVEL_SD_RAD = math.radians(2.0)
+# One sigma of velocity (m/s) that no start claims to beat.
+LEAST_VELOCITY_SD = 0.05
+# One sigma of a road's slope: main roads are built to 3 to 6 %, streets in hills to 12 %.
+SLOPE_SD = 0.06
+
+Place = tuple[PositionAid | None, Array, float]
+"""The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
+
+
+def as_geodetic(metres: Array, lat: float) -> Array:
+    """A short way north, east, down (3,) in m as latitude, longitude (rad) and height (m)."""
+    n, e, d = metres
+    return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
+
+
+def velocity_of(aid: VelocityAid) -> tuple[Array, Array]:
+    """Velocity NED (3,) and one sigma (3,). NMEA measures no vertical velocity: it is then 0, give
+    or take what a road's slope makes of the speed."""
+    if len(aid.v_ned) == 3:
+        return np.array(aid.v_ned), np.full(3, max(aid.sd))
+    sd = max(aid.sd)
+    climb = math.hypot(sd, SLOPE_SD * math.hypot(*aid.v_ned))
+    return np.array([*aid.v_ned, 0.0]), np.array([sd, sd, climb])
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found."""
+
+    t_ns: int
+    nav: Array
+    xi: Array
+    covariance: Array
+    how: str
+
+
+def build_start(
+    model: Model,
+    t_ns: int,
+    place: Place,
+    dcm: Array,
+    sd_yaw: float,
+    velocity: Array,
+    sd_velocity: Array,
+    how: str,
+    *,
+    bias: tuple[Array, float] | None = None,
+    levelled: bool = False,
+    compassed: bool = False,
+) -> Start:
+    """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
+
+    `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
+    at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors.
+    """
+    fix, where, sd_position = place
+    lat, height = float(where[0]), float(where[2])
+    nav = np.zeros(10)
+    nav[:3] = where
+    nav[3:6] = velocity
+    nav[6:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
+    if fix is not None:
+        nav[:3] -= as_geodetic(dcm @ np.array(fix.lever), lat)
+    p = np.diag(model.initial**2)
+    tilt_sd = LEVEL_SD_RAD if levelled else MOTION_LEVEL_SD_RAD
+    p[0, 0] = p[1, 1] = tilt_sd**2
+    p[2, 2] = sd_yaw**2
+    p[3:6, 3:6] = np.diag(np.maximum(sd_velocity, LEAST_VELOCITY_SD) ** 2)
+    vertical = fix.sd[2] if fix is not None and fix.height_m is not None else sd_position
+    p[6:9, 6:9] = np.diag([sd_position**2, sd_position**2, vertical**2])
+    xi = np.zeros(model.size)
+    if bias is not None:
+        _start_biases(model, p, xi, *bias)
+    if levelled:
+        _correlate(model, p, dcm, lat, height, compassed)
+    return Start(t_ns, nav, xi, p, how)
+
+
+def _start_biases(model: Model, p: Array, xi: Array, bias: Array, sd: float) -> None:
+    """Take the rate bias seen at rest, where it is better known than the sheet says."""
+    for axis in range(3):
+        slot = model.parameters(9 + axis)[0]
+        prior = p[slot, slot]
+        floor = LEVEL_SD_RAD / 60.0  # a vehicle at rest that settles 0.1 deg in a minute
+        variance = sd**2 + floor**2
+        xi[slot] = bias[axis] * prior / (prior + variance)
+        p[slot, slot] = prior * variance / (prior + variance)
+
+
+def _correlate(
+    model: Model, p: Array, dcm: Array, lat: float, height: float, compassed: bool
+) -> None:
+    """Attitude errors that come of sensor errors: J Pss J^T on attitude, J Pss across."""
+    size = model.size
+    jacobian = np.zeros((3, size))
+    by_force = levelling_jacobian(dcm, lat, height)
+    for axis in range(3):
+        for slot in model.parameters(12 + axis):
+            jacobian[:, slot] = by_force[:, axis]
+    if compassed:
+        north, down = EARTH_RATE_RAD_S * math.cos(lat), -EARTH_RATE_RAD_S * math.sin(lat)
+        jacobian[2] = jacobian[0] * down / north
+        for axis in range(3):
+            for slot in model.parameters(9 + axis):
+                jacobian[2, slot] += dcm[1, axis] / north
+    cross = jacobian @ p
+    p[:3, :3] += cross @ jacobian.T
+    p[:3, 9:] += cross[:, 9:]
+    p[9:, :3] = p[:3, 9:].T

@@ -1,0 +1,233 @@
+"""The timeline: aids in order of validity, checkpoints of the filter, exact rewinding.
+
+An aid whose instant has passed takes the filter back to the last checkpoint before it; it is
+applied at its own instant, and everything after it runs again. The state that results is, bit for
+bit, the one that would have come of arrival in order of validity, as long as the aid is younger
+than the oldest checkpoint. Aids of one instant are ordered by source, not by arrival; a feedback
+that is due comes first.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from fusiond.aiding.base import Linearised
+from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
+from fusiond.estimators.base import Estimator, Outcome, Snapshot
+from fusiond.navigation.imu_buffer import ImuBuffer
+
+Key = tuple[int, str, int]
+
+# A source whose aids have failed the gate for this long, and this often, is believed again with the
+# covariance widened by the innovation: a filter that trusts nobody cannot recover. Ten seconds
+# are longer than any multipath burst at a street crossing; five fixes are more than chance.
+RECOVERY_NS = 10_000_000_000
+RECOVERY_COUNT = 5
+# Aids that may wait for the start or for the IMU: more than a minute of all that a well-equipped
+# vehicle sends. Beyond it the oldest are given up.
+MOST_WAITING = 4096
+
+
+@dataclass(slots=True)
+class Entry:
+    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
+    `judged` that its innovation has been looked at: a rewind applies it again."""
+
+    key: Key
+    aid: Linearised
+    outcome: Outcome | None = None
+    judged: bool = False
+
+
+@dataclass(slots=True)
+class _Checkpoint:
+    snapshot: Snapshot
+    last_key: Key | None
+    failing: dict[str, tuple[int, int]]
+
+
+@dataclass(slots=True)
+class Counters:
+    """Outcomes by source; `rewinds` and how far they went in all."""
+
+    outcomes: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    rewinds: int = 0
+    rewound_ns: int = 0
+
+
+class Timeline:
+    """Runs an estimator over IMU samples and aids in order of validity.
+
+    `on_outcome` is called with each entry whenever it has been applied, again after a rewind.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        imu: ImuBuffer,
+        keep_s: float,
+        checkpoint_s: float,
+        on_outcome: Callable[[Entry], None] | None = None,
+    ) -> None:
+        self.estimator = estimator
+        self.imu = imu
+        self.counters = Counters()
+        self._keep_ns = round(keep_s * 1e9)
+        self._checkpoint_ns = round(checkpoint_s * 1e9)
+        self._on_outcome = on_outcome
+        self._entries: list[Entry] = []
+        self._keys: list[Key] = []
+        self._next = 0
+        self._checkpoints: list[_Checkpoint] = []
+        self._failing: dict[str, tuple[int, int]] = {}
+
+    def start(self) -> None:
+        """Begin at the estimator's state: nothing earlier can be applied any more."""
+        self._next = 0
+        self._failing.clear()
+        self._checkpoints = [_Checkpoint(self.estimator.snapshot(), None, {})]
+        self._give_up(bisect_left(self._keys, (self.estimator.t_ns, "", 0)), "no_alignment")
+        self.imu.needed = self.estimator.sample
+
+    def clear(self) -> None:
+        """Forget all that waits (the estimator is about to be started anew)."""
+        del self._entries[: self._next], self._keys[: self._next]
+        self._next = 0
+        self._give_up(len(self._entries), "no_alignment")
+        self._checkpoints.clear()
+        self.imu.needed = None
+
+    @property
+    def waiting(self) -> int:
+        """Number of aids whose instant the filter has not reached."""
+        return len(self._entries) - self._next
+
+    @property
+    def oldest_ns(self) -> int:
+        """The earliest instant that an aid may still be valid at."""
+        return self._checkpoints[0].snapshot.t_ns if self._checkpoints else 0
+
+    def insert(self, aid: Linearised, serial: int = 0) -> Entry:
+        """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
+        # What is due to be fed back is fed back before anything of the same instant is applied: the
+        # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
+        key = (aid.t_ns, "" if isinstance(aid, FeedBackAid) else aid.source, serial)
+        entry = Entry(key, aid)
+        if self._checkpoints and not self._precedes(self._checkpoints[0], key):
+            self._count(entry, Outcome("too_old"))
+            return entry
+        last = len(self._keys)
+        at = last if not last or self._keys[-1] < key else bisect_left(self._keys, key)
+        if at < last and self._keys[at] == key:
+            self._count(entry, Outcome("duplicate"))
+            return entry
+        self._keys.insert(at, key)
+        self._entries.insert(at, entry)
+        if self._checkpoints and (
+            at < self._next or (at == self._next and aid.t_ns < self.estimator.t_ns)
+        ):
+            if at < self._next:
+                self._next += 1
+            self._rewind(key)
+        elif self.waiting > MOST_WAITING:
+            self._give_up(1, "no_imu" if self._checkpoints else "no_alignment")
+        return entry
+
+    def run(self, record: bool = False) -> None:
+        """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
+        latest = self.imu.latest_ns
+        estimator = self.estimator
+        while self._next < len(self._entries) and self._keys[self._next][0] <= latest:
+            entry = self._entries[self._next]
+            if entry.key[0] > estimator.t_ns:
+                estimator.propagate(self.imu, entry.key[0], record)
+                self._checkpoint()
+            self._count(entry, self._apply(entry))
+            self._next += 1
+        estimator.propagate(self.imu, latest, record)
+        self._checkpoint()
+        self._forget(latest - self._keep_ns)
+
+    def _give_up(self, count: int, name: str) -> None:
+        """Drop the first `count` of those that wait."""
+        rows = slice(self._next, self._next + count)
+        for entry in self._entries[rows]:
+            self._count(entry, Outcome(name))
+        del self._entries[rows], self._keys[rows]
+
+    def _apply(self, entry: Entry) -> Outcome:
+        source, t_ns = entry.aid.source, entry.key[0]
+        since, count = self._failing.get(source, (t_ns, 0))
+        recover = count >= RECOVERY_COUNT and t_ns - since >= RECOVERY_NS
+        if isinstance(entry.aid, FeedBackAid):
+            self.estimator.release()
+        elif isinstance(entry.aid, RdssPositionAid) and entry.aid.holds:
+            self.estimator.hold()
+        outcome = self.estimator.update(entry.aid, inflate=recover)
+        if outcome.name == "gated":
+            self._failing[source] = (since, count + 1)
+        elif outcome.name == "fused":
+            self._failing.pop(source, None)
+        return outcome
+
+    def _count(self, entry: Entry, outcome: Outcome) -> None:
+        counts = self.counters.outcomes[entry.aid.source]
+        if entry.outcome is not None:
+            counts[entry.outcome.name] -= 1
+        counts[outcome.name] += 1
+        entry.outcome = outcome
+        if self._on_outcome is not None:
+            self._on_outcome(entry)
+
+    def _checkpoint(self) -> None:
+        last = self._checkpoints[-1]
+        if self.estimator.t_ns - last.snapshot.t_ns >= self._checkpoint_ns:
+            last_key = self._keys[self._next - 1] if self._next else last.last_key
+            self._checkpoints.append(
+                _Checkpoint(self.estimator.snapshot(), last_key, dict(self._failing))
+            )
+
+    def _rewind(self, key: Key) -> None:
+        """Back to the last checkpoint that `key` could still follow."""
+        before = self.estimator.t_ns
+        while len(self._checkpoints) > 1 and not self._precedes(self._checkpoints[-1], key):
+            self._checkpoints.pop()
+        checkpoint = self._checkpoints[-1]
+        self.estimator.restore(checkpoint.snapshot)
+        self._failing = dict(checkpoint.failing)
+        self._next = (
+            0 if checkpoint.last_key is None else bisect_left(self._keys, checkpoint.last_key) + 1
+        )
+        self.counters.rewinds += 1
+        self.counters.rewound_ns += max(0, before - key[0])
+
+    @staticmethod
+    def _precedes(checkpoint: _Checkpoint, key: Key) -> bool:
+        if checkpoint.snapshot.t_ns > key[0]:
+            return False
+        return checkpoint.last_key is None or checkpoint.last_key < key
+
+    def _forget(self, horizon_ns: int) -> None:
+        """Drop checkpoints and entries that nothing can need any more."""
+        drop = 0
+        while (
+            drop + 1 < len(self._checkpoints)
+            and self._checkpoints[drop + 1].snapshot.t_ns <= horizon_ns
+        ):
+            drop += 1
+        if drop:
+            del self._checkpoints[:drop]
+        oldest = self._checkpoints[0]
+        self.imu.needed = oldest.snapshot.sample
+        stale = 0
+        while stale < self._next and (
+            oldest.last_key is not None and self._keys[stale] < oldest.last_key
+        ):
+            stale += 1
+        if stale:
+            del self._entries[:stale]
+            del self._keys[:stale]
+            self._next -= stale

@@ -1,0 +1,251 @@
+"""Files of aids as measurements with their arrivals: `fusiond process --aid KIND=FILE`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.measurements import (
+    Attitude,
+    Bearing,
+    DelayedFix,
+    Measurement,
+    MonotonicStamp,
+    PositionFix,
+    UtcStamp,
+    WheelSpeed,
+)
+from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
+from drivers.raw.decoder import RawDecoder
+from drivers.raw.messages import RawEvent, RawGnssEpoch
+from fusiond.configuration.aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
+from fusiond.configuration.schema import Config
+from fusiond.files.csv_tables import Rejection, TableError
+from fusiond.files.tables import (
+    ImuTable,
+    read_attitude,
+    read_bearing,
+    read_gnss,
+    read_rdss,
+    read_wheel,
+)
+from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
+
+Array = NDArray[np.float64]
+
+# A recording may be old; before selective availability ended there was no receiver worth replaying.
+EARLIEST_DATE = date(2000, 5, 1)
+SECONDS_OF_WEEK = 604800.0
+
+
+_REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset", "unknown")
+
+
+class Arrival(NamedTuple):
+    """A measurement, or what a satellite broadcast, and when it came."""
+
+    t_arrival_ns: int
+    measurement: Measurement | RawEvent
+
+
+def source_of(kind: str, config: Config) -> str:
+    """The source that a file's measurements are taken to come from.
+
+    The kind of the file (`gnss` for `nmea`); an attitude is a star tracker's where the
+    configuration has one and no [aiding.attitude], a bearing that of the configured radar, raw data
+    that of the section of kind `raw`.
+    """
+    sections: dict[str, type[Aiding]] = {
+        "attitude": StarTrackerAiding,
+        "bearing": SarAiding,
+        "raw": RawAiding,
+    }
+    wanted = sections.get(kind)
+    if wanted is None or kind in config.aiding:
+        return "gnss" if kind == "nmea" else kind
+    fallback = "sar" if kind == "bearing" else kind
+    return next((n for n, s in config.aiding.items() if isinstance(s, wanted)), fallback)
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * 1e9)
+
+
+_Read = tuple[list[Arrival], list[Rejection]]
+
+
+def _arrivals(
+    t_s: Array, t_arrival_s: Array, make: Callable[[int, int, int], Measurement]
+) -> list[Arrival]:
+    valid = np.rint(t_s * 1e9).astype(np.int64)
+    arrival = np.where(np.isnan(t_arrival_s), valid, np.rint(t_arrival_s * 1e9))
+    instants = zip(valid.tolist(), arrival.astype(np.int64).tolist(), strict=True)
+    return [Arrival(seen, make(i, t_ns, seen)) for i, (t_ns, seen) in enumerate(instants)]
+
+
+def _vector(row: list[float]) -> tuple[float, float, float] | None:
+    x, y, z = row
+    return None if math.isnan(x + y + z) else (x, y, z)
+
+
+def _horizontal(row: list[float]) -> tuple[float, float, float | None] | None:
+    x, y, z = row
+    if math.isnan(x + y):
+        return None
+    return x, y, None if math.isnan(z) else z
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _read_gnss(path: Path, _: ImuTable, source: str) -> _Read:
+    table = read_gnss(path)
+    lat, lon, height = table.lat_rad.tolist(), table.lon_rad.tolist(), table.height_m.tolist()
+    quality = np.where(np.isnan(table.quality), 1, table.quality).astype(int).tolist()
+    sd, v, sd_v = table.sd_position.tolist(), table.v.tolist(), table.sd_v.tolist()
+
+    def fix(i: int, t_ns: int, seen: int) -> Measurement:
+        return PositionFix(
+            source,
+            seen,
+            MonotonicStamp(t_ns),
+            lat[i],
+            lon[i],
+            _or_none(height[i]),
+            quality=quality[i],
+            sd_ned_m=_vector(sd[i]),
+            v_ned_m_s=_horizontal(v[i]),
+            sd_v_ned_m_s=_horizontal(sd_v[i]),
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
+
+
+def _read_rdss(path: Path, _: ImuTable, source: str) -> _Read:
+    table = read_rdss(path)
+
+    def fix(i: int, t_ns: int, seen: int) -> Measurement:
+        return DelayedFix(
+            source,
+            seen,
+            MonotonicStamp(t_ns),
+            float(table.lat_rad[i]),
+            float(table.lon_rad[i]),
+            float(table.height_m[i]),
+            float(table.precision_class_m[i]),
+            bool(table.multi_value[i]),
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, fix), table.rejected
+
+
+def _read_attitude(path: Path, _: ImuTable, source: str) -> _Read:
+    table = read_attitude(path)
+
+    def attitude(i: int, t_ns: int, seen: int) -> Measurement:
+        roll, pitch, yaw = (float(a) for a in table.rpy[i])
+        sd_roll, sd_pitch, sd_yaw = (float(a) for a in table.sd_rpy[i])
+        return Attitude(
+            source, seen, MonotonicStamp(t_ns), (roll, pitch, yaw), (sd_roll, sd_pitch, sd_yaw)
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, attitude), table.rejected
+
+
+def _read_bearing(path: Path, _: ImuTable, source: str) -> _Read:
+    table = read_bearing(path)
+
+    def bearing(i: int, t_ns: int, seen: int) -> Measurement:
+        azimuth, elevation = (float(a) for a in table.angles[i])
+        lat, lon, height = (float(x) for x in table.point[i])
+        sd_azimuth, sd_elevation = (float(s) for s in table.sd[i])
+        sd = None if math.isnan(sd_azimuth) else (sd_azimuth, sd_elevation)
+        stamp, point = MonotonicStamp(t_ns), (lat, lon, height)
+        return Bearing(source, seen, stamp, azimuth, elevation, sd, "", point)
+
+    return _arrivals(table.t_s, table.t_arrival_s, bearing), table.rejected
+
+
+def _read_wheel(path: Path, _: ImuTable, source: str) -> _Read:
+    table = read_wheel(path)
+
+    def speed(i: int, t_ns: int, seen: int) -> Measurement:
+        return WheelSpeed(
+            source,
+            seen,
+            MonotonicStamp(t_ns),
+            float(table.speed_m_s[i]),
+            _or_none(float(table.sd_m_s[i])),
+        )
+
+    return _arrivals(table.t_s, table.t_arrival_s, speed), table.rejected
+
+
+def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
+    """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
+    maps to: GPS second of week (below 604800) or POSIX seconds."""
+    decoder = NmeaDecoder(source, NmeaDecoding(earliest_date=EARLIEST_DATE))
+    found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
+    of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    rows = []
+    for m in found:
+        if not isinstance(m, PositionFix) or not isinstance(m.stamp, UtcStamp):
+            continue
+        t_ns = m.stamp.utc_ns
+        if of_week:
+            t_ns = _ns(utc_ns_to_gps_week_seconds(t_ns))
+        rows.append(Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
+    if found and not rows:
+        raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
+    refused = [Rejection(0, name, f"{count} times") for name, count in decoder.counters.items()]
+    return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
+
+
+def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
+    """UBX or RTCM 3 as it came off the wire. An epoch's time is GPS time: the IMU's `t_s` must be
+    GPS second of week or POSIX seconds.
+
+    What the satellites broadcast is known from the first epoch on, as to a receiver that has been
+    on for some minutes: a recording that starts in the middle would take half a minute to several
+    to say it again.
+    """
+    decoder = RawDecoder(source, earliest=EARLIEST_DATE)
+    of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    epochs: list[Arrival] = []
+    broadcast: list[RawEvent] = []
+    for event in [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]:
+        if not isinstance(event, RawGnssEpoch):
+            broadcast.append(event)
+            continue
+        now = _ns(event.tow_s)
+        if not of_week and isinstance(event.stamp, UtcStamp):
+            now = event.stamp.utc_ns
+        epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
+    if not epochs:
+        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
+    refused = [
+        Rejection(0, name, f"{count} times")
+        for name, count in decoder.counters.items()
+        if count and name.endswith(_REFUSALS)
+    ]
+    first_ns = min(epoch.t_arrival_ns for epoch in epochs)
+    return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused
+
+
+READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
+    "gnss": _read_gnss,
+    "rdss": _read_rdss,
+    "attitude": _read_attitude,
+    "bearing": _read_bearing,
+    "wheel": _read_wheel,
+    "nmea": _read_nmea,
+    "raw": _read_raw,
+}

@@ -1,0 +1,1 @@
+"""Simulated satellites and receivers, their fixes and raw streams."""

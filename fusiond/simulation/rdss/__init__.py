@@ -1,0 +1,1 @@
+"""A simulated double-star centre and terminal."""

@@ -1,0 +1,1 @@
+"""Tight against loose coupling (paper 003)."""

@@ -1,0 +1,1 @@
+"""Federated filtering (paper 004)."""

@@ -1,0 +1,308 @@
+r"""Study `federated`: the four experiments of paper 004, and faults in one of three local filters.
+
+Experiments: `fusiond.studies.federated.papers` (1 to 3), `fusiond.studies.federated.platform` (4).
+Faults and honesty: `fusiond.studies.federated.runs`. A fault lasts 100 s; errors count from its
+start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
+is the median over the runs; a run in which it is not detected counts as later than any.
+
+The daemon believes a source again that its gate has refused for ten seconds
+(`fusiond.navigator.timeline`), because a filter that trusts nobody cannot recover; a persistent
+fault enters a centralised filter that way. `rms_centralised_gate_only_m` is without that rule.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from os import cpu_count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.federated.options import FederatedOptions
+from fusiond.studies.federated import papers, platform
+from fusiond.studies.federated.runs import (
+    DRIFT_M_S,
+    DURATION_S,
+    EQUAL_M,
+    FAULT_END_S,
+    FAULT_START_S,
+    NEES_DOF,
+    STEP_M,
+    UNEQUAL_M,
+    WORKERS,
+    FaultKind,
+    Filter,
+    Trace,
+    grid,
+    monte_carlo,
+)
+from fusiond.studies.rdss.study import nees_interval
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+DEFAULT_RUNS = 50
+PAPER = {
+    "source": "paper 004: experiments 1 to 4, shown as pictures without figures",
+    "experiments": ["random truth", "constant truth", "two sensors", "active and passive"],
+}
+FAULTS: tuple[FaultKind, ...] = ("step", "drift", "frozen")
+MODES = ("no_reset", "fusion_reset", "zero_reset", "rescale")
+HONEST_FROM_S = 20.0
+_CENTRALISED, _UNISOLATED, _GATE_ONLY = "centralised", "unisolated", "centralised_gate_only"
+FILTERS = (
+    *(Filter(mode, FederatedOptions(mode=mode)) for mode in MODES),  # type: ignore[arg-type]
+    Filter("adaptive", FederatedOptions(adaptive=True)),
+    Filter(_CENTRALISED),
+)
+FAULT_FILTERS = (
+    *FILTERS,
+    Filter(_UNISOLATED, FederatedOptions(fault_detection=False)),
+    Filter(_GATE_ONLY, recovers=False),
+)
+
+
+def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+    """The study with `runs` Monte Carlo runs (default 50) of everything. All repeats exactly."""
+    count = runs or DEFAULT_RUNS
+    if count < 2:
+        raise ValueError("runs must be at least 2")
+    done, total = 0, count * (len(FAULTS) + 3)
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    honest = {
+        name: _honesty(monte_carlo(FILTERS, "", sd_m, count, seed, step))
+        for name, sd_m in (("equal", EQUAL_M), ("unequal", UNEQUAL_M))
+    }
+    faults, series = {}, {}
+    for fault in FAULTS:
+        found = monte_carlo(FAULT_FILTERS, fault, EQUAL_M, count, seed, step)
+        faults[fault], series[fault] = _fault(found), _course(found)
+    result = {
+        "study": "federated",
+        "runs": count,
+        "seed": seed,
+        "paper": PAPER,
+        "experiments": {
+            "1_random_truth": papers.random_truth(count, seed),
+            "2_constant_truth": papers.constant_truth(count, seed),
+            "3_two_sensors": papers.two_sensors(count, seed),
+            "4_active_and_passive": platform.platform(_platform(count, seed, step)),
+        },
+        "sources_sd_m": {"equal": list(EQUAL_M), "unequal": list(UNEQUAL_M)},
+        "fault": {
+            "start_s": FAULT_START_S,
+            "end_s": FAULT_END_S,
+            "run_s": DURATION_S,
+            "step_m": STEP_M,
+            "drift_m_s": DRIFT_M_S,
+        },
+        "honesty": honest,
+        "faults": faults,
+        "series": {"t_s": grid()[0].tolist(), "horizontal_rms_m": series},
+    }
+    return {**result, "finding": _finding(result)}
+
+
+def _platform(count: int, seed: int, step: Callable[[], None]) -> list[dict[str, Array]]:
+    found = []
+    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, count)) as pool:
+        for one in pool.map(partial(platform.simulate, seed), range(count)):
+            found.append(one)
+            step()
+    return found
+
+
+def _horizontal(found: list[dict[str, Trace]], name: str) -> Array:
+    """Horizontal errors (runs, m) in metres."""
+    return np.array([np.hypot(*traces[name].error[:, 6:8].T) for traces in found])
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _honesty(found: list[dict[str, Trace]]) -> dict[str, Any]:
+    counted = grid()[0] >= HONEST_FROM_S
+    return {
+        "nees_dof": NEES_DOF,
+        "nees_interval": nees_interval(len(found), NEES_DOF),
+        "filters": {
+            name: {
+                "nees_mean": float(np.mean([traces[name].nees for traces in found])),
+                "horizontal_rms_m": _rms(_horizontal(found, name)[:, counted]),
+                "false_alarms": sum(traces[name].false_alarms for traces in found),
+            }
+            for name in found[0]
+        },
+    }
+
+
+def _fault(found: list[dict[str, Trace]]) -> dict[str, Any]:
+    counted = grid()[0] >= FAULT_START_S
+    rms = {name: _rms(_horizontal(found, name)[:, counted]) for name in found[0]}
+    modes = {
+        name: {
+            **_detected(found, name),
+            "rms_m": rms[name],
+            "false_alarms": sum(traces[name].false_alarms for traces in found),
+        }
+        for name in (*MODES, "adaptive")
+    }
+    return {
+        "detected_after_s": modes["no_reset"]["detected_after_s"],
+        "detected_rate": modes["no_reset"]["detected_rate"],
+        "rms_isolated_m": rms["no_reset"],
+        "rms_unisolated_m": rms[_UNISOLATED],
+        "rms_centralised_m": rms[_CENTRALISED],
+        "rms_centralised_gate_only_m": rms[_GATE_ONLY],
+        "modes": modes,
+    }
+
+
+def _detected(found: list[dict[str, Trace]], name: str) -> dict[str, Any]:
+    after = np.array([traces[name].isolated_s - FAULT_START_S for traces in found])
+    median = float(np.median(np.where(np.isnan(after), np.inf, after)))
+    return {
+        "detected_after_s": median if math.isfinite(median) else None,
+        "detected_rate": float(np.mean(~np.isnan(after))),
+    }
+
+
+def _course(found: list[dict[str, Trace]]) -> dict[str, list[float]]:
+    names = ("no_reset", "fusion_reset", _UNISOLATED, _CENTRALISED, _GATE_ONLY)
+    return {n: np.sqrt(np.mean(_horizontal(found, n) ** 2, axis=0)).tolist() for n in names}
+
+
+def _finding(result: dict[str, Any]) -> str:
+    parts = []
+    for name, f in result["faults"].items():
+        after = "never" if f["detected_after_s"] is None else f"after {f['detected_after_s']:g} s"
+        parts.append(
+            f"{name} {after}, {f['rms_isolated_m']:.2f} m with isolation, "
+            f"{f['rms_unisolated_m']:.1f} m without, {f['rms_centralised_m']:.1f} m centralised "
+            f"({f['rms_centralised_gate_only_m']:.2f} m if its gate never gives in)"
+        )
+    unequal = result["honesty"]["unequal"]
+    drift = result["faults"]["drift"]["modes"]["fusion_reset"]
+    low, high = unequal["nees_interval"]
+    late = drift["detected_after_s"]
+    sees = "never" if late is None else f"after {late:g} s"
+    return (
+        f"Three local filters, one faulty: {'; '.join(parts)}; without reset the NEES with unequal "
+        f"sources is {unequal['filters']['no_reset']['nees_mean']:.1f} (centralised and fusion "
+        f"reset {unequal['filters']['fusion_reset']['nees_mean']:.1f}, {low:.1f} to {high:.1f} "
+        f"expected); fusion reset sees the drift {sees} and has {drift['rms_m']:.2f} m."
+    )
+
+
+# --------------------------------------------------------------------------- for people
+
+
+def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, header and rows of each part, for `fusiond study`."""
+    e = result["experiments"]
+    one, two = e["1_random_truth"], e["2_constant_truth"]
+    found = [
+        (
+            "1 random truth, 2 constant truth",
+            ["", "m"],
+            [
+                ["1: measured, RMS", f"{one['measured_rms_m']:.2f}"],
+                ["1: filtered, RMS", f"{one['filtered_rms_m']:.2f}"],
+                ["1: sigma stated", f"{one['filter_sigma_m']:.2f}"],
+                *(
+                    [f"2: RMS after {k} (theory {theory:.2f})", f"{rms:.2f}"]
+                    for k, rms, theory in zip(
+                        two["after_steps"], two["rms_m"], two["theory_m"], strict=True
+                    )
+                ),
+            ],
+        ),
+        (
+            "3 two sensors and their fusion",
+            ["", "RMS m", "sigma m", "NEES (2)"],
+            [
+                [name, *(f"{f[key]:.2f}" for key in ("rms_m", "sigma_m", "nees_mean"))]
+                for name, f in e["3_two_sensors"]["estimates"].items()
+            ],
+        ),
+        (
+            "4 active and passive receiver on one platform",
+            ["", "horizontal RMS m"],
+            [
+                [name.removesuffix("_rms_m"), f"{value:.2f}"]
+                for name, value in e["4_active_and_passive"].items()
+            ],
+        ),
+    ]
+    for name, honest in result["honesty"].items():
+        low, high = honest["nees_interval"]
+        found.append(
+            (
+                f"no fault, {name} sources; NEES of {honest['nees_dof']} within "
+                f"[{low:.2f}, {high:.2f}]",
+                ["", "horizontal RMS m", "NEES", "false alarms"],
+                [
+                    [
+                        n,
+                        f"{f['horizontal_rms_m']:.2f}",
+                        f"{f['nees_mean']:.2f}",
+                        str(f["false_alarms"]),
+                    ]
+                    for n, f in honest["filters"].items()
+                ],
+            )
+        )
+    for name, fault in result["faults"].items():
+        rows = [
+            [
+                mode,
+                "" if f["detected_after_s"] is None else f"{f['detected_after_s']:g}",
+                f"{f['rms_m']:.2f}",
+            ]
+            for mode, f in fault["modes"].items()
+        ]
+        rows.append(["no isolation", "", f"{fault['rms_unisolated_m']:.2f}"])
+        rows.append(["centralised", "", f"{fault['rms_centralised_m']:.2f}"])
+        gate_only = fault["rms_centralised_gate_only_m"]
+        rows.append(["centralised, gate for ever", "", f"{gate_only:.2f}"])
+        found.append((f"fault: {name}", ["", "isolated after s", "horizontal RMS m"], rows))
+    return found
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Experiments 1 and 2 as the paper's figures, and the courses of the faults, to `path`."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+
+    figure = Figure(figsize=(9.0, 13.0), layout="constrained")
+    axes = figure.subplots(5, 1)
+    for panel, key in zip(axes[:2], ("1_random_truth", "2_constant_truth"), strict=True):
+        for name, values in result["experiments"][key]["series"].items():
+            panel.plot(values, linewidth=0.6 if name == "measured" else 1.6, label=name)
+        panel.set_title(f"experiment {key.replace('_', ' ')}", loc="left")
+        panel.set_xlabel("step")
+        panel.set_ylabel("m")
+    for panel, fault in zip(axes[2:], FAULTS, strict=True):
+        for name, values in result["series"]["horizontal_rms_m"][fault].items():
+            panel.plot(result["series"]["t_s"], values, label=name.replace("_", " "))
+        panel.axvspan(result["fault"]["start_s"], result["fault"]["end_s"], alpha=0.1)
+        panel.set_yscale("log")
+        panel.set_ylim(top=10.0 * panel.get_ylim()[1])  # room for the legend
+        panel.set_title(f"fault in one of three sources: {fault}", loc="left")
+        panel.set_xlabel("s")
+        panel.set_ylabel("horizontal RMS, m")
+    for panel in axes:
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize="small", ncols=5, loc="upper left")
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,1 @@
+"""Multi-scale block filtering (paper 001)."""

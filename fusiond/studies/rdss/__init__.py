@@ -1,0 +1,1 @@
+"""Delayed double-star fixes (paper 000)."""

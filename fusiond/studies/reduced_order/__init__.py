@@ -1,0 +1,1 @@
+"""23 states against 17 (paper 002)."""

@@ -1,0 +1,187 @@
+r"""What a step costs in studies `reduced-order` and `ins-gnss-sar`, as CPU time.
+
+`step`: the filter's own recursion, as paper 002 times it: the covariance propagated once, then the
+epoch's ranges, rates (of four satellites or of all in view) and two angles gated, folded in and fed
+back. These are the live filter's kernels, called from compiled code: no INS, no geometry, no
+Python, and no judgement of single ranges (`fusiond.estimators.screening`), which the paper's filter
+does not have.
+
+`live second`: a second of the running filter (`KalmanEstimator`): 100 IMU samples through the
+strapdown equations and the covariance, rows computed from satellites and radar point, every range
+judged, update. What does not depend on the number of states is most of it.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections.abc import Callable
+from functools import cache
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import State
+from fusiond.estimators.covariance import covariance_for, work_size
+from fusiond.estimators.update import fuse
+from fusiond.models.model import Model
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import COEFFICIENTS, WIDTHS, coefficients
+from fusiond.navigation.strapdown import STEP_SIZE
+from fusiond.studies.reduced_order import flight
+from fusiond.studies.reduced_order.runs import started
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+IMU_RATE_HZ = 100.0
+"""The live rate that the system is built for."""
+LIVE_S = 30
+RECURSIONS = 1000
+"""Timed at once: some milliseconds, long against the resolution of the clock."""
+ROUNDS = 45
+
+_covariance_narrow, _covariance_middle = (covariance_for(w) for w in WIDTHS[:2])
+
+
+class Cost(NamedTuple):
+    """CPU seconds of a recursion and of a live second."""
+
+    step_s: float
+    live_second_s: float
+
+
+@cache
+def _recursions_for(width: int) -> Callable[..., None]:
+    """`recursions` for covariances of `width` rows, one of the first two of WIDTHS."""
+    narrow = width == WIDTHS[0]
+
+    @compiled(
+        "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
+        "f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
+    )
+    def recursions(
+        count: int,
+        cov: Array,
+        step: Array,
+        c: Array,
+        h: float,
+        active: NDArray[np.bool_],
+        sensor_terms: Indices,
+        rate_terms: Indices,
+        noise: Array,
+        work: Array,
+        rows: Array,
+        r: Array,
+        nav: Array,
+        xi: Array,
+    ) -> None:
+        """`count` times: `cov` over h seconds, then `rows` (m, n) with variances `r` (m,)."""
+        z, y, dx = np.zeros(r.shape[0]), np.zeros(r.shape[0]), np.zeros(xi.shape[0])
+        for _ in range(count):
+            if narrow:
+                _covariance_narrow(
+                    cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
+                )
+            else:
+                _covariance_middle(
+                    cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
+                )
+            fuse(nav, xi, cov, dx, z, rows, r, math.inf, False, y)
+
+    return recursions
+
+
+def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
+    """A function that times the recursion of a model: CPU seconds of one."""
+    nav = flight.true_nav(flight.truth(float(LIVE_S)))[1]
+    scene = flight.scenes(float(LIVE_S), all_in_view)[0]
+    state = State(nav, np.zeros(of.size), np.zeros(STEP_SIZE), of)
+    _, rows, r = flight.rows(flight.aids(scene, np.zeros(scene.rows)), state)
+    step, c = level_step(nav), np.zeros(COEFFICIENTS)
+    h = 1.0 / IMU_RATE_HZ
+    coefficients(nav, step, h, c)
+    kernel, width = _recursions_for(of.width), of.width
+    p = np.zeros((width, width))
+    p[: of.size, : of.size] = np.diag(flight.initial_sd(of) ** 2)
+
+    def timed() -> float:
+        cov, work, xi = p.copy(), np.zeros(work_size(width)), np.zeros(of.size)
+        start = time.process_time_ns()
+        kernel(
+            *(RECURSIONS, cov, step, c, h),
+            *(of.active, of.sensor_terms, of.rate_terms, of.noise, work),
+            *(rows, r, nav.copy(), xi),
+        )
+        return (time.process_time_ns() - start) * 1e-9 / RECURSIONS
+
+    return timed
+
+
+def level_step(nav: Array) -> Array:
+    """What a strapdown step (18,) leaves in level flight at a constant velocity, nearly."""
+    state = State(nav, np.zeros(0), np.zeros(0), flight.model("ins17"))
+    step = np.zeros(STEP_SIZE)
+    step[2] = step[8] = -9.8
+    step[9:] = state.dcm.ravel()
+    return step
+
+
+def _live_second(of: Model, all_in_view: bool) -> Callable[[], float]:
+    """A function that times the running filter: CPU seconds of a second of flight."""
+    path = flight.truth(float(LIVE_S), IMU_RATE_HZ)
+    nav = flight.true_nav(path)
+    buffer = flight.imu_buffer(np.hstack([path.gyro, path.accel]), IMU_RATE_HZ)
+    true = State(nav[1], np.zeros(of.size), np.zeros(STEP_SIZE), of)
+    given = [
+        flight.measured(scene, true._replace(nav=nav[k + 1]), np.zeros(scene.rows))
+        for k, scene in enumerate(flight.scenes(float(LIVE_S), all_in_view))
+    ]
+
+    def timed() -> float:
+        estimator = started(of, nav[0])
+        start = time.process_time_ns()
+        for aids in given:
+            estimator.propagate(buffer, aids[0].t_ns)
+            for aid in aids:
+                estimator.update(aid)
+        return (time.process_time_ns() - start) * 1e-9 / len(given)
+
+    return timed
+
+
+def costs(
+    models: dict[str, Model], rounds: int = ROUNDS, all_in_view: bool = False
+) -> dict[str, Cost]:
+    """Medians over `rounds` of recursions, then over a third as many of live seconds.
+
+    The filters take turns, so that a processor which changes its clock changes it for all.
+    """
+    recursions = {name: _recursion(of, all_in_view) for name, of in models.items()}
+    live = {name: _live_second(of, all_in_view) for name, of in models.items()}
+    steps, seconds = _in_turn(recursions, rounds), _in_turn(live, -(-rounds // 3))
+    return {name: Cost(steps[name], seconds[name]) for name in models}
+
+
+def step_ratio(rounds: int = ROUNDS) -> float:
+    """Time of a step of 17 states over that of 23."""
+    models = {"17": flight.model("ins17"), "23": flight.model("ins23")}
+    steps = _in_turn({name: _recursion(of) for name, of in models.items()}, rounds)
+    return steps["17"] / steps["23"]
+
+
+def _in_turn(timed: dict[str, Callable[[], float]], rounds: int) -> dict[str, float]:
+    spent: dict[str, list[float]] = {name: [] for name in timed}
+    gc.collect()
+    for _ in range(rounds + 1):
+        for name, once in timed.items():
+            spent[name].append(once())
+    return {name: median(values[1:]) for name, values in spent.items()}  # the first warms caches
+
+
+# Compiled, or loaded from the cache, when this module is imported.
+for _width in WIDTHS[:2]:
+    _recursions_for(_width)

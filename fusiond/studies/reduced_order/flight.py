@@ -1,0 +1,284 @@
+r"""The flight of paper 002 (studies `reduced-order` and `ins-gnss-sar`): truth, satellites, radar
+points, and what is measured.
+
+Set-up: 120 deg E, 30 deg N, 1000 m, due east at 300 m/s for 4000 s, gyro 0.1 deg/h, accelerometer
+1e-4 g, pseudorange and its rate to the four satellites of best GDOP (or to all in view), SAR
+azimuth and elevation of known points. What the paper does not print is chosen here, each with its
+reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.bearing import BearingAid
+from fusiond.aiding.pseudorange import PseudorangeAid
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.estimators.base import ErrorStateFilter
+from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
+from fusiond.gnss.orbit import WEEK_S
+from fusiond.gnss.selection import best_four
+from fusiond.models.model import SAR_MISALIGNMENT, Model, make_model, misalignment
+from fusiond.navigation.earth import meridian_radius
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import quaternion_from_rpy
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.trajectories import Path, Profile
+from fusiond.studies.covariance_analysis import System
+
+Array = NDArray[np.float64]
+
+START = (30.0 * DEG, 120.0 * DEG, 1000.0)
+SPEED_M_S = 300.0
+DURATION_S = 4000.0
+ARC_SECOND = DEG / 3600.0
+
+IMU = Imu(
+    rate_hz=20.0,
+    gyro_noise_deg_sqrt_h=0.01,
+    accel_noise_m_s_sqrt_h=0.01,
+    gyro_bias_initial_deg_h=0.1,
+    gyro_bias_instability_deg_h=0.1,
+    accel_bias_initial_mg=0.1,
+    accel_bias_instability_mg=1e-9,
+    bias_correlation_s=3600.0,
+    gyro_scale_ppm=1e-6,
+    accel_scale_ppm=1e-6,
+)
+"""The paper's 0.1 deg/h for the constant and for the Markov part, its 1e-4 g for a constant bias.
+Correlation time of paper 000; white noise of a gyro of that grade (0.01 deg/sqrt(h)). Nothing
+changes along a straight flight, so 20 Hz serve."""
+
+RANGE_SD_M, RATE_SD_M_S = 5.0, 0.05
+"""Code with its atmosphere modelled, and Doppler."""
+BEARING_SD_RAD = 1e-3
+"""A resolution cell of some tens of metres at 30 km."""
+SAR_SD_RAD = 20.0 * ARC_SECOND
+"""Misalignment of the radar, one sigma an axis. The paper prints none; its azimuth error of 33 arc
+seconds cannot come out of a radar that is mounted less well than that."""
+
+EPOCH_NS = 1_000_000_000
+MASK_RAD = 10.0 * DEG
+CHOICE_S = 60.0
+"""The satellites are chosen anew this often."""
+WEEK = round(EPOCH_S / WEEK_S)
+POINT_SPACING_S = 150.0
+POINT_ASIDE_M = 30_000.0
+"""Radar points: 45 km apart, 30 km left and right of the track in turn, on the ground; the one that
+is abeam next or was last. Azimuth runs 37 deg to both sides of the beam."""
+LEAST_RANGE_M = 5_000.0
+GATE = 1.0
+"""No gate: no filter hides its errors by refusing measurements, and the analysis is linear."""
+
+INITIAL_ATTITUDE_SD = np.array([60.0, 60.0, 600.0]) * ARC_SECOND
+INITIAL_VELOCITY_SD_M_S = 0.5
+INITIAL_POSITION_SD_M = 20.0
+"""North, east, down: about what an alignment with such an IMU and a first fix leave (1e-4 g tilts
+by 20 arc seconds, 0.1 deg/h turns the azimuth by 1600; here a reference has helped)."""
+
+
+@lru_cache(maxsize=2)
+def truth(seconds: float, rate_hz: float = IMU.rate_hz) -> Truth:
+    """Level and due east."""
+    still = Profile([0.0], [0.0])
+    path = Path(Profile([0.0], [SPEED_M_S]), Profile([0.0], [0.5 * math.pi]), still)
+    return Truth(path, START, rate_hz, seconds)
+
+
+def true_nav(flight: Truth) -> Array:
+    """Navigation states (n + 1, 10) at 0, 1, ... s."""
+    states = flight.at(np.arange(round(flight.duration_s) + 1, dtype=np.float64))
+    q = np.array([quaternion_from_rpy(*rpy) for rpy in states.rpy])
+    return np.column_stack([states.position, states.v_ned, q])
+
+
+def model(name: str, sar_sd: float = SAR_SD_RAD, bias_as_noise: bool = False) -> Model:
+    """`ins23` or `ins17` with the study's IMU and radar.
+
+    With `bias_as_noise` the accelerometer biases are white noise to the filter, as paper 002 has it
+    for its 17 states: of density b^2 T, which over one step T adds the same velocity variance as
+    the bias b does.
+    """
+    noise = imu_noise(IMU)
+    if bias_as_noise:
+        step_s = EPOCH_NS * 1e-9
+        noise = replace(
+            noise,
+            force_noise=math.hypot(noise.force_noise, noise.force_bias_initial * math.sqrt(step_s)),
+        )
+    return make_model(name, noise, misalignment(SAR_MISALIGNMENT, sar_sd))
+
+
+def filters(sar_sd: float = SAR_SD_RAD) -> dict[str, Model]:
+    """The filters compared; the first describes the truth.
+
+    `17_bare` takes no notice of the accelerometer biases, `17` has them as white noise.
+    """
+    return {
+        "23": model("ins23", sar_sd),
+        "17": model("ins17", sar_sd, bias_as_noise=True),
+        "17_bare": model("ins17", sar_sd),
+    }
+
+
+def initial_sd(of: Model) -> Array:
+    """One sigma (n,) at the start."""
+    sd = of.initial.copy()
+    sd[0:3], sd[3:6] = INITIAL_ATTITUDE_SD, INITIAL_VELOCITY_SD_M_S
+    sd[6:9] = INITIAL_POSITION_SD_M
+    return sd
+
+
+class Scene(NamedTuple):
+    """What can be measured at an instant: n satellites (n, 3), ECEF, their places `at` (n,) in the
+    constellation, and a point for the radar.
+
+    Geometry of one instant: truth and filter leave the flight time of the signal out alike.
+    """
+
+    t_ns: int
+    names: tuple[str, ...]
+    at: list[int]
+    position: Array
+    velocity: Array
+    point: Vector3
+
+    @property
+    def rows(self) -> int:
+        """n ranges, n rates, azimuth, elevation."""
+        return 2 * len(self.names) + 2
+
+    def noise(self, drawn: Array) -> Array:
+        """Noise (rows,) out of that of all the constellation (DRAWN, 2): a satellite's is the same
+        whichever others are used."""
+        return np.concatenate([drawn[self.at, 0], drawn[self.at, 1], drawn[-1]])
+
+
+Aids = tuple[PseudorangeAid, BearingAid]
+DRAWN = len(list(beidou_slots())) + 1
+"""Pairs of noise an epoch: range and rate of each satellite, then azimuth and elevation."""
+
+
+@lru_cache(maxsize=4)
+def scenes(seconds: float, all_in_view: bool = False) -> tuple[Scene, ...]:
+    """One for each second of the flight, from 1 s on: the best four, or all above the mask."""
+    nav = true_nav(truth(seconds))
+    sky_of = Constellation(constellation(WEEK, 0.0, ("C",)))
+    names: tuple[str, ...] = ()
+    found = []
+    for k in range(1, len(nav)):
+        lat, lon, height = (float(x) for x in nav[k, :3])
+        sky = sky_of.line_of_sight(lat, lon, height, WEEK * WEEK_S + k)
+        if (k - 1) % CHOICE_S == 0:
+            up = sky.above(MASK_RAD)
+            best = best_four(up.unit_ned)
+            if best is None:
+                raise ValueError(f"no four satellites at {k} s")
+            names = up.satellites if all_in_view else tuple(up.satellites[i] for i in best[0])
+        at = [sky.satellites.index(name) for name in names]
+        position, velocity = sky.position_ecef_m[at], sky.velocity_ecef_m_s[at]
+        found.append(Scene(k * EPOCH_NS, names, at, position, velocity, _point(nav, k)))
+    return tuple(found)
+
+
+def _point(nav: Array, k: int) -> Vector3:
+    """The radar point abeam of the middle of the stretch that second k lies in."""
+    number = int(k // POINT_SPACING_S)
+    # Due east at a constant speed: longitude grows evenly.
+    rate = (nav[-1, 1] - nav[0, 1]) / (len(nav) - 1)
+    lon = nav[0, 1] + rate * (number + 0.5) * POINT_SPACING_S
+    aside = POINT_ASIDE_M if number % 2 else -POINT_ASIDE_M
+    return (float(nav[0, 0] + aside / meridian_radius(nav[0, 0])), float(lon), 0.0)
+
+
+def aids(scene: Scene, values: Array) -> Aids:
+    """The epoch's aids with measured `values` (rows,): ranges, rates, azimuth, elevation."""
+    n = len(scene.names)
+    ranges = PseudorangeAid(
+        "gnss",
+        scene.t_ns,
+        GATE,
+        scene.names,
+        scene.position,
+        scene.velocity,
+        values[:n],
+        values[n : 2 * n],
+        np.full(n, RANGE_SD_M**2),
+        np.full(n, RATE_SD_M_S**2),
+        np.zeros(n, dtype=np.int64),
+    )
+    bearing = BearingAid(
+        "sar",
+        scene.t_ns,
+        GATE,
+        float(values[-2]),
+        float(values[-1]),
+        (BEARING_SD_RAD, BEARING_SD_RAD),
+        scene.point,
+        (0.0, 0.0, 0.0),
+        LEAST_RANGE_M,
+        block=SAR_MISALIGNMENT,
+    )
+    return ranges, bearing
+
+
+def rows(of: Aids, state: State) -> Innovation:
+    """The rows of both aids, one below the other."""
+    found = [aid.innovation(state) for aid in of]
+    refused = [f.outcome for f in found if isinstance(f, NotApplicable)]
+    if refused:
+        raise ValueError(f"a measurement of the flight does not apply: {refused}")
+    z, h, r = zip(*found, strict=True)
+    return Innovation(np.concatenate(z), np.vstack(h), np.concatenate(r))
+
+
+def measured(scene: Scene, true: State, noise: Array) -> Aids:
+    """What is measured in the `true` state, its parameters among it; `noise` (rows,) in sigmas."""
+    z, _, r = rows(aids(scene, np.zeros(scene.rows)), true)  # of measured zeros: what is predicted
+    return aids(scene, z + np.sqrt(r) * noise)
+
+
+def imu_buffer(samples: Array, rate_hz: float = IMU.rate_hz) -> ImuBuffer:
+    """A buffer that holds all samples (n, 6)."""
+    buffer = ImuBuffer(rate_hz, len(samples) / rate_hz, np.eye(3), 0.0, IMU.gap_s)
+    times = np.arange(1, len(samples) + 1, dtype=np.int64) * round(1e9 / rate_hz)
+    buffer.append(times, samples)
+    return buffer
+
+
+class _Transitions(ErrorStateFilter):
+    """The filters' own propagation, asked for the transition and noise of a second."""
+
+    def over_a_second(self, buffer: ImuBuffer, nav: Array, second: int) -> tuple[Array, Array]:
+        """Transition (n, n) and noise (n, n) from `second` on, from the true state (10,) there."""
+        n, width = self.model.size, self.model.width
+        self.nav[:], self.t_ns = nav, second * EPOCH_NS
+        self.sample = round(second * IMU.rate_hz)
+        self._phi = np.eye(width)
+        self._phi[n:] = 0.0
+        self._covs[:] = 0.0
+        self.propagate(buffer, self.t_ns + EPOCH_NS)
+        return self._phi[:n, :n].copy(), self._covs[0, :n, :n].copy()
+
+
+def systems(of: Model, seconds: float) -> Iterator[System]:
+    """The linear model of each second along the true flight, as the filter would have it there."""
+    flight = truth(seconds)
+    nav = true_nav(flight)
+    buffer = imu_buffer(np.hstack([flight.gyro, flight.accel]))
+    transitions = _Transitions(of, IMU.gap_s)
+    xi = np.zeros(of.size)
+    for k, scene in enumerate(scenes(seconds)):
+        phi, q = transitions.over_a_second(buffer, nav[k], k)
+        state = State(nav[k + 1], xi, transitions.step, of)
+        _, h, r = rows(aids(scene, np.zeros(scene.rows)), state)
+        yield System(phi, q, h, r)

@@ -1,0 +1,108 @@
+"""Attitude and velocity sigmas of paper 002's flight, for JSON, tables and pictures.
+
+East, north, up, as the paper has them: attitude in arc seconds, velocity in m/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.studies.reduced_order.flight import ARC_SECOND
+
+Array = NDArray[np.float64]
+
+EAST_NORTH_UP = [1, 0, 2]
+AXES = ("E", "N", "U")
+HEADER = ["", *(f'phi {a} "' for a in AXES), *(f"dV {a} m/s" for a in AXES), "us/step"]
+KEYS = ("attitude_sigma_arcsec", "velocity_sigma_m_s")
+BELIEVED = ("believed_attitude_sigma_arcsec", "believed_velocity_sigma_m_s")
+
+PAPER: dict[str, Any] = {
+    "source": "paper 002, tables 1 and 2: 120 E, 30 N, 1000 m, due east, 300 m/s, 4000 s",
+    "models": {
+        "23": {
+            "attitude_sigma_arcsec": [33.11, 36.25, 33.08],
+            "velocity_sigma_m_s": [0.023, 0.0163, 0.002],
+            "time_per_step_us": 110_000,
+        },
+        "17": {
+            "attitude_sigma_arcsec": [36.52, 65.62, 56.11],
+            "velocity_sigma_m_s": [0.0609, 0.0384, 0.008],
+            "time_per_step_us": 50_000,
+        },
+    },
+    "time_ratio": 0.45,
+    "not_printed": "measurement noise, radar misalignment, white IMU noise, initial sigma",
+}
+
+
+def east_north_up(p: Array) -> tuple[list[float], list[float]]:
+    """Attitude (arc seconds) and velocity (m/s), one sigma each, of a covariance (n, n)."""
+    sd = np.sqrt(np.diag(p)[:6])
+    attitude = sd[:3][EAST_NORTH_UP] / ARC_SECOND
+    return attitude.tolist(), sd[3:6][EAST_NORTH_UP].tolist()
+
+
+def sigmas(p: Array, keys: tuple[str, str] = KEYS) -> dict[str, list[float]]:
+    """The two figures of a covariance (n, n)."""
+    return dict(zip(keys, east_north_up(p), strict=True))
+
+
+def list_of(values: Sequence[float], digits: int) -> str:
+    """Figures of the axes, in a sentence."""
+    return "/".join(f"{v:.{digits}f}" for v in values)
+
+
+def sigma_cells(of: dict[str, Any], keys: tuple[str, str] = KEYS) -> list[str]:
+    """Six cells of a row under `HEADER`."""
+    attitude, velocity = keys
+    return [*(f"{v:.2f}" for v in of[attitude]), *(f"{v:.4f}" for v in of[velocity])]
+
+
+def paper_rows() -> list[list[str]]:
+    """Rows under `HEADER`."""
+    return [
+        [f"{name} paper", *sigma_cells(of), f"{of['time_per_step_us']:.0f}"]
+        for name, of in PAPER["models"].items()
+    ]
+
+
+def curves(of: Iterable[Array]) -> dict[str, list[list[float]]]:
+    """Both figures of covariances (n, n) over time, for `picture`."""
+    found = [east_north_up(p) for p in of]
+    return {key: [figures[k] for figures in found] for k, key in enumerate(KEYS)}
+
+
+def picture(series: dict[str, Any], path: Path) -> None:
+    """Sigmas over time: attitude left, velocity right, one row an axis; dashed what is believed.
+
+    `series`: instants `t_s`, and of each of `models` the `true` and the `believed` `curves` there.
+    """
+    from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
+
+    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
+    axes = figure.subplots(3, 2, sharex=True)
+    for column, (key, unit) in enumerate(zip(KEYS, ("arc seconds", "m/s"), strict=True)):
+        for row, axis in enumerate(AXES):
+            panel = axes[row, column]
+            for number, (name, found) in enumerate(series["models"].items()):
+                for what, line in (("true", "-"), ("believed", "--")):
+                    values = [sigma[row] for sigma in found[what][key]]
+                    label = f"{name.replace('_', ' ')} states" if what == "true" else None
+                    panel.plot(series["t_s"], values, line, color=f"C{number}", label=label)
+            for number, of in enumerate(PAPER["models"].values()):
+                panel.axhline(of[key][row], color=f"C{number}", linewidth=0.8, linestyle=":")
+            panel.set_yscale("log")
+            panel.set_ylabel(f"{axis}, {unit}")
+            panel.grid(alpha=0.3)
+    axes[0, 0].set_title("attitude, one sigma", loc="left")
+    axes[0, 1].set_title("velocity: dashed what is believed, dotted the paper's", loc="left")
+    axes[0, 1].legend(fontsize="small")
+    for panel in axes[2]:
+        panel.set_xlabel("s")
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,309 @@
+r"""Study `reduced-order`: paper 002, 23 states of INS/GNSS/SAR against 17.
+
+The flight is linearised second by second (`fusiond.studies.reduced_order.flight`); the covariance
+analysis (`fusiond.studies.covariance_analysis`) runs each filter's gain in the 23 states that
+describe the truth. Live filters on drawn errors (`fusiond.studies.reduced_order.runs`) hold it to
+the real thing. Sigmas are those of the *true* error at the end of the flight, east, north, up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from fusiond.configuration.settings import DEG
+from fusiond.models.model import Model
+from fusiond.studies.covariance_analysis import Result, System, analyse
+from fusiond.studies.observability import Epoch, Observability, observability
+from fusiond.studies.reduced_order import flight
+from fusiond.studies.reduced_order.cost import IMU_RATE_HZ, costs
+from fusiond.studies.reduced_order.report import (
+    BELIEVED,
+    EAST_NORTH_UP,
+    HEADER,
+    PAPER,
+    curves,
+    list_of,
+    paper_rows,
+    picture,
+    sigma_cells,
+    sigmas,
+)
+from fusiond.studies.reduced_order.runs import Flown, combinations, monte_carlo, nees
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+DEFAULT_RUNS = 40
+CONFIDENCE = 0.99
+SERIES_EVERY_S = 20
+WEAKEST = 6
+COARSE_SAR_RAD = 0.1 * DEG
+"""The models' own default for a radar mounted mechanically."""
+VALIDATION_S = 600.0
+CHECKED_S = 100
+"""Errors of the live filters are taken at every 100th second."""
+
+
+def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+    """The study; `runs` (default 40) live flights of 600 s check the covariance analysis.
+
+    All but times repeat exactly.
+    """
+    count = DEFAULT_RUNS if runs is None else runs
+    if count < 2:
+        raise ValueError("runs must be at least 2")
+    steps, done = 3 + count, 0
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, steps)
+
+    models = flight.filters()
+    fine = _analysis(models, flight.DURATION_S)
+    advance()
+    coarse = _analysis(flight.filters(COARSE_SAR_RAD), flight.DURATION_S)
+    advance()
+    short = _analysis(models, VALIDATION_S)
+    flown = monte_carlo(models, VALIDATION_S, CHECKED_S, count, seed, advance)
+    validation = _validation(models, short, flown)
+    times = costs(models)
+    advance()
+    result: dict[str, Any] = {
+        "study": "reduced-order",
+        "runs": count,
+        "seed": seed,
+        "duration_s": flight.DURATION_S,
+        "sar_misalignment_sd_arcsec": flight.SAR_SD_RAD / flight.ARC_SECOND,
+        "models": {
+            name: {
+                **_sigmas(fine[name]),
+                "time_per_step_us": times[name].step_s * 1e6,
+                "live_second_us": times[name].live_second_s * 1e6,
+            }
+            for name in models
+        },
+        "time_ratio": times["17"].step_s / times["23"].step_s,
+        "live_second_ratio": times["17"].live_second_s / times["23"].live_second_s,
+        "live_imu_rate_hz": IMU_RATE_HZ,
+        "observability": _observability(fine["23"]),
+        "variants": {
+            "sar_0.1_deg": {
+                "sar_misalignment_sd_arcsec": COARSE_SAR_RAD / flight.ARC_SECOND,
+                "models": {name: _sigmas(coarse[name]) for name in models},
+                "observability": _observability(coarse["23"]),
+            }
+        },
+        "validation": validation,
+        "series": _series(fine),
+        "paper": PAPER,
+    }
+    result["finding"] = _finding(result)
+    return result
+
+
+# --------------------------------------------------------------------------- analysis
+
+
+class Analysed:
+    """A filter over the flight: what the analysis gives at each second, and its linear model."""
+
+    def __init__(self, of: Model, kept: NDArray[np.int64], systems: list[System]) -> None:
+        self.model, self.kept, self.systems = of, kept, systems
+        self.results: list[Result] = []
+
+
+def _analysis(models: dict[str, Model], seconds: float) -> dict[str, Analysed]:
+    names = list(models)
+    full = models[names[0]]
+    truth = list(flight.systems(full, seconds))
+    initial = np.diag(flight.initial_sd(full) ** 2)
+    found = {}
+    for name, of in models.items():
+        # The same blocks of the full model, in the filter's order.
+        kept = np.array([slot for block in of.blocks for slot in full.slots_of(block.name)])
+        own = truth if name == names[0] else list(flight.systems(of, seconds))
+        analysed = Analysed(of, kept, own)
+        believed = np.diag(flight.initial_sd(of) ** 2)
+        # The filter feeds back all that is a navigation error (its slots 0 to 8).
+        analysed.results = list(
+            analyse(zip(truth, own, strict=True), kept, initial, believed, np.arange(9))
+        )
+        found[name] = analysed
+    return found
+
+
+def _sigmas(of: Analysed) -> dict[str, Any]:
+    """True error and belief at the end."""
+    last = of.results[-1]
+    return {**sigmas(last.true), **sigmas(last.believed, BELIEVED)}
+
+
+def _series(found: dict[str, Analysed]) -> dict[str, Any]:
+    """Sigmas over time: true and believed, for the picture."""
+    every = slice(SERIES_EVERY_S - 1, None, SERIES_EVERY_S)
+    seconds = np.arange(1, len(found["23"].results) + 1)[every]
+    out: dict[str, Any] = {"t_s": seconds.tolist(), "models": {}}
+    for name, of in found.items():
+        chosen = of.results[every]
+        out["models"][name] = {
+            "true": curves([r.true for r in chosen]),
+            "believed": curves([r.believed for r in chosen]),
+        }
+    return out
+
+
+def state_names(of: Model) -> list[str]:
+    """Names (n,) in the order of the slots."""
+    return [f"{block.name}.{state}" for block in of.blocks for state in block.states]
+
+
+def _observability(of: Analysed) -> dict[str, Any]:
+    """Rank, weakest directions, and each state: share of its sigma that is left."""
+    names, sd = state_names(of.model), flight.initial_sd(of.model)
+    found: Observability = observability((Epoch(s.phi, s.h, s.r) for s in of.systems), sd)
+    filtered = np.sqrt(np.diag(of.results[-1].true)) / sd
+    return {
+        "states": len(names),
+        "rank": found.rank,
+        "informative": found.informative,
+        "weakest": [
+            {
+                "singular_value": d.singular,
+                "sigma_left": d.sigma_left,
+                "states": d.states(names),
+            }
+            for d in found.directions[-WEAKEST:]
+        ],
+        "sigma_left": {
+            name: {"without_process_noise": float(a), "filter_at_end": float(b)}
+            for name, a, b in zip(names, found.sigma_left, filtered, strict=True)
+        },
+        "not_estimated": found.not_estimated(names),
+    }
+
+
+# --------------------------------------------------------------------------- validation
+
+
+def _validation(
+    models: dict[str, Model], short: dict[str, Analysed], flown: dict[str, Flown]
+) -> dict[str, Any]:
+    """NEES of live filters against the analysis and against their own belief.
+
+    Averages over the runs at the last instant; instants of one run are not independent.
+    `rms_to_sigma`: east, north, up, RMS of the live errors over the analysis's sigma.
+    """
+    project = combinations(next(iter(models.values())))
+    runs = len(next(iter(flown.values())).error)
+    tail = 0.5 * (1.0 - CONFIDENCE)
+
+    def interval(dof: int) -> list[float]:
+        return [float(chi2.ppf(q, runs * dof)) / runs for q in (tail, 1.0 - tail)]
+
+    found: dict[str, Any] = {
+        "seconds": VALIDATION_S,
+        "nees_dof": len(project),
+        "nees_interval": interval(len(project)),
+        "rms_to_sigma_interval": [math.sqrt(x) for x in interval(1)],
+        "models": {},
+    }
+    for name, of in models.items():
+        at = [short[name].results[second - 1] for second in _checked()]
+        error = flown[name].error
+        true = np.array([project @ r.true @ project.T for r in at])
+        analysed = nees(error, true[None])
+        estimated = combinations(of).any(axis=1)
+        own = flown[name].believed[:, :, estimated][:, :, :, estimated]
+        believed = nees(error[:, :, estimated], own)
+        sd = np.sqrt(np.array([np.diag(p) for p in true]))
+        ratio = np.sqrt(np.mean(np.square(error / sd), axis=0))[-1]
+        found["models"][name] = {
+            "nees_mean": float(analysed[:, -1].mean()),
+            "nees_all_instants": float(analysed.mean()),
+            "believed_nees_per_dof": float(believed[:, -1].mean() / estimated.sum()),
+            "attitude_rms_to_sigma": ratio[:3][EAST_NORTH_UP].tolist(),
+            "velocity_rms_to_sigma": ratio[3:6][EAST_NORTH_UP].tolist(),
+        }
+    return found
+
+
+def _checked() -> range:
+    return range(CHECKED_S, round(VALIDATION_S) + 1, CHECKED_S)
+
+
+# --------------------------------------------------------------------------- for people
+
+
+def _finding(result: dict[str, Any]) -> str:
+    full, small, bare = (result["models"][k] for k in ("23", "17", "17_bare"))
+    seen = result["observability"]
+
+    return (
+        f"A step of the filter takes 17 states {result['time_ratio']:.2f} of the time of 23 (the "
+        f"paper: 0.45; a live second with INS and satellite geometry "
+        f"{result['live_second_ratio']:.2f}), and they err by "
+        f"{list_of(small['attitude_sigma_arcsec'], 1)} instead of "
+        f"{list_of(full['attitude_sigma_arcsec'], 1)} arc seconds and "
+        f"{list_of(small['velocity_sigma_m_s'], 3)} instead of "
+        f"{list_of(full['velocity_sigma_m_s'], 3)} m/s (east/north/up), the accelerometer biases "
+        f"being white noise to them; where nothing stands for the biases the vertical velocity "
+        f"errs by {bare['velocity_sigma_m_s'][2]:.2f} m/s while the filter believes "
+        f"{bare['believed_velocity_sigma_m_s'][2]:.3f}; of the 23 states the straight flight "
+        f"shows {seen['rank']} directions, and each that it hides joins attitude, misalignment of "
+        f"the radar and a level accelerometer bias, but it shows the gyro constants and the "
+        f"vertical accelerometer bias, which the paper drops too."
+    )
+
+
+def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Sigmas beside the paper's, observability, validation."""
+    found = []
+    cases = {"radar misalignment": result, **result["variants"]}
+    for case in cases.values():
+        rows = []
+        for name, figures in case["models"].items():
+            spent = f"{figures['time_per_step_us']:.1f}" if "time_per_step_us" in figures else ""
+            rows.append([f"{name} true error", *sigma_cells(figures), spent])
+            rows.append([f"{name} believes", *sigma_cells(figures, BELIEVED), ""])
+        rows.extend(paper_rows())
+        title = (
+            f"radar misalignment {case['sar_misalignment_sd_arcsec']:.0f} arc seconds: "
+            f"one sigma after {result['duration_s']:.0f} s"
+        )
+        found.append((title, HEADER, rows))
+        seen = case["observability"]
+        title = (
+            f"observability: rank {seen['rank']} of {seen['states']}, {seen['informative']} "
+            "directions better known than before; share of the initial sigma that is left"
+        )
+        states = [
+            [name, f"{left['without_process_noise']:.4f}", f"{left['filter_at_end']:.4f}"]
+            for name, left in seen["sigma_left"].items()
+        ]
+        found.append((title, ["state", "Gramian", "filter"], states))
+    checked = result["validation"]
+    low, high = checked["nees_interval"]
+    title = (
+        f"analysis against {result['runs']} live flights of {checked['seconds']:.0f} s: NEES of "
+        f"{checked['nees_dof']}, 99 % interval [{low:.2f}, {high:.2f}]"
+    )
+    rows = [
+        [name, f"{v['nees_mean']:.2f}", f"{v['believed_nees_per_dof']:.2f}"]
+        for name, v in checked["models"].items()
+    ]
+    found.append((title, ["", "NEES by the analysis", "NEES per state by its own P"], rows))
+    return found
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Sigmas over time, true and believed, beside the paper's."""
+    picture(result["series"], path)

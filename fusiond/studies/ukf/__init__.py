@@ -1,0 +1,1 @@
+"""The unscented filter against the extended one (paper 003)."""

@@ -1,0 +1,215 @@
+"""The console script as a person calls it: output, exit codes, no traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from tests.places import REPOSITORY
+
+FUSIOND = Path(sys.executable).with_name("fusiond")
+HEADER = "t_s,lat_deg,lon_deg,height_m,sd_n_m,sd_e_m,sd_d_m,status"
+
+
+def fusiond(*args: str | Path) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [FUSIOND, *args], capture_output=True, text=True, timeout=60, check=False, cwd=REPOSITORY
+    )
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def test_version_and_help() -> None:
+    assert fusiond("--version").stdout == f"fusiond {version('fusiond')}\n"
+    text = fusiond("--help").stdout
+    for command in ("run", "demo", "check", "doctor", "process", "simulate", "compare", "bench"):
+        assert command in text
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys, fusiond.commands.app; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert not {"numpy", "numba", "pydantic", "can", "fusiond.configuration.schema"} & set(
+        done.stdout.split()
+    )
+
+
+def test_check() -> None:
+    done = fusiond("check", "config/vehicle.toml")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == [
+        "config/vehicle.toml: ok, vehicle vehicle",
+        "  imu: driver can_imu",
+        "  gnss: driver nmea, aids as gnss",
+        "  rdss: driver rdss, aids as rdss",
+    ]
+
+
+@pytest.mark.parametrize("command", ["run", "check", "doctor"])
+def test_configuration_mistake_exits_78(tmp_path: Path, command: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text("[imu]\nrate_hz = -5\n")
+    done = fusiond(command, path)
+    assert (done.returncode, done.stdout) == (78, "")
+    assert done.stderr == f"{path}: imu.rate_hz = -5: expected a number above 0\n"
+
+
+def test_missing_configuration_exits_78(tmp_path: Path) -> None:
+    done = fusiond("run", tmp_path / "none.toml")
+    assert done.returncode == 78
+    assert "none.toml: No such file or directory" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "word"),
+    [
+        ("--aid=gnns=a.csv", "gnss, rdss, attitude, bearing, wheel"),
+        ("--aid=gnss", "KIND=FILE"),
+        ("--outage=5", "START:LENGTH"),
+        ("--outage=5:0", "LENGTH above 0"),
+        ("--outage=nan:5", "START:LENGTH"),
+    ],
+)
+def test_wrong_command_line_exits_2(option: str, word: str) -> None:
+    done = fusiond("process", "config/drive_0708.toml", "--imu", "imu.csv", option)
+    assert done.returncode == 2
+    assert word in done.stderr
+
+
+def write(path: Path, *rows: str) -> Path:
+    path.write_text("\n".join([HEADER, *rows]) + "\n")
+    return path
+
+
+def test_compare_prints_text_and_writes_json(tmp_path: Path) -> None:
+    solution = write(
+        tmp_path / "solution.csv",
+        "0,,,,,,,aligning",
+        "1,40,-105,10,1,1,1,navigating",
+        "2,40,-105,13,1,1,0,navigating",
+        "3,40,-105,13,1,1,1,navigating",
+        "3.5,40,-105,13,1,1,1,navigating",
+    )
+    truth = write(tmp_path / "truth.csv", "1,40,-105,10,,,,", "3.5,40,-105,10,,,,")
+    report = tmp_path / "report.json"
+    done = fusiond("compare", solution, truth, "--json", report)
+    assert done.returncode == 0
+    assert "line 4: sd_not_positive: sd_d_m = 0" in done.stderr
+    assert "2 epochs, 1.000 to 3.500 s; 0 not covered by the solution" in done.stdout
+    assert "\x1b" not in done.stdout
+    figures = json.loads(report.read_text())
+    assert figures["down_max_m"] == pytest.approx(3.0)
+    assert figures["yaw_rms_deg"] is None
+    piped = fusiond("compare", solution, truth, "--json", "-", "--after", "2")
+    assert json.loads(piped.stdout)["epochs"] == 1
+
+
+def test_compare_with_unusable_files_exits_65(tmp_path: Path) -> None:
+    solution = write(tmp_path / "solution.csv", "1,40,-105,10,1,1,1,navigating")
+    truth = write(tmp_path / "truth.csv", "9,40,-105,10,,,,")
+    done = fusiond("compare", solution, truth)
+    assert done.returncode == 65
+    assert "no common epoch" in done.stderr
+    done = fusiond("compare", solution, tmp_path / "none.csv")
+    assert done.returncode == 65
+    assert "none.csv: No such file or directory" in done.stderr
+
+
+def test_output_that_cannot_be_written_exits_74(tmp_path: Path) -> None:
+    solution = write(tmp_path / "solution.csv", "1,40,-105,10,1,1,1,navigating")
+    done = fusiond("compare", solution, solution, "--json", tmp_path / "no" / "report.json")
+    assert done.returncode == 74
+    assert "report.json: No such file or directory" in done.stderr
+
+
+def test_simulate_writes_what_the_readers_read(tmp_path: Path) -> None:
+    done = fusiond(
+        "simulate", "static", "--out", tmp_path / "sim", "--seed", "3", "--duration", "5"
+    )
+    assert done.returncode == 0, done.stderr
+    truth = tmp_path / "sim" / "truth.csv"
+    rows = len(truth.read_text().splitlines()) - 1
+    assert rows > 1
+    assert f"{truth}: {rows} rows" in done.stdout.splitlines()
+    same = fusiond("compare", truth, truth, "--json", "-")
+    assert json.loads(same.stdout)["horizontal_max_m"] == pytest.approx(0.0, abs=1e-6)
+    assert fusiond("simulate", "boat", "--out", tmp_path).returncode == 2
+
+
+@pytest.mark.parametrize("raw_format", ["ubx", "rtcm3"])
+def test_a_simulated_raw_stream_is_processed(tmp_path: Path, raw_format: str) -> None:
+    """Tightly coupled from the bytes of the simulated receiver, through 20 s with three satellites,
+    without any other aid."""
+    done = fusiond(
+        *("simulate", "drive", "--out", tmp_path, "--seed", "2", "--duration", "150"),
+        *("--gnss-raw", raw_format, "--gnss-mask", "canyon3:110:20"),
+    )
+    assert done.returncode == 0, done.stderr
+    config = tmp_path / "vehicle.toml"
+    config.write_text(
+        'vehicle = "simulated"\n[imu]\naxes = ["+x", "-y", "-z"]\n'
+        "[aiding.raw]\nlever_arm_m = [0.0, 0.0, -1.0]\n"
+    )
+    out, raw = tmp_path / "nav.csv", tmp_path / f"gnss.{raw_format}"
+    done = fusiond(
+        "process", config, "--imu", tmp_path / "imu.csv", "--aid", f"raw={raw}", "--out", out
+    )
+    assert done.returncode == 0, done.stderr
+    judged = fusiond("compare", out, tmp_path / "truth.csv", "--after", "20", "--json", "-")
+    report = json.loads(judged.stdout)
+    assert report["horizontal_rms_m"] < 2.0
+    bad = fusiond("simulate", "drive", "--out", tmp_path, "--gnss-mask", "cave:1:2")
+    assert bad.returncode == 2
+    assert "no mask 'cave'" in bad.stderr
+
+
+def test_process_names_what_it_rejected(tmp_path: Path) -> None:
+    assert fusiond("simulate", "static", "--out", tmp_path, "--duration", "20").returncode == 0
+    imu, gnss = tmp_path / "imu.csv", tmp_path / "gnss.csv"
+    lines = imu.read_text().splitlines()
+    lines[10] = lines[9]
+    lines[500] = lines[500].rpartition(",")[0] + ",nan"
+    imu.write_text("\n".join(lines) + "\n")
+    aid, out = f"gnss={gnss}", tmp_path / "solution.csv"
+    done = fusiond("process", "config/vehicle.toml", "--imu", imu, "--aid", aid, "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"imu: {len(lines) - 1} rows, 2 rejected" in done.stdout.splitlines()
+    assert "  line 11: time_repeated: " in done.stdout
+    assert "  line 501: not_finite: accel_z_m_s2 = nan" in done.stdout
+    assert out.read_text().startswith("t_s,lat_deg,")
+    piped = fusiond("process", "config/vehicle.toml", "--imu", imu, "--aid", aid, "--json", "-")
+    assert json.loads(piped.stdout)["files"]["imu"]["rejected"] == {
+        "time_repeated": 1,
+        "not_finite": 1,
+    }
+    assert "line 11" in piped.stderr
+    absent = fusiond("process", "config/vehicle.toml", "--imu", tmp_path / "none.csv")
+    assert (absent.returncode, absent.stdout) == (65, "")
+    assert "none.csv: No such file or directory" in absent.stderr
+
+
+def test_interrupt_exits_130(tmp_path: Path) -> None:
+    fifo = tmp_path / "truth.csv"
+    os.mkfifo(fifo)
+    # A suite that runs in the background ignores SIGINT, and hands that on.
+    command = ["env", "--default-signal=INT", FUSIOND, "compare", fifo, fifo]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=REPOSITORY)
+    writer = os.open(fifo, os.O_WRONLY)  # returns once the command waits for the file
+    try:
+        process.send_signal(signal.SIGINT)
+        _, text = process.communicate(timeout=30)
+    finally:
+        os.close(writer)
+        process.kill()
+        process.wait()
+    assert process.returncode == 130
+    assert "Traceback" not in text

@@ -1,0 +1,62 @@
+"""docs/configuration.md names every key of every section with its default."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from fusiond.configuration import aiding as config_aiding
+from fusiond.configuration import schema as config
+from tests.places import REPOSITORY
+
+PAGE = (REPOSITORY / "docs" / "configuration.md").read_text(encoding="utf-8")
+SECTIONS = {
+    "[imu]": config.Imu,
+    "[aiding.gnss]": config_aiding.GnssAiding,
+    "[aiding.raw]": config_aiding.RawAiding,
+    "[aiding.rdss]": config_aiding.RdssAiding,
+    "[aiding.attitude]": config_aiding.AttitudeAiding,
+    "[aiding.star_tracker]": config_aiding.StarTrackerAiding,
+    "[aiding.sar]": config_aiding.SarAiding,
+    "[aiding.heading]": config_aiding.HeadingAiding,
+    "[aiding.height]": config_aiding.HeightAiding,
+    "[aiding.wheel]": config_aiding.WheelAiding,
+    "[constraints.zero_velocity]": config.ZeroVelocity,
+    "[constraints.non_holonomic]": config.NonHolonomic,
+    "[alignment]": config.Alignment,
+    "[estimator]": config.Estimator,
+    "[estimator.multiscale]": config.Multiscale,
+    "[estimator.federated]": config.Federated,
+    "[estimator.unscented]": config.Unscented,
+    "[consistency]": config.ConsistencyTest,
+    "[scheduler]": config.Scheduler,
+    "[clock]": config.ClockOptions,
+    "[mqtt]": config.Mqtt,
+}
+
+
+@pytest.mark.parametrize("title", SECTIONS)
+def test_every_key_is_documented_with_its_default(title: str) -> None:
+    section = PAGE.split(f"## `{title}`", 1)[1].split("\n## ", 1)[0]
+    rows = dict(re.findall(r"^\| `(\w+)` \| (`[^`]*`|required) \|", section, flags=re.M))
+    fields = SECTIONS[title].model_fields
+    assert rows.keys() == fields.keys()
+    for name, field in fields.items():
+        value = field.get_default()
+        if isinstance(value, float | int) and not isinstance(value, bool):
+            assert float(rows[name].strip("`")) == value, name
+
+
+def test_every_section_is_in_the_list() -> None:
+    def sections(model: type[config_aiding.Section]) -> set[type]:
+        found = set()
+        for field in model.model_fields.values():
+            if isinstance(field.annotation, type) and issubclass(
+                field.annotation, config_aiding.Section
+            ):
+                found |= {field.annotation} | sections(field.annotation)
+        return found
+
+    listed = set(SECTIONS.values()) | {config.Constraints}
+    assert sections(config.Config) <= listed

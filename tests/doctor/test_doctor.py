@@ -1,0 +1,290 @@
+"""The doctor against simulated devices on ptys and virtual CAN: all well, and each fault."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import os
+import re
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import Config
+from fusiond.doctor import devices as doctor_devices
+from fusiond.doctor.doctor import doctor, examine
+from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.scenarios import SCENARIOS
+from fusiond.simulation.vehicle import SimulatedVehicle
+from tests.broker import Broker, free_port
+from tests.pty_device import Device
+
+SECONDS = 2.0
+
+
+def config(tmp_path: Path, port: int | None = None, **changes: Any) -> Config:
+    """A car on virtual CAN and ptys; its own channel, since virtual buses are shared."""
+    imu = {"driver": "can_imu", **SIM_IMU.model_dump(), "channel": str(tmp_path)}
+    gnss = {"driver": "nmea", "port": str(tmp_path / "gnss")}
+    rdss = {"driver": "rdss", "port": str(tmp_path / "rdss")}
+    data = {
+        "imu": {"axes": ["+x", "-y", "-z"], "rate_hz": 100.0},
+        "sources": {"imu": imu, "gnss": gnss, "rdss": rdss},
+        "mqtt": {"enabled": port is not None, "host": "127.0.0.1", "port": port or 1883},
+    }
+    return Config.model_validate({**data, **changes})
+
+
+@asynccontextmanager
+async def vehicle(tmp_path: Path) -> AsyncIterator[SimulatedVehicle]:
+    scenario = SCENARIOS["static"]
+    car = SimulatedVehicle(
+        replace(scenario, rdss=replace(scenario.rdss, service_frequency_s=1)),
+        duration_s=60.0,
+        can_imu=SIM_IMU.model_copy(update={"channel": str(tmp_path)}),
+        gnss_link=tmp_path / "gnss",
+        rdss_link=tmp_path / "rdss",
+    )
+    task = asyncio.create_task(car.run())
+    await asyncio.sleep(0)
+    try:
+        yield car
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def report(config: Config, seconds: float = SECONDS) -> tuple[int, str]:
+    out = io.StringIO()
+    code = await examine(config, seconds, out)
+    return code, out.getvalue()
+
+
+def without(config: Config, *names: str) -> Config:
+    sources = {k: v for k, v in config.sources.items() if k not in names}
+    return config.model_copy(update={"sources": sources})
+
+
+async def test_all_is_well(tmp_path: Path) -> None:
+    with Broker(tmp_path) as broker:
+        async with vehicle(tmp_path):
+            code, text = await report(config(tmp_path, broker.port))
+    assert code == 0, text
+    assert text.endswith("all is well\n")
+    assert f"imu: can_imu on virtual {tmp_path}: running" in text
+    assert "ImuSample: " in text
+    assert "at rest: specific force 9.8" in text
+    assert "PositionFix: " in text
+    assert "gnss: nmea on " in text
+    assert "rdss_card: family 4.0" in text
+    assert "system clock minus GNSS" in text
+    assert "connected" in text
+    rates = [line for line in text.splitlines() if "ImuSample" in line]
+    assert 80.0 < float(rates[0].split(", ")[1].removesuffix(" Hz")) < 120.0
+
+
+async def test_ports_that_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "ttyUSB7").touch()
+    monkeypatch.setattr(doctor_devices, "SERIAL_PATTERNS", (str(tmp_path / "ttyUSB*"),))
+    code, text = await report(without(config(tmp_path), "imu"), 0.5)
+    assert code == 1
+    assert f"! {tmp_path}/gnss is not there" in text
+    assert f"! {tmp_path}/rdss is not there" in text
+    assert "correct port in [sources.gnss]" in text
+    assert f"there are {tmp_path}/ttyUSB7" in text
+    assert text.endswith("2 findings\n")
+
+
+def test_no_port_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_devices, "SERIAL_PATTERNS", ())
+    assert "there is no serial port at all" in doctor_devices.absent_port("gnss", "/dev/no", "")
+
+
+async def test_a_file_is_no_port(tmp_path: Path) -> None:
+    (tmp_path / "gnss").write_text("no terminal")
+    code, text = await report(without(config(tmp_path), "imu", "rdss"), 0.5)
+    assert code == 1
+    assert "gnss is not a serial port" in text
+
+
+def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root may open everything, so access(2) is told to refuse."""
+    monkeypatch.setattr(doctor_devices.os, "access", lambda path, mode: False)
+    text = doctor_devices.absent_port("gnss", "/dev/tty", "Permission denied")
+    group = doctor_devices.grp.getgrgid(os.stat("/dev/tty").st_gid).gr_name
+    assert "no permission for /dev/tty (crw" in text
+    assert f"usermod -aG {group} USER" in text
+
+
+async def test_port_in_use(tmp_path: Path) -> None:
+    async with vehicle(tmp_path):
+        both = config(tmp_path)
+        twice = {"gnss": both.sources["gnss"], "other": both.sources["gnss"]}
+        code, text = await report(both.model_copy(update={"sources": twice}))
+    assert code == 1
+    assert "is in use by another program" in text
+
+
+async def _sending(device: Device, data: Callable[[], bytes]) -> None:
+    while True:
+        await asyncio.sleep(0.05)
+        try:
+            device.send(data())
+        except BlockingIOError:
+            continue
+
+
+async def test_wrong_baud_rate(tmp_path: Path) -> None:
+    """NMEA read at another rate is bytes with broken framing."""
+    device = Device(tmp_path / "gnss")
+    device.plug()
+    sender = asyncio.create_task(_sending(device, lambda: bytes(range(128, 192))))
+    code, text = await report(without(config(tmp_path), "imu", "rdss"))
+    sender.cancel()
+    device.unplug()
+    assert code == 1
+    assert "115200 baud is probably not the device's rate" in text
+
+
+async def test_silent_line(tmp_path: Path) -> None:
+    device = Device(tmp_path / "gnss")
+    device.plug()
+    code, text = await report(without(config(tmp_path), "imu", "rdss"))
+    device.unplug()
+    assert code == 1
+    assert "nothing arrives in 2 s" in text
+
+
+async def test_terminal_that_does_not_answer(tmp_path: Path) -> None:
+    device = Device(tmp_path / "rdss")
+    device.plug()
+    sender = asyncio.create_task(_sending(device, lambda: b"\x00\xff" * 8))
+    code, text = await report(without(config(tmp_path), "imu", "gnss"))
+    sender.cancel()
+    device.unplug()
+    assert code == 1
+    assert "no terminal has answered yet" in text
+
+
+async def test_suppressed_terminal(tmp_path: Path) -> None:
+    async with vehicle(tmp_path) as car:
+        car.terminal.suppressed = True
+        code, text = await report(without(config(tmp_path), "imu", "gnss"))
+    assert code == 1
+    assert "the centre has switched the transmitter off" in text
+
+
+async def test_damaged_sentences(tmp_path: Path) -> None:
+    device = Device(tmp_path / "gnss")
+    device.plug()
+    sender = asyncio.create_task(_sending(device, lambda: b"$GNVTG,,T,,M,0.0,N,0.0,K,A*00\r\n"))
+    code, text = await report(without(config(tmp_path), "imu", "rdss"))
+    sender.cancel()
+    device.unplug()
+    assert code == 1
+    assert "wrong checksums against 0 sound" in text
+
+
+async def test_imu_that_says_nothing(tmp_path: Path) -> None:
+    code, text = await report(without(config(tmp_path), "gnss", "rdss"))
+    assert code == 1
+    assert "SIM_GYRO" in text
+    assert "check bit rate" in text
+
+
+async def test_can_interface_that_does_not_exist(tmp_path: Path) -> None:
+    base = config(tmp_path)
+    imu = base.sources["imu"].model_copy(update={"interface": "socketcan", "channel": "nocan7"})
+    code, text = await report(base.model_copy(update={"sources": {"imu": imu}}), 0.5)
+    assert code == 1
+    # A host without CAN in its kernel says so instead.
+    assert "nocan7 does not exist" in text or "no CAN" in text
+
+
+def test_can_interface_that_is_down() -> None:
+    options = SIM_IMU.model_copy(update={"interface": "socketcan", "channel": "can0"})
+    text = doctor_devices.absent_interface("imu", options, "can0 is down (ip link set can0 up)")
+    assert text.startswith("can0 is down: ip link set can0 up")
+
+
+def test_can_interfaces_are_listed_by_type(tmp_path: Path) -> None:
+    for name, kind in (("can1", "280"), ("eth0", "1"), ("vcan0", "280")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "type").write_text(kind + "\n")
+    assert doctor_devices.can_interfaces(tmp_path) == ["can1", "vcan0"]
+
+
+async def test_axes_that_do_not_fit_gravity(tmp_path: Path) -> None:
+    """The simulated unit has x forward, y left, z up; the configuration says z down."""
+    async with vehicle(tmp_path):
+        wrong = config(tmp_path, imu={"axes": ["+x", "+y", "+z"], "rate_hz": 100.0})
+        code, text = await report(without(wrong, "gnss", "rdss"))
+    assert code == 1
+    assert re.search(r"gravity lies 1[78]\d deg off", text)
+    assert "axes must end with '-z' (now '+z')" in text
+
+
+async def test_unit_and_rate_that_do_not_fit(tmp_path: Path) -> None:
+    async with vehicle(tmp_path):
+        base = config(tmp_path, imu={"axes": ["+x", "-y", "-z"], "rate_hz": 400.0})
+        # The device speaks m/s^2; read as g, rest would be 9.8 g.
+        imu = base.sources["imu"].model_copy(update={"accel_unit": "g"})
+        code, text = await report(base.model_copy(update={"sources": {"imu": imu}}))
+    assert code == 1
+    assert "[imu] rate_hz = 400" in text
+    assert "specific force at rest is 96." in text
+    assert "accel_unit" in text
+
+
+async def test_broker_that_is_not_there(tmp_path: Path) -> None:
+    port = free_port()
+    code, text = await report(config(tmp_path, port, sources={}), 0.5)
+    assert code == 1
+    assert f"is 127.0.0.1:{port} right?" in text
+    assert "none: add a [sources.NAME] section" in text
+
+
+async def test_broker_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusiond.doctor.doctor._BROKER_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        code, text = await report(config(tmp_path, mute.getsockname()[1], sources={}), 0.5)
+    assert code == 1
+    assert "is a broker running there" in text
+
+
+async def test_broker_that_wants_a_password(tmp_path: Path) -> None:
+    (tmp_path / "passwords").write_text("")
+    lines = ("allow_anonymous false", f"password_file {tmp_path / 'passwords'}")
+    with Broker(tmp_path, *lines) as broker:
+        code, text = await report(config(tmp_path, broker.port, sources={}), 0.5)
+    assert code == 1
+    assert "FUSIOND_MQTT_PASSWORD" in text
+
+
+async def test_system_clock_that_is_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Late:
+        """The system clock an hour behind."""
+
+        monotonic_ns = staticmethod(time.monotonic_ns)
+
+        @staticmethod
+        def realtime_ns() -> int:
+            return time.time_ns() - 3_600_000_000_000
+
+    monkeypatch.setattr("fusiond.doctor.doctor.Clock", lambda options: Clock(options, Late()))
+    async with vehicle(tmp_path):
+        code, text = await report(without(config(tmp_path), "imu", "rdss"))
+    assert code == 1
+    assert "the system clock is -3600.0 s off GNSS" in text
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor(config(tmp_path, sources={}), 0.1) == 1
+    assert "1 finding\n" in capsys.readouterr().out

@@ -1,0 +1,342 @@
+"""The real driver on real python-can buses, and the examples of the manual."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import re
+import socket
+import struct
+import subprocess
+import threading
+import tomllib
+from collections.abc import AsyncIterator, Callable, Iterator
+
+import can
+import pytest
+
+from drivers.can import bus as can_bus
+from drivers.can.bus import CanBus, CanFrame
+from drivers.can.errors import controller_state
+from drivers.can.imu import CanImuDriver, CanImuOptions
+from drivers.measurements import DeviceEvent, DeviceStamp, ImuSample, KernelStamp, Measurement
+from tests.places import REPOSITORY
+
+GROUP = "239.74.163.77"
+SBG = {
+    "dbc": "sbg_ellipse",
+    "gyro": ("IMU_GYRO.GYRO_X", "IMU_GYRO.GYRO_Y", "IMU_GYRO.GYRO_Z"),
+    "accel": ("IMU_ACCEL.ACCEL_X", "IMU_ACCEL.ACCEL_Y", "IMU_ACCEL.ACCEL_Z"),
+    "device_time": "IMU_INFO.TIME_STAMP",
+    "timeout_s": 0.2,
+}
+
+
+def sample_frames(k: int) -> list[can.Message]:
+    parts = (
+        (0x120, struct.pack("<IHh", 5000 * k, 0, 2500)),
+        (0x121, struct.pack("<3h", k % 1000, 2, 981)),
+        (0x122, struct.pack("<3h", k % 1000, 20, 350)),
+    )
+    return [can.Message(arbitration_id=i, data=d, is_extended_id=False) for i, d in parts]
+
+
+def error_frame(classes: int, detail: int = 0) -> can.Message:
+    return can.Message(
+        arbitration_id=classes,
+        data=bytes([0, detail, 0, 0, 0, 0, 0, 0]),
+        is_error_frame=True,
+        is_extended_id=False,
+    )
+
+
+class Running:
+    """A driver at work, with what it emitted."""
+
+    def __init__(self, **options: object) -> None:
+        self.emitted: list[Measurement | DeviceEvent] = []
+        self.driver = CanImuDriver(
+            "imu", CanImuOptions.model_validate({**SBG, **options}), self.emitted.append
+        )
+
+    @property
+    def samples(self) -> list[ImuSample]:
+        return [e for e in self.emitted if isinstance(e, ImuSample)]
+
+    @property
+    def codes(self) -> list[str]:
+        return [e.code for e in self.emitted if isinstance(e, DeviceEvent)]
+
+    @contextlib.asynccontextmanager
+    async def run(self) -> AsyncIterator[Running]:
+        task = asyncio.create_task(self.driver.run())
+        try:
+            await until(lambda: self.driver.status.state != "starting")
+            yield self
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10.0):
+        while not condition():  # noqa: ASYNC110 (nothing announces it)
+            await asyncio.sleep(0.005)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def multicast_route() -> Iterator[None]:
+    """A host without any network has no route for multicast: give the group one over loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            join = socket.inet_aton(GROUP) + socket.inet_aton("0.0.0.0")
+            probe.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, join)
+            probe.sendto(b"", (GROUP, 9))
+            added = False
+        except OSError:
+            subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+            subprocess.run(["ip", "route", "add", GROUP, "dev", "lo"], check=True)
+            added = True
+    yield
+    if added:
+        subprocess.run(["ip", "route", "del", GROUP, "dev", "lo"], check=True)
+
+
+@pytest.mark.parametrize(("interface", "channel"), [("virtual", "t-e2e"), ("udp_multicast", GROUP)])
+async def test_samples_silence_and_recovery(interface: str, channel: str) -> None:
+    async with Running(interface=interface, channel=channel).run() as imu:
+        with can.Bus(interface=interface, channel=channel, ignore_config=True) as sender:
+            for k in range(20):
+                for message in sample_frames(k):
+                    sender.send(message)
+                await asyncio.sleep(0.005)
+            await until(lambda: len(imu.samples) == 20)
+            assert imu.driver.status.state == "running"
+            assert [s.stamp for s in imu.samples] == [
+                DeviceStamp("imu", 5_000_000 * k) for k in range(20)
+            ]
+            assert imu.samples[7].gyro_rad_s == pytest.approx((0.007, 0.02, 0.35))
+            await until(lambda: imu.driver.status.state == "silent")
+            await until(lambda: "0x122 IMU_GYRO" in imu.driver.status.detail)
+            for message in sample_frames(100):
+                sender.send(message)
+            await until(lambda: imu.driver.status.state == "running")
+    assert imu.codes == []
+
+
+async def test_bus_stamps_are_reported() -> None:
+    imu = Running(interface="virtual", channel="t-stamp", timestamp="kernel", latency_s=0.003)
+    async with imu.run():
+        with can.Bus(interface="virtual", channel="t-stamp", ignore_config=True) as sender:
+            for message in sample_frames(1):
+                sender.send(message)
+            await until(lambda: bool(imu.samples))
+    (sample,) = imu.samples
+    assert isinstance(sample.stamp, KernelStamp)
+    assert sample.stamp.latency_s == 0.003
+
+
+async def test_error_frames_become_events_and_state() -> None:
+    async with Running(interface="virtual", channel="t-error", timeout_s=30.0).run() as imu:
+        with can.Bus(interface="virtual", channel="t-error", ignore_config=True) as sender:
+            for message in sample_frames(0):
+                sender.send(message)
+            for _ in range(3):
+                sender.send(error_frame(0x004, 0x20))
+            sender.send(error_frame(0x004, 0x01))
+            sender.send(error_frame(0x008 | 0x020 | 0x080))
+            sender.send(error_frame(0x040))
+            await until(lambda: "bus_off" in imu.codes)
+            assert imu.driver.status.state == "silent"
+            assert "left the bus" in imu.driver.status.detail
+            sender.send(error_frame(0x100))
+            for message in sample_frames(1):
+                sender.send(message)
+            await until(lambda: len(imu.samples) == 2)
+            assert imu.driver.status.state == "running"
+    assert imu.codes == ["error_passive", "bus_off", "error_active"]
+    counters = imu.driver.counters
+    assert counters["error_frames"] == 7
+    assert counters["error_controller"] == 4
+    assert counters["error_overflow"] == 1
+    for name in ("protocol", "no_acknowledge", "bus_error", "bus_off", "restarted"):
+        assert counters[f"error_{name}"] == 1
+
+
+async def test_a_shorted_bus_does_not_flood_the_operator() -> None:
+    async with Running(interface="virtual", channel="t-short").run() as imu:
+        with can.Bus(interface="virtual", channel="t-short", ignore_config=True) as sender:
+            for _ in range(50):
+                sender.send(error_frame(0x040))
+                sender.send(error_frame(0x100))
+            await until(lambda: imu.driver.counters["error_frames"] == 100)
+    assert imu.codes == ["bus_off", "error_active"]
+    assert imu.driver.counters["error_bus_off"] == 50
+
+
+def test_controller_state_of_error_frames() -> None:
+    assert controller_state(0x040, bytes(8)) == "bus_off"
+    assert controller_state(0x100, bytes(8)) == "active"
+    assert controller_state(0x004, bytes([0, 0x04])) == "warning"
+    assert controller_state(0x004, bytes([0, 0x10])) == "passive"
+    assert controller_state(0x004, bytes([0, 0x40])) == "active"
+    assert controller_state(0x004, b"") is None
+    assert controller_state(0x001, bytes(8)) is None
+
+
+async def test_garbage_on_the_wire_is_counted() -> None:
+    async with Running(interface="udp_multicast", channel=GROUP).run() as imu:
+        with (
+            can.Bus(interface="udp_multicast", channel=GROUP, ignore_config=True) as sender,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rough,
+        ):
+            for junk in (b"", b"\xff" * 40, b"\x81", b"not a frame"):
+                rough.sendto(junk, (GROUP, 43113))
+            for message in sample_frames(1):
+                sender.send(message)
+            await until(lambda: len(imu.samples) == 1)
+    assert imu.driver.counters["bad_datagrams"] == 4
+
+
+async def test_absent_interface_is_reported_once_and_tried_again() -> None:
+    async with Running(interface="socketcan", channel="fusiond-none").run() as imu:
+        await until(lambda: imu.driver.counters["bus_open_failed"] >= 2)
+        assert imu.driver.status.state == "absent"
+        assert "fusiond-none" in imu.driver.status.detail
+    assert imu.codes == ["interface_down"]
+
+
+async def test_a_bus_that_dies_is_closed_and_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fault of the bus itself, as a vanished interface raises it, on a descriptor that stays
+    readable: the reader must be taken off the loop, not called for ever."""
+    dead = threading.Event()
+    calls = 0
+    whole = can_bus.CanBus.read_message
+
+    def failing(self: CanBus, bus: can.BusABC, timeout_s: float) -> CanFrame | None:
+        nonlocal calls
+        if dead.is_set():
+            calls += 1
+            raise can_bus._BusFaultError(self._explain(OSError(errno.ENETDOWN, "down")))
+        return whole(self, bus, timeout_s)
+
+    monkeypatch.setattr(can_bus.CanBus, "read_message", failing)
+    async with Running(interface="udp_multicast", channel=GROUP).run() as imu:
+        with can.Bus(interface="udp_multicast", channel=GROUP, ignore_config=True) as sender:
+            for message in sample_frames(1):
+                sender.send(message)
+            await until(lambda: len(imu.samples) == 1)
+            dead.set()
+            sender.send(sample_frames(2)[0])
+            await until(lambda: imu.driver.status.state == "absent")
+            assert calls == 1
+            dead.clear()
+            await until(lambda: "interface_up" in imu.codes)
+            for message in sample_frames(3):
+                sender.send(message)
+            await until(lambda: len(imu.samples) == 2)
+    assert imu.codes == ["interface_down", "interface_up"]
+
+
+async def test_frames_of_the_kernel_layout_are_read_in_bounded_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """struct can_frame and canfd_frame off a descriptor, more of them than one turn takes."""
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+
+    class OneSocket(can.BusABC):
+        def __init__(self) -> None:
+            super().__init__(channel="pair")
+            self.socket = near
+
+        def fileno(self) -> int:
+            return near.fileno()
+
+        def send(self, msg: can.Message, timeout: float | None = None) -> None:
+            raise NotImplementedError
+
+    monkeypatch.setattr(can_bus.CanBus, "_open", lambda self: OneSocket())
+    frames: list[CanFrame] = []
+    links: list[bool] = []
+    bus = CanBus("socketcan", "pair")
+    task = asyncio.create_task(
+        bus.run(frames.append, lambda up, why: links.append(up), lambda state: None)
+    )
+    far.send(struct.pack("=IB3x8s", 0x80000000 | 0x18F02A80, 3, b"abcdefgh"))
+    far.send(struct.pack("=IBB2x64s", 0x7FF, 64, 0x04, bytes(range(64))))
+    far.send(struct.pack("=IB3x8s", 0x40000123, 8, bytes(8)))
+    far.send(struct.pack("=IB3x8s", 0x20000040, 8, bytes(8)))
+    for i in range(2 * can_bus.FRAMES_PER_WAKEUP):
+        far.send(struct.pack("=IB3x8s", i, 0, bytes(8)))
+        if i % 50 == 49:
+            await asyncio.sleep(0)
+    await until(lambda: len(frames) == 2 + 2 * can_bus.FRAMES_PER_WAKEUP)
+    assert frames[0][:3] == (0x18F02A80, True, b"abc")
+    assert frames[1][:3] == (0x7FF, False, bytes(range(64)))
+    assert bus.counters["remote_frames"] == 1
+    assert bus.counters["error_bus_off"] == 1
+    assert links == [True]
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    near.close()
+    far.close()
+
+
+async def test_a_slow_loop_costs_frames_that_are_counted() -> None:
+    frames: list[CanFrame] = []
+    bus = CanBus("virtual", "t-ring")
+    opened = asyncio.Event()
+    task = asyncio.create_task(
+        bus.run(frames.append, lambda up, why: opened.set(), lambda state: None)
+    )
+    await opened.wait()
+    sent = can_bus.RING_FRAMES + 500
+    with can.Bus(interface="virtual", channel="t-ring", ignore_config=True) as sender:
+        for i in range(sent):
+            sender.send(can.Message(arbitration_id=i % 2048, is_extended_id=False))
+        pause = threading.Event()
+        for _ in range(10_000):  # the loop stands still here, on purpose
+            if bus.counters["ring_overflow"] == 500:
+                break
+            pause.wait(0.001)
+        await until(lambda: len(frames) == can_bus.RING_FRAMES)
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    assert bus.counters["ring_overflow"] == 500
+    assert [f.can_id for f in frames] == [i % 2048 for i in range(500, sent)]
+
+
+async def test_a_defect_of_the_consumer_leaves_the_driver() -> None:
+    """The supervisor must see it; it must not vanish in a callback of the loop."""
+    options = CanImuOptions.model_validate({**SBG, "interface": "virtual", "channel": "t-defect"})
+
+    def broken(item: Measurement | DeviceEvent) -> None:
+        raise ZeroDivisionError
+
+    driver = CanImuDriver("imu", options, broken)
+    task = asyncio.create_task(driver.run())
+    await until(lambda: driver.status.state == "silent")
+    with can.Bus(interface="virtual", channel="t-defect", ignore_config=True) as sender:
+        for message in sample_frames(1):
+            sender.send(message)
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.wait_for(task, 10.0)
+
+
+PAGE = REPOSITORY / "docs" / "can-imu.md"
+BLOCKS = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_every_example_of_the_manual_builds_a_driver() -> None:
+    built = set()
+    for block in BLOCKS:
+        for name, source in tomllib.loads(block)["sources"].items():
+            assert source.pop("driver") == "can_imu"
+            driver = CanImuDriver(name, CanImuOptions.model_validate(source), lambda item: None)
+            built.add(driver.options.dbc)
+    shipped = {"sbg_ellipse", "xsens_mti600", "bosch_mm5_10", "bosch_mm7_10"}
+    assert shipped | {"racelogic_imu04", "aceinna_openimu300ri"} <= built

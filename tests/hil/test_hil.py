@@ -1,0 +1,79 @@
+"""Hardware in the loop: the tests of `tests/hil/inside` with a real CAN bus, ptys and Mosquitto."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from tests.hil.uml import HarnessError, Result, run_in_uml, run_with_vcan
+
+INSIDE = Path(__file__).parent / "inside"
+GROUPS = (
+    ("test_bench.py", "test_daemon.py", "test_daemon_rdss.py"),
+    ("test_daemon_drive.py", "test_daemon_estimators.py", "test_daemon_raw.py"),
+)
+"""Each group has a guest of its own, side by side on two cores; about equally long."""
+# A guest that hangs must not hold the build; the suite takes a third of it.
+TIMEOUT_S = 1200.0
+
+
+def test_hardware_in_the_loop(capfd: pytest.CaptureFixture[str]) -> None:
+    # What numba compiles is shared with the guests, where it takes three times as long.
+    subprocess.run(
+        [sys.executable, "-c", "import fusiond.live.daemon"], check=True, timeout=TIMEOUT_S
+    )
+    assert sorted(name for group in GROUPS for name in group) == sorted(
+        path.name for path in INSIDE.glob("test_*.py")
+    )
+    with capfd.disabled(), ThreadPoolExecutor() as guests:  # the guests' reports, as they are made
+        print()
+        runs = [guests.submit(_run, f"{k + 1}| ", group) for k, group in enumerate(GROUPS)]
+        results = [run.result() for run in runs]
+    for result in results:
+        assert result.status == 0, f"failures in the report above (ran on: {result.where})"
+
+
+def _run(mark: str, group: tuple[str, ...]) -> Result:
+    """The files of a group where there is a bus of its own; its report with a mark each line."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-v", "--durations=3"]
+    return run_with_vcan(
+        [*command, *(str(INSIDE / name) for name in group)], TIMEOUT_S, Marked(mark)
+    )
+
+
+class Marked(io.StringIO):
+    """Standard output, where two guests write in turns, a line each."""
+
+    def __init__(self, mark: str) -> None:
+        super().__init__()
+        self._mark = mark
+
+    def write(self, text: str) -> int:
+        sys.stdout.write(self._mark + text)
+        sys.stdout.flush()
+        return len(text)
+
+
+def test_a_failure_inside_is_a_failure_outside() -> None:
+    report = io.StringIO()
+    result = run_with_vcan(["sh", "-c", "echo heard; exit 3"], 60.0, report)
+    assert result.status == 3
+    assert "heard" in report.getvalue()
+
+
+def test_a_run_that_does_not_end_is_an_error() -> None:
+    with pytest.raises(HarnessError, match="killed"):
+        run_with_vcan(["sleep", "1000"], 3.0, io.StringIO())
+
+
+def test_a_guest_without_a_status_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "shutil.which", lambda program: f"/bin/{program.replace('linux.uml', 'true')}"
+    )
+    with pytest.raises(HarnessError, match="without an exit status"):
+        run_in_uml(["true"], 10.0, io.StringIO())

@@ -1,0 +1,323 @@
+"""From raw epochs to aids, health and verdicts: one receiver in the navigator and in `process`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.measurements import MonotonicStamp, PositionFix
+from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.pseudorange import PseudorangeAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.configuration.aiding import RawAiding
+from fusiond.configuration.schema import Config, Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.base import Outcome
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
+from fusiond.files.tables import read_solution, read_truth
+from fusiond.models.model import CLOCK_OFFSET, make_model
+from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.offline.compare import compare
+from fusiond.offline.process import process
+from fusiond.simulation.files import simulate
+from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
+from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
+from tests.runs import level_nav
+
+LEVER = (0.0, 0.0, -1.0)
+TRUTH = SCENARIOS["drive"].truth(20.0)
+
+
+def receiver(**options: Any) -> GnssRaw:
+    return GnssRaw(TRUTH, GnssRawOptions(rate_hz=1.0, **options), np.random.default_rng(4))
+
+
+def informed(section: RawAiding | None = None, sim: GnssRaw | None = None) -> RawGnss:
+    """A receiver's room that knows all ephemerides in view."""
+    sim = sim or receiver()
+    raw = RawGnss("raw", section or RawAiding())
+    seen = {(s.system, s.prn) for s in sim.epoch(0).signals}
+    for message in (*sim.broadcast(0.0, seen), *sim.ionosphere):
+        raw.learn(message)
+    return raw
+
+
+def place(k: int) -> Any:
+    return TRUTH.at(np.array([k + 1.0])).position[0]
+
+
+def started(section: RawAiding) -> KalmanEstimator:
+    """A filter at rest at the true place of epoch 0."""
+    model = make_model("ins15", imu_noise(Imu()), *raw_blocks(section))
+    estimator = KalmanEstimator(model, Imu().gap_s)
+    sigma = model.initial.copy()
+    sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [5.0] * 3
+    lat, lon, height = place(0)
+    nav = level_nav((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    nav[:3] = lat, lon, height
+    estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sigma**2))
+    return estimator
+
+
+def off(estimator: KalmanEstimator) -> float:
+    """Horizontal distance to the true place, m."""
+    d = (estimator.nav[:2] - place(0)[:2]) * 6.37e6
+    return float(np.hypot(d[0], d[1] * np.cos(place(0)[0])))
+
+
+# --------------------------------------------------------------------------- epochs to aids
+
+
+def test_without_a_place_or_satellites_there_is_no_aid() -> None:
+    epoch = receiver().epoch(0)
+    assert informed().aid(epoch, 0, None) == "no_position"
+    deaf = RawGnss("raw", RawAiding())
+    assert deaf.aid(epoch, 0, place(0)) == "no_satellites"
+    assert sum(deaf.refused.values()) == len(epoch.signals)
+    assert set(deaf.refused) == {"G_no_ephemeris", "C_no_ephemeris"}
+    assert set(deaf.sky().refused.values()) == {"no_ephemeris"}
+
+
+def test_an_epoch_alone_starts_the_alignment() -> None:
+    raw, sim = informed(), receiver()
+    position, velocity = raw.start_aids(sim.epoch(0), 7)
+    assert isinstance(position, PositionAid)
+    assert isinstance(velocity, VelocityAid)
+    assert (position.t_ns, velocity.source) == (7, "raw_velocity")
+    lat, lon, height = place(0)
+    assert abs(position.lat_rad - lat) * 6.37e6 < 5.0 * position.sd[0]
+    assert abs(position.lon_rad - lon) * 6.37e6 < 5.0 * position.sd[1]
+    assert position.height_m is not None
+    assert abs(position.height_m - height) < 5.0 * position.sd[2]
+    few = replace(sim.epoch(1), signals=sim.epoch(1).signals[:3])
+    assert raw.start_aids(few, 8) == []
+    assert raw.refused["too_few"] == 1
+    assert isinstance(raw.aid(few, 8, None), PseudorangeAid), "the first epoch told the place"
+
+
+def test_options() -> None:
+    epoch = receiver().epoch(0)
+    usual = informed().aid(epoch, 0, place(0))
+    wide = informed(RawAiding(sigma_scale=2.0)).aid(epoch, 0, place(0))
+    four = informed(RawAiding(best_four=True)).aid(epoch, 0, place(0))
+    gps = informed(RawAiding(systems=("G",))).aid(epoch, 0, place(0))
+    high = informed(RawAiding(elevation_mask_deg=40.0)).aid(epoch, 0, place(0))
+    for aid in (usual, wide, four, gps, high):
+        assert isinstance(aid, PseudorangeAid)
+    assert wide.range_variance == pytest.approx(4.0 * usual.range_variance)
+    assert wide.rate_variance == pytest.approx(4.0 * usual.rate_variance)
+    assert len(four.satellites) == 4
+    assert {s[0] for s in gps.satellites} == {"G"}
+    assert 0 < len(high.satellites) < len(usual.satellites)
+
+
+# --------------------------------------------------------------------------- health and verdicts
+
+
+def test_sky_names_every_satellite() -> None:
+    sim = receiver()
+    raw = informed(sim=sim)
+    epoch = sim.epoch(0)
+    aid = raw.aid(epoch, 0, place(0))
+    assert isinstance(aid, PseudorangeAid)
+    n = len(aid.satellites)
+    codes = [KEPT] * (2 * n)
+    codes[0], codes[1], codes[n + 2] = GATED, RESIDUAL, GATED
+    raw.judged(aid, Outcome("fused", 1.0, 2 * n - 3, (0.5,) * (2 * n), tuple(codes)))
+    sky = raw.sky()
+    assert set(sky.used) | set(sky.refused) == {s.satellite for s in epoch.signals}
+    assert not set(sky.used) & set(sky.refused)
+    first, second, third = aid.satellites[:3]
+    assert (sky.refused[first], sky.refused[second]) == ("gated", "residual")
+    assert third in sky.used, "its range is used, its rate is not"
+    assert sky.innovation_rms == pytest.approx(0.5)
+    assert sky.dops is not None
+    assert 0.4 < sky.dops.hdop < 3.0
+    assert raw.refused[f"{first[0]}_range_gated"] == 1
+    assert raw.refused[f"{second[0]}_range_residual"] == 1
+    assert raw.refused[f"{third[0]}_rate_gated"] == 1
+
+
+def test_an_epoch_refused_as_a_whole_names_its_satellites() -> None:
+    raw = informed()
+    aid = raw.aid(receiver().epoch(0), 0, place(0))
+    assert isinstance(aid, PseudorangeAid)
+    raw.judged(aid, Outcome("gated", 900.0, 0, (), (GATED,) * (2 * len(aid.satellites))))
+    sky = raw.sky()
+    assert sky.used == ()
+    assert {sky.refused[s] for s in aid.satellites} == {"gated"}
+
+
+def test_figures_of_a_system_are_standard_normal() -> None:
+    rng = np.random.default_rng(2)
+    raw = informed()
+    aid = raw.aid(receiver().epoch(0), 0, place(0))
+    assert isinstance(aid, PseudorangeAid)
+    rows = 2 * len(aid.satellites)
+    figures = []
+    for _ in range(4000):
+        codes = np.where(rng.random(rows) < 0.05, GATED, KEPT)
+        whitened = np.where(codes == KEPT, rng.standard_normal(rows), 0.0)
+        outcome = Outcome("fused", 1.0, rows, tuple(whitened.tolist()), tuple(codes.tolist()))
+        figures.append([*per_system(aid, outcome)["G"], *per_system(aid, outcome)["C"]])
+    covariance = np.cov(np.array(figures).T)
+    assert covariance == pytest.approx(np.eye(4), abs=0.1)
+
+
+def test_a_system_without_rates_has_no_figure() -> None:
+    raw = informed()
+    aid = raw.aid(receiver().epoch(0), 0, place(0))
+    assert isinstance(aid, PseudorangeAid)
+    rates = np.where([s[0] == "G" for s in aid.satellites], np.nan, aid.rates)
+    silent = replace(aid, rates=rates)
+    rows = len(silent.labels)
+    found = per_system(silent, Outcome("fused", 1.0, rows, (1.0,) * rows, (KEPT,) * rows))
+    assert set(found) == {"C"}
+
+
+# --------------------------------------------------------------------------- in the filter
+
+
+def moved(epoch: RawGnssEpoch, metres: float, satellites: set[str] | None = None) -> RawGnssEpoch:
+    signals = tuple(
+        replace(s, pseudorange_m=s.pseudorange_m + metres)
+        if satellites is None or s.satellite in satellites
+        else s
+        for s in epoch.signals
+    )
+    return replace(epoch, signals=signals)
+
+
+def test_a_clock_set_by_a_millisecond_moves_nothing_but_the_clock() -> None:
+    sim, section = receiver(clock_drift_constant_sd_m_s=0.0, clock_drift_sd_m_s=1e-3), RawAiding()
+    for flagged in (True, False):
+        raw, estimator = informed(section, sim), started(section)
+        epoch = sim.epoch(0)
+        for _ in range(3):
+            aid = raw.aid(epoch, 0, estimator.nav[:3])
+            assert isinstance(aid, PseudorangeAid)
+            assert estimator.update(aid).name == "fused"
+        offset = estimator.xi[estimator.model.slots_of(CLOCK_OFFSET)].copy()
+        before = off(estimator)
+        jump = SPEED_OF_LIGHT_M_S * 1e-3
+        set_clock = replace(moved(epoch, jump), clock_reset=flagged)
+        aid = raw.aid(set_clock, 0, estimator.nav[:3])
+        assert isinstance(aid, PseudorangeAid)
+        outcome = estimator.update(aid)
+        assert outcome.name == "fused"
+        assert set(outcome.rows) == {KEPT}
+        assert off(estimator) == pytest.approx(before, abs=0.5)
+        heard = [0, 2]  # GPS and BeiDou of G, E, C
+        after = estimator.xi[estimator.model.slots_of(CLOCK_OFFSET)]
+        assert (after - offset)[heard] == pytest.approx([jump, jump], abs=5.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_fewer_than_four_satellites_help(count: int) -> None:
+    """Each takes off variance along its line, none makes the place worse."""
+    sim, section = receiver(), RawAiding()
+    raw, estimator = informed(section, sim), started(section)
+    epoch = sim.epoch(0)
+    for _ in range(3):  # clocks are known from a fuller sky
+        aid = raw.aid(epoch, 0, estimator.nav[:3])
+        assert isinstance(aid, PseudorangeAid)
+        estimator.update(aid)
+    for slot in range(6, 9):
+        estimator.covariance[slot, slot] += 20.0**2
+    before = estimator.sigmas()[:3].copy()
+    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0, estimator.nav[:3])
+    assert isinstance(aid, PseudorangeAid)
+    outcome = estimator.update(aid)
+    assert (outcome.name, outcome.degrees) == ("fused", 2 * count)
+    after = estimator.sigmas()[:3]
+    assert (after < before).all()
+    assert (after**2).sum() < (before**2).sum() - count * 10.0**2
+    assert off(estimator) < 5.0
+
+
+def test_one_bad_satellite_is_refused_alone() -> None:
+    sim, section = receiver(), RawAiding()
+    raw, estimator = informed(section, sim), started(section)
+    epoch = sim.epoch(0)
+    for _ in range(3):
+        aid = raw.aid(epoch, 0, estimator.nav[:3])
+        assert isinstance(aid, PseudorangeAid)
+        estimator.update(aid)
+    bad = epoch.signals[2].satellite
+    aid = raw.aid(moved(epoch, 80.0, {bad}), 0, estimator.nav[:3])
+    assert isinstance(aid, PseudorangeAid)
+    outcome = estimator.update(aid)
+    left_out = [label for label, code in zip(aid.labels, outcome.rows, strict=True) if code]
+    assert left_out == [(bad, "range")]
+    raw.judged(aid, outcome)
+    assert set(raw.sky().refused) >= {bad}
+
+
+def test_fixes_or_ranges_of_a_receiver_never_both() -> None:
+    """The one line: `kind` of the section."""
+    fix = PositionFix("gnss", 0, MonotonicStamp(0), 0.5, 2.0, 30.0)
+    epoch = replace(receiver().epoch(0), source="gnss")
+    for kind, refused in (("raw", "raw_is_used"), ("gnss", "raw_not_used")):
+        navigator = Navigator(Config.model_validate({"aiding": {"gnss": {"kind": kind}}}))
+        navigator.add(fix, 0)
+        navigator.add(epoch, 0)
+        assert navigator.refused["gnss"][refused] == 1
+
+
+# --------------------------------------------------------------------------- through `process`
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files of 150 s of a simulated drive, with UBX."""
+    folder = tmp_path_factory.mktemp("drive")
+    simulate(SCENARIOS["drive"], folder, seed=3, duration_s=150.0, gnss_raw="ubx")
+    return folder
+
+
+def run(
+    folder: Path, out: Path, *kinds: str, **estimator: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Result of `process` and errors after 20 s of navigation."""
+    aiding = {kind: {"lever_arm_m": LEVER} for kind in ("gnss", "rdss", "raw")}
+    config = {"imu": CAR_IMU, "aiding": aiding, "estimator": estimator}
+    names = {"gnss": "gnss.csv", "rdss": "rdss.csv", "raw": "gnss.ubx"}
+    aids = [(kind, folder / names[kind]) for kind in kinds]
+    result = process(Config.model_validate(config), folder / "imu.csv", aids, out=out)
+    return result, compare(read_solution(out), read_truth(folder / "truth.csv"), after_s=20.0)
+
+
+@pytest.mark.parametrize("name", ["kalman", "unscented", "federated", "multiscale"])
+def test_every_estimator_takes_ranges(name: str, drive: Path, tmp_path: Path) -> None:
+    result, errors = run(drive, tmp_path / "s.csv", "raw", filter=name)
+    assert result["mode"] == "navigating"
+    assert result["sources"]["raw"]["fused"] > 400
+    assert errors["horizontal_rms_m"] < 2.0
+    assert errors["horizontal_inside_3_sigma"] > 0.98
+    assert {"raw_G", "raw_C"} <= set(result["consistency"])
+
+
+def test_fixes_ranges_and_rdss_together(drive: Path, tmp_path: Path) -> None:
+    result, errors = run(drive, tmp_path / "s.csv", "gnss", "raw", "rdss")
+    for source, least in (("gnss", 800), ("raw", 400), ("rdss", 5)):
+        assert result["sources"][source]["fused"] > least
+    assert errors["horizontal_rms_m"] < 0.5
+    assert errors["horizontal_inside_3_sigma"] > 0.9  # sigma is 8 cm; 16 such drives: NEES 1.6 of 2
+
+
+def test_a_planar_model_holds_the_height_and_states_no_sigma_for_it(
+    drive: Path, tmp_path: Path
+) -> None:
+    result, errors = run(drive, tmp_path / "s.csv", "raw", model="planar15")
+    assert result["mode"] == "navigating"
+    assert errors["horizontal_rms_m"] < 5.0
+    assert errors["horizontal_nees"] is not None
+    assert errors["position_nees"] is None
+    assert np.isnan(read_solution(tmp_path / "s.csv").sd_position[:, 2]).all()

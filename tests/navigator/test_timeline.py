@@ -1,0 +1,333 @@
+"""The timeline: whatever the order of arrival, the result of order of validity, bit for bit."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from fusiond.aiding.attitude import HeadingAid
+from fusiond.aiding.base import Linearised
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.configuration.schema import Imu
+from fusiond.estimators.base import Outcome
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
+from fusiond.navigator.timeline import RECOVERY_COUNT, RECOVERY_NS, Entry, Timeline
+from tests import runs
+
+Array = NDArray[np.float64]
+
+IMU = Imu(rate_hz=50.0)
+SECONDS = 30.0
+START_NS = 5 * runs.SECOND
+KEEP_S = 10.0
+GATE = 0.9999
+
+
+class Drive:
+    """Half a minute of driving: samples, start and aids in order of validity."""
+
+    def __init__(self) -> None:
+        truth = runs.town_truth(SECONDS, IMU.rate_hz)
+        self.times = runs.sample_times(truth, START_NS)
+        self.samples = runs.imu_run(IMU, truth, 7).samples
+        self.nav = runs.true_nav(truth, np.zeros(1))[0]
+        self.sd = np.radians([0.3, 0.3, 2.0])
+        rng = np.random.default_rng(8)
+        self.aids: list[Linearised] = []
+        for t in np.arange(0.507, SECONDS - 1.0, 0.9):
+            nav = runs.true_nav(truth, np.array([t]))[0]
+            nav = runs.with_error(
+                nav, rng.standard_normal(9) * ([0.01] * 3 + [0.1] * 3 + [1.5] * 3)
+            )
+            lat, lon, height, n, e, d = (float(x) for x in nav[:6])
+            if 11.0 < t < 13.0:
+                lat += 1e-4  # an outlier of 640 m
+            t_ns = START_NS + round(t * 1e9)
+            lever_v = (0.0, 0.0, 0.0)
+            yaw = rpy_from_dcm(dcm_from_quaternion(nav[6:]))[2]
+            sd = (1.5, 1.5, 1.5)
+            lever = (0.4, -0.3, -1.2)
+            if round(t) % 4 == 0:  # carried without feedback for 1.3 s, across other aids
+                late = t_ns + 1_300_000_000
+                held = RdssPositionAid(
+                    "rdss", t_ns + 3, GATE, lat, lon, (400.0, 50.0, 300.0), lever_v, holds=True
+                )
+                self.aids += [held, FeedBackAid("rdss_feedback", late, GATE)]
+            self.aids += [
+                HeadingAid("compass", t_ns, GATE, yaw, 0.01),
+                PositionAid("gnss", t_ns, GATE, lat, lon, height, sd, lever),
+                VelocityAid("gnss_velocity", t_ns - 100_000_000, GATE, (n, e, d), sd, lever_v),
+            ]
+        self.aids.sort(key=lambda a: (a.t_ns, a.source))
+
+    def estimator(self) -> KalmanEstimator:
+        """At the start, before the first sample."""
+        model, estimator = runs.make_estimator("ins21", IMU)
+        p = np.diag(runs.initial_sd(model, self.sd, 0.2, 3.0) ** 2)
+        estimator.initialise(START_NS, 0, self.nav, np.zeros(model.size), p)
+        return estimator
+
+    def timeline(self, keep_s: float = KEEP_S, checkpoint_s: float = 0.5) -> Timeline:
+        """Started, with no sample and no aid yet; its buffer is moved every 20 s or so."""
+        buffer = ImuBuffer(1.0, keep_s, np.eye(3), 0.0, IMU.gap_s)
+        timeline = Timeline(self.estimator(), buffer, keep_s, checkpoint_s)
+        timeline.start()
+        return timeline
+
+
+@lru_cache(maxsize=1)
+def drive() -> Drive:
+    return Drive()
+
+
+@lru_cache(maxsize=1)
+def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
+    """The reference knows no timeline: propagate to each aid in turn, apply it, go on."""
+    d = drive()
+    estimator = d.estimator()
+    buffer = runs.filled_buffer(IMU, d.times, d.samples)
+    outcomes = []
+    for aid in d.aids:
+        estimator.propagate(buffer, aid.t_ns)
+        if isinstance(aid, FeedBackAid):
+            estimator.release()
+        elif isinstance(aid, RdssPositionAid):
+            estimator.hold()
+        outcomes.append(estimator.update(aid))
+    estimator.propagate(buffer, buffer.latest_ns)
+    return estimator, outcomes
+
+
+def assert_same_state(a: KalmanEstimator, b: KalmanEstimator) -> None:
+    """Bit for bit."""
+    assert a.t_ns == b.t_ns
+    assert a.nav.tobytes() == b.nav.tobytes()
+    assert a.xi.tobytes() == b.xi.tobytes()
+    assert a.covariance.tobytes() == b.covariance.tobytes()
+    assert a.step.tobytes() == b.step.tobytes()
+
+
+def test_the_reference_has_outliers_and_navigates() -> None:
+    estimator, outcomes = in_order()
+    names = Counter(o.name for o in outcomes)
+    assert names["gated"] == 3
+    assert names["fed_back"] > 5
+    assert names["fused"] == len(outcomes) - 3 - names["fed_back"]
+    assert np.sqrt(np.diag(estimator.covariance)[6:8]).max() < 1.5
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.data())
+def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
+    d = drive()
+    count = len(d.aids)
+    delay = st.sampled_from([0.0, 0.1, 0.6, 1.5, 4.0, 8.0])
+    delays = data.draw(st.lists(delay, min_size=count, max_size=count))
+    early = data.draw(st.sets(st.integers(0, count - 1), max_size=5))
+    twice = data.draw(st.lists(st.integers(0, count - 1), max_size=6, unique=True))
+    largest = data.draw(st.sampled_from([1, 7, 60]))
+    lazy = data.draw(st.booleans())
+    checkpoint_s = data.draw(st.sampled_from([0.02, 0.5, 3.0]))
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+
+    arrivals = [
+        (aid.t_ns + (-500_000_000 if i in early else round(delay_s * 1e9)), i)
+        for i, (aid, delay_s) in enumerate(zip(d.aids, delays, strict=True))
+    ]
+    arrivals += [(arrivals[i][0] + 300_000_000, i) for i in twice]
+    rng.shuffle(arrivals)  # ties in any order
+    arrivals.sort(key=lambda a: a[0])
+    timeline = d.timeline(checkpoint_s=checkpoint_s)
+    entries: dict[int, Entry] = {}
+    following = sample = 0
+    while sample < len(d.times) or following < len(arrivals):
+        upto = min(len(d.times), sample + int(rng.integers(1, largest + 1)))
+        timeline.imu.append(d.times[sample:upto], d.samples[sample:upto])
+        sample = upto
+        now = timeline.imu.latest_ns if sample < len(d.times) else arrivals[-1][0]
+        while following < len(arrivals) and arrivals[following][0] <= now:
+            i = arrivals[following][1]
+            entry = timeline.insert(d.aids[i])
+            if i in entries:
+                assert entry.outcome is not None
+                assert entry.outcome.name == "duplicate"
+            entries.setdefault(i, entry)
+            following += 1
+            if not lazy:
+                timeline.run()
+        timeline.run()
+
+    reference, outcomes = in_order()
+    assert_same_state(timeline.estimator, reference)
+    assert [entries[i].outcome for i in range(count)] == outcomes
+    counted: Counter[str] = sum(timeline.counters.outcomes.values(), Counter())
+    expected = Counter(o.name for o in outcomes)
+    expected["duplicate"] += len(twice)
+    assert counted == +expected  # each measurement ends in exactly one outcome
+
+
+def test_order_of_arrival_within_one_instant_is_not_seen() -> None:
+    """Aids of one instant at the very end of the data, before and after the filter got there."""
+    d = drive()
+    end = int(d.times[-1])
+    last = [replace(a, t_ns=end) for a in d.aids[-3:]]  # type: ignore[type-var]
+    states = []
+    for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
+        timeline = d.timeline()
+        timeline.imu.append(d.times, d.samples)
+        timeline.run()
+        for i in order:
+            timeline.insert(last[i])
+            timeline.run()
+        states.append(timeline.estimator)
+    assert_same_state(states[0], states[1])
+    assert_same_state(states[0], states[2])
+
+
+@pytest.mark.parametrize("chunk", [1, 33, 300])
+def test_an_aid_at_the_oldest_instant_is_exact_and_before_it_too_old(chunk: int) -> None:
+    """Whenever it comes: right after the buffer was moved, and with checkpoints far apart."""
+    d = drive()
+    late = next(a for a in d.aids if isinstance(a, PositionAid))
+    for arrival in range(600, len(d.times), 97):
+        timeline = d.timeline(checkpoint_s=1.0)
+        for first in range(0, arrival, chunk):
+            rows = slice(first, min(first + chunk, arrival))
+            timeline.imu.append(d.times[rows], d.samples[rows])
+            if rows.stop < arrival:
+                timeline.run()
+        oldest = timeline.oldest_ns
+        assert oldest <= timeline.imu.latest_ns - round(KEEP_S * 1e9)
+        assert timeline.insert(replace(late, t_ns=oldest - 1)).outcome == Outcome("too_old")
+        aid = replace(late, t_ns=oldest)
+        assert timeline.insert(aid).outcome is None
+        timeline.run()
+
+        reference = d.estimator()
+        buffer = runs.filled_buffer(IMU, d.times[:arrival], d.samples[:arrival])
+        reference.propagate(buffer, oldest)
+        reference.update(aid)
+        reference.propagate(buffer, buffer.latest_ns)
+        assert_same_state(timeline.estimator, reference)
+
+
+def test_before_the_start() -> None:
+    d = drive()
+    timeline = Timeline(d.estimator(), d.timeline().imu, KEEP_S, 0.5)
+    early = replace(d.aids[0], t_ns=START_NS - 1)  # type: ignore[type-var]
+    entry = timeline.insert(early)
+    timeline.insert(d.aids[1])
+    timeline.start()
+    assert entry.outcome == Outcome("no_alignment")
+    assert timeline.counters.outcomes[early.source] == {"no_alignment": 1}
+    assert timeline.insert(early).outcome == Outcome("too_old")
+    timeline.imu.append(d.times, d.samples)
+    timeline.run()
+    assert timeline.counters.outcomes[d.aids[1].source]["fused"] == 1
+
+
+def test_what_waits_is_bounded_and_ends_with_a_name() -> None:
+    """Days without alignment, or without IMU: aids come on and on, memory does not grow."""
+    d = drive()
+    count = 20_000
+    aids = [replace(d.aids[0], t_ns=START_NS + k * 100_000_000) for k in range(count)]  # type: ignore[type-var]
+    source = d.aids[0].source
+    for started, name in ((False, "no_alignment"), (True, "no_imu")):
+        timeline = d.timeline()
+        if not started:
+            timeline.clear()
+        for aid in aids:
+            timeline.insert(aid)
+        waiting = timeline.waiting
+        assert waiting <= 5000
+        assert timeline.counters.outcomes[source] == {name: count - waiting}
+        timeline.clear()
+        assert timeline.counters.outcomes[source].total() == count
+        assert timeline.waiting == 0
+
+
+def test_memory_does_not_grow_on_a_long_run() -> None:
+    d = drive()
+    timeline = d.timeline()
+    timeline.imu.append(d.times[:1], d.samples[:1])
+    sizes = []
+    step = int(d.times[1] - d.times[0])
+    still = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -9.79]] * 50)
+    for second in range(200):
+        times = int(d.times[0]) + step * np.arange(1 + 50 * second, 51 + 50 * second)
+        timeline.imu.append(times, still)
+        timeline.insert(replace(d.aids[0], t_ns=int(times[25]) - 3 * runs.SECOND))  # type: ignore[type-var]
+        timeline.run()
+        sizes.append((len(timeline._entries), len(timeline._checkpoints), len(timeline.imu.times)))
+    assert max(s[0] for s in sizes) < 20
+    assert max(s[1] for s in sizes) < 40
+    assert len({s[2] for s in sizes}) == 1
+    assert timeline.counters.rewinds > 150
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 2.0])
+def test_a_lasting_disagreement_is_ended(delay_s: float) -> None:
+    """Gated for `RECOVERY_NS` and `RECOVERY_COUNT` times, then believed with a wider covariance;
+    late fixes recover at the very same fix as prompt ones."""
+    d = drive()
+    timeline = d.timeline()
+    fixes = [
+        replace(a, lat_rad=a.lat_rad + 5e-5)
+        for a in d.aids
+        if isinstance(a, PositionAid) and abs(a.t_ns - START_NS - 12 * runs.SECOND) > runs.SECOND
+    ]
+    entries = []
+    sample = 0
+    for fix in fixes:
+        upto = int(np.searchsorted(d.times, fix.t_ns + round(delay_s * 1e9), side="right"))
+        timeline.imu.append(d.times[sample:upto], d.samples[sample:upto])
+        sample = upto
+        timeline.run()
+        entries.append(timeline.insert(fix))
+        timeline.run()
+    timeline.imu.append(d.times[sample:], d.samples[sample:])
+    timeline.run()
+    names = [e.outcome.name for e in entries if e.outcome]
+    first_fused = names.index("fused")
+    assert first_fused >= RECOVERY_COUNT
+    assert set(names[:first_fused]) == {"gated"}
+    before, then = (fixes[i].t_ns - fixes[0].t_ns for i in (first_fused - 1, first_fused))
+    assert before < RECOVERY_NS <= then
+    assert set(names[first_fused:]) == {"fused"}
+    metres = (timeline.estimator.nav[0] - d.nav[0]) * runs.metres(*d.nav[[0, 2]])[0]
+    truth = runs.town_truth(SECONDS, IMU.rate_hz)
+    moved = (truth.position[-1, 0] - d.nav[0]) * runs.metres(*d.nav[[0, 2]])[0]
+    assert metres - moved == pytest.approx(5e-5 * 6.36e6, abs=5.0)
+
+
+def test_a_wrong_heading_is_recovered_from_in_heading() -> None:
+    """The covariance that is widened is that of what the aid measures."""
+    d = drive()
+    timeline = d.timeline()
+    compass = [
+        replace(a, yaw_rad=a.yaw_rad + math.radians(40.0))
+        for a in d.aids
+        if isinstance(a, HeadingAid)
+    ]
+    timeline.imu.append(d.times, d.samples)
+    entries = [timeline.insert(a) for a in compass]
+    timeline.run()
+    names = [e.outcome.name for e in entries if e.outcome]
+    first = names.index("fused")
+    assert set(names[:first]) == {"gated"}
+    assert set(names[first:]) == {"fused"}
+    truth = runs.true_nav(runs.town_truth(SECONDS, IMU.rate_hz), np.array([SECONDS]))[0]
+    phi = runs.nav_error(timeline.estimator.nav, truth)[:3]
+    assert -phi[2] == pytest.approx(math.radians(40.0), abs=math.radians(3.0))

@@ -1,0 +1,68 @@
+"""`fusiond process` over the real drive: the figures that the README states, as bounds.
+
+0.10 m RMS to the RTK track after a minute; 5 m RMS of the largest error in each of eight 15 s
+outages (7.6 m is what others reach); the track inside two stated sigma in 90 to 99.5 % of the
+epochs inside them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fusiond.configuration.load import load_config
+from fusiond.files.tables import GnssTable, TrajectoryTable, read_gnss, read_solution, read_truth
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.offline.compare import compare
+from fusiond.offline.process import process
+from tests.places import DATA, REPOSITORY
+
+DRIVE = DATA / "drive_0708"
+OUTAGES = [(243433.499 + 45.0 * i, 15.0) for i in range(8)]
+
+pytestmark = pytest.mark.skipif(
+    not DRIVE.is_dir(), reason=f"real drive drive_0708 is absent: {DRIVE} (set FUSIOND_DATA)"
+)
+
+
+def _process(folder: Path, outages: list[tuple[float, float]]) -> tuple[dict[str, Any], Path]:
+    out = folder / "solution.csv"
+    config = load_config(REPOSITORY / "config" / "drive_0708.toml")
+    result = process(config, DRIVE / "imu.csv", [("gnss", DRIVE / "gnss.csv")], outages, out)
+    return result, out
+
+
+def _errors(solution: TrajectoryTable, track: GnssTable, rows: Any) -> tuple[Any, Any]:
+    """North and east errors (n, 2) in m at rows of the track, and the stated sigmas (n, 2)."""
+    t = track.t_s[rows]
+    lat, lon = track.lat_rad[rows], track.lon_rad[rows]
+    there = float(lat[0])
+    north = (np.interp(t, solution.t_s, solution.lat_rad) - lat) * meridian_radius(there)
+    east = (np.interp(t, solution.t_s, solution.lon_rad) - lon) * transverse_radius(there)
+    sigma = [np.interp(t, solution.t_s, solution.sd_position[:, i]) for i in range(2)]
+    return np.column_stack([north, east * np.cos(there)]), np.column_stack(sigma)
+
+
+def test_follows_the_track_from_nothing_but_the_data(tmp_path: Path) -> None:
+    result, out = _process(tmp_path, [])
+    assert result["aligned"] == "GNSS course"
+    assert result["mode"] == "navigating"
+    report = compare(read_solution(out), read_truth(DRIVE / "gnss.csv"), after_s=60.0)
+    assert report["horizontal_rms_m"] <= 0.10
+
+
+def test_outages_and_their_stated_sigma(tmp_path: Path) -> None:
+    result, out = _process(tmp_path, OUTAGES)
+    assert result["sources"]["gnss"]["withheld"] == 8 * 60  # 4 Hz
+    solution, track = read_solution(out), read_gnss(DRIVE / "gnss.csv")
+    largest, inside = [], []
+    for start, length in OUTAGES:
+        rows = (track.t_s >= start) & (track.t_s < start + length)
+        error, sigma = _errors(solution, track, rows)
+        largest.append(np.hypot(*error.T).max())
+        inside.append(((error / sigma) ** 2).sum(axis=1) <= 4.0)
+    assert np.sqrt(np.mean(np.square(largest))) <= 5.0
+    assert 0.90 <= np.concatenate(inside).mean() <= 0.995

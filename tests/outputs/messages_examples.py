@@ -1,0 +1,124 @@
+"""One message of each topic, as `docs/mqtt.md` shows them, made by the daemon's own builders."""
+
+from __future__ import annotations
+
+from math import radians
+from typing import Any
+
+from fusiond.clock.clock import ClockStatus
+from fusiond.integrity.consistency import judge
+from fusiond.live.scheduler import SchedulerStatus
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.messages import (
+    ReplyMessage,
+    SourceHealth,
+    consistency_message,
+    event_message,
+    health_message,
+    nav_message,
+    stamp,
+    status_message,
+)
+
+UTC_NS = 1_795_217_587_123_456_789
+
+SOLUTION = Solution(
+    t_ns=5_000_000_000,
+    mode=Mode.NAVIGATING,
+    reason="aided by gnss, rdss",
+    lat_rad=radians(31.025438871),
+    lon_rad=radians(121.441209483),
+    height_m=17.42,
+    v_ned_m_s=(8.213, -2.034, 0.041),
+    rpy_rad=(radians(0.412), radians(-1.205), radians(-13.91)),
+    sd_ned_m=(0.9, 0.85, 1.7),
+    sd_v_ned_m_s=(0.06, 0.06, 0.08),
+    sd_rpy_rad=(radians(0.08), radians(0.08), radians(0.6)),
+)
+
+SCHEDULER = SchedulerStatus(
+    ticks=360_412,
+    overruns=3,
+    lateness_p50_ms=0.631,
+    lateness_p99_ms=1.259,
+    lateness_max_ms=31.4,
+    gc_collections=1811,
+    gc_forced=0,
+    gc_max_ms=2.1,
+)
+
+EXAMPLES: dict[str, Any] = {
+    "nav": nav_message(SOLUTION, UTC_NS),
+    "status": status_message(
+        SOLUTION,
+        UTC_NS,
+        since_utc_ns=UTC_NS - 3_500_000_000_000,
+        version="0.1.0",
+        config_digest="9f2c41d07be3",
+        uptime_s=3604.12,
+        scheduler=SCHEDULER,
+        fused=35_610,
+        rejected=14,
+        mqtt={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
+    ),
+    "health": health_message(
+        UTC_NS,
+        sources={
+            "gnss": SourceHealth(
+                state="running",
+                detail="/dev/ttyGNSS",
+                received=35_580,
+                fused=35_571,
+                rejected={"gated": 9},
+                age_s=0.06,
+                fused_age_s=0.06,
+                latency_s=0.071,
+                counters={"checksum": 2, "sentences": 213_480},
+                verdict="consistent",
+            ),
+            "rdss": SourceHealth(
+                state="silent",
+                detail="no beam above level 2",
+                received=58,
+                fused=53,
+                rejected={"multi_value": 4, "too_old": 1},
+                age_s=187.2,
+                fused_age_s=187.2,
+                latency_s=1.42,
+                counters={"no_beam": 12, "requests": 61},
+                verdict="coloured",
+            ),
+        },
+        scheduler=SCHEDULER,
+        clock=ClockStatus(
+            utc_source="gnss", settled=True, system_error_s=-0.012, counters={"utc_jump": 0}
+        ),
+        cpu_percent=17.3,
+        memory_mb=141.8,
+    ),
+    "consistency": consistency_message(
+        UTC_NS,
+        {
+            "rdss": judge(
+                50,
+                100,
+                0.893,
+                (-0.4054, -0.0259, -0.0411, -0.0881, 0.1637, -0.1903, 0.0842, 0.1781),
+            )
+        },
+    ),
+    "event": event_message(
+        UTC_NS,
+        source="rdss",
+        code="rdss_suppressed",
+        level="warning",
+        text="the terminal's transmitter is suppressed",
+    ),
+    "reply": ReplyMessage(
+        **dict(zip(("t_utc", "t_ms"), stamp(UTC_NS), strict=True)),
+        id="a1",
+        command="set_position",
+        ok=True,
+        text="position set, sigma 5 m",
+    ),
+}

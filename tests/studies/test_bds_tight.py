@@ -1,0 +1,147 @@
+"""Study `bds-tight`: its problem is what it says, its rows are the daemon's, its figures hold."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.gnss.ecef import ned_axes, to_geodetic
+from fusiond.gnss.single_point import SinglePoint
+from fusiond.navigator.intake import Intake
+from fusiond.navigator.raw_gnss import raw_blocks
+from fusiond.studies import STUDIES
+from fusiond.studies.bds_tight import runs
+from fusiond.studies.bds_tight import study as bds_tight
+
+FILTERS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white")
+
+
+@cache
+def result() -> dict[str, Any]:
+    return bds_tight.run(2)
+
+
+def test_keys_of_the_issue() -> None:
+    found = result()
+    assert STUDIES["bds-tight"] == "fusiond.studies.bds_tight.study"
+    assert found["runs"] == 2
+    assert found["paper"]["filter"] == "UKF"
+    assert found["nees_dof"] == 3
+    assert set(found["cases"]) == {"open", "canyon2", "canyon3", "canyon4"}
+    for case in found["cases"].values():
+        for row in (*FILTERS, "receiver"):
+            for key in ("horizontal_rms_m", "nees_mean", "availability"):
+                assert isinstance(case[row][key], float)
+    json.dumps(found, allow_nan=False)
+
+
+def test_the_canyons_leave_as_many_satellites_as_they_say() -> None:
+    cases, sky = result()["cases"], result()["sky"]
+    assert [sky[f"canyon{n}"]["satellites_mean"] for n in (2, 3, 4)] == [2.0, 3.0, 4.0]
+    assert sky["open"]["satellites_mean"] > 8.0
+    for name in ("canyon2", "canyon3"):
+        assert cases[name]["receiver"]["stretch"]["solution_rate"] == 0.0
+        # 200 of the 471 epochs from 30 to 500 s
+        assert cases[name]["receiver"]["solution_rate"] == pytest.approx(271 / 471, abs=0.01)
+    assert 0.0 < cases["canyon4"]["receiver"]["stretch"]["solution_rate"] < 1.0
+    for case in cases.values():
+        for row in FILTERS:
+            assert case[row]["availability"] <= case[row]["solution_rate"] == 1.0
+        assert case["receiver"]["availability"] <= case["receiver"]["solution_rate"]
+
+
+def test_three_satellites_help_the_tight_filter_alone() -> None:
+    three = result()["cases"]["canyon3"]
+    tight, loose, coasting = (
+        three[row]["stretch"]["horizontal_rms_m"] for row in ("tight_ekf", "loose", "coasting")
+    )
+    assert tight < 0.5 * loose
+    assert loose == pytest.approx(coasting, rel=0.1)
+    assert three["tight_ekf"]["availability"] > three["loose"]["availability"]
+    ratios = result()["three_satellites"]["ratio"]
+    assert ratios["200"] < bds_tight.CLAIM
+    # From a fair start nothing bends: both filters agree.
+    assert three["tight_ukf"]["horizontal_rms_m"] == pytest.approx(
+        three["tight_ekf"]["horizontal_rms_m"], rel=0.01
+    )
+
+
+def test_sigma_is_honest_where_errors_are_what_the_filter_takes_them_for() -> None:
+    """Without orbit errors, which it takes as white, tight may be cautious but never too sure; the
+    bound is the 99.9 % point of two independent errors of 3 degrees, 11 a run."""
+    largest, *_, none = result()["orbit_errors"]
+    assert none["orbit_error_m"] == 0.0
+    for found in none["cases"].values():
+        assert 0.05 < found["tight_ekf"]["nees_mean"] < 11.2
+    found = result()["cases"]["open"]
+    low, high = 0.1, result()["nees_interval"][1]
+    assert low < found["tight_ekf"]["nees_mean"] < high
+    assert low < found["receiver"]["nees_mean"] < high
+    # Loose has no state for what its fixes share: orbit errors make it too sure.
+    white = [entry["cases"]["open"]["loose_white"]["nees_mean"] for entry in (largest, none)]
+    assert white[0] > result()["nees_interval"][1] > white[1]
+    assert largest["cases"]["open"]["loose"]["nees_mean"] < result()["nees_interval"][1]
+
+
+def test_tables_and_picture(tmp_path: Path) -> None:
+    every, few, orbits = bds_tight.tables(result())
+    assert [len(t[2]) for t in (every, few, orbits)] == [27, 21, 12]
+    for _, header, rows in (every, few, orbits):
+        assert {len(row) for row in rows} == {len(header)}
+    pytest.importorskip("matplotlib")
+    bds_tight.plot(result(), tmp_path / "tight.png")
+    assert (tmp_path / "tight.png").stat().st_size > 10_000
+
+
+def test_the_clock_is_the_papers_and_as_restless_as_the_filters() -> None:
+    o = runs.OPTIONS
+    assert o.clock_drift_constant_sd_m_s == 0.0
+    drift_block = next(b for b in raw_blocks(runs.RAW) if b.name == "clock_drift")
+    density = 2.0 * o.clock_drift_sd_m_s**2 / o.clock_drift_correlation_s
+    assert density == pytest.approx(drift_block.white)
+    steps = []
+    for number in range(30):
+        simulated = runs.GnssRaw(runs.drive_truth(), o, np.random.default_rng(number))
+        steps.append(np.diff(simulated.clock_drift_m_s))
+    # 15 000 steps of a second; four sigma of their mean square, and exp(-dt/tau) is 1 to 0.3 %.
+    assert np.mean(np.square(steps)) == pytest.approx(
+        density, rel=4.0 * math.sqrt(2.0 / 15e3) + 0.004
+    )
+
+
+def test_every_case_has_the_same_errors() -> None:
+    epochs = {case: runs.observe(case, 0, 1)[1] for case in ("open", "canyon3")}
+    first = {s.satellite: s.pseudorange_m for s in epochs["open"][250].signals}
+    left = {s.satellite: s.pseudorange_m for s in epochs["canyon3"][250].signals}
+    assert len(left) == 3
+    # Multipath, twice that of the open, is all that differs: metres.
+    assert all(abs(first[name] - value) < 10.0 for name, value in left.items())
+    assert epochs["open"][100] == epochs["canyon3"][100]
+
+
+def test_a_fix_becomes_the_daemons_aids_with_the_receivers_sigmas() -> None:
+    simulated, observed = runs.observe("open", 0, 0)
+    found = runs.Receiver(simulated).solve(observed[60])
+    assert isinstance(found, SinglePoint)
+    aids = Intake({"gnss": runs.LOOSE}).aids(runs.fix(found, 5), 5, 0.0)
+    assert not isinstance(aids, str)
+    position, velocity = aids
+    assert isinstance(position, PositionAid)
+    assert isinstance(velocity, VelocityAid)
+    lat, lon, height = to_geodetic(*found.position)
+    axes = ned_axes(lat, lon)
+    assert (position.lat_rad, position.lon_rad, position.height_m) == (lat, lon, height)
+    assert np.square(position.sd) == pytest.approx(np.diag(axes.T @ found.covariance @ axes))
+    assert found.velocity_covariance is not None
+    expected = np.diag(axes.T @ found.velocity_covariance @ axes)
+    assert np.square(velocity.sd) == pytest.approx(expected)
+    assert velocity.v_ned == pytest.approx(axes.T @ found.velocity)
+    assert position.lever == velocity.lever == runs.LEVER
