@@ -273,7 +273,7 @@ def study(
     with progress_bar(name) as progress:
         result = module.run(runs, progress=progress)
     if json_path != "-":
-        from fusiond.studies.report import print_study  # noqa: PLC0415
+        from fusiond.commands.study_report import print_study  # noqa: PLC0415
 
         print_study(module, result)
     write_json(result, json_path)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.table import Table
 
+from fusiond.commands.tables import print_table
 from fusiond.offline.compare import Report
 
 _ROWS = (
@@ -46,22 +46,3 @@ def print_report(report: Report, console: Console | None = None) -> None:
     print_table(console, ["error", "RMS", "95 %", "max", ""], errors)
     if shares:
         print_table(console, ["consistency", "found", "Gaussian"], shares)
-
-
-def print_table(console: Console, header: list[str], rows: list[list[str]]) -> None:
-    """Rows of text under a header: a rich table on a terminal, aligned columns in a pipe."""
-    if console.is_terminal:
-        table = Table(*header)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-        return
-    widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
-    for row in [header, *rows]:
-        first, *rest = (cell.rjust(width) for cell, width in zip(row, widths, strict=True))
-        console.print(
-            "  ".join([first.strip().ljust(widths[0]), *rest]).rstrip(),
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from fusiond.commands.compare_report import print_table
+from fusiond.commands.tables import print_table
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, DEG_PER_HOUR, MILLI_G
 from fusiond.navigator.filters import model_of

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from fusiond.commands.compare_report import print_table
+from fusiond.commands.tables import print_table
 
 Table = tuple[str, list[str], list[list[str]]]
 
