@@ -34,10 +34,11 @@ demo: $(STAMP) ## simulated vehicle, real daemon; ARGS="--duration 60 --headless
 
 test: lint unit hil ## everything that CI checks
 
-lint: $(STAMP) ## ruff and mypy
+lint: $(STAMP) ## ruff, mypy, and who may import whom
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache --no-logo
 
 unit: $(STAMP) test-packages ## unit and property tests, on every core
 	@echo "compiling the kernels once, before the tests share them"
