@@ -10,7 +10,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit hil format bench load lock clean test-packages
+.PHONY: help install demo test lint unit hil format picture bench load lock clean test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -34,11 +34,12 @@ demo: $(STAMP) ## simulated vehicle, real daemon; ARGS="--duration 60 --headless
 
 test: lint unit hil ## everything that CI checks
 
-lint: $(STAMP) ## ruff, mypy, and who may import whom
+lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
+	$(BIN)/python tools/house.py --check
 
 unit: $(STAMP) test-packages ## unit and property tests, on every core
 	@echo "compiling the kernels once, before the tests share them"
@@ -54,6 +55,9 @@ test-packages:
 format: $(STAMP) ## let ruff lay out the code
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+picture: $(STAMP) ## docs/house.svg, from the imports
+	$(BIN)/python tools/house.py
 
 bench: $(STAMP) ## figures as JSON
 	$(BIN)/fusiond bench $(ARGS)

@@ -1,0 +1,125 @@
+"""The picture of the house, and the names that CONTRIBUTING uses for what is in it."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from tests.places import REPOSITORY
+from tools.house import PICTURE, House, Room, draw, floors, main, survey
+
+CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text()
+SVG = "{http://www.w3.org/2000/svg}"
+HOUSE = House(
+    (
+        Room("fusiond", 0, "The roof"),
+        Room("fusiond.attic", 1, "What <is> under & over"),
+        Room("fusiond.hall", 2, ""),
+        Room("drivers", 3, "The cellar"),
+    ),
+    frozenset({("fusiond", "fusiond.attic"), ("fusiond.attic", "drivers"), ("fusiond", "drivers")}),
+)
+
+
+def drawn(house: House) -> ET.Element:
+    return ET.fromstring(draw(house))
+
+
+def texts(picture: ET.Element) -> list[str]:
+    return [element.text or "" for element in picture.iter(f"{SVG}text")]
+
+
+def test_every_room_and_every_arrow_is_drawn() -> None:
+    picture = drawn(HOUSE)
+    said = texts(picture)
+    assert {"attic", "hall", "drivers", "What <is> under & over"} <= set(said)
+    assert "4 rooms, 4 floors, 3 arrows, all of them down" in said[1]
+    assert len(list(picture.iter(f"{SVG}circle"))) == 3
+    assert said[-1] == "0 · 2"
+
+
+def test_an_arrow_that_runs_up_is_told() -> None:
+    wrong = House(HOUSE.rooms, HOUSE.arrows | {("drivers", "fusiond.hall")})
+    assert "4 arrows, 1 of them up" in texts(drawn(wrong))[1]
+    assert 'stroke="#c62828"' in draw(wrong)
+    assert 'stroke="#c62828"' not in draw(HOUSE)
+
+
+def test_the_order_of_arrows_does_not_show() -> None:
+    assert draw(HOUSE) == draw(House(HOUSE.rooms, frozenset(sorted(HOUSE.arrows, reverse=True))))
+
+
+def test_floors_are_those_of_the_contract(tmp_path: Path) -> None:
+    pyproject = tmp_path / "pyproject.toml"
+    pyproject.write_text(
+        '[[tool.importlinter.contracts]]\nid = "other"\n'
+        '[[tool.importlinter.contracts]]\nid = "floors"\nlayers = ["a", "b | (c)", "(d)"]\n'
+    )
+    assert floors(pyproject) == [["a"], ["b", "c"], ["d"]]
+
+
+def test_the_house_is_that_of_the_sources() -> None:
+    house = survey(REPOSITORY)
+    packages = {f"fusiond.{path.parent.name}" for path in REPOSITORY.glob("fusiond/*/__init__.py")}
+    assert {room.name for room in house.rooms} == {"fusiond", "drivers", *packages}
+    assert all(room.sentence for room in house.rooms)
+    assert ("fusiond.live", "fusiond.navigator") in house.arrows
+    assert ("fusiond.gnss", "drivers") in house.arrows
+    assert not {(a, b) for a, b in house.arrows if a == "drivers"}
+
+
+def test_an_old_picture_is_found_and_renewed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "house.svg"
+    monkeypatch.setattr("tools.house.PICTURE", picture)
+    assert main(["--check"]) == 1
+    picture.write_text(PICTURE.read_text().replace("arrows", "errors"))
+    assert main(["--check"]) == 1
+    assert "make picture" in capsys.readouterr().err
+    assert main([]) == 0
+    assert main(["--check"]) == 0
+
+
+def sources_of(module: str) -> list[Path]:
+    """The file of a module, or all files of a package."""
+    path = REPOSITORY.joinpath(*module.split("."))
+    file = path.with_suffix(".py")
+    return [file] if file.exists() else sorted(path.glob("**/*.py"))
+
+
+def test_what_contributing_names_exists() -> None:
+    modules = set(re.findall(r"`((?:fusiond|drivers)\.[\w.]+)`", CONTRIBUTING))
+    modules.remove("fusiond.drivers")  # the group of entry points
+    assert len(modules) > 25
+    assert [module for module in modules if not sources_of(module)] == []
+    paths = set(
+        re.findall(r"[`(]((?:fusiond|drivers|tests|tools|docs)/[\w/.-]*)[`)]", CONTRIBUTING)
+    )
+    assert len(paths) > 8
+    assert [path for path in paths if not (REPOSITORY / path).exists()] == []
+
+
+def test_what_stands_by_a_module_is_in_it() -> None:
+    """On the two ways through the house: "`drivers.can.bus` (`CanBus`)"."""
+    pairs = re.findall(r"`((?:fusiond|drivers)\.[\w.]+)`\s\(`([\w.]+)`\)", CONTRIBUTING)
+    assert len(pairs) > 20
+    for module, name in pairs:
+        source = "".join(path.read_text() for path in sources_of(module))
+        for part in name.split("."):
+            definition = rf"^\s*(?:async def|def|class) {part}\b"
+            assert re.search(definition, source, re.MULTILINE), f"{module} has no {name}"
+
+
+def test_every_room_says_what_it_must_not_do() -> None:
+    rows = {
+        name
+        for line in CONTRIBUTING.splitlines()
+        if line.startswith("| `")
+        for name in re.findall(r"`([\w]+)/`", line.split("|")[1])
+    }
+    packages = {path.parent.name for path in REPOSITORY.glob("fusiond/*/__init__.py")}
+    assert packages | {"drivers"} <= rows
