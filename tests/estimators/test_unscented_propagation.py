@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionAid
-from fusiond.configuration.schema import Config, Imu
+from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import SPREAD, UnscentedEstimator
@@ -18,7 +18,6 @@ from fusiond.estimators.update import feed_back
 from fusiond.models.model import clock_blocks, make_model
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
-from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.timeline import Timeline
 from tests import runs
 from tests.estimators.test_kalman import random_covariance
@@ -33,7 +32,7 @@ from tests.estimators.test_unscented import (
     linear_aids,
     pair_of,
 )
-from tests.navigator import test_navigator as vehicle
+from tests.navigator import vehicle
 
 Array = NDArray[np.float64]
 
@@ -293,19 +292,15 @@ def test_in_the_navigator_whatever_the_delays(propagation: bool) -> None:
     late = rng.choice([0.0, 0.1, 1.5, 8.0], len(d.measurements)).tolist()
     found = []
     for delays in ([0.0] * len(late), late):
-        navigator = Navigator(Config.model_validate(data))
-        row = round(vehicle.STARTED_S * vehicle.RATE_HZ)
-        for first in range(0, row, 10):
-            navigator.add_imu(d.times[first : first + 10], d.samples[first : first + 10])
-            navigator.advance()
-        vehicle._feed(navigator, row, [7], delays)
+        navigator, row = vehicle.started(data)
+        vehicle.feed(navigator, row, [7], delays)
         found.append(navigator)
     on_time, delayed = found
     assert isinstance(on_time.estimator, UnscentedEstimator)
     assert on_time.estimator.propagation is propagation
-    assert vehicle._bytes(on_time) == vehicle._bytes(delayed)
-    outcomes = vehicle._outcomes(on_time)
-    assert outcomes == vehicle._outcomes(delayed)
+    assert vehicle.state_bytes(on_time) == vehicle.state_bytes(delayed)
+    outcomes = vehicle.outcomes_of(on_time)
+    assert outcomes == vehicle.outcomes_of(delayed)
     assert outcomes["gnss"]["fused"] == outcomes["wheel"]["fused"] == 34
     assert outcomes["non_holonomic"]["fused"] > 60
     true = runs.true_nav(d.truth, np.array([vehicle.SECONDS]))[0]

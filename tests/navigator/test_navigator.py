@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from drivers.measurements import (
     Attitude,
@@ -22,122 +21,30 @@ from drivers.measurements import (
     MonotonicStamp,
     PositionFix,
     TimeReport,
-    WheelSpeed,
 )
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.timeline import Entry
-from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.trajectories import Leg, follow
 from tests import runs
-
-Array = NDArray[np.float64]
-
-RATE_HZ, SECONDS = 50.0, 44.0
-START_NS = 7_003 * runs.SECOND
-STARTED_S = 8.0  # by then the filter runs; what follows comes in any way
-CONFIG: dict[str, Any] = {
-    "imu": {"rate_hz": RATE_HZ},
-    "alignment": {
-        "heading": ["config"],
-        "heading_deg": 41.0,
-        "heading_sd_deg": 2.0,
-        "position_deg_m": [30.5, 114.3, 40.0],
-        "position_sd_m": 5.0,
-    },
-    "constraints": {"non_holonomic": {"enabled": True, "interval_s": 0.2}},
-    "estimator": {"buffer_s": 12.0},
-}
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Stamps (n,), samples (n, 6) and measurements of a drive that starts and ends at rest."""
-
-    truth: Truth
-    times: NDArray[np.int64]
-    samples: Array
-    measurements: list[Measurement]
-
-
-@lru_cache(maxsize=1)
-def drive() -> Drive:
-    legs = [
-        Leg(10),
-        Leg(6, speed_m_s=10.0),
-        Leg(6, turn_deg=60.0),
-        Leg(6, turn_deg=-90.0),
-        Leg(6, speed_m_s=0.0),
-        Leg(10),
-    ]
-    truth = Truth(follow(legs, SECONDS, course_deg=40.0), runs.ORIGIN, RATE_HZ, SECONDS)
-    config = Config.model_validate(CONFIG)
-    rng = np.random.default_rng(20)
-    found: list[Measurement] = []
-    t = np.arange(9.013, SECONDS - 1.0, 1.0)
-    states = truth.at(t)
-    for t_s, p, v in zip(t, states.position, states.v_ned, strict=True):
-        lat, lon, up = (float(x) for x in p + rng.standard_normal(3) / runs.metres(p[0], p[2]))
-        n, e, d = (float(x) for x in v + rng.standard_normal(3) * 0.1)
-        at = START_NS + round(t_s * 1e9)
-        stamp = MonotonicStamp(at)
-        fix = PositionFix("gnss", at, stamp, lat, lon, up, sd_ned_m=(1.0, 1.0, 1.0))
-        speed = math.hypot(*v[:2])
-        found.append(replace(fix, v_ned_m_s=(n, e, d)))
-        found.append(WheelSpeed("wheel", at, stamp, speed + 0.05 * float(rng.standard_normal())))
-    return Drive(
-        truth,
-        runs.sample_times(truth, START_NS),
-        runs.imu_run(config.imu, truth, 21).samples,
-        found,
-    )
-
-
-def _started(**callbacks: Any) -> tuple[Navigator, int]:
-    """A navigator after the first seconds, always fed alike, and the row that comes next."""
-    d = drive()
-    navigator = Navigator(Config.model_validate(CONFIG), **callbacks)
-    row = round(STARTED_S * RATE_HZ)
-    for first in range(0, row, 10):
-        navigator.add_imu(d.times[first : first + 10], d.samples[first : first + 10])
-        navigator.advance()
-    assert navigator.started is not None
-    return navigator, row
-
-
-def _feed(navigator: Navigator, row: int, chunks: list[int], delays: list[float]) -> None:
-    """Chunks in turn, over and over; measurement i arrives `delays[i]` s after it was true."""
-    d = drive()
-    arrivals = sorted(
-        (m.t_seen_ns + round(s * 1e9), i)
-        for i, (m, s) in enumerate(zip(d.measurements, delays, strict=True))
-    )
-    turn = 0
-    while row < len(d.times):
-        rows = slice(row, row + chunks[turn % len(chunks)])
-        navigator.add_imu(d.times[rows], d.samples[rows])
-        row, turn = rows.stop, turn + 1
-        now = int(d.times[min(row, len(d.times)) - 1])
-        while arrivals and (arrivals[0][0] <= now or row >= len(d.times)):
-            m = d.measurements[arrivals.pop(0)[1]]
-            assert navigator.add(m, m.t_seen_ns) == "accepted"
-        navigator.advance()
-
-
-def _bytes(navigator: Navigator) -> tuple[bytes, ...]:
-    e = navigator.estimator
-    return e.nav.tobytes(), e.xi.tobytes(), e.covariance.tobytes(), e.step.tobytes()
-
-
-def _outcomes(navigator: Navigator) -> dict[str, Counter[str]]:
-    return {k: +v for k, v in navigator.timeline.counters.outcomes.items() if +v}
+from tests.navigator.vehicle import (
+    CONFIG,
+    RATE_HZ,
+    SECONDS,
+    START_NS,
+    STARTED_S,
+    drive,
+    feed,
+    outcomes_of,
+    started,
+    state_bytes,
+)
 
 
 @lru_cache(maxsize=1)
 def _in_order() -> Navigator:
-    navigator, row = _started()
-    _feed(navigator, row, [1], [0.0] * len(drive().measurements))
+    navigator, row = started()
+    feed(navigator, row, [1], [0.0] * len(drive().measurements))
     return navigator
 
 
@@ -147,7 +54,7 @@ def test_the_drive_is_navigated() -> None:
     error = runs.nav_error(navigator.estimator.nav, true)
     sd = np.sqrt(np.diag(navigator.estimator.covariance)[:9])
     assert (np.abs(error) < 4.0 * sd).all()
-    outcomes = _outcomes(navigator)
+    outcomes = outcomes_of(navigator)
     assert outcomes["zero_velocity"]["fused"] >= 8
     assert outcomes["zero_rate"]["fused"] >= 8
     assert outcomes["non_holonomic"]["fused"] > 60
@@ -163,10 +70,10 @@ def test_the_drive_is_navigated() -> None:
 )
 def test_chunks_and_delays_leave_no_trace(chunks: list[int], delays: list[float]) -> None:
     """Standstill windows and the no-slip constraint come of the samples: they too are the same."""
-    navigator, row = _started()
-    _feed(navigator, row, chunks, delays)
-    assert _bytes(navigator) == _bytes(_in_order())
-    assert _outcomes(navigator) == _outcomes(_in_order())
+    navigator, row = started()
+    feed(navigator, row, chunks, delays)
+    assert state_bytes(navigator) == state_bytes(_in_order())
+    assert outcomes_of(navigator) == outcomes_of(_in_order())
 
 
 def test_outcomes_are_heard_and_each_aid_ends_in_one() -> None:
@@ -175,15 +82,15 @@ def test_outcomes_are_heard_and_each_aid_ends_in_one() -> None:
     def hear(entry: Entry) -> None:
         last[id(entry)] = entry
 
-    navigator, row = _started(on_outcome=hear)
-    _feed(navigator, row, [33], [3.0] * 68)
+    navigator, row = started(on_outcome=hear)
+    feed(navigator, row, [33], [3.0] * 68)
     heard = Counter((e.aid.source, e.outcome.name) for e in last.values() if e.outcome is not None)
-    counted = {(s, n): c for s, names in _outcomes(navigator).items() for n, c in names.items()}
+    counted = {(s, n): c for s, names in outcomes_of(navigator).items() for n, c in names.items()}
     assert {k: c for k, c in heard.items() if k in counted} == counted
 
 
 def test_refusals_are_named_and_counted() -> None:
-    navigator, _ = _started()
+    navigator, _ = started()
     now = navigator.imu.latest_ns
     stamp = MonotonicStamp(now)
     lat, lon, up = runs.ORIGIN
@@ -203,19 +110,19 @@ def test_refusals_are_named_and_counted() -> None:
         assert navigator.add(m, t_ns, seen_ns=now) == name
         expected.setdefault(m.source, Counter())[name] += 1
     assert navigator.refused == expected
-    before = _bytes(navigator)
+    before = state_bytes(navigator)
     navigator.advance()
-    assert _bytes(navigator) == before
+    assert state_bytes(navigator) == before
     assert navigator.add(fix, now + 150_000_000, seen_ns=now) == "accepted"
     old = now - 40 * runs.SECOND
     assert navigator.add(Height("baro", now, MonotonicStamp(old), 40.0), old) == "accepted"
-    assert _outcomes(navigator)["baro"] == {"too_old": 1}
+    assert outcomes_of(navigator)["baro"] == {"too_old": 1}
 
 
 def test_bad_samples_leave_no_trace() -> None:
     """NaN, absurd values, repeated and backward stamps between the good ones."""
     d = drive()
-    navigator, row = _started()
+    navigator, row = started()
     rng = np.random.default_rng(5)
     for first in range(row, len(d.times), 20):
         times, samples = d.times[first : first + 20], d.samples[first : first + 20]
@@ -248,7 +155,7 @@ def test_bad_samples_leave_no_trace() -> None:
 
 def test_a_gap_is_invalid_while_it_lasts_and_honest_after() -> None:
     d = drive()
-    navigator, row = _started()
+    navigator, row = started()
     stop = round(18.0 * RATE_HZ)
     _feed_until(navigator, row, stop)
     before = navigator.estimator.sigmas()
@@ -279,7 +186,7 @@ def _feed_until(navigator: Navigator, row: int, stop: int) -> None:
 def test_a_long_silence_aligns_anew() -> None:
     d = drive()
     events: list[tuple[str, str]] = []
-    navigator, row = _started(on_event=lambda code, text: events.append((code, text)))
+    navigator, row = started(on_event=lambda code, text: events.append((code, text)))
     late = d.times + 100 * runs.SECOND
     navigator.add_imu(late[row : row + 10], d.samples[row : row + 10])
     navigator.advance()
@@ -297,7 +204,7 @@ def test_a_stamp_far_ahead_does_not_silence_the_imu() -> None:
     """One sample an hour ahead: what follows is backward, until that is plain; then anew."""
     d = drive()
     events: list[str] = []
-    navigator, row = _started(on_event=lambda code, text: events.append(code))
+    navigator, row = started(on_event=lambda code, text: events.append(code))
     hour = 3600 * runs.SECOND
     navigator.add_imu(d.times[row : row + 1] + hour, d.samples[row : row + 1])
     navigator.advance()
@@ -353,7 +260,7 @@ def test_everything_at_once(started: bool) -> None:
 
 def test_the_solution_is_carried_ahead_of_the_last_sample() -> None:
     d = drive()
-    navigator, row = _started()
+    navigator, row = started()
     _feed_until(navigator, row, round(20.0 * RATE_HZ))
     now = navigator.imu.latest_ns
     later = navigator.solution(now + 60_000_000)
@@ -392,14 +299,14 @@ def test_a_long_wait_for_alignment_does_not_grow() -> None:
 
 
 def test_a_height_that_we_gave_does_not_come_back_as_a_measurement() -> None:
-    navigator, _ = _started()
+    navigator, _ = started()
     now = navigator.imu.latest_ns
     lat, lon, up = runs.ORIGIN
     fix = DelayedFix("rdss", now, MonotonicStamp(now), lat, lon, up, 20.0)
     assert navigator.add(replace(fix, height_given=True), now, seen_ns=now) == "accepted"
     navigator.advance()
-    assert set(_outcomes(navigator)) & {"rdss", "rdss_height"} == {"rdss"}
+    assert set(outcomes_of(navigator)) & {"rdss", "rdss_height"} == {"rdss"}
     later = now - 1_000_000
     assert navigator.add(fix, later, seen_ns=now) == "accepted"
     navigator.advance()
-    assert set(_outcomes(navigator)) & {"rdss", "rdss_height"} == {"rdss", "rdss_height"}
+    assert set(outcomes_of(navigator)) & {"rdss", "rdss_height"} == {"rdss", "rdss_height"}
