@@ -25,8 +25,8 @@ from fusiond.gnss.orbit import WEEK_S
 from fusiond.models.model import CLOCK_OFFSET, clock_blocks, make_model
 from fusiond.navigator.filters import federated
 from tests import runs
-from tests.estimators.test_multiscale import IMU, LEVER, SECONDS, begun, drive
-from tests.estimators.test_multiscale_screened import Ranges, ranges
+from tests.estimators.screened_ranges import Ranges, ranges
+from tests.estimators.town_drive import IMU, LEVER, SECONDS, begun, drive
 
 MODES: tuple[Mode, ...] = ("no_reset", "fusion_reset", "zero_reset", "rescale")
 MODEL = make_model("ins15", imu_noise(IMU), *clock_blocks(("G",)))

@@ -22,22 +22,13 @@ from fusiond.estimators.propagation import GAP_FORCE_M_S2, GAP_RATE_RAD_S
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import dense_transition
 from tests import runs
+from tests.estimators.covariances import random_covariance
 
 Array = NDArray[np.float64]
 
 IMU = Imu(rate_hz=50.0)
 MODELS = ("ins15", "ins21", "planar15")
 STEP_NS = 20_000_000
-
-
-def random_covariance(rng: np.random.Generator, model: Model) -> Array:
-    """A full covariance of plausible size with correlations everywhere; inactive slots empty."""
-    scale = np.concatenate([[0.02] * 3, [0.3] * 3, [5.0] * 3, np.maximum(model.initial[9:], 1e-6)])
-    a = rng.standard_normal((model.size, model.size + 5))
-    p = scale[:, None] * (a @ a.T / (model.size + 5)) * scale
-    p[~model.active] = 0.0
-    p[:, ~model.active] = 0.0
-    return np.asarray(0.5 * (p + p.T))
 
 
 def started(name: str, seed: int = 1) -> tuple[Model, KalmanEstimator, Array]:

@@ -16,53 +16,21 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
-from fusiond.configuration.schema import Imu
 from fusiond.models.model import Model
-from fusiond.simulation.imu_truth import Truth
 from tests import runs
+from tests.estimators.monte_carlo import (
+    FIRST_FIX_S,
+    MATCHED,
+    RATE_HZ,
+    drawn_aids,
+    interval,
+)
 
 Array = NDArray[np.float64]
 
-RATE_HZ, SECONDS, RUNS = 50.0, 240.0, 100
-FIRST_FIX_S = 0.303  # inside an IMU interval, so that every fix splits one
+SECONDS, RUNS = 240.0, 100
 INSTANTS_S = (20.0, 90.0, 160.0, 239.0)
-LEVER = (0.4, -0.3, -1.2)
-NO_SCALE = 1e-6  # ppm: models without scale factors meet an IMU without
-MATCHED = {
-    "ins15": Imu(rate_hz=RATE_HZ, gyro_scale_ppm=NO_SCALE, accel_scale_ppm=NO_SCALE),
-    "ins21": Imu(rate_hz=RATE_HZ),
-    # One Markov state an axis stands for all of the accelerometer's bias: no turn-on part. A better
-    # gyro than the others': 20 m fixes leave the heading of a MEMS one at 5 deg, where the filter's
-    # linearisation, not its noise model, sets the NEES (measured: 19.6 instead of 12 after 60 s).
-    "planar15": Imu(
-        rate_hz=RATE_HZ,
-        gyro_noise_deg_sqrt_h=0.05,
-        accel_noise_m_s_sqrt_h=0.02,
-        gyro_bias_initial_deg_h=10.0,
-        gyro_bias_instability_deg_h=3.0,
-        accel_bias_initial_mg=1e-9,
-        accel_bias_instability_mg=0.5,
-        gyro_scale_ppm=NO_SCALE,
-        accel_scale_ppm=NO_SCALE,
-    ),
-    # As planar15, but for what it has no states for: the gyro's constant part, the accelerometer.
-    "planar10": Imu(
-        rate_hz=RATE_HZ,
-        gyro_noise_deg_sqrt_h=0.05,
-        accel_noise_m_s_sqrt_h=0.02,
-        gyro_bias_initial_deg_h=1e-9,
-        gyro_bias_instability_deg_h=3.0,
-        accel_bias_initial_mg=1e-9,
-        accel_bias_instability_mg=1e-9,
-        gyro_scale_ppm=NO_SCALE,
-        accel_scale_ppm=NO_SCALE,
-    ),
-}
 
 
 @dataclass
@@ -73,31 +41,6 @@ class Figures:
     degrees: dict[str, int]
     nis: dict[str, tuple[float, int]] = field(default_factory=dict)
     gated: int = 0
-
-
-def _aids(name: str, truth: Truth, t_s: Array, rng: np.random.Generator) -> list[list[Linearised]]:
-    """GNSS position and velocity; horizontal 20 m fixes for the planar models."""
-    states = truth.at(t_s, LEVER)
-    planar = name.startswith("planar")
-    sd, sd_v = (20.0, 20.0, 20.0) if planar else (1.5, 1.5, 3.0), (0.05, 0.05, 0.1)
-    aids: list[list[Linearised]] = []
-    for t, p, v in zip(t_s, states.position, states.v_ned, strict=True):
-        lat, lon, height = (
-            float(x)
-            for x in p + rng.standard_normal(3) * sd / runs.metres(float(p[0]), float(p[2]))
-        )
-        t_ns = round(t * 1e9)
-        if planar:
-            aids.append([PositionAid("rdss", t_ns, 1 - 1e-9, lat, lon, None, sd, LEVER)])
-            continue
-        n, e, d = (float(x) for x in v + rng.standard_normal(3) * sd_v)
-        aids.append(
-            [
-                PositionAid("gnss", t_ns, 1 - 1e-9, lat, lon, height, sd, LEVER),
-                VelocityAid("gnss_velocity", t_ns, 1 - 1e-9, (n, e, d), sd_v, LEVER),
-            ]
-        )
-    return aids
 
 
 def _projection(model: Model) -> Array:
@@ -142,7 +85,7 @@ def monte_carlo(name: str, count: int, first_seed: int = 1000) -> Figures:
         estimator.initialise(
             0, 0, runs.with_error(true_at[0], error[:9]), np.zeros(model.size), np.diag(sd**2)
         )
-        aids = _aids(name, truth, fixes_s, rng)
+        aids = drawn_aids(name, truth, fixes_s, rng)
         following = 0
         for at, t_s in enumerate(INSTANTS_S):
             while following < len(fixes_s) and fixes_s[following] <= t_s:
@@ -165,12 +108,6 @@ def monte_carlo(name: str, count: int, first_seed: int = 1000) -> Figures:
             for g, s in groups.items():
                 figures.nees[g][k, at] = x[s] @ np.linalg.solve(p[s, s], x[s])
     return figures
-
-
-def interval(degrees: int, probability: float) -> tuple[float, float]:
-    """Two-sided chi-square interval."""
-    tail = 0.5 * (1.0 - probability)
-    return float(chi2.ppf(tail, degrees)), float(chi2.ppf(1.0 - tail, degrees))
 
 
 @pytest.mark.parametrize("name", sorted(MATCHED))

@@ -12,7 +12,7 @@ import pytest
 
 from fusiond.studies.reduced_order import flight
 from fusiond.studies.reduced_order.runs import fly
-from tests.estimators.test_nees import interval
+from tests.estimators.monte_carlo import interval
 
 RUNS, SECONDS, EVERY_S = 50, 300.0, 100
 # `ins17` has one Markov state an axis for all of a gyro's drift and none for the accelerometer.

@@ -20,7 +20,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.model import make_model, misalignment
 from fusiond.simulation.aid_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
 from tests import runs
-from tests.estimators.test_nees import FIRST_FIX_S, LEVER, MATCHED, RATE_HZ, _aids, interval
+from tests.estimators.monte_carlo import FIRST_FIX_S, LEVER, MATCHED, RATE_HZ, drawn_aids, interval
 
 RUNS, SECONDS, SD = 30, 150.0, 180.0 * ARCSEC
 GATE = 1.0 - 1e-9
@@ -67,7 +67,9 @@ def test_misalignment_is_estimated_honestly(tau_s: float | None) -> None:
     for k in range(RUNS):
         rng = np.random.default_rng([77, k])
         star, sar = StarTracker(truth, star_options, rng), SarRadar(truth, sar_options, rng)
-        aids: list[Linearised] = [a for fix in _aids("ins15", truth, fixes_s, rng) for a in fix]
+        aids: list[Linearised] = [
+            a for fix in drawn_aids("ins15", truth, fixes_s, rng) for a in fix
+        ]
         for t, rpy in zip(star.t_s, star.rpy, strict=True):
             angles = (float(rpy[0]), float(rpy[1]), float(rpy[2]))
             sd_star = (float(star.sd_rad[0]),) * 3

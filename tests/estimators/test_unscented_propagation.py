@@ -20,9 +20,9 @@ from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
 from fusiond.navigator.timeline import Timeline
 from tests import runs
-from tests.estimators.test_kalman import random_covariance
-from tests.estimators.test_nees import interval
-from tests.estimators.test_unscented import (
+from tests.estimators.covariances import random_covariance
+from tests.estimators.monte_carlo import interval
+from tests.estimators.side_by_side import (
     GATE,
     IMU,
     LEVER,
