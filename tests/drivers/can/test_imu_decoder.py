@@ -1,4 +1,4 @@
-"""CAN frames to IMU samples without a bus: worked frames, pairing, losses, refusals."""
+"""CAN frames to IMU samples without a bus: axes, units, filters, refusals, bad mappings."""
 
 from __future__ import annotations
 
@@ -6,150 +6,25 @@ import math
 import struct
 from pathlib import Path
 
-import cantools
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base import PermanentDriverError
-from drivers.can.dbc import STANDARD_GRAVITY_M_S2, load_dbc, parameter_group
+from drivers.can.dbc import STANDARD_GRAVITY_M_S2, parameter_group
 from drivers.can.imu import CanImuDecoder, CanImuOptions
-from drivers.measurements import ArrivalStamp, DeviceStamp, ImuSample, KernelStamp
-from tests.places import REPOSITORY
-
-MS = 1_000_000
-T0 = 50_000 * MS
-EPOCH = 1_760_000_000_000 * MS
-
-WORKED = [
-    (
-        "sbg_ellipse",
-        0x121,
-        "0C 00 DE FF D5 03",
-        {"ACCEL_X": 0.12, "ACCEL_Y": -0.34, "ACCEL_Z": 9.81},
-    ),
-    ("sbg_ellipse", 0x122, "0A 00 EC FF 5E 01", {"GYRO_X": 0.01, "GYRO_Y": -0.02, "GYRO_Z": 0.35}),
-    (
-        "xsens_mti600",
-        0x032,
-        "00 08 FF F0 00 B0",
-        {"GYRO_X": 0.015625, "GYRO_Y": -0.03125, "GYRO_Z": 0.34375},
-    ),
-    (
-        "xsens_mti600",
-        0x034,
-        "00 20 FF C0 09 D0",
-        {"ACCEL_X": 0.125, "ACCEL_Y": -0.25, "ACCEL_Z": 9.8125},
-    ),
-    ("xsens_mti600", 0x005, "00 01 E2 40", {"TIME": 12.3456}),
-    ("bosch_mm5_10", 0x174, "A0 8F 00 00 57 78 00 00", {"YAW_RATE": 20.0, "AY": -0.24999}),
-    ("bosch_mm5_10", 0x178, "A8 7D 00 00 11 83 00 00", {"ROLL_RATE": -3.0, "AX": 0.10003}),
-    ("bosch_mm7_10", 0x174, "A0 8F 00 00 57 78 00 00", {"YAW_RATE": 20.0, "AY": -0.24999}),
-    ("bosch_mm7_10", 0x178, "A8 7D 00 00 11 83 00 00", {"ROLL_RATE": -3.0, "AX": 0.10003}),
-    ("racelogic_imu04", 0x600, "41 A0 00 00 3D CC CC CD", {"YAW_RATE": 20.0, "ACCEL_X": 0.1}),
-    (
-        "aceinna_openimu300ri",
-        0x0CF02A80,
-        "80 7D 00 7C 00 87 00 00",
-        {"RATE_X": 1.0, "RATE_Y": -2.0, "RATE_Z": 20.0},
-    ),
-    (
-        "aceinna_openimu300ri",
-        0x08F02D80,
-        "0C 7D DE 7C D5 80 00 00",
-        {"ACCEL_X": 0.12, "ACCEL_Y": -0.34, "ACCEL_Z": 9.81},
-    ),
-]
-
-
-@pytest.mark.parametrize(("dbc", "can_id", "frame", "values"), WORKED)
-def test_worked_frames_both_ways(
-    dbc: str, can_id: int, frame: str, values: dict[str, float]
-) -> None:
-    message = load_dbc(dbc).get_message_by_frame_id(can_id)
-    data = bytes.fromhex(frame)
-    decoded = message.decode(data)
-    assert isinstance(decoded, dict)
-    for name, value in values.items():
-        assert decoded[name] == pytest.approx(value, abs=6e-6)
-    others = {signal.name: decoded[signal.name] for signal in message.signals}
-    assert message.encode({**others, **values}) == data
-
-
-@pytest.mark.parametrize("dbc", sorted({worked[0] for worked in WORKED}))
-def test_shipped_dbc_is_strict_and_has_units(dbc: str) -> None:
-    path = REPOSITORY / "config" / "dbc" / f"{dbc}.dbc"
-    database = cantools.database.load_file(path, strict=True)
-    for message in database.messages:
-        for signal in message.signals:
-            if (
-                signal.name.startswith(("GYRO", "RATE_", "YAW_RATE"))
-                and "STATUS" not in signal.name
-            ):
-                assert signal.unit in {"rad/s", "deg/s"}
-
-
-SBG = CanImuOptions(
-    dbc="sbg_ellipse",
-    gyro=("IMU_GYRO.GYRO_X", "IMU_GYRO.GYRO_Y", "-IMU_GYRO.GYRO_Z"),
-    accel=("IMU_ACCEL.ACCEL_X", "-IMU_ACCEL.ACCEL_Y", "IMU_ACCEL.ACCEL_Z"),
-    device_time="IMU_INFO.TIME_STAMP",
+from drivers.measurements import ArrivalStamp, DeviceStamp
+from tests.drivers.can.imu_frames import (
+    ACEINNA,
+    IMU04,
+    MM7,
+    MS,
+    SBG,
+    SBG_UNTIMED,
+    T0,
+    Line,
+    sbg_time,
 )
-SBG_UNTIMED = SBG.model_copy(update={"device_time": ()})
-MM7 = CanImuOptions(
-    dbc="bosch_mm7_10",
-    gyro=("-TX2.ROLL_RATE", "TX3.PITCH_RATE", "TX1.YAW_RATE"),
-    accel=("TX2.AX", "TX1.AY", "TX3.AZ"),
-    counter=("TX1.COUNTER", "TX2.COUNTER", "TX3.COUNTER"),
-)
-IMU04 = CanImuOptions(
-    dbc="racelogic_imu04",
-    gyro=("IMU_602.ROLL_RATE", "IMU_602.PITCH_RATE", "IMU_600.YAW_RATE"),
-    accel=("IMU_600.ACCEL_X", "-IMU_601.ACCEL_Y", "IMU_603.ACCEL_Z"),
-)
-ACEINNA = CanImuOptions(
-    dbc="aceinna_openimu300ri",
-    gyro=("ARI.RATE_X", "ARI.RATE_Y", "ARI.RATE_Z"),
-    accel=("ACCS.ACCEL_X", "ACCS.ACCEL_Y", "ACCS.ACCEL_Z"),
-)
-
-
-class Line:
-    """Feeds a decoder with frames; frames of one sample lie 0.3 ms apart."""
-
-    def __init__(self, options: CanImuOptions, kernel: bool = True) -> None:
-        self.decoder = CanImuDecoder("imu", options)
-        self.counters = self.decoder.counters
-        self.samples: list[ImuSample] = []
-        self.kernel = kernel
-        self.offset_ns = EPOCH
-
-    def frame(self, at_ns: int, can_id: int, data: bytes, extended: bool = False) -> None:
-        stamp = at_ns + self.offset_ns if self.kernel else None
-        sample = self.decoder.feed(can_id, extended, data, at_ns, stamp)
-        if sample is not None:
-            self.samples.append(sample)
-
-    def burst(self, at_ns: int, *frames: tuple[int, bytes]) -> None:
-        for i, (can_id, data) in enumerate(frames):
-            self.frame(at_ns + i * 300_000, can_id, data)
-
-
-def sbg_time(us: int) -> tuple[int, bytes]:
-    return 0x120, struct.pack("<IHh", us % 2**32, 0, 2500)
-
-
-def sbg_accel(k: int) -> tuple[int, bytes]:
-    return 0x121, struct.pack("<3h", k % 1000, 2, 981)
-
-
-def sbg_gyro(k: int) -> tuple[int, bytes]:
-    return 0x122, struct.pack("<3h", k % 1000, 20, 350)
-
-
-def mm7(k: int, tx: int, value: int | None = None) -> tuple[int, bytes]:
-    raw = 0x8000 + (k % 1000 if value is None else value)
-    return 0x170 + 4 * tx, struct.pack("<HHHBB", raw, 0, raw, k % 16, 0)
 
 
 def test_axes_signs_and_units() -> None:
@@ -191,148 +66,6 @@ def test_constant_axes_of_a_partial_imu() -> None:
     assert line.samples[-1].gyro_rad_s[1] == 0.0
     assert line.samples[-1].accel_m_s2[2] == -9.80665
     assert line.samples[-1].stamp == ArrivalStamp(0.004)
-
-
-def test_device_time_wraps_and_counts_losses() -> None:
-    line = Line(SBG)
-    first_us = 2**32 - 20_000
-    kept = [k for k in range(40) if k not in (10, 11, 25)]
-    for k in kept:
-        us = first_us + 5000 * k
-        line.burst(T0 + 5 * MS * k, sbg_time(us), sbg_accel(k), sbg_gyro(k))
-    ticks = [s.stamp.ticks_ns for s in line.samples if isinstance(s.stamp, DeviceStamp)]
-    assert ticks == [(first_us + 5000 * k) * 1000 for k in kept]
-    assert line.counters["lost_samples"] == 3
-    assert line.counters["device_restarts"] == 0
-
-
-@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
-def test_a_stamp_message_ahead_or_behind_lends_its_time_to_its_own_sample(
-    order: tuple[int, int, int],
-) -> None:
-    line = Line(SBG)
-    for k in range(30):
-        parts = (sbg_time(5000 * k), sbg_accel(k), sbg_gyro(k))
-        line.burst(T0 + 5 * MS * k, *(parts[i] for i in order))
-    assert len(line.samples) >= 24
-    for sample in line.samples[-20:]:
-        assert isinstance(sample.stamp, DeviceStamp)
-        k = sample.stamp.ticks_ns // (5 * MS)
-        assert sample.gyro_rad_s[0] == pytest.approx(k * 0.001)
-        assert sample.accel_m_s2[0] == pytest.approx(k * 0.01)
-
-
-def test_device_restart_begins_a_new_clock() -> None:
-    line = Line(SBG)
-    for k in range(20):
-        line.burst(T0 + 5 * MS * k, sbg_time(900_000_000 + 5000 * k), sbg_accel(k), sbg_gyro(k))
-    for k in range(20):
-        line.burst(T0 + 5000 * MS + 5 * MS * k, sbg_time(5000 * k), sbg_accel(k), sbg_gyro(k))
-    assert line.counters["device_restarts"] == 1
-    assert line.samples[-1].stamp == DeviceStamp("imu/1", 95 * MS)
-    assert line.counters["lost_samples"] == 0
-
-
-def test_setting_the_system_clock_is_no_restart() -> None:
-    line = Line(SBG)
-    for k in range(40):
-        if k == 20:
-            line.offset_ns += 3600 * 1000 * MS
-        line.burst(T0 + 5 * MS * k, sbg_time(5000 * k), sbg_accel(k), sbg_gyro(k))
-    assert line.counters["device_restarts"] == 0
-    assert len(line.samples) == 40
-
-
-def test_device_time_that_goes_back_is_refused() -> None:
-    line = Line(SBG)
-    for k, us in enumerate([0, 5000, 10_000, 15_000, 20_000, 12_000, 30_000]):
-        line.burst(T0 + 5 * MS * k, sbg_time(us), sbg_accel(k), sbg_gyro(k))
-    ticks = [s.stamp.ticks_ns for s in line.samples if isinstance(s.stamp, DeviceStamp)]
-    assert ticks == [us * 1000 for us in (0, 5000, 10_000, 15_000, 20_000, 30_000)]
-    assert line.counters["time_backward"] == 1
-
-
-def test_pairing_by_counter_needs_no_arrival_times() -> None:
-    """Frames of two samples interleaved, all with the same stamp."""
-    line = Line(MM7)
-    for k in range(0, 40, 2):
-        line.burst(T0, mm7(k, 1), mm7(k + 1, 1), mm7(k, 2), mm7(k + 1, 2))
-        line.burst(T0, mm7(k, 3), mm7(k + 1, 3))
-    assert len(line.samples) == 40
-    for k, sample in enumerate(line.samples):
-        rate = math.radians(0.005 * k)
-        assert sample.gyro_rad_s == pytest.approx((-rate, rate, rate), abs=1e-9)
-    assert line.counters["unpaired"] == 0
-
-
-def test_counter_counts_losses_beyond_its_modulus() -> None:
-    line = Line(MM7)
-    kept = [*range(20), *range(20 + 37, 80)]
-    for k in kept:
-        line.burst(T0 + 5 * MS * k, mm7(k, 1), mm7(k, 2), mm7(k, 3))
-    assert line.counters["lost_samples"] == 37
-    assert len(line.samples) == len(kept)
-
-
-def test_a_frame_missing_makes_no_sample() -> None:
-    line = Line(MM7)
-    for k in range(20):
-        frames = [mm7(k, 1), mm7(k, 2), mm7(k, 3)]
-        if k == 8:
-            del frames[1]
-        line.burst(T0 + 5 * MS * k, *frames)
-    assert len(line.samples) == 19
-    assert line.counters["unpaired"] == 2
-    assert line.counters["lost_samples"] == 1
-
-
-def test_pairing_by_arrival_learns_the_interval_and_counts_losses() -> None:
-    line = Line(SBG_UNTIMED)
-    for k in range(60):
-        if k in (30, 31):
-            continue
-        frames = [sbg_accel(k), sbg_gyro(k)]
-        if k == 45:
-            del frames[0]
-        line.burst(T0 + 5 * MS * k, *frames)
-    for sample in line.samples:
-        assert sample.gyro_rad_s[0] * 10.0 == pytest.approx(sample.accel_m_s2[0])
-        assert isinstance(sample.stamp, KernelStamp)
-    assert line.samples[-1].stamp == KernelStamp(EPOCH + T0 + 59 * 5 * MS)
-    assert line.counters["lost_samples"] == 3
-    assert len(line.samples) >= 50
-
-
-def test_jitter_of_arrival_is_no_loss() -> None:
-    line = Line(SBG_UNTIMED, kernel=False)
-    late = {20: 9.0, 21: 4.5, 22: 0.5, 40: 2.0}
-    for k in range(60):
-        line.burst(T0 + int((5.0 * k + late.get(k, 0.0)) * MS), sbg_accel(k), sbg_gyro(k))
-    assert line.counters["lost_samples"] == 0
-    assert line.samples[-1].stamp == ArrivalStamp(0.0)
-
-
-def test_duplicates_are_dropped() -> None:
-    for options in (SBG, SBG_UNTIMED):
-        line = Line(options)
-        for k in range(20):
-            frames = [sbg_time(5000 * k)] if options is SBG else []
-            frames += [sbg_accel(k), sbg_gyro(k)]
-            if k > 10:
-                frames += frames[-2:]
-            line.burst(T0 + 5 * MS * k, *frames)
-        values = [s.gyro_rad_s[0] for s in line.samples]
-        assert values == sorted(set(values))
-        assert values[-1] == pytest.approx(0.019)
-        assert line.counters["duplicates"] == 18
-
-
-def test_equal_readings_at_rest_are_no_duplicates() -> None:
-    line = Line(SBG_UNTIMED)
-    for k in range(30):
-        line.burst(T0 + 5 * MS * k, sbg_accel(0), sbg_gyro(0))
-    assert line.counters["duplicates"] == 0
-    assert len(line.samples) >= 24
 
 
 def test_refusals_are_named() -> None:
