@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from functools import reduce
-from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -23,23 +21,8 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.driver import NmeaDriver, NmeaOptions
+from tests.drivers.nmea.sentences import gga, made, rmc, wire
 from tests.pty_device import Device, until
-
-
-def nmea(body: str) -> bytes:
-    return b"$%s*%02X\r\n" % (body.encode(), reduce(xor, body.encode(), 0))
-
-
-def gga(second: int, quality: int = 4) -> bytes:
-    return nmea(
-        f"GNGGA,0214{second:02d}.00,3958.12345,N,11619.54321,E,{quality},18,0.62,45.3,M,-9.1,M,,"
-    )
-
-
-def rmc(second: int) -> bytes:
-    return nmea(
-        f"GNRMC,0214{second:02d}.00,A,3958.12345,N,11619.54321,E,19.438,090.00,011226,,,R,V"
-    )
 
 
 class Vehicle:
@@ -167,8 +150,8 @@ async def test_wrong_baud_rate_is_named(device: Device) -> None:
     [
         (b"", "silent", "no bytes for 0.3 s"),
         (b"\xb5\x62\x01\x07\x00\x00\x08\x19", "silent", "switch on NMEA output"),
-        (nmea("GPGSV,1,1,00,1"), "running", "switch on GGA"),
-        (nmea("GNGGA,,,,,,0,00,99.99,,,,,,"), "running", "no fix"),
+        (wire(made("GPGSV,1,1,00,1")), "running", "switch on GGA"),
+        (wire(made("GNGGA,,,,,,0,00,99.99,,,,,,")), "running", "no fix"),
         (gga(29, quality=6), "running", "dead reckoning"),
         (gga(29, quality=8), "running", "simulates"),
     ],

@@ -20,7 +20,7 @@ from drivers.nmea.decoder import NmeaDecoding
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.driver import GnssDecoder, GnssDriver, GnssOptions
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from tests.drivers.nmea.test_driver import gga, rmc
+from tests.drivers.nmea.sentences import gga, rmc
 from tests.drivers.raw.frames import d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
 from tests.pty_device import Device, until
 

@@ -1,0 +1,250 @@
+"""Fields of NMEA sentences: quality, velocity, sigma, heading; what is refused, by name."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.measurements import (
+    ArrivalStamp,
+    Heading,
+    PositionFix,
+    TimeOfDayStamp,
+    TimeReport,
+    UtcStamp,
+)
+from tests.drivers.nmea.sentences import (
+    GGA,
+    GGA_NO_FIX,
+    GGA_SW,
+    GNS,
+    GSA,
+    GSA_2D,
+    GST,
+    GST_EMPTY,
+    HDT,
+    RMC,
+    RMC_V,
+    THS,
+    THS_E,
+    UTC_NS,
+    VTG,
+    ZDA,
+    ZDA_RDSS,
+    changed,
+    decode,
+    fix_of,
+    fixes,
+    made,
+)
+
+
+def test_a_whole_epoch() -> None:
+    found, one = decode(RMC, VTG, GGA, GSA, GST, ZDA)
+    report, fix = found
+    assert report == TimeReport("gnss", 7, UTC_NS, trusted=False)
+    assert isinstance(fix, PositionFix)
+    assert fix.stamp == UtcStamp(UTC_NS)
+    assert math.degrees(fix.lat_rad) == pytest.approx(39 + 58.12345 / 60, abs=1e-9)
+    assert math.degrees(fix.lon_rad) == pytest.approx(116 + 19.54321 / 60, abs=1e-9)
+    assert fix.height_m == pytest.approx(45.3 - 9.1)
+    assert (fix.quality, fix.satellites, fix.hdop, fix.vdop) == (4, 18, 0.62, 1.04)
+    assert fix.sd_ned_m == (0.014, 0.012, 0.031)
+    assert fix.v_ned_m_s is not None
+    assert fix.v_ned_m_s == (
+        pytest.approx(0.0, abs=1e-9),
+        pytest.approx(19.438 * 1852 / 3600),
+        None,
+    )
+    assert fix.sd_v_ned_m_s is None
+    assert one.counters["fixes"] == one.counters["epochs"] == 1
+
+
+def test_hemispheres_and_absent_separation() -> None:
+    fix = fix_of(GGA_SW)
+    assert math.degrees(fix.lat_rad) == pytest.approx(-(39 + 58.12345 / 60))
+    assert math.degrees(fix.lon_rad) == pytest.approx(-(116 + 19.54321 / 60))
+    assert fix.height_m is None  # sea level alone is no ellipsoidal height
+    assert fix.stamp == TimeOfDayStamp(2 * 3600 + 14 * 60 + 29.0)
+    assert (fix.v_ned_m_s, fix.sd_ned_m, fix.vdop) == (None, None, None)
+
+
+@pytest.mark.parametrize("talker", ["GP", "GN", "BD", "GB", "GL", "GA", "GQ"])
+def test_every_talker(talker: str) -> None:
+    assert fix_of(changed(GGA, "GN", talker)).quality == 4
+
+
+def test_talkers_of_other_devices_are_not_taken() -> None:
+    found, one = decode(changed(GGA, "GN", "II"), changed(HDT, "GN", "HE"))
+    assert not found
+    assert one.counters["other_talker"] == 2
+
+
+def test_gns_where_gga_is_not_sent() -> None:
+    fix = fix_of(RMC, GNS)
+    assert fix.quality == 1  # RRNAN: one system is autonomous
+    assert fix.height_m == pytest.approx(36.2)
+    assert (fix.satellites, fix.hdop) == (18, 0.62)
+
+
+@pytest.mark.parametrize(
+    ("modes", "quality"),
+    [("A", 1), ("DDDN", 2), ("RRRR", 4), ("RF", 5), ("RFDA", 1), ("PR", 3), ("NNNR", 4)],
+)
+def test_worst_system_counts_in_gns(modes: str, quality: int) -> None:
+    assert fix_of(changed(GNS, "RRNAN", modes)).quality == quality
+
+
+def test_gga_settles_quality_beside_gns_in_either_order() -> None:
+    assert fix_of(GGA, GNS).quality == 4
+    assert fix_of(GNS, GGA).quality == 4
+
+
+def test_velocity_from_vtg_where_rmc_is_not_sent() -> None:
+    v = fix_of(GGA, VTG).v_ned_m_s
+    assert v is not None
+    assert v[1] == pytest.approx(19.438 * 1852 / 3600)
+    v = fix_of(GGA, changed(VTG, "19.438", "")).v_ned_m_s
+    assert v is not None
+    assert v[1] == pytest.approx(10.0)  # km/h
+    assert fix_of(GGA, changed(VTG, "K,R", "K,N")).v_ned_m_s is None
+
+
+def test_velocity_needs_a_course_unless_at_rest() -> None:
+    moving = changed(RMC, "19.438,090.00", "2.000,")
+    resting = changed(RMC, "19.438,090.00", "0.013,")
+    assert fix_of(GGA, moving).v_ned_m_s is None
+    assert fix_of(GGA, resting).v_ned_m_s == (0.0, 0.0, None)
+    v = fix_of(GGA, moving, VTG).v_ned_m_s
+    assert v is not None
+    assert v[1] == pytest.approx(2.0 * 1852 / 3600)
+
+
+def test_two_dimensional_fix_has_no_height() -> None:
+    found, one = decode(GGA, GSA_2D)
+    assert fixes(found)[0].height_m is None
+    assert one.counters["height_not_measured"] == 1
+
+
+def test_sigma_without_numbers_is_none() -> None:
+    assert fix_of(GGA, GST_EMPTY).sd_ned_m is None
+    assert fix_of(GGA, changed(GST, "0.014", "0.000")).sd_ned_m is None
+
+
+@pytest.mark.parametrize(
+    ("sentences", "name"),
+    [
+        ([changed(GGA, "E,4", "E,6")], "dead_reckoning_refused"),
+        ([GGA, changed(RMC, "R,V", "E,V")], "dead_reckoning_refused"),
+        ([GGA, changed(VTG, "K,R", "K,E")], "dead_reckoning_refused"),
+        ([changed(GNS, "RRNAN", "AENNN")], "dead_reckoning_refused"),
+        ([changed(GGA, "E,4", "E,6"), RMC_V], "dead_reckoning_refused"),
+        ([changed(GGA, "E,4", "E,0")], "no_fix"),
+        ([changed(GGA, "E,4", "E,")], "no_fix"),
+        ([GGA_NO_FIX], "no_fix"),
+        ([GGA, RMC_V], "no_fix"),
+        ([changed(GNS, "RRNAN", "NNNNN")], "no_fix"),
+        ([changed(GGA, "E,4", "E,7")], "manual_refused"),
+        ([changed(GGA, "E,4", "E,8")], "simulator_refused"),
+        ([GGA, changed(RMC, "R,V", "S,V")], "simulator_refused"),
+        ([changed(GGA, "E,4", "E,9")], "unknown_quality"),
+    ],
+)
+def test_epochs_refused_by_name(sentences: list[str], name: str) -> None:
+    found, one = decode(*sentences)
+    assert not fixes(found)
+    assert one.counters[name] == 1
+    assert one.refusal == name
+
+
+def test_simulator_where_allowed() -> None:
+    assert fix_of(changed(GGA, "E,4", "E,8"), allow_simulator=True).quality == 8
+    assert fix_of(changed(GGA, "E,4", "E,7"), allow_simulator=True).quality == 7
+    found, one = decode(changed(GGA, "E,4", "E,6"), allow_simulator=True)
+    assert (fixes(found), one.counters["dead_reckoning_refused"]) == ([], 1)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "old", "new"),
+    [
+        (GGA, "3958.12345", "3960.12345"),
+        (GGA, "3958.12345", "9158.12345"),
+        (GGA, "11619.54321", "18019.54321"),
+        (GGA, "3958.12345", "-958.12345"),
+        (GGA, ",N,", ",,"),
+        (GGA, ",N,", ",X,"),
+        (GGA, "0.62", "nan"),
+        (GGA, "45.300", "inf"),
+        (GGA, "E,4,18", "E,4,x"),
+        (GGA, "021429.00", "241429.00"),
+        (GGA, "021429.00", "021460.00"),
+        (GGA, "021429.00", "2:14:29"),
+        (RMC, "19.438", "-1.0"),
+        (RMC, "090.00", "361.0"),
+        (GST, "0.014", "-0.1"),
+        (ZDA, ",06,", ",13,"),
+        (HDT, "350.00", "400.0"),
+    ],
+)
+def test_a_field_that_cannot_be_true_refuses_the_sentence_only(
+    sentence: str, old: str, new: str
+) -> None:
+    found, one = decode(changed(sentence, old, new), GGA)
+    assert one.counters["bad_field"] == 1
+    assert len(fixes(found)) == 1
+
+
+def test_cut_sentences_that_verify() -> None:
+    for whole in (GGA, RMC, VTG, GNS, GSA, GST, ZDA, HDT, THS):
+        fields = whole[1:-3].split(",")
+        for length in range(1, len(fields)):
+            decode(made(",".join(fields[:length])), GGA)
+
+
+@given(
+    st.sampled_from(["GGA", "RMC", "VTG", "GNS", "GSA", "GST", "ZDA", "HDT", "THS"]),
+    st.lists(
+        st.sampled_from(["", "021429.00", "9999999", "A", "nan", "-1", "3958.1", "N", "E", "6"])
+        | st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E), max_size=8),
+        max_size=20,
+    ),
+)
+@settings(max_examples=300, deadline=None)
+def test_no_verified_sentence_raises(formatter: str, fields: list[str]) -> None:
+    body = ",".join(["GN" + formatter, *fields]).replace("$", "").replace("*", "")
+    for measurement in decode(made(body), GGA, RMC)[0]:
+        if isinstance(measurement, PositionFix):
+            assert math.isfinite(measurement.lat_rad)
+            assert math.isfinite(measurement.lon_rad)
+
+
+def test_rdss_text_on_the_same_port_is_left_alone() -> None:
+    found, one = decode(GGA, ZDA_RDSS, made("BDFKI,DWA,N,Y,0,0058"), RMC)
+    assert fixes(found)[0].stamp == UtcStamp(UTC_NS)
+    assert one.counters["rdss_sentence"] == 2
+    assert one.counters["implausible_date"] == 0
+
+
+def test_heading_with_baseline_offset() -> None:
+    headings = list(decode(GGA, RMC, HDT, heading_offset_deg=30.0)[0][1:])
+    assert isinstance(headings[1], Heading)
+    assert math.degrees(headings[1].yaw_rad) == pytest.approx(20.0)
+    assert headings[1].stamp == UtcStamp(UTC_NS)
+    (heading,) = [m for m in decode(GGA, THS)[0] if isinstance(m, Heading)]
+    assert math.degrees(heading.yaw_rad) == pytest.approx(10.5)
+
+
+def test_heading_that_is_not_a_measurement_is_refused() -> None:
+    for sentences in ([GGA, THS_E], [changed(GGA, "E,4", "E,6"), HDT], [GGA_NO_FIX, HDT]):
+        found, one = decode(*sentences)
+        assert not [m for m in found if isinstance(m, Heading)]
+        assert one.counters["heading_mode_refused"] == 1
+
+
+def test_heading_alone_has_only_its_arrival() -> None:
+    found, one = decode(HDT, HDT, HDT)
+    assert [m.stamp for m in found if isinstance(m, Heading)] == [ArrivalStamp()] * 3
+    assert one.counters["untimed_epoch"] == 3
