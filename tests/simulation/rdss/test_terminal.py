@@ -1,20 +1,14 @@
-"""Simulated devices without I/O: what they say is read by the drivers' own decoders."""
+"""A simulated RDSS terminal without I/O: what it says is read by the driver's own decoders."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 import pytest
-from pynmeagps import VALCKSUM
-from pynmeagps.nmeareader import NMEAReader
 
-from drivers.can.imu import CanImuDecoder, CanImuOptions
-from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix, UtcStamp
-from drivers.nmea.decoder import NmeaDecoder
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.cycle import FixReady, Send, TerminalOptions
 from drivers.rdss.messages import (
@@ -40,149 +34,12 @@ from drivers.rdss.messages import (
     VersionRequest,
 )
 from drivers.rdss.terminal import Terminal
-from fusiond.simulation.can.imu import SIM_IMU, CanImu
-from fusiond.simulation.gnss.receiver import GnssOptions, GnssReceiver, latitude, longitude
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssOptions
 from fusiond.simulation.rdss.terminal import RdssTerminal
-from fusiond.simulation.trajectories import drive
+from tests.simulation.utc_start import UTC_START_NS
 
-UTC_START = datetime(2026, 11, 20, 23, 59, 30, 123456, tzinfo=UTC)
-UTC_START_NS = int(UTC_START.timestamp()) * 1_000_000_000 + 123_456_789
-ORIGIN = (math.radians(30.5), math.radians(114.3), 40.0)
 FAMILIES: tuple[Family, ...] = ("4.0", "2.1")
-
-
-@pytest.fixture(scope="module")
-def truth() -> Truth:
-    return Truth(drive(300.0), ORIGIN, 50.0, 300.0)
-
-
-def _receiver(truth: Truth, **options: Any) -> GnssReceiver:
-    return GnssReceiver(truth, GnssOptions(**options), np.random.default_rng(1))
-
-
-# --------------------------------------------------------------------------- GNSS
-
-
-@pytest.mark.parametrize("talker", ["GP", "GN", "BD", "GB"])
-def test_pynmeagps_reads_every_sentence(truth: Truth, talker: str) -> None:
-    names = ("GGA", "RMC", "VTG", "GSA", "GST", "ZDA", "HDT", "THS")
-    gnss = _receiver(truth, talker=talker, sentences=names, rate_hz=1.0, outages=((100.0, 10.0),))
-    for k in range(50, 150):
-        lines = gnss.nmea(k, UTC_START_NS).splitlines(keepends=True)
-        parsed = [NMEAReader.parse(line, validate=VALCKSUM, msgmode=0) for line in lines]
-        assert [m.msgID for m in parsed if m is not None] == list(names)
-        assert all(m is not None and m.talker == talker for m in parsed)
-        assert all(len(line) <= 100 for line in lines)
-
-
-def test_epochs_come_back_through_the_nmea_driver(truth: Truth) -> None:
-    sentences = ("GGA", "RMC", "VTG", "GSA", "GST", "ZDA", "THS")
-    gnss = _receiver(truth, rate_hz=5.0, outages=((200.0, 20.0),), sentences=sentences)
-    decoder = NmeaDecoder("gnss")
-    found = []
-    for k in range(len(gnss)):
-        found += decoder.feed(gnss.nmea(k, UTC_START_NS), k)
-        found += decoder.silence()
-    fixes = [m for m in found if isinstance(m, PositionFix)]
-    expected = [gnss.fix(k) for k in range(len(gnss)) if gnss.valid[k]]
-    assert len(fixes) == len(expected) == 1400
-    assert len([m for m in found if isinstance(m, Heading)]) == 1400
-    assert decoder.counters["no_fix"] == 100
-    for fix, sent in zip(fixes, expected, strict=True):
-        assert isinstance(fix.stamp, UtcStamp)  # through midnight, to 10 ms
-        assert abs(fix.stamp.utc_ns - UTC_START_NS - sent.t_s * 1e9) <= 5.1e6
-        assert math.degrees(fix.lat_rad) == pytest.approx(sent.lat_deg, abs=2e-9)
-        assert math.degrees(fix.lon_rad) == pytest.approx(sent.lon_deg, abs=2e-9)
-        assert fix.height_m == pytest.approx(sent.height_m, abs=1.1e-3)
-        assert fix.sd_ned_m == pytest.approx(gnss.sd_ned_m)
-        assert fix.v_ned_m_s is not None
-        north, east, down = fix.v_ned_m_s
-        assert (north, east) == pytest.approx(sent.v_ned_m_s[:2], abs=1e-3)
-        assert down is None
-
-
-def test_gnss_errors_have_the_sigma_that_gst_states(truth: Truth) -> None:
-    gnss = _receiver(truth, correlated_sd_m=(0.6, 1.0), correlation_s=5.0)
-    states = truth.at(gnss.t_s)
-    north = (gnss.position[:, 0] - states.position[:, 0]) * 6.353e6
-    down = states.position[:, 2] - gnss.position[:, 2]
-    assert gnss.sd_ned_m[0] == pytest.approx(1.0)
-    assert north.std() == pytest.approx(gnss.sd_ned_m[0], rel=0.2)
-    assert down.std() == pytest.approx(gnss.sd_ned_m[2], rel=0.2)
-    assert (gnss.v_ned[:, 1] - states.v_ned[:, 1]).std() == pytest.approx(0.05, rel=0.1)
-    assert np.all(np.diff(gnss.t_arrival_s) >= 0.0)
-
-
-def test_angles_round_into_the_next_minute() -> None:
-    assert latitude(29.99999999999) == ("3000.0000000", "N")
-    assert latitude(-0.5) == ("0030.0000000", "S")
-    assert longitude(181.0) == ("17900.0000000", "W")
-    with pytest.raises(ValueError, match="XYZ"):
-        _receiver(Truth(drive(2.0), ORIGIN, 50.0, 2.0), sentences=("XYZ",)).nmea(0, 0)
-
-
-# --------------------------------------------------------------------------- CAN
-
-SBG = CanImuOptions(
-    dbc="sbg_ellipse",
-    gyro=("IMU_GYRO.GYRO_X", "IMU_GYRO.GYRO_Y", "IMU_GYRO.GYRO_Z"),
-    accel=("IMU_ACCEL.ACCEL_X", "IMU_ACCEL.ACCEL_Y", "-IMU_ACCEL.ACCEL_Z"),
-    device_time="IMU_INFO.TIME_STAMP",
-)
-XSENS = CanImuOptions(
-    dbc="xsens_mti600",
-    gyro=("RATE_OF_TURN.GYRO_X", "RATE_OF_TURN.GYRO_Y", "RATE_OF_TURN.GYRO_Z"),
-    accel=("ACCELERATION.ACCEL_X", "ACCELERATION.ACCEL_Y", "ACCELERATION.ACCEL_Z"),
-    device_time="SAMPLE_TIME.TIME",
-)
-
-
-@pytest.mark.parametrize(
-    ("options", "gyro_step", "accel_step", "tick_ns"),
-    [
-        (SIM_IMU, 1e-5, 2e-4, 1000),
-        (SBG, 1e-3, 1e-2, 1000),
-        (XSENS, 2**-9, 2**-8, 100_000),
-    ],
-)
-def test_samples_come_back_through_the_can_driver(
-    options: CanImuOptions, gyro_step: float, accel_step: float, tick_ns: int
-) -> None:
-    rng = np.random.default_rng(3)
-    gyro, accel = rng.normal(0.0, 0.3, (300, 3)), rng.normal(0.0, 5.0, (300, 3))
-    encoder, decoder = CanImu(options), CanImuDecoder("imu", options)
-    samples: list[ImuSample] = []
-    for k in range(300):
-        t_ns = 5_000_000 * k + 2**32 * 1000 - 500_000_000  # the device's time wraps on the way
-        for frame in encoder.frames(k, t_ns, gyro[k].tolist(), accel[k].tolist()):
-            sample = decoder.feed(
-                frame.arbitration_id, frame.is_extended_id, bytes(frame.data), t_ns, t_ns
-            )
-            if sample is not None:
-                samples.append(sample)
-    assert decoder.counters["lost"] == 0
-    assert len(samples) >= 295  # pairing without a counter needs a few samples to begin
-    first = 300 - len(samples)
-    read = np.array([s.gyro_rad_s for s in samples])
-    assert np.abs(read - gyro[first:]).max() <= 0.5001 * gyro_step
-    read = np.array([s.accel_m_s2 for s in samples])
-    assert np.abs(read - accel[first:]).max() <= 0.5001 * accel_step
-    ticks = [s.stamp.ticks_ns for s in samples if isinstance(s.stamp, DeviceStamp)]
-    assert len(ticks) == len(samples)
-    assert np.abs(np.diff(ticks) - 5_000_000).max() <= tick_ns
-
-
-def test_values_beyond_the_range_saturate() -> None:
-    gyro_frame = CanImu().frames(17, 0, (100.0, -100.0, 0.0), (0.0, 0.0, 0.0))[1]
-    raw = int.from_bytes(gyro_frame.data, "little")
-    assert raw & 0xFFFFF == 0x7FFFF
-    assert raw >> 20 & 0xFFFFF == 0x80000
-    assert raw >> 60 == 1
-
-
-# --------------------------------------------------------------------------- RDSS
 
 
 class Host:
