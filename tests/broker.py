@@ -17,8 +17,9 @@ from typing import Any
 
 import aiomqtt
 
+from tests.patience import PATIENCE_S
+
 _PATH = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"])
-START_S = 10.0
 
 
 def free_port() -> int:
@@ -77,7 +78,7 @@ class Broker:
             self._process = subprocess.Popen(
                 [binary, "-v", "-c", str(self._config)], stdout=log, stderr=log
             )
-        end = time.monotonic() + START_S
+        end = time.monotonic() + PATIENCE_S
         while True:
             assert self._process.poll() is None, self.log
             with socket.socket() as s:
@@ -98,7 +99,7 @@ class Broker:
         if self._process is not None:
             self._process.send_signal(number)
             self._process.send_signal(signal.SIGCONT)
-            self._process.wait(START_S)
+            self._process.wait(PATIENCE_S)
             self._process = None
 
     def freeze(self) -> None:
@@ -125,7 +126,9 @@ class Listener:
     def payloads(self, topic: str) -> list[bytes]:
         return [bytes(m.payload) for m in self.messages if m.topic.value == topic]
 
-    async def until(self, condition: Callable[[Listener], Any], timeout_s: float = 20.0) -> Any:
+    async def until(
+        self, condition: Callable[[Listener], Any], timeout_s: float = PATIENCE_S
+    ) -> Any:
         """The first true value of `condition(self)`; an error after `timeout_s`."""
         async with asyncio.timeout(timeout_s):
             while not (value := condition(self)):

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import tty
-from collections.abc import Callable
 from pathlib import Path
-
-PATIENCE_S = 20.0
-"""Only bounds a broken run; nothing here passes or fails by its length."""
 
 
 class Device:
@@ -36,9 +31,3 @@ class Device:
 
     def send(self, data: bytes) -> None:
         assert os.write(self.master, data) == len(data)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():  # noqa: ASYNC110 - the other side is a tty, nothing to await
-            await asyncio.sleep(0.002)

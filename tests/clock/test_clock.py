@@ -105,7 +105,7 @@ def test_impossible_kernel_stamps_fall_back_to_arrival(host: Host) -> None:
     drift_ppm=st.integers(-80, 80),
     start=st.integers(0, 2**40),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_device_clock_under_jitter(jitter: list[int], drift_ppm: int, start: int) -> None:
     """Causal, in order, never further from the truth than the smallest delay so far and drift."""
     clock = Clock(ClockOptions(), Host())
@@ -368,7 +368,7 @@ def test_coarse_rdss_time_yields_to_the_receiver_and_takes_over_when_it_is_gone(
         max_size=60,
     )
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_same_inputs_give_same_outputs_and_nothing_from_the_future(
     inputs: list[tuple[int, int, bool, str]],
 ) -> None:

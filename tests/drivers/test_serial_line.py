@@ -13,7 +13,8 @@ import pytest
 
 from drivers.base import Backoff
 from drivers.serial_line import PENDING_WRITE_BYTES, READ_BYTES, SerialLine
-from tests.pty_device import Device, until
+from tests.patience import until
+from tests.pty_device import Device
 
 
 class Host:

@@ -138,7 +138,7 @@ class Row:
         return Innovation(self.z, self.h, self.r)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.sampled_from(MODELS), st.integers(1, 6), st.integers(0, 2**31), st.floats(-8.0, 1.0))
 def test_update_is_the_textbook_batch_update(name: str, m: int, seed: int, log_r: float) -> None:
     """Sequential rows against K = P H^T S^-1, (I - K H) P; NIS against nu^T S^-1 nu."""
@@ -209,7 +209,7 @@ def test_a_measurement_that_is_no_number_changes_nothing(bad: float) -> None:
         assert np.array_equal(np.asarray(now), np.asarray(then))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.sampled_from(MODELS), st.integers(0, 2**31), st.sampled_from([1e-12, 1e-6, 1.0]))
 def test_covariance_stays_symmetric_and_positive(name: str, seed: int, r: float) -> None:
     """Rates of a tumbling body, thousands of steps, measurements of absurd precision."""

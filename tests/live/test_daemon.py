@@ -36,7 +36,8 @@ from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.broker import Broker, Listener, listening
-from tests.pty_device import Device, until
+from tests.patience import until
+from tests.pty_device import Device
 
 FUSIOND = Path(sys.executable).with_name("fusiond")
 REST = replace(SCENARIOS["drive"], path=partial(drive, rest_s=60.0))

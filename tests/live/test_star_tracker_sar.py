@@ -27,8 +27,8 @@ from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.live.test_daemon import running
+from tests.patience import until
 from tests.places import REPOSITORY
-from tests.pty_device import until
 
 FLIGHT = SCENARIOS["flight-sar"]
 AIRCRAFT = tomllib.loads((REPOSITORY / "config" / "flight_sar.toml").read_text())

@@ -88,7 +88,7 @@ def test_axes_and_time_offset() -> None:
     assert buffer.latest_ns == 80_000_000
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.integers(1, 700) | st.just(2600), min_size=1, max_size=30),
     st.booleans(),

@@ -32,7 +32,10 @@ from drivers.measurements import (
 )
 from fusiond.simulation.can.aids import SIM_SAR, SIM_STAR
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
+from tests.patience import until
 from tests.places import REPOSITORY
+
+SECOND = 1_000_000_000
 
 DEG, ARCSEC = math.pi / 180.0, math.pi / 648e3
 STEP = 0.00035 * DEG
@@ -136,35 +139,38 @@ async def test_three_drivers_on_one_channel() -> None:
     """IMU, star tracker and radar share a bus; each takes its own frames and stamps."""
     channel = {"interface": "virtual", "channel": "t-shared"}
     emitted: list[Measurement | DeviceEvent] = []
-    imu = CanImuDriver("imu", CanImuOptions(**{**SIM_IMU.model_dump(), **channel}), emitted.append)
+    star_ns = SECOND  # clocks stand still: nobody falls silent because the host is busy
+    imu = CanImuDriver(
+        "imu", CanImuOptions(**{**SIM_IMU.model_dump(), **channel}), emitted.append, lambda: SECOND
+    )
     star = CanAttitudeDriver(
         "star_tracker",
         CanAttitudeOptions(**{**SIM_STAR.model_dump(), **channel, "timeout_s": 0.3}),
         emitted.append,
+        lambda: star_ns,
     )
     sar = CanBearingDriver(
-        "sar", CanBearingOptions(**{**SIM_SAR.model_dump(), **channel}), emitted.append
+        "sar",
+        CanBearingOptions(**{**SIM_SAR.model_dump(), **channel}),
+        emitted.append,
+        lambda: SECOND,
     )
     drivers = (imu, star, sar)
     tasks = [asyncio.create_task(d.run()) for d in drivers]
     try:
-        async with asyncio.timeout(10.0):
-            while any(d.status.state == "starting" for d in drivers):  # noqa: ASYNC110
-                await asyncio.sleep(0.005)
-            with can.Bus(interface="virtual", channel="t-shared", ignore_config=True) as bus:
-                for k in range(8):
-                    for m in CanImu().frames(k, k * 10_000_000, (0.0,) * 3, (0.0, 0.0, -9.8)):
-                        bus.send(m)
-                    for can_id, data in (*star_frames(k), *sar_frames(k)):
-                        bus.send(
-                            can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
-                        )
-                while len(emitted) < 24:  # noqa: ASYNC110
-                    await asyncio.sleep(0.005)
-                assert [d.status.state for d in drivers] == ["running"] * 3
-                while star.status.state != "silent":  # noqa: ASYNC110
-                    await asyncio.sleep(0.02)
-            assert "0x111 STAR_ATTITUDE" in star.status.detail
+        await until(lambda: all(d.status.state != "starting" for d in drivers))
+        with can.Bus(interface="virtual", channel="t-shared", ignore_config=True) as bus:
+            for k in range(8):
+                for m in CanImu().frames(k, k * 10_000_000, (0.0,) * 3, (0.0, 0.0, -9.8)):
+                    bus.send(m)
+                for can_id, data in (*star_frames(k), *sar_frames(k)):
+                    bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            await until(lambda: len(emitted) == 24)
+            assert [d.status.state for d in drivers] == ["running"] * 3
+            star_ns += SECOND
+            await until(lambda: star.status.state == "silent")
+            await until(lambda: "0x111 STAR_ATTITUDE" in star.status.detail)
+        assert [d.status.state for d in drivers] == ["running", "silent", "running"]
     finally:
         for task in tasks:
             task.cancel()

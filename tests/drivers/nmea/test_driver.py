@@ -22,7 +22,8 @@ from drivers.measurements import (
 )
 from drivers.nmea.driver import NmeaDriver, NmeaOptions
 from tests.drivers.nmea.sentences import gga, made, rmc, wire
-from tests.pty_device import Device, until
+from tests.patience import PATIENCE_S, until
+from tests.pty_device import Device
 
 
 class Vehicle:
@@ -134,7 +135,7 @@ async def test_wrong_baud_rate_is_named(device: Device) -> None:
     garbage = bytes((i * 193 + 7) % 256 | 0x80 for i in range(80))
     async with running(vehicle):
         await until(lambda: opened(vehicle))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE_S):
             while vehicle.state() != "silent" or "baud" not in vehicle.driver.status.detail:
                 device.send(garbage)
                 await asyncio.sleep(0.02)
@@ -164,7 +165,7 @@ async def test_status_says_what_is_wrong(
     vehicle = Vehicle(device, timeout_s=0.3)
     async with running(vehicle):
         await until(lambda: opened(vehicle))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE_S):
             while vehicle.state() != state or words not in vehicle.driver.status.detail:
                 device.send(sent)
                 await asyncio.sleep(0.02)
@@ -177,7 +178,7 @@ async def test_a_receiver_that_hangs_is_named(device: Device) -> None:
     vehicle = Vehicle(device, timeout_s=0.3)
     async with running(vehicle):
         await until(lambda: opened(vehicle))
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(PATIENCE_S):
             while "repeats" not in vehicle.driver.status.detail:
                 device.send(gga(29))
                 await asyncio.sleep(0.02)

@@ -134,7 +134,7 @@ def test_an_endless_epoch_is_bounded() -> None:
 
 
 @given(st.integers(1, 60))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_any_chunks_give_the_same_measurements(size: int) -> None:
     stream = wire(*(s for epoch in seconds(10, 5, RMC, VTG, GGA, GSA, GST, ZDA) for s in epoch))
     one = decoder()

@@ -212,7 +212,7 @@ def test_cut_sentences_that_verify() -> None:
         max_size=20,
     ),
 )
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_no_verified_sentence_raises(formatter: str, fields: list[str]) -> None:
     body = ",".join(["GN" + formatter, *fields]).replace("$", "").replace("*", "")
     for measurement in decode(made(body), GGA, RMC)[0]:

@@ -167,14 +167,14 @@ STREAMS = st.lists(PIECES | st.binary(max_size=40), max_size=14).map(b"".join)
 
 
 @given(STREAMS)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_split_at_every_byte_gives_the_same(stream: bytes) -> None:
     whole = split(stream)
     assert split(*(stream[i : i + 1] for i in range(len(stream)))) == whole
 
 
 @given(STREAMS, st.lists(st.integers(0, 600), max_size=6))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_any_split_gives_the_same(stream: bytes, cuts: list[int]) -> None:
     edges = [0, *sorted(cut for cut in cuts if cut < len(stream)), len(stream)]
     pieces = [stream[a:b] for a, b in itertools.pairwise(edges)]
@@ -182,7 +182,7 @@ def test_any_split_gives_the_same(stream: bytes, cuts: list[int]) -> None:
 
 
 @given(st.binary(max_size=300))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_resynchronises_within_one_good_sentence(garbage: bytes) -> None:
     splitter = NmeaSplitter()
     splitter.feed(garbage)

@@ -22,7 +22,8 @@ from drivers.raw.driver import GnssDecoder, GnssDriver, GnssOptions
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from tests.drivers.nmea.sentences import gga, rmc
 from tests.drivers.raw.frames import d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
-from tests.pty_device import Device, until
+from tests.patience import until
+from tests.pty_device import Device
 
 
 def raw(second: int) -> bytes:

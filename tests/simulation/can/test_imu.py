@@ -46,7 +46,7 @@ def test_samples_come_back_through_the_can_driver(
             )
             if sample is not None:
                 samples.append(sample)
-    assert decoder.counters["lost"] == 0
+    assert decoder.counters["lost_samples"] == 0
     assert len(samples) >= 295  # pairing without a counter needs a few samples to begin
     first = 300 - len(samples)
     read = np.array([s.gyro_rad_s for s in samples])
