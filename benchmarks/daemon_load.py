@@ -34,7 +34,8 @@ from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.broker import Broker, listening
-from tests.hil.processes import SIM_IMU, DaemonProcess, Heard
+from tests.hil.heard import Heard
+from tests.hil.processes import SIM_IMU, DaemonProcess
 
 IMU_HZ, TICK_HZ, GNSS_HZ, NAV_HZ = 200.0, 100.0, 10.0, 20.0
 SETTLE_S = 5.0

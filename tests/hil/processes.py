@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
-from math import degrees, radians
 from pathlib import Path
-from typing import Any
+from types import TracebackType
 
-import aiomqtt
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from fusiond.files.tables import read_truth
-from tests.broker import Listener
 from tests.places import REPOSITORY
-from tests.runs import metres
 
 FUSIOND = Path(sys.executable).with_name("fusiond")
 PATIENCE_S = 240.0
@@ -43,7 +36,9 @@ device_time = "SIM_TIME.TIME"
 
 
 class DaemonProcess:
-    """`fusiond run CONFIG` with a service manager that listens; `log` is its standard error."""
+    """`fusiond run CONFIG` with a service manager that listens; `log` is its standard error.
+
+    `async with` starts nothing; it sees to it that nothing is left running."""
 
     def __init__(self, config: Path) -> None:
         self._config = config
@@ -100,8 +95,18 @@ class DaemonProcess:
         self._hang_up()
         return status
 
-    async def kill(self) -> None:
-        """End it whatever it does."""
+    async def __aenter__(self) -> DaemonProcess:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
+        """End it whatever it does; a test that failed shows its log."""
+        if error is not None:
+            print(self.log)
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
             await self._process.wait()
@@ -115,112 +120,10 @@ class DaemonProcess:
             self._socket = None
 
 
-class Heard:
-    """What a vehicle has published, to look at and to wait for."""
-
-    def __init__(self, listener: Listener, vehicle: str) -> None:
-        self._listener = listener
-        self._base = f"fusiond/{vehicle}"
-
-    def all(self, name: str, since: int = 0) -> list[dict[str, Any]]:
-        """The messages of a topic since number `since` of all messages."""
-        messages = self._listener.messages[since:]
-        topic = f"{self._base}/{name}"
-        return [json.loads(_payload(m)) for m in messages if m.topic.value == topic]
-
-    @property
-    def count(self) -> int:
-        """How many messages have come."""
-        return len(self._listener.messages)
-
-    async def until(
-        self,
-        name: str,
-        condition: Callable[[dict[str, Any]], Any] = lambda message: True,
-        patience_s: float = PATIENCE_S,
-    ) -> dict[str, Any]:
-        """The first message of a topic from now on that fulfils `condition`."""
-        since = self.count
-        try:
-            found = await self._listener.until(
-                lambda _: [m for m in self.all(name, since) if condition(m)], patience_s
-            )
-        except TimeoutError:
-            raise AssertionError(f"{name} never came so; last: {self.all(name)[-1:]}") from None
-        message: dict[str, Any] = found[0]
-        return message
-
-    async def online(self, word: bytes) -> None:
-        """Wait for `online` to say so."""
-        await self._listener.until(
-            lambda heard: heard.payloads(f"{self._base}/online")[-1:] == [word], PATIENCE_S
-        )
-
-
-STRETCH_S = 5.0
-"""Without an overrun. Longer silences of a busy host are not the daemon's; a filter that takes
-longer than a tick never manages such a stretch."""
-
-
-async def stretch_without_overrun(heard: Heard, rate_hz: float) -> None:
-    """Wait until the daemon has kept its ticks for `STRETCH_S`, at `rate_hz`."""
-    first = await heard.until("status")
-    while True:
-        status = await heard.until("status")
-        if status["overruns"] > first["overruns"]:
-            first = status
-        elif status["uptime_s"] - first["uptime_s"] >= STRETCH_S:
-            ticks = status["ticks"] - first["ticks"]
-            elapsed_s = status["uptime_s"] - first["uptime_s"]
-            assert ticks == pytest.approx(elapsed_s * rate_hz, abs=3)
-            return
-
-
-def _payload(message: aiomqtt.Message) -> bytes:
-    assert isinstance(message.payload, bytes)
-    return message.payload
-
-
-def nav_errors(nav: dict[str, Any], truth: NDArray[np.float64]) -> dict[str, tuple[float, float]]:
-    """Error and stated sigma of each figure of a `nav` message; m, m/s and degrees."""
-    lat, lon, height, v_n, v_e, v_d, roll, pitch, yaw = (float(x) for x in truth)
-    north, east, _ = metres(lat, height)
-    errors = {
-        "n_m": (radians(nav["lat_deg"]) - lat) * north,
-        "e_m": (radians(nav["lon_deg"]) - lon) * east,
-        "d_m": height - nav["height_m"],
-        "vn_m_s": nav["v_n_m_s"] - v_n,
-        "ve_m_s": nav["v_e_m_s"] - v_e,
-        "vd_m_s": nav["v_d_m_s"] - v_d,
-        "roll_deg": nav["roll_deg"] - degrees(roll),
-        "pitch_deg": nav["pitch_deg"] - degrees(pitch),
-        "yaw_deg": (nav["yaw_deg"] - degrees(yaw) + 180.0) % 360.0 - 180.0,
-    }
-    return {name: (error, nav[f"sd_{name}"]) for name, error in errors.items()}
-
-
-SIGMAS = 5.0
-"""A consistent error exceeds them once in two million."""
-PRINTED = {"m": 0.03, "m_s": 0.01, "deg": 0.05}
-"""Figures are printed to 1e-4 m/s, the instant to 1 ms: 0.03 m at 30 m/s."""
-
-
-def judge(
-    vehicle: VehicleProcess, solutions: list[dict[str, Any]], bounds: dict[str, float]
-) -> None:
-    """`nav` messages against the truth: each error within five of its sigmas, and within the bound
-    of its unit (m, m_s, deg), where there is one, whatever the sigma."""
-    for nav in solutions:
-        assert nav["mode"] == "navigating"
-        for name, (error, sigma) in nav_errors(nav, vehicle.truth(nav["t_ms"])).items():
-            unit = name.split("_", 1)[1]
-            at = f"{name} at t_s = {vehicle.t_s(nav['t_ms']):.2f}"
-            assert abs(error) < SIGMAS * sigma + PRINTED[unit], f"{at}: {error}, sigma {sigma}"
-            assert abs(error) < bounds.get(unit, math.inf), f"{at}: {error}"
-
-
 class VehicleProcess:
-    """`python -m fusiond.simulation.vehicle`, its plugs, and the truth at any instant of UTC."""
+    """`python -m fusiond.simulation.vehicle`, its plugs, and the truth at any instant of UTC.
+
+    `async with` starts nothing, as for the daemon."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         self.gnss, self.rdss = folder / "gnss", folder / "rdss"
@@ -287,7 +190,15 @@ class VehicleProcess:
         t_s = self.t_s(utc_ms)
         return np.array([np.interp(t_s, self._times, column) for column in self._states.T])
 
-    async def quit(self) -> None:
+    async def __aenter__(self) -> VehicleProcess:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        tb: TracebackType | None,
+    ) -> None:
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
             await self._process.wait()

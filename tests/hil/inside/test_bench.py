@@ -15,6 +15,7 @@ import serial
 
 from tests.broker import Broker
 from tests.hil.bench import SerialLine
+from tests.patience import PATIENCE_S
 
 
 def test_a_frame_crosses_the_bus_with_the_kernels_stamp(can_channel: str) -> None:
@@ -24,7 +25,7 @@ def test_a_frame_crosses_the_bus_with_the_kernels_stamp(can_channel: str) -> Non
     ):
         sent = can.Message(arbitration_id=0x132, data=b"\x01\x02\xff", is_extended_id=False)
         sender.send(sent)
-        received = receiver.recv(timeout=10.0)
+        received = receiver.recv(timeout=PATIENCE_S)
         assert received is not None
         assert received.equals(
             sent, timestamp_delta=None, check_channel=False, check_direction=False
@@ -47,7 +48,7 @@ def test_the_interface_can_go_down_and_come_back(can_channel: str) -> None:
 
 
 def test_bytes_cross_a_serial_line_both_ways(serial_line: SerialLine) -> None:
-    with serial.Serial(serial_line.path, 115200, timeout=10.0) as port:
+    with serial.Serial(serial_line.path, 115200, timeout=PATIENCE_S) as port:
         os.write(serial_line.fd, b"$GNGGA\r\n\x00\x11\x13\xff")
         assert port.read(12) == b"$GNGGA\r\n\x00\x11\x13\xff"
         port.write(b"$CCICA\r\n")
@@ -58,7 +59,7 @@ async def test_a_message_goes_round_through_the_broker(broker: Broker) -> None:
     async with aiomqtt.Client("127.0.0.1", broker.port) as client:
         await client.subscribe("fusiond/bench/#", qos=1)
         await client.publish("fusiond/bench/nav", b"\x00payload", qos=1)
-        message = await asyncio.wait_for(anext(aiter(client.messages)), timeout=10.0)
+        message = await asyncio.wait_for(anext(aiter(client.messages)), timeout=PATIENCE_S)
     assert (str(message.topic), message.payload) == ("fusiond/bench/nav", b"\x00payload")
 
 

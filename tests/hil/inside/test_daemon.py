@@ -8,57 +8,18 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from math import hypot
 from pathlib import Path
 
 import pytest
 
-from tests.broker import Broker, listening
-from tests.hil.processes import (
-    FUSIOND,
-    SIM_IMU,
-    DaemonProcess,
-    Heard,
-    VehicleProcess,
-    judge,
-)
+from tests.broker import Broker
+from tests.hil.drives import configuration, drive, section
+from tests.hil.heard import Heard, hearing, judge
+from tests.hil.processes import FUSIOND, PATIENCE_S, DaemonProcess, VehicleProcess
 
 VEHICLE = "bench"
 RATE_HZ = 50.0
-CONFIG = """
-vehicle = "bench"
-state_file = "state.json"
-[imu]
-axes = ["+x", "-y", "-z"]
-rate_hz = 100.0
-{imu}
-[sources.gnss]
-driver = "nmea"
-port = "{gnss}"
-timeout_s = 2.0
-[aiding.gnss]
-lever_arm_m = [0.0, 0.0, -1.0]
-[sources.rdss]
-driver = "rdss"
-port = "{rdss}"
-baud = 115200
-family = "4.0"
-[aiding.rdss]
-lever_arm_m = [0.0, 0.0, -1.0]
-[constraints.non_holonomic]
-enabled = true
-lever_arm_m = [-1.0, 0.0, 0.5]
-[estimator]
-coast_after_s = 6.0
-[scheduler]
-rate_hz = {rate}
-[mqtt]
-host = "127.0.0.1"
-port = {port}
-nav_rate_hz = 10.0
-"""
 # What no error may exceed whatever the stated sigma: the receiver's white noise is 0.8 m and 1.5 m
 # (fusiond.simulation.gnss.receiver).
 BOUNDS = {"m": 4.0, "m_s": 1.0, "deg": 5.0}
@@ -66,12 +27,6 @@ BOUNDS = {"m": 4.0, "m_s": 1.0, "deg": 5.0}
 
 def _link(state: str) -> None:
     subprocess.run(["ip", "link", "set", "vcan0", state], check=True)
-
-
-@asynccontextmanager
-async def _heard(broker: Broker) -> AsyncIterator[Heard]:
-    async with listening(broker) as (listener, _):
-        yield Heard(listener, VEHICLE)
 
 
 async def _check_against_truth(heard: Heard, vehicle: VehicleProcess, messages: int = 20) -> None:
@@ -89,7 +44,7 @@ async def _start_with_nothing(daemon: DaemonProcess, broker: Broker) -> None:
     while "bus_open_failed" not in daemon.log and "vcan0 is down" not in daemon.log:  # noqa: ASYNC110
         await asyncio.sleep(0.05)
     broker.start()
-    async with _heard(broker) as heard:
+    async with hearing(broker, VEHICLE) as heard:
         await heard.online(b"online")
         status = await heard.until("status")
         assert (status["mode"], status["why"]) == ("waiting", "waiting for IMU data")
@@ -162,7 +117,7 @@ async def _lose_broker(broker: Broker, before: dict[str, float]) -> None:
     broker.kill()
     await asyncio.sleep(3.0)
     broker.start()
-    async with _heard(broker) as heard:
+    async with hearing(broker, VEHICLE) as heard:
         await heard.online(b"online")
         await heard.until("nav", lambda m: m["mode"] == "navigating")
         status = await heard.until("status", lambda m: m["mqtt_reconnects"] == 1)
@@ -197,36 +152,29 @@ async def _restart_at_rest(
 
 async def test_a_drive_through_every_fault(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
-    # 8 s at rest; stops again for 20 s at 101 s.
-    vehicle = VehicleProcess(
-        tmp_path,
-        *("--scenario", "drive", "--rest", "8", "--duration", "420", "--seed", "7"),
-        *("--can", "socketcan:vcan0", "--service-frequency", "2"),
-    )
+    vehicle = drive(tmp_path, 8, 420, 7)  # stops again for 20 s at 101 s
     config = tmp_path / "bench.toml"
-    imu = SIM_IMU.format(interface="socketcan", channel="vcan0")
+    no_slip = {"enabled": True, "lever_arm_m": [-1.0, 0.0, 0.5]}
     config.write_text(
-        CONFIG.format(imu=imu, gnss=vehicle.gnss, rdss=vehicle.rdss, rate=RATE_HZ, port=broker.port)
+        'state_file = "state.json"\n'
+        + configuration(VEHICLE, vehicle, broker.port, RATE_HZ, {"timeout_s": 2.0})
+        + section("constraints.non_holonomic", **no_slip)
+        + section("estimator", coast_after_s=6.0)
     )
-    daemon = DaemonProcess(config)
     try:
-        await _start_with_nothing(daemon, broker)
-        async with _heard(broker) as heard:
-            await vehicle.start()
-            await _align(heard, vehicle)
-            await _lose_position(heard, vehicle)
-            await _lose_imu(heard, vehicle)
-            before = await heard.until("status")
-        await _lose_broker(broker, before)
-        async with _heard(broker) as heard:
-            await _restart_at_rest(heard, daemon, vehicle, tmp_path)
-        assert await daemon.terminate() == 0
-    except BaseException:
-        print(daemon.log)
-        raise
+        async with vehicle, DaemonProcess(config) as daemon:
+            await _start_with_nothing(daemon, broker)
+            async with hearing(broker, VEHICLE) as heard:
+                await vehicle.start()
+                await _align(heard, vehicle)
+                await _lose_position(heard, vehicle)
+                await _lose_imu(heard, vehicle)
+                before = await heard.until("status")
+            await _lose_broker(broker, before)
+            async with hearing(broker, VEHICLE) as heard:
+                await _restart_at_rest(heard, daemon, vehicle, tmp_path)
+            assert await daemon.terminate() == 0
     finally:
-        await daemon.kill()
-        await vehicle.quit()
         broker.stop()
         _link("up")
 
@@ -235,7 +183,7 @@ def test_a_config_mistake_exits_78(tmp_path: Path) -> None:
     config = tmp_path / "bench.toml"
     config.write_text('[scheduler]\nrate_hz = 0\n[sources.imu]\ndriver = "can_imy"\n')
     ended = subprocess.run(
-        [FUSIOND, "run", config], capture_output=True, text=True, timeout=120, check=False
+        [FUSIOND, "run", config], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert ended.returncode == 78
     for word in (str(config), "rate_hz", "0", "can_imy", "can_imu"):

@@ -15,7 +15,6 @@ from __future__ import annotations
 import asyncio
 import csv
 import math
-import os
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -29,15 +28,17 @@ import pytest
 from fusiond.configuration.load import load_config
 from fusiond.files.tables import read_solution
 from fusiond.offline.process import process
-from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
-from fusiond.simulation.can.imu import CanImu
+from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss.receiver import KNOT_M_S, latitude, longitude, sentence
 from fusiond.simulation.pty_line import PtyLine
-from tests.broker import Broker, listening
-from tests.hil.processes import REPOSITORY, SIM_IMU, DaemonProcess, Heard
+from tests.broker import Broker
+from tests.hil.drives import imu_section
+from tests.hil.heard import hearing
+from tests.hil.processes import DaemonProcess
+from tests.places import DATA, REPOSITORY
 from tests.runs import metres
 
-DRIVE = Path(os.environ.get("FUSIOND_DATA", REPOSITORY.parent / "shared/data")) / "drive_0708"
+DRIVE = DATA / "drive_0708"
 FROM_S, UNTIL_S = 243288.0, 243358.0
 """GPS second of week: 10 s of rest, then 60 s of driving."""
 GPS_WEEK_UTC = datetime(2025, 7, 6, tzinfo=UTC) - timedelta(seconds=18)  # less the leap seconds
@@ -88,7 +89,7 @@ def _nmea(row: dict[str, str]) -> bytes:
 
 
 def _events(imu: list[dict[str, str]], gnss: list[dict[str, str]]) -> list[_Event]:
-    encoder = CanImu(SIM_IMU_OPTIONS)
+    encoder = CanImu(SIM_IMU)
     events = []
     for number, row in enumerate(imu):
         t_s, *values = (float(v) for v in row.values())
@@ -124,7 +125,7 @@ def _config(path: Path, line: PtyLine, port: int) -> Path:
     mqtt = f'[mqtt]\nhost = "127.0.0.1"\nport = {port}\nnav_rate_hz = 20.0\n'
     text = text.replace("[mqtt]\nenabled = false\n", mqtt)
     assert mqtt in text
-    text += SIM_IMU.format(interface="socketcan", channel="vcan0")
+    text += imu_section()
     # The recording is older than the program, which refuses such dates unless told otherwise.
     text += f'[sources.gnss]\ndriver = "nmea"\nport = "{line.link}"\nearliest_date = 2025-01-01\n'
     text += "[scheduler]\nrate_hz = 50.0\n"
@@ -154,9 +155,10 @@ def _differences(messages: list[dict[str, Any]], solution: Path) -> tuple[Any, A
 
 
 @pytest.mark.skipif(not DRIVE.is_dir(), reason=f"{DRIVE} is missing: set FUSIOND_DATA")
-async def test_the_drive_ends_where_the_offline_run_ends(tmp_path: Path, line: PtyLine) -> None:
+async def test_the_drive_ends_where_the_offline_run_ends(
+    tmp_path: Path, line: PtyLine, broker: Broker
+) -> None:
     imu, gnss = _rows("imu.csv"), _rows("gnss.csv")
-    broker = Broker(tmp_path)
     config = _config(tmp_path / "drive_0708.toml", line, broker.port)
     solution = tmp_path / "solution.csv"
     velocity = ("v_n_m_s", "v_e_m_s")  # NMEA has neither the third nor a sigma
@@ -169,30 +171,23 @@ async def test_the_drive_ends_where_the_offline_run_ends(tmp_path: Path, line: P
     assert offline["aligned"] == "GNSS course"
     events = _events(imu, gnss)
 
-    daemon = DaemonProcess(config)
-    try:
-        with broker, can.Bus(interface="socketcan", channel="vcan0") as bus:
+    with can.Bus(interface="socketcan", channel="vcan0") as bus:
+        async with DaemonProcess(config) as daemon:
             await daemon.start()
-            async with listening(broker) as (listener, _):
-                heard = Heard(listener, "drive_0708")
+            async with hearing(broker, "drive_0708") as heard:
                 await heard.until("health", lambda m: m["sources"]["gnss"]["state"] != "absent")
                 await _feed(events, bus, line)
                 await heard.until("status", lambda m: m["mode"] == "invalid")  # the drive is over
                 await heard.until("health")
             assert await daemon.terminate() == 0
-        health = heard.all("health")[-1]["sources"]
-        assert health["imu"]["received"] == len(imu)
-        assert health["gnss"]["received"] == len(gnss)
-        fused = health["gnss"]["fused"]
-        assert abs(fused - offline["sources"]["gnss"]["fused"]) <= 3
-        distance, yaw = _differences(heard.all("nav"), solution)
-        print(f"last {LAST_S:g} s: {np.median(distance):.3f} m, at most {distance.max():.3f} m;")
-        print(f"yaw {np.abs(yaw).max():.3f} deg; fused {fused}, {offline['sources']['gnss']}")
-        assert np.median(distance) < MEDIAN_M
-        assert distance.max() < LARGEST_M
-        assert np.abs(yaw).max() < YAW_DEG
-    except BaseException:
-        print(daemon.log)
-        raise
-    finally:
-        await daemon.kill()
+    health = heard.all("health")[-1]["sources"]
+    assert health["imu"]["received"] == len(imu)
+    assert health["gnss"]["received"] == len(gnss)
+    fused = health["gnss"]["fused"]
+    assert abs(fused - offline["sources"]["gnss"]["fused"]) <= 3
+    distance, yaw = _differences(heard.all("nav"), solution)
+    print(f"last {LAST_S:g} s: {np.median(distance):.3f} m, at most {distance.max():.3f} m;")
+    print(f"yaw {np.abs(yaw).max():.3f} deg; fused {fused}, {offline['sources']['gnss']}")
+    assert np.median(distance) < MEDIAN_M
+    assert distance.max() < LARGEST_M
+    assert np.abs(yaw).max() < YAW_DEG

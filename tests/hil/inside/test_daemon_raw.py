@@ -7,45 +7,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.broker import Broker, listening
-from tests.hil.processes import (
-    SIM_IMU,
-    DaemonProcess,
-    Heard,
-    VehicleProcess,
-    judge,
-    stretch_without_overrun,
-)
+from tests.broker import Broker
+from tests.hil.drives import configuration, drive
+from tests.hil.heard import hearing, judge, keeps_up
+from tests.hil.processes import DaemonProcess
 
 VEHICLE = "raw"
 RATE_HZ = 100.0
-CONFIG = """
-vehicle = "raw"
-[imu]
-axes = ["+x", "-y", "-z"]
-rate_hz = 100.0
-{imu}
-[sources.gnss]
-driver = "gnss"
-port = "{gnss}"
-allow_simulator = true
-[aiding.gnss]
-kind = "raw"
-lever_arm_m = [0.0, 0.0, -1.0]
-[sources.rdss]
-driver = "rdss"
-port = "{rdss}"
-baud = 115200
-family = "4.0"
-[aiding.rdss]
-lever_arm_m = [0.0, 0.0, -1.0]
-[scheduler]
-rate_hz = {rate}
-[mqtt]
-host = "127.0.0.1"
-port = {port}
-nav_rate_hz = 10.0
-"""
 CANYON_S = (50.0, 40.0)
 """Start and length on the trajectory, the drive's motion from 4 s on."""
 BOUNDS = {"m": 15.0, "m_s": 1.0}
@@ -54,22 +22,19 @@ BOUNDS = {"m": 15.0, "m_s": 1.0}
 
 async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: Broker) -> None:
     start_s, length_s = CANYON_S
-    vehicle = VehicleProcess(
-        tmp_path,
-        *("--scenario", "drive", "--rest", "4", "--duration", "200", "--seed", "5"),
-        *("--can", "socketcan:vcan0", "--service-frequency", "2", "--gnss-raw", "ubx"),
-        *("--gnss-mask", f"canyon2:{start_s}:{length_s}"),
+    vehicle = drive(
+        *(tmp_path, 4, 200, 5),
+        *("--gnss-raw", "ubx", "--gnss-mask", f"canyon2:{start_s}:{length_s}"),
     )
     config = tmp_path / "raw.toml"
-    imu = SIM_IMU.format(interface="socketcan", channel="vcan0")
-    devices = {"gnss": vehicle.gnss, "rdss": vehicle.rdss, "port": broker.port}
-    config.write_text(CONFIG.format(imu=imu, rate=RATE_HZ, **devices))
-    daemon = DaemonProcess(config)
-    try:
+    receiver = {"driver": "gnss", "allow_simulator": True}
+    config.write_text(
+        configuration(VEHICLE, vehicle, broker.port, RATE_HZ, receiver, {"kind": "raw"})
+    )
+    async with vehicle, DaemonProcess(config) as daemon:
         await vehicle.start()
         await daemon.start()
-        async with listening(broker) as (listener, _):
-            heard = Heard(listener, VEHICLE)
+        async with hearing(broker, VEHICLE) as heard:
             await heard.until("status", lambda m: m["mode"] == "navigating")
             health = await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
             sky = health["sources"]["gnss"]["sky"]
@@ -78,7 +43,7 @@ async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: 
             assert 0.5 < sky["hdop"] < 3.0
             assert sky["innovation_rms"] < 3.0
             since = heard.count
-            await stretch_without_overrun(heard, RATE_HZ)
+            await keeps_up(heard, RATE_HZ)
             judge(vehicle, heard.all("nav", since), BOUNDS)
 
             await heard.until("health", lambda m: len(m["sources"]["gnss"]["sky"]["used"]) == 2)
@@ -91,9 +56,3 @@ async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: 
             verdicts = (await heard.until("consistency"))["sources"]
             assert {"gnss_G", "gnss_C"} <= set(verdicts)
         assert await daemon.terminate() == 0
-    except BaseException:
-        print(daemon.log)
-        raise
-    finally:
-        await daemon.kill()
-        await vehicle.quit()

@@ -14,8 +14,10 @@ import pytest
 
 from drivers.rdss.messages import Family
 from fusiond.integrity.consistency import LAGS
-from tests.broker import Broker, listening
-from tests.hil.processes import SIM_IMU, DaemonProcess, Heard, VehicleProcess, nav_errors
+from tests.broker import Broker
+from tests.hil.drives import imu_section
+from tests.hil.heard import Heard, hearing, nav_errors
+from tests.hil.processes import DaemonProcess, VehicleProcess
 
 VEHICLE = "rdss"
 SERVICE_S = 2
@@ -86,7 +88,7 @@ async def _meet_refusals(heard: Heard, family: Family) -> None:
     await heard.until("status", lambda m: m["why"] == "heading from configured heading")
     awaited = {"refused_frequency", NO_BEAM[family][0], "timeout_fix"}
     health = await heard.until(
-        "health", lambda m: awaited <= m["sources"]["rdss"]["counters"].keys(), patience_s=120.0
+        "health", lambda m: awaited <= m["sources"]["rdss"]["counters"].keys()
     )
     fused = health["sources"]["rdss"]["fused"]
     await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] > fused)
@@ -158,7 +160,9 @@ def _check_counters(heard: Heard, terminal: dict[str, int], family: Family) -> N
 
 
 @pytest.mark.parametrize("family", ["4.0", "2.1"])
-async def test_a_drive_on_rdss_alone_ends_within_its_sigma(tmp_path: Path, family: Family) -> None:
+async def test_a_drive_on_rdss_alone_ends_within_its_sigma(
+    tmp_path: Path, broker: Broker, family: Family
+) -> None:
     least, greatest = DELAY_S
     config = tmp_path / "rdss.toml"
     vehicle = VehicleProcess(
@@ -169,27 +173,18 @@ async def test_a_drive_on_rdss_alone_ends_within_its_sigma(tmp_path: Path, famil
         *("--rdss-delay", str(least), str(greatest)),
         *("--rdss-refuse", "0.25", "--rdss-drop", "0.08"),
     )
-    daemon = DaemonProcess(config)
-    try:
-        with Broker(tmp_path) as broker:
-            imu = SIM_IMU.format(interface="socketcan", channel="vcan0")
-            config.write_text(CONFIG.format(imu=imu, rdss=vehicle.rdss, port=broker.port))
-            await daemon.start()
-            async with listening(broker) as (listener, _):
-                heard = Heard(listener, VEHICLE)
-                await heard.online(b"online")
-                await vehicle.start()
-                await _meet_refusals(heard, family)
-                await _lose_the_radio(heard, vehicle, family)
-                await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= FEWEST_FUSED)
-                await _end_within_sigma(heard, vehicle)
-                terminal = await vehicle.finish()
-                await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
-                _check_counters(heard, terminal, family)
-            assert await daemon.terminate() == 0
-    except BaseException:
-        print(daemon.log)
-        raise
-    finally:
-        await daemon.kill()
-        await vehicle.quit()
+    text = CONFIG.format(imu=imu_section(), rdss=vehicle.rdss, port=broker.port)
+    config.write_text(text)
+    async with vehicle, DaemonProcess(config) as daemon:
+        await daemon.start()
+        async with hearing(broker, VEHICLE) as heard:
+            await heard.online(b"online")
+            await vehicle.start()
+            await _meet_refusals(heard, family)
+            await _lose_the_radio(heard, vehicle, family)
+            await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= FEWEST_FUSED)
+            await _end_within_sigma(heard, vehicle)
+            terminal = await vehicle.finish()
+            await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
+            _check_counters(heard, terminal, family)
+        assert await daemon.terminate() == 0
