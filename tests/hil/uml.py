@@ -26,7 +26,10 @@ REPOSITORY = HERE.parents[1]
 NETWORK = HERE / "network.sh"
 GUEST_MEMORY_MIB = 2048
 # What the guest takes over from the caller's environment; the rest is the host's own affair.
-PASSED_ON = ("FUSIOND_", "NUMBA_", "PYTEST_", "CI", "HOME", "LANG", "TERM", "VIRTUAL_ENV")
+PASSED_ON = (
+    *("FUSIOND_", "NUMBA_", "PYTEST_", "PYTHONPATH", "XDG_CACHE_HOME"),
+    *("CI", "HOME", "LANG", "TERM", "VIRTUAL_ENV"),
+)
 _SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # mosquitto, ip and insmod live there
 
 
