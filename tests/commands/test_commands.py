@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_S
 from tests.places import REPOSITORY
 
 FUSIOND = Path(sys.executable).with_name("fusiond")
@@ -20,7 +21,12 @@ HEADER = "t_s,lat_deg,lon_deg,height_m,sd_n_m,sd_e_m,sd_d_m,status"
 
 def fusiond(*args: str | Path) -> subprocess.CompletedProcess[str]:
     done = subprocess.run(
-        [FUSIOND, *args], capture_output=True, text=True, timeout=60, check=False, cwd=REPOSITORY
+        [FUSIOND, *args],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+        cwd=REPOSITORY,
     )
     assert "Traceback" not in done.stderr
     return done
@@ -36,7 +42,7 @@ def test_version_and_help() -> None:
 def test_help_imports_nothing_heavy() -> None:
     code = "import sys, fusiond.commands.app; print(*sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=True
     )
     assert not {"numpy", "numba", "pydantic", "can", "fusiond.configuration.schema"} & set(
         done.stdout.split()
@@ -206,7 +212,7 @@ def test_interrupt_exits_130(tmp_path: Path) -> None:
     writer = os.open(fifo, os.O_WRONLY)  # returns once the command waits for the file
     try:
         process.send_signal(signal.SIGINT)
-        _, text = process.communicate(timeout=30)
+        _, text = process.communicate(timeout=PATIENCE_S)
     finally:
         os.close(writer)
         process.kill()

@@ -36,7 +36,7 @@ from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.broker import Broker, Listener, listening
-from tests.patience import until
+from tests.patience import PATIENCE_S, until
 from tests.pty_device import Device
 
 FUSIOND = Path(sys.executable).with_name("fusiond")
@@ -453,7 +453,7 @@ def test_what_cannot_run_exits_78(tmp_path: Path, text: str, word: str) -> None:
         text += _imu_section(SIM_IMU)
     config.write_text(text)
     ended = subprocess.run(
-        [FUSIOND, "run", config], capture_output=True, text=True, timeout=120, check=False
+        [FUSIOND, "run", config], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert ended.returncode == 78, ended.stderr
     assert str(config) in ended.stderr

@@ -20,6 +20,7 @@ from fusiond.outputs.messages import EVENT, HEALTH, NAV, STATUS, EventMessage, N
 from fusiond.outputs.mqtt import MqttPublisher
 from tests.broker import Broker, Listener, listening
 from tests.outputs.messages_examples import EXAMPLES
+from tests.patience import PATIENCE_S
 
 UTC_NS = 1_795_217_587_123_456_789
 BASE = "fusiond/truck"
@@ -45,8 +46,8 @@ class Running:
     def codes(self) -> list[str]:
         return [code for code, _ in self.events]
 
-    async def until(self, condition: Callable[[Running], Any], timeout_s: float = 20.0) -> None:
-        async with asyncio.timeout(timeout_s):
+    async def until(self, condition: Callable[[Running], Any]) -> None:
+        async with asyncio.timeout(PATIENCE_S):
             while not condition(self):  # noqa: ASYNC110 - the publisher has no such event
                 await asyncio.sleep(0.01)
 
@@ -60,7 +61,7 @@ async def running(options: Mqtt, **more: Any) -> AsyncIterator[Running]:
         assert not task.done(), task
     finally:
         task.cancel()
-        await asyncio.wait({task}, timeout=15.0)
+        await asyncio.wait({task}, timeout=PATIENCE_S)
         assert task.cancelled()
 
 
@@ -200,8 +201,8 @@ async def test_frozen_broker_is_noticed_and_costs_no_tick(tmp_path: Path) -> Non
 
 async def test_shutdown_with_a_frozen_broker_ends(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
-        async with asyncio.timeout(20.0):
-            async with running(options(broker, keepalive_s=60)) as it:
+        async with asyncio.timeout(PATIENCE_S):
+            async with running(options(broker, keepalive_s=600)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 broker.freeze()
                 it.publisher.publish_event(event("nobody hears this"))
