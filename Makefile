@@ -10,7 +10,8 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit hil format picture bench load lock clean test-packages
+.PHONY: help install demo test lint unit hil format picture bench load lock clean kernels \
+	test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -32,7 +33,10 @@ $(STAMP): requirements-dev.lock pyproject.toml | $(BIN)/python
 demo: $(STAMP) ## simulated vehicle, real daemon; ARGS="--duration 60 --headless"
 	$(BIN)/fusiond demo $(ARGS)
 
-test: lint unit hil ## everything that CI checks
+test: $(STAMP) ## everything that CI checks; one core compiles while the other lints
+	$(MAKE) --jobs=2 --output-sync lint kernels
+	$(MAKE) unit
+	$(MAKE) hil
 
 lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/ruff check
@@ -41,10 +45,12 @@ lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python tools/house.py --check
 
-unit: $(STAMP) test-packages ## unit and property tests, on every core
+kernels: $(STAMP)
 	@echo "compiling the kernels once, before the tests share them"
 	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle'
-	$(BIN)/pytest -n auto --ignore tests/hil/test_hil.py $(ARGS)
+
+unit: kernels test-packages ## unit and property tests, on every core
+	$(BIN)/pytest -n auto --dist worksteal --ignore tests/hil/test_hil.py $(ARGS)
 
 hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
 	$(BIN)/pytest tests/hil/test_hil.py
