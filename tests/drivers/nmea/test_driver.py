@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from drivers.base import Driver
+from drivers.base import Driver, Now, monotonic_ns
 from drivers.measurements import (
     DeviceEvent,
     Measurement,
@@ -29,10 +29,10 @@ from tests.pty_device import Device
 class Vehicle:
     """A driver and all that it handed over."""
 
-    def __init__(self, device: Device, **options: Any) -> None:
+    def __init__(self, device: Device, now_ns: Now = monotonic_ns, **options: Any) -> None:
         self.emitted: list[Measurement | DeviceEvent] = []
         self.driver = NmeaDriver(
-            "gnss", NmeaOptions(port=str(device.link), **options), self.emitted.append
+            "gnss", NmeaOptions(port=str(device.link), **options), self.emitted.append, now_ns
         )
 
     @property
@@ -131,13 +131,16 @@ async def test_unplugged_in_the_middle_of_a_sentence_and_plugged_again(device: D
 async def test_wrong_baud_rate_is_named(device: Device) -> None:
     """What 115200 looks like when read at 9600: bytes, mostly with the high bit set."""
     device.plug()
-    vehicle = Vehicle(device, timeout_s=0.3, baud=9600)
+    now_ns = 0  # moves while rubbish comes, and stands still after
+
+    vehicle = Vehicle(device, lambda: now_ns, timeout_s=0.3, baud=9600)
     garbage = bytes((i * 193 + 7) % 256 | 0x80 for i in range(80))
     async with running(vehicle):
         await until(lambda: opened(vehicle))
         async with asyncio.timeout(PATIENCE_S):
             while vehicle.state() != "silent" or "baud" not in vehicle.driver.status.detail:
                 device.send(garbage)
+                now_ns += 20_000_000
                 await asyncio.sleep(0.02)
         assert "9600 baud" in vehicle.driver.status.detail
         assert "device_silent" in vehicle.events
