@@ -70,7 +70,7 @@ async def hearing(broker: Broker, vehicle: str) -> AsyncIterator[Heard]:
 
 
 STRETCH_S = 5.0
-"""Over which ticks are counted: 250 periods at the lowest rate."""
+"""Over which ticks are counted."""
 
 
 async def keeps_up(heard: Heard, rate_hz: float) -> None:
