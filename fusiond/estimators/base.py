@@ -25,7 +25,8 @@ from fusiond.aiding.base import Innovation, Linearised, State
 from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back
-from fusiond.models.model import CLOCK_OFFSET, Model
+from fusiond.models.blocks import CLOCK_OFFSET
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
