@@ -1,6 +1,7 @@
 # The targets that a person runs are the ones that CI runs. `make help` lists them.
 PYTHON ?= python3
 ARGS ?=
+RUNS ?= 100000
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -10,7 +11,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit hil format picture bench load lock clean kernels \
+.PHONY: help install demo test lint unit fuzz hil format picture bench load lock clean kernels \
 	test-packages
 
 help: ## this list
@@ -52,6 +53,10 @@ kernels: $(STAMP)
 unit: kernels test-packages ## unit and property tests, on every core
 	$(BIN)/pytest -n auto --dist worksteal --ignore tests/hil/test_hil.py $(ARGS)
 
+fuzz: $(STAMP) ## every parser with atheris; RUNS=1000000 ARGS=nmea for one of them
+	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install --quiet 'atheris>=3'
+	$(BIN)/python -m tests.fuzz.run --runs $(RUNS) $(ARGS)
+
 hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
 	$(BIN)/pytest tests/hil/test_hil.py
 
@@ -77,5 +82,5 @@ lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for n
 	$(COMPILE) --extra demo --extra raw --output-file requirements.lock pyproject.toml
 
 clean: ## remove what the other targets made
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist *.egg-info .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

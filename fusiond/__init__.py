@@ -35,10 +35,10 @@ if TYPE_CHECKING:  # the same names as in _HOMES, for whoever reads types
     from fusiond.files.tables import read_truth as read_truth
     from fusiond.files.tables import read_wheel as read_wheel
     from fusiond.files.trajectory import trajectory_of as trajectory_of
-    from fusiond.models.model import MODELS as MODELS
-    from fusiond.models.model import Block as Block
+    from fusiond.models.blocks import Block as Block
+    from fusiond.models.catalogue import MODELS as MODELS
+    from fusiond.models.catalogue import make_model as make_model
     from fusiond.models.model import Model as Model
-    from fusiond.models.model import make_model as make_model
     from fusiond.navigation.solution import Mode as Mode
     from fusiond.navigation.solution import Solution as Solution
     from fusiond.navigator.filters import estimator_of as estimator_of
@@ -65,7 +65,9 @@ _HOMES = {
         *("read_rdss", "read_solution", "read_truth", "read_wheel"),
     ),
     "fusiond.files.trajectory": ("trajectory_of",),
-    "fusiond.models.model": ("MODELS", "Block", "Model", "make_model"),
+    "fusiond.models.blocks": ("Block",),
+    "fusiond.models.catalogue": ("MODELS", "make_model"),
+    "fusiond.models.model": ("Model",),
     "fusiond.navigation.solution": ("Mode", "Solution"),
     "fusiond.navigator.filters": ("estimator_of", "model_of"),
     "fusiond.navigator.navigator": ("Navigator",),

@@ -18,10 +18,10 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from statistics import median
 
 from drivers.can.dbc import MessagePlan, Part
+from drivers.can.device_time import DeviceTime
 
 INTERVALS = 31
 """Distances of frames the median is taken of: outlives a burst of fifteen late frames."""
@@ -29,60 +29,6 @@ INTERVALS_NEEDED = 4
 """Fewer say nothing about the interval; unstamped frames are not paired before (`unpaired`)."""
 OPEN_GROUPS = 4
 """Most samples whose frames are awaited at once; a device queues a sample or two, not more."""
-RESTART_S = 1.0
-"""Device time and arrival may differ by this between two samples before the device must have
-restarted: more than a stalled reader with a full socket buffer makes, less than any boot."""
-DEVICE_DRIFT = 1e-3
-"""Bound of the rate error of a device's clock; crystals have 100 ppm at worst, RC oscillators ten
-times that."""
-
-
-class DeviceTime:
-    """Unwraps a device's time; `restarts` counts how often it began anew.
-
-    The number of wraps is the one that fits the arrivals best, so a pause may last longer than the
-    counter's period.
-    """
-
-    def __init__(self, modulus: int, tick_ns: Fraction) -> None:
-        self.restarts = 0
-        self._modulus = modulus
-        self._tick_ns = tick_ns
-        self._ticks: int | None = None
-        self._arrivals_ns: tuple[int, int] = (0, 0)
-
-    def unwrap(self, raw: int, arrivals_ns: tuple[int, int]) -> int | None:
-        """Ticks in ns since the clock's own zero; None for a time that did not advance.
-
-        `arrivals_ns`: instant of arrival on two clocks (kernel stamp, monotonic); the device has
-        restarted only if it disagrees with both, for the one can be set and the other can stall.
-        """
-        if self._ticks is None:
-            self._ticks, self._arrivals_ns = raw, arrivals_ns
-            return self._ns()
-        step = (raw - self._ticks) % self._modulus
-        best: tuple[float, int] | None = None
-        for now, before in zip(arrivals_ns, self._arrivals_ns, strict=True):
-            elapsed = (now - before) / float(self._tick_ns)
-            advance = step + self._modulus * round((elapsed - step) / self._modulus)
-            allowed = RESTART_S * 1e9 / float(self._tick_ns) + DEVICE_DRIFT * abs(elapsed)
-            miss = abs(advance - elapsed) / allowed
-            if best is None or miss < best[0]:
-                best = miss, advance
-        assert best is not None
-        miss, advance = best
-        if miss > 1.0:
-            self.restarts += 1
-            self._ticks, self._arrivals_ns = raw, arrivals_ns
-            return self._ns()
-        if advance <= 0:
-            return None
-        self._ticks, self._arrivals_ns = self._ticks + advance, arrivals_ns
-        return self._ns()
-
-    def _ns(self) -> int:
-        assert self._ticks is not None
-        return self._ticks * self._tick_ns.numerator // self._tick_ns.denominator
 
 
 @dataclass(slots=True)

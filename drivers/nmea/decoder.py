@@ -32,6 +32,7 @@ from drivers.nmea.epochs import (
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
+from drivers.plausible import SIGMA_M
 
 BUILD_DATE = date(2026, 11, 20)
 """No receiver can truly report a date before this software was written."""
@@ -61,8 +62,9 @@ class NmeaDecoder:
     Counts, beside those of `NmeaSplitter`, `Calendar` and `EpochOrder`: `epochs`, `fixes`;
     refused sentences `other_talker`, `unused_sentence`, `rdss_sentence`, `bad_field`,
     `repeated_sentence`; noted `late_sentence`; refused epochs `no_fix`,
-    `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`; within one
-    `heading_mode_refused`, `height_not_measured`, `untimed_epoch`.
+    `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
+    `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
+    `height_not_measured`, `sigma_too_small`, `untimed_epoch`.
     """
 
     def __init__(
@@ -235,7 +237,9 @@ class NmeaDecoder:
         if epoch.lat_deg is None:
             return "no_fix"
         simulated = self._decoding.allow_simulator and epoch.quality in (7, 8)
-        return None if epoch.quality in _QUALITIES or simulated else "unknown_quality"
+        if not (epoch.quality in _QUALITIES or simulated):
+            return "unknown_quality"
+        return epoch.implausible()
 
     def _date(self, epoch: Epoch, found: list[Measurement], *, valid: bool) -> date | None:
         """The epoch's date, its own or the calendar's; reports the time when it is its own."""
@@ -272,6 +276,10 @@ class NmeaDecoder:
         if epoch.two_dimensional and height is not None:
             self.counters["height_not_measured"] += 1
             height = None
+        sd_ned_m = epoch.sd_ned_m
+        if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:
+            self.counters["sigma_too_small"] += 1
+            sd_ned_m = None
         return PositionFix(
             self._source,
             epoch.t_seen_ns,
@@ -283,6 +291,6 @@ class NmeaDecoder:
             epoch.satellites,
             epoch.hdop,
             epoch.vdop,
-            epoch.sd_ned_m,
+            sd_ned_m,
             epoch.v_ned_m_s(),
         )

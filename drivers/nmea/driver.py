@@ -19,6 +19,9 @@ REFUSALS = {
     "simulator_refused": "the receiver simulates: allow_simulator would accept it",
     "duplicate_epoch": "the receiver repeats an epoch or goes back in time",
     "unknown_quality": "the receiver states a GGA quality that NMEA does not know",
+    "height_implausible": "the receiver states a height at which no vehicle can be",
+    "speed_implausible": "the receiver states a speed that no vehicle has",
+    "sigma_too_large": "the receiver states that it does not know where it is (GST)",
 }
 
 

@@ -25,6 +25,7 @@ from pynmeagps.nmeareader import NMEAReader
 from drivers.measurements import Vector3
 from drivers.nmea.framing import Sentence
 from drivers.nmea.time import parse_time_of_day
+from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 
 TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GQ"})
 MAX_CYCLE = 24
@@ -73,6 +74,7 @@ class Epoch:
     vdop: float | None = None
     two_dimensional: bool = False
     sd_ned_m: Vector3 | None = None
+    """As printed; `implausible` judges it."""
     speed_m_s: float | None = None
     course_deg: float | None = None
     heading_deg: float | None = None
@@ -93,6 +95,17 @@ class Epoch:
         if self.lat_deg is None or self.lon_deg is None or self.quality is None:
             return None
         return self.lat_deg, self.lon_deg, self.quality
+
+    def implausible(self) -> str | None:
+        """The counter of what no receiver can mean, None where all can be."""
+        height = (self.altitude_m or 0.0) + (self.separation_m or 0.0)
+        if not within(height, HEIGHT_M):
+            return "height_implausible"
+        if self.speed_m_s is not None and self.speed_m_s > SPEED_M_S:
+            return "speed_implausible"
+        if self.sd_ned_m is not None and max(self.sd_ned_m) > SIGMA_M[1]:
+            return "sigma_too_large"
+        return None
 
     def v_ned_m_s(self) -> tuple[float, float, None] | None:
         """Horizontal velocity; None when the receiver gives no course though it moves."""
@@ -139,6 +152,14 @@ def _number(message: NMEAMessage, name: str, least: float = -math.inf) -> float 
 def _count(message: NMEAMessage, name: str) -> int | None:
     number = _number(message, name, 0.0)
     return None if number is None else int(number)
+
+
+def _sigma(message: NMEAMessage, name: str) -> float | None:
+    """A sigma that is no number is as large as can be: it must not pass for one not given."""
+    value = getattr(message, name, "")
+    if isinstance(value, float) and not math.isfinite(value):
+        return math.inf
+    return _number(message, name, 0.0)
 
 
 def _letter(message: NMEAMessage, name: str) -> str:
@@ -230,9 +251,8 @@ def _take_gsa(epoch: Epoch, message: NMEAMessage) -> None:
 
 
 def _take_gst(epoch: Epoch, message: NMEAMessage) -> None:
-    north, east = _number(message, "stdLat", 0.0), _number(message, "stdLong", 0.0)
-    down = _number(message, "stdAlt", 0.0)
-    if north and east and down:  # a sigma of zero is none
+    north, east, down = (_sigma(message, name) for name in ("stdLat", "stdLong", "stdAlt"))
+    if north is not None and east is not None and down is not None:
         epoch.sd_ned_m = (north, east, down)
 
 

@@ -6,6 +6,7 @@
 
 Binary frames are taken whole, so that a `$` inside one starts nothing. A frame whose check fails,
 or inside which a whole sentence verifies, was none: scanning goes on one byte behind its first.
+Whatever false headers promise, each byte is summed once (drivers.nmea.running_checks).
 Sources: NMEA 0183 4.11 section 5.3; u-blox ZED-F9P interface description section 3; RTCM 10403.3
 section 4.
 """
@@ -13,12 +14,13 @@ section 4.
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from functools import reduce
-from itertools import accumulate
 from operator import xor
 from typing import Literal
+
+from drivers.nmea.running_checks import RunningCrc24q, RunningFletcher
 
 MAX_SENTENCE = 256
 """Bytes from `$` to the checksum. The standard says 82, receivers exceed it; a longer run of text
@@ -98,11 +100,19 @@ class StreamSplitter:
     def __init__(self, counters: Counter[str] | None = None) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self._buffer = bytearray()
+        self._whole = _WholeSentences()
+        self._fletcher = RunningFletcher()
+        self._crc = RunningCrc24q()
 
     @property
     def waiting(self) -> int:
         """Bytes kept until more come."""
         return len(self._buffer)
+
+    @property
+    def summed(self) -> int:
+        """Bytes that the checks of binary frames worked on, of both kinds together."""
+        return self._fletcher.taken + self._crc.taken
 
     def feed(self, data: bytes) -> list[Item]:
         """The sentences and frames that `data` completes, in order."""
@@ -143,6 +153,8 @@ class StreamSplitter:
                     self.counters["frame_cut"] += 1
             at += used
         del buffer[:at]
+        for along in (self._whole, self._fletcher, self._crc):
+            along.drop(at)
 
     def _garbage(self, skipped: bytearray) -> None:
         self.counters["garbage_bytes"] += len(skipped) - skipped.count(0x0D) - skipped.count(0x0A)
@@ -192,17 +204,54 @@ class StreamSplitter:
             return 1
         buffer = self._buffer
         end = at + length
-        for inside in _WHOLE.finditer(buffer, at, min(end, len(buffer))):
-            if _verifies(inside.group()):
-                return self._refuse(f"{kind}_damaged", 1)
+        if self._whole.inside(buffer, at, end):
+            return self._refuse(f"{kind}_damaged", 1)
         if len(buffer) < end:
             return None
-        frame = bytes(buffer[at:end])
-        if not (_ubx_verifies(frame) if kind == "ubx" else crc24q(frame) == 0):
+        good = (
+            self._fletcher.holds(buffer, at + 2, end)
+            if kind == "ubx"
+            else self._crc.holds(buffer, at, end)
+        )
+        if not good:
             return self._refuse(f"{kind}_damaged", 1)
+        frame = bytes(buffer[at:end])
         self.counters[f"{kind}_frames"] += 1
         items.append(Frame(kind, frame))
         return length
+
+
+class _WholeSentences:
+    """Where in a growing buffer whole sentences verify; what was searched is not searched again."""
+
+    def __init__(self) -> None:
+        self._found: deque[tuple[int, int]] = deque()
+        self._searched = 0
+
+    def inside(self, buffer: bytearray, start: int, end: int) -> bool:
+        """Whether one stands in start..end, as far as that has come."""
+        self._search(buffer)
+        found = self._found
+        while found and found[0][0] < start:
+            found.popleft()
+        return bool(found) and found[0][1] <= end
+
+    def _search(self, buffer: bytearray) -> None:
+        if self._searched == len(buffer):
+            return
+        after = self._searched
+        for match in _WHOLE.finditer(buffer, after):
+            after = match.end()
+            if _verifies(match.group()):
+                self._found.append(match.span())
+        # A sentence may have begun, of which the rest is to come.
+        begun = buffer.rfind(b"$", max(after, len(buffer) - MAX_SENTENCE))
+        self._searched = len(buffer) if begun < 0 else begun
+
+    def drop(self, count: int) -> None:
+        """The first `count` bytes leave the buffer."""
+        self._searched = max(0, self._searched - count)
+        self._found = deque((a - count, b - count) for a, b in self._found if a >= count)
 
 
 class NmeaSplitter:
@@ -253,31 +302,3 @@ def _rtcm_length(buffer: bytearray, at: int) -> int | None:
     if not (1001 <= number <= 1300 or number >= 4001):  # the numbers RTCM 10403.3 gives out
         return 0
     return (int.from_bytes(head[1:3], "big") & 0x3FF) + 6
-
-
-def _ubx_verifies(frame: bytes) -> bool:
-    covered = frame[2:-2]
-    if sum(covered) & 0xFF != frame[-2]:
-        return False
-    return sum(accumulate(covered)) & 0xFF == frame[-1]
-
-
-def _crc24q_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 16
-        for _ in range(8):
-            crc = (crc << 1) ^ (0x1864CFB if crc & 0x800000 else 0)
-        table.append(crc & 0xFFFFFF)
-    return tuple(table)
-
-
-_CRC24Q = _crc24q_table()
-
-
-def crc24q(data: bytes) -> int:
-    """CRC-24Q (RTCM 10403.3 section 4.2, polynomial 1864CFB hex); 0 over a whole good frame."""
-    crc = 0
-    for byte in data:
-        crc = (crc << 8) & 0xFFFFFF ^ _CRC24Q[crc >> 16 ^ byte]
-    return crc

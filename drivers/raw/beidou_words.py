@@ -10,9 +10,12 @@ correct one bit of fifteen; a word in doubt is refused instead.
 
 from __future__ import annotations
 
-from drivers.raw.bits import Bits
-from drivers.raw.messages import Klobuchar
-from drivers.raw.subframes import RefusedError, Subframe
+from typing import Any
+
+from drivers.raw.bits import Bits, s
+from drivers.raw.messages import Ephemeris
+from drivers.raw.subframes import RefusedError, Subframe, ephemeris, ura_m, week_of_toe
+from drivers.raw.weeks import WeekReference
 
 WORDS = 10
 PREAMBLE = 0b11100010010
@@ -20,7 +23,8 @@ FREE_BITS = 26
 """Information bits of word 1; every other word has 22."""
 HEADER_BITS = 38
 """Preamble 11, reserved 4, subframe number 3, second of week 20."""
-GROUP_DELAY_S = 1e-10
+_DELAYS = (s(40, 10, 0, 1e-10), s(50, 10, 0, 1e-10))
+"""TGD1 and TGD2, in 0.1 ns."""
 GEO = frozenset(range(1, 6)) | frozenset(range(59, 64))
 
 
@@ -67,12 +71,30 @@ def second_of_week(bits: Bits) -> int:
     return bits.unsigned(18, 20)
 
 
-def klobuchar(subframe: Subframe, alpha: dict[str, float], beta: dict[str, float]) -> Klobuchar:
-    """From the numbers of `klobuchar_table`."""
-    return Klobuchar(
-        subframe.source,
-        subframe.t_seen_ns,
-        "C",
-        (alpha["0"], alpha["1"], alpha["2"], alpha["3"]),
-        (beta["0"], beta["1"], beta["2"], beta["3"]),
+def beidou_ephemeris(
+    subframe: Subframe,
+    message: str,
+    numbers: dict[str, Any],
+    first: Bits,
+    tow_s: int,
+    weeks: WeekReference,
+) -> Ephemeris:
+    """The ephemeris of D1 or D2. RefusedError by name.
+
+    `numbers`: what the message's own table reads; `first`: subframe 1 (D1) or page 1 (D2) without
+    its header, in which both hold health, ages, accuracy, week and delays at the same bits;
+    `tow_s`: BDT at which the first began.
+    """
+    if numbers["toe_s"] != numbers["toc_s"]:
+        raise RefusedError("ephemeris_mixed")
+    week = weeks.bdt_week(first.unsigned(10, 13), tow_s)
+    return ephemeris(
+        subframe,
+        message,
+        numbers,
+        week=week_of_toe(week, tow_s, numbers["toe_s"]),
+        group_delay_s=tuple(delay.read(first) for delay in _DELAYS),
+        issue=first.unsigned(1, 5),
+        accuracy_m=ura_m(first.unsigned(6, 4)),
+        healthy=first.unsigned(0, 1) == 0,
     )

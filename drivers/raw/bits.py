@@ -93,8 +93,11 @@ def read(bits: Bits, table: Table) -> dict[str, Any]:
     return {name: number.read(bits) for name, number in table.items()}
 
 
-def klobuchar_table(at: int) -> tuple[Table, Table]:
+KlobucharTable = tuple[tuple[Number, ...], tuple[Number, ...]]
+
+
+def klobuchar_table(at: int) -> KlobucharTable:
     """Alpha and beta of GPS and BeiDou, eight bits each, one behind the other from bit `at`."""
-    alpha = {f"{i}": s(at + 8 * i, 8, e) for i, e in enumerate((-30, -27, -24, -24))}
-    beta = {f"{i}": s(at + 32 + 8 * i, 8, e) for i, e in enumerate((11, 14, 16, 16))}
+    alpha = tuple(s(at + 8 * i, 8, e) for i, e in enumerate((-30, -27, -24, -24)))
+    beta = tuple(s(at + 32 + 8 * i, 8, e) for i, e in enumerate((11, 14, 16, 16)))
     return alpha, beta

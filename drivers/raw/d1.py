@@ -8,25 +8,16 @@ Source: BDS-SIS-ICD-B1I-3.0, section 5.2.4 and figures 5-8 to 5-10.
 from __future__ import annotations
 
 from drivers.raw.beidou_words import (
-    GROUP_DELAY_S,
     HEADER_BITS,
     WORDS,
+    beidou_ephemeris,
     information,
-    klobuchar,
     second_of_week,
     subframe_number,
 )
 from drivers.raw.bits import Bits, angle, klobuchar_table, read, s, u
 from drivers.raw.messages import Ephemeris
-from drivers.raw.subframes import (
-    Decoded,
-    Parts,
-    RefusedError,
-    Subframe,
-    ephemeris,
-    ura_m,
-    week_of_toe,
-)
+from drivers.raw.subframes import Decoded, Parts, Subframe, klobuchar
 from drivers.raw.weeks import WeekReference
 
 _N = 186
@@ -53,8 +44,7 @@ TABLE = {
     "ascending_node": angle(2 * _N + 121, 32, -31),
     "perigee": angle(2 * _N + 153, 32, -31),
 }
-_DELAYS = (s(40, 10, 0, GROUP_DELAY_S), s(50, 10, 0, GROUP_DELAY_S))
-_ALPHA, _BETA = klobuchar_table(60)
+_IONOSPHERE = klobuchar_table(60)
 
 
 class D1Decoder:
@@ -73,7 +63,7 @@ class D1Decoder:
         frame_s = second_of_week(bits) - 6 * (number - 1)
         found: Decoded = []
         if number == 1:
-            found.append(klobuchar(subframe, read(body, _ALPHA), read(body, _BETA)))
+            found.append(klobuchar(subframe, body, _IONOSPHERE))
         # Subframes of another frame are no fault: the receiver joined in the middle, or lost one.
         self._parts.add(frame_s, number, body)
         if len(self._parts.found) == 3:
@@ -84,16 +74,4 @@ class D1Decoder:
         one: Bits = self._parts.found[1]
         numbers = read(Bits.join(*(self._parts.found[n] for n in (1, 2, 3))), TABLE)
         self._parts.clear()
-        if numbers["toe_s"] != numbers["toc_s"]:
-            raise RefusedError("ephemeris_mixed")
-        week = weeks.bdt_week(one.unsigned(10, 13), tow_s)
-        return ephemeris(
-            subframe,
-            "d1",
-            numbers,
-            week=week_of_toe(week, tow_s, numbers["toe_s"]),
-            group_delay_s=tuple(delay.read(one) for delay in _DELAYS),
-            issue=one.unsigned(1, 5),
-            accuracy_m=ura_m(one.unsigned(6, 4)),
-            healthy=one.unsigned(0, 1) == 0,
-        )
+        return beidou_ephemeris(subframe, "d1", numbers, one, tow_s, weeks)

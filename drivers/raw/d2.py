@@ -8,24 +8,10 @@ Source: BDS-SIS-ICD-B1I-3.0, section 5.3.3 and figure 5-14.
 
 from __future__ import annotations
 
-from drivers.raw.beidou_words import (
-    GROUP_DELAY_S,
-    information,
-    klobuchar,
-    second_of_week,
-    subframe_number,
-)
+from drivers.raw.beidou_words import beidou_ephemeris, information, second_of_week, subframe_number
 from drivers.raw.bits import Bits, angle, klobuchar_table, read, s, u
 from drivers.raw.messages import Ephemeris
-from drivers.raw.subframes import (
-    Decoded,
-    Parts,
-    RefusedError,
-    Subframe,
-    ephemeris,
-    ura_m,
-    week_of_toe,
-)
+from drivers.raw.subframes import Decoded, Parts, Subframe, klobuchar
 from drivers.raw.weeks import WeekReference
 
 PAGE_WORDS = 5
@@ -65,8 +51,7 @@ TABLE = {
     "perigee": angle(447, 32, -31),  # 9 and 10
     "inclination_rate": angle(479, 14, -43),
 }
-_DELAYS = (s(40, 10, 0, GROUP_DELAY_S), s(50, 10, 0, GROUP_DELAY_S))
-_ALPHA, _BETA = klobuchar_table(42)
+_IONOSPHERE = klobuchar_table(42)
 
 
 class D2Decoder:
@@ -82,7 +67,7 @@ class D2Decoder:
             return []
         page = bits.unsigned(38, 4)
         if page == 2:
-            return [klobuchar(subframe, read(bits, _ALPHA), read(bits, _BETA))]
+            return [klobuchar(subframe, bits, _IONOSPHERE)]
         if page not in USED:
             return []
         first_s = second_of_week(bits) - PAGE_S * (page - 1)
@@ -95,16 +80,4 @@ class D2Decoder:
         one: Bits = self._parts.found[1]
         numbers = read(Bits.join(*(self._parts.found[page] for page in USED)), TABLE)
         self._parts.clear()
-        if numbers["toe_s"] != numbers["toc_s"]:
-            raise RefusedError("ephemeris_mixed")
-        week = weeks.bdt_week(one.unsigned(10, 13), tow_s)
-        return ephemeris(
-            subframe,
-            "d2",
-            numbers,
-            week=week_of_toe(week, tow_s, numbers["toe_s"]),
-            group_delay_s=tuple(delay.read(one) for delay in _DELAYS),
-            issue=one.unsigned(1, 5),
-            accuracy_m=ura_m(one.unsigned(6, 4)),
-            healthy=one.unsigned(0, 1) == 0,
-        )
+        return beidou_ephemeris(subframe, "d2", numbers, one, tow_s, weeks)

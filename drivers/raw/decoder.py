@@ -2,7 +2,8 @@
 
 Every verified frame ends in exactly one of these counters:
 
-    UBX     rawx, rawx_unreadable, time_unset; sfrbx_unreadable, one name per subframe; ubx_not_used
+    UBX     rawx, rawx_unreadable, time_unset, time_implausible; sfrbx_unreadable, one name per
+            subframe; ubx_not_used
     RTCM 3  msm, week_unknown, rtcm_ephemerides, ..._not_used, rtcm_unreadable, and the refusals of
             an ephemeris
 
@@ -38,7 +39,7 @@ from drivers.raw.ubx import (
     parse_rawx,
     parse_sfrbx,
 )
-from drivers.raw.weeks import FIRST_RAWX_WEEK, LEAP_SECONDS, WeekReference, utc_ns
+from drivers.raw.weeks import FIRST_RAWX_WEEK, LAST_WEEK, LEAP_SECONDS, WeekReference, utc_ns
 
 
 class MessageDecoder(Protocol):
@@ -140,6 +141,9 @@ class RawDecoder:
             return []
         if epoch.week < FIRST_RAWX_WEEK:
             self.counters["time_unset"] += 1
+            return []
+        if epoch.week > LAST_WEEK:
+            self.counters["time_implausible"] += 1
             return []
         self.counters["rawx"] += 1
         self.counters["epochs_raw"] += 1

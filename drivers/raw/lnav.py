@@ -12,12 +12,12 @@ has the ionosphere. Source: IS-GPS-200, 20.3.3 and figure 20-1.
 from __future__ import annotations
 
 from drivers.raw.bits import Bits, angle, klobuchar_table, read, s, u
-from drivers.raw.messages import Klobuchar
 from drivers.raw.subframes import (
     Decoded,
     RefusedError,
     Subframe,
     ephemeris,
+    klobuchar,
     ura_m,
     week_of_toe,
 )
@@ -52,7 +52,7 @@ TABLE = {
     "inclination_rate": angle(2 * _N + 224, 14, -43),
 }
 _TGD = s(160, 8, -31)
-_ALPHA, _BETA = klobuchar_table(56)
+_IONOSPHERE = klobuchar_table(56)
 
 
 def _mask(*bits: int) -> int:
@@ -107,7 +107,7 @@ class LnavDecoder:
         bits = subframe_bits(subframe.words)
         number = bits.unsigned(43, 3)
         if number == 4 and bits.unsigned(50, 6) == IONOSPHERE_PAGE:
-            return [_ionosphere(subframe, bits)]
+            return [klobuchar(subframe, bits, _IONOSPHERE)]
         if number not in (1, 2, 3):
             return []
         self._parts[number] = bits
@@ -139,14 +139,3 @@ class LnavDecoder:
 def _issue(number: int, bits: Bits) -> int:
     """IODE, or the low byte of IODC."""
     return bits.unsigned({1: 168, 2: 48, 3: 216}[number], 8)
-
-
-def _ionosphere(subframe: Subframe, bits: Bits) -> Klobuchar:
-    a, b = read(bits, _ALPHA), read(bits, _BETA)
-    return Klobuchar(
-        subframe.source,
-        subframe.t_seen_ns,
-        "G",
-        (a["0"], a["1"], a["2"], a["3"]),
-        (b["0"], b["1"], b["2"], b["3"]),
-    )

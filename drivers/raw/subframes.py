@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from drivers.raw.bits import Bits, KlobucharTable
 from drivers.raw.messages import Ephemeris, Klobuchar, System
 from drivers.raw.weeks import HALF_WEEK_S, WeekReference
 
@@ -74,6 +75,14 @@ def ephemeris(subframe: Subframe, message: str, numbers: dict[str, Any], **rest:
     )
     check_orbit(found)
     return found
+
+
+def klobuchar(subframe: Subframe, bits: Bits, table: KlobucharTable) -> Klobuchar:
+    """The ionosphere that `table` (drivers.raw.bits.klobuchar_table) finds in `bits`."""
+    (a0, a1, a2, a3), (b0, b1, b2, b3) = ([n.read(bits) for n in row] for row in table)
+    return Klobuchar(
+        subframe.source, subframe.t_seen_ns, subframe.system, (a0, a1, a2, a3), (b0, b1, b2, b3)
+    )
 
 
 def check_orbit(found: Ephemeris) -> None:

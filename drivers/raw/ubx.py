@@ -17,6 +17,7 @@ import struct
 from collections import Counter
 from dataclasses import dataclass
 
+from drivers.plausible import LEAP_SECONDS, within
 from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S, RawSignal, System
 
 RAWX = b"\x02\x15"
@@ -25,6 +26,8 @@ SFRBX = b"\x02\x13"
 PSEUDORANGE_M = (1.5e7, 5.0e7)
 """A GPS satellite overhead is 20,200 km away, an IGSO one at the horizon 42,000 km; the rest is
 room for a receiver clock of 17 ms."""
+MAX_RATE_M_S = 10_000.0
+"""A satellite moves at 3.9 km/s at most, a vehicle below 1 km/s, and a clock 10 ppm off adds 3."""
 MAX_PRN: dict[System, int] = {"G": 32, "E": 36, "C": 63}
 SYSTEM_BY_ID: dict[int, System] = {0: "G", 2: "E", 3: "C"}
 OTHER_SYSTEMS = {1: "sbas", 5: "qzss", 6: "glonass", 7: "navic"}
@@ -98,7 +101,9 @@ def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
 
     Every measurement is counted as `measured_G`, `measured_E`, `measured_C`, or with the name of
     another system, and again where one of the three is refused: `signal_unknown`, `prn_unknown`,
-    `pseudorange_invalid`, `not_finite`, `pseudorange_implausible`, `signal_repeated`.
+    `pseudorange_invalid`, `not_finite`, `pseudorange_implausible`, `rate_implausible`,
+    `signal_repeated`. A leap second count that cannot be is counted as `leap_seconds_implausible`
+    and not known.
     """
     if len(payload) < _HEADER.size:
         return None
@@ -115,10 +120,14 @@ def parse_rawx(payload: bytes, counters: Counter[str]) -> Rawx | None:
             counters["signal_repeated"] += 1
             continue
         signals[key] = signal
+    known = bool(status & _LEAP_KNOWN)
+    if known and not within(leap, LEAP_SECONDS):
+        counters["leap_seconds_implausible"] += 1
+        known = False
     return Rawx(
         tow_s,
         week,
-        leap if status & _LEAP_KNOWN else None,
+        leap if known else None,
         bool(status & _CLOCK_RESET),
         tuple(signals.values()),
     )
@@ -151,6 +160,9 @@ def _signal(
         counters["pseudorange_implausible"] += 1
         return None
     _, code, wavelength = known
+    if abs(doppler * wavelength) > MAX_RATE_M_S:
+        counters["rate_implausible"] += 1
+        return None
     return RawSignal(
         system,
         prn,

@@ -24,6 +24,8 @@ LEAP_SECONDS = 18
 """GPS time minus UTC since 2017, taken while a receiver does not know better."""
 FIRST_RAWX_WEEK = 1773
 """Start of 2014. No receiver sent RXM-RAWX before; an earlier week is a clock never set."""
+LAST_WEEK = 6260
+"""The last that begins in 2099: the calendar of NMEA ends there too, with its two-digit years."""
 
 _GPS_ORDINAL = date(1980, 1, 6).toordinal()
 

@@ -298,19 +298,7 @@ class Decoder(FrameDecoder):
         if checksum(whole):
             self.counters["bad_checksum"] += 1
             return None
-        name, user, payload = (
-            ascii_name(whole[1:5]),
-            int.from_bytes(whole[7:10], "big"),
-            whole[10:-1],
-        )
+        name, payload = ascii_name(whole[1:5]), whole[10:-1]
+        user = int.from_bytes(whole[7:10], "big") & MAX_USER
         read = _DECODE.get(name)
-        if read is None:
-            self.counters["unknown"] += 1
-            return Unknown(name, payload, user & MAX_USER)
-        try:
-            message = read(user & MAX_USER, payload)
-        except ValueError:
-            self.counters["bad_field"] += 1
-            return None
-        self.counters["frames"] += 1
-        return message
+        return self._judge(read and (lambda: read(user, payload)), Unknown(name, payload, user))

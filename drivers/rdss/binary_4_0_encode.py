@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from drivers.rdss.framing import checksum
+from drivers.rdss.framing import checksum, whole_frame
 from drivers.rdss.messages import (
     CARD_FAULTS,
     FORBIDDEN,
@@ -244,9 +244,4 @@ def _encode(m: Message) -> bytes:
 
 def encode(message: Message) -> bytes:
     """The frame that says `message`. EncodeError if 4.0 cannot say it or it must not be sent."""
-    try:
-        return _encode(message)
-    except EncodeError:
-        raise
-    except (OverflowError, ValueError) as error:
-        raise EncodeError(f"{message}: {error}") from None
+    return whole_frame(_encode, message)

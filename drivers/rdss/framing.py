@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Callable
 from functools import reduce
 from operator import xor
 from typing import ClassVar
 
-from drivers.rdss.messages import Message
+from drivers.rdss.messages import EncodeError, Message, Unknown
 
 
 def checksum(data: bytes | bytearray | memoryview) -> int:
@@ -20,11 +21,22 @@ def checksum(data: bytes | bytearray | memoryview) -> int:
     return reduce(xor, data, 0)
 
 
+def whole_frame(say: Callable[[Message], bytes], message: Message) -> bytes:
+    """The frame that says `message`. EncodeError where a value of it does not fit its field."""
+    try:
+        return say(message)
+    except EncodeError:
+        raise
+    except (OverflowError, ValueError, TypeError) as error:
+        raise EncodeError(f"{message}: {error}") from None
+
+
 class FrameDecoder(ABC):
     """Bytes in, messages out, both directions. Buffers at most one frame.
 
-    Counters: `abandoned` (frame whose rest never came), `garbage_bytes`, and the faults that a
-    family names.
+    Counters: `frames`, `unknown` (well-formed, not read here), `bad_field` (good checksum,
+    impossible value), `abandoned` (frame whose rest never came), `garbage_bytes`, and the faults
+    that a family names.
     """
 
     BETWEEN: ClassVar[bytes] = b""
@@ -78,6 +90,16 @@ class FrameDecoder(ABC):
             at += 1
         del buffer[:at]
         return messages
+
+    def _judge(self, read: Callable[[], Message | None] | None, unknown: Unknown) -> Message | None:
+        """What a frame with a good checksum says, counted; `unknown` where nobody reads it."""
+        try:
+            message = read() if read is not None else None
+        except ValueError:
+            self.counters["bad_field"] += 1
+            return None
+        self.counters["unknown" if message is None else "frames"] += 1
+        return unknown if message is None else message
 
     @abstractmethod
     def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:

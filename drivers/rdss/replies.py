@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from drivers.plausible import HEIGHT_M, within
 from drivers.rdss.cycle import (
     ALWAYS,
     BEAM_POLL_NS,
@@ -233,6 +234,9 @@ class Replies:
             return
         if not session.answerable or session.pace.requested_ns is None:
             session.counters["unsolicited"] += 1
+            return
+        if not within(fix.height_m + fix.height_anomaly_m, HEIGHT_M):
+            session.counters["height_implausible"] += 1
             return
         session.answerable = False
         session.timeouts = 0

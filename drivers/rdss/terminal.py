@@ -75,7 +75,7 @@ class Terminal:
     `timeout_feedback`, `timeout_fix`; one for each refusal: `refused`, `refused_other`,
     `refused_frequency`, `no_beam`, `not_sent`, `encryption_error`, `crc_error`, `no_permission`,
     `low_battery`, `suppressed`, `silence`, `no_card`; `feedback_unmatched`, `bad_fraction`,
-    `beams_unknown`, `probes`, `echo`, `before_identity`.
+    `height_implausible`, `beams_unknown`, `probes`, `echo`, `before_identity`.
     """
 
     def __init__(self, options: TerminalOptions, counters: Counter[str] | None = None) -> None:

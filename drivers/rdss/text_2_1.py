@@ -8,6 +8,7 @@ talker): they pass as `Unknown`. A raw Chinese text may hold bytes of 0x80 and m
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 from drivers.rdss.framing import FrameDecoder, checksum
@@ -50,6 +51,7 @@ from drivers.rdss.text_2_1_encode import (
 __all__ = ["Decoder", "checksum", "encode", "sentence"]
 
 _HEADER = 7
+_CONTROL = re.compile(rb"[\x00-\x1f]")
 
 Fields = list[str]
 
@@ -323,9 +325,9 @@ class Decoder(FrameDecoder):
         if fault:
             return 0, fault
         limit = at + MAX_SENTENCE
-        for i in range(at, min(limit, len(buffer))):
-            if buffer[i] < 0x20:
-                return i + 1 - at, ""
+        end = _CONTROL.search(buffer, at, limit)
+        if end is not None:
+            return end.end() - at, ""
         return (0, "bad_length") if len(buffer) >= limit else (MAX_SENTENCE, "")
 
     def _read(self, whole: bytes) -> Message | None:
@@ -338,16 +340,9 @@ class Decoder(FrameDecoder):
             return None
         name, fields = ascii_name(body[:5]), body[6:]
         read = _DECODE.get(name)
-        try:
-            message = read(fields.decode("latin-1").split(",")) if read else None
-        except ValueError:
-            self.counters["bad_field"] += 1
-            return None
-        if message is None:
-            self.counters["unknown"] += 1
-            return Unknown(name, fields)
-        self.counters["frames"] += 1
-        return message
+        return self._judge(
+            read and (lambda: read(fields.decode("latin-1").split(","))), Unknown(name, fields)
+        )
 
 
 def _header_fault(header: bytes) -> str:

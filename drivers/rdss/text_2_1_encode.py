@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from drivers.rdss.framing import checksum
+from drivers.rdss.framing import checksum, whole_frame
 from drivers.rdss.messages import (
     FORBIDDEN,
     ZTI_FAULTS,
@@ -197,9 +197,4 @@ def _encode(m: Message) -> bytes:
 
 def encode(message: Message) -> bytes:
     """The sentence that says `message`. EncodeError if 2.1 cannot say it or it must not be sent."""
-    try:
-        return _encode(message)
-    except EncodeError:
-        raise
-    except (OverflowError, ValueError, TypeError) as error:
-        raise EncodeError(f"{message}: {error}") from None
+    return whole_frame(_encode, message)

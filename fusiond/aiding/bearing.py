@@ -44,7 +44,7 @@ from fusiond.aiding.base import (
     misaligned_axes,
 )
 from fusiond.gnss.ecef import ned_axes, to_ecef
-from fusiond.models.model import SAR_MISALIGNMENT
+from fusiond.models.blocks import SAR_MISALIGNMENT
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew, wrap_angle
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN

@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
-from fusiond.models.model import CLOCK_DRIFT, CLOCK_OFFSET
+from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR

@@ -39,7 +39,8 @@ from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
-from fusiond.models.model import Model, make_model
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.filters import federated

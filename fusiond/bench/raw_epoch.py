@@ -20,7 +20,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.gnss.orbit import is_beidou_geo
-from fusiond.models.model import make_model
+from fusiond.models.catalogue import make_model
 from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
 from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
 from fusiond.simulation.scenarios import SCENARIOS

@@ -293,7 +293,7 @@ def model(
 ) -> None:
     """Print an error-state model: states, units, noise and initial sigma."""
     from fusiond.commands.model_report import model_report, print_model  # noqa: PLC0415
-    from fusiond.models.model import MODELS  # noqa: PLC0415
+    from fusiond.models.catalogue import MODELS  # noqa: PLC0415
 
     if name not in MODELS:
         raise typer.BadParameter(f"{name!r}: there are {', '.join(MODELS)}")

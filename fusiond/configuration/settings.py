@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu, ZeroVelocity
-from fusiond.models.model import ClockNoise, ImuNoise
+from fusiond.models.blocks import ClockNoise, ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigation.standstill import QuietLimits

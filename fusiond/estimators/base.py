@@ -25,12 +25,20 @@ from fusiond.aiding.base import Innovation, Linearised, State
 from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back
-from fusiond.models.model import CLOCK_OFFSET, Model
+from fusiond.models.blocks import CLOCK_OFFSET
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Span = tuple[
+    *tuple[bool, NDArray[np.bool_], Indices, Indices, Array],  # of the model
+    *tuple[Indices, Array, int, int],  # of the samples
+    *tuple[int, int, int],  # from, to, gap
+    *tuple[bool, Array, Array],  # whether to record, and where
+]
 
 # One sigma (rad) added to the attitude when a filter that rejects everything is opened again: what
 # a bad alignment on the move can be wrong by.
@@ -183,7 +191,6 @@ class ErrorStateFilter:
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
-        model = self.model
         first, self.t_ns = self._kernel(
             self.nav,
             self.xi,
@@ -193,6 +200,15 @@ class ErrorStateFilter:
             self._phi,
             self.step,
             self._scratch,
+            *self._span(imu, target_ns, record),
+            self._holding or self._carrying,
+        )
+        self.sample = first + imu.start
+
+    def _span(self, imu: ImuBuffer, target_ns: int, record: bool) -> Span:
+        """What every propagation kernel is told of the model, the samples and how far to go."""
+        model = self.model
+        return (
             model.hold_height,
             model.active,
             model.sensor_terms,
@@ -208,9 +224,7 @@ class ErrorStateFilter:
             record,
             imu.nav,
             imu.sigmas,
-            self._holding or self._carrying,
         )
-        self.sample = first + imu.start
 
     @property
     def state(self) -> State:

@@ -19,7 +19,8 @@ from fusiond.aiding.height import HeightAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.models.model import ImuNoise, Model
+from fusiond.models.blocks import ImuNoise
+from fusiond.models.model import Model
 from fusiond.navigation.alignment import (
     gyrocompass,
     gyrocompass_sd,

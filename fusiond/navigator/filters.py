@@ -17,7 +17,9 @@ from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
-from fusiond.models.model import Block, Model, TooManyStatesError, make_model
+from fusiond.models.blocks import Block
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model, TooManyStatesError
 
 
 def model_of(config: Config, *extra: Block) -> Model:

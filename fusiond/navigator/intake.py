@@ -45,7 +45,7 @@ from fusiond.configuration.aiding import (
     WheelAiding,
 )
 from fusiond.configuration.settings import ARCSEC, DEG
-from fusiond.models.model import Block, misalignment, position_bias
+from fusiond.models.blocks import Block, misalignment, position_bias
 from fusiond.navigator.raw_gnss import RawGnss, raw_blocks
 
 # What a fix moved forward by the computed velocity is wrong by: an acceleration of 2.5 m/s^2 over a

@@ -28,7 +28,7 @@ from fusiond.gnss.ranges import RangeModel, RangeOptions, Rows
 from fusiond.gnss.selection import best_four
 from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
 from fusiond.gnss.store import EphemerisStore
-from fusiond.models.model import Block, clock_blocks, position_bias
+from fusiond.models.blocks import Block, clock_blocks, position_bias
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,9 @@ from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.models.model import Model, make_model, position_bias
+from fusiond.models.blocks import position_bias
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.rotation import dcm_from_quaternion, dcm_from_rpy, rpy_from_dcm
 from fusiond.navigation.strapdown import STEP_SIZE

@@ -17,7 +17,9 @@ from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.gnss.ecef import to_ecef
-from fusiond.models.model import Model, make_model, misalignment
+from fusiond.models.blocks import misalignment
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.strapdown import STEP_SIZE
 from tests import runs

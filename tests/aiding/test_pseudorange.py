@@ -12,7 +12,9 @@ from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.models.model import Model, clock_blocks, make_model
+from fusiond.models.blocks import clock_blocks
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import STEP_SIZE

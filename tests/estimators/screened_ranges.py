@@ -9,7 +9,7 @@ import numpy as np
 
 from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State
 from fusiond.aiding.position import PositionAid
-from fusiond.models.model import CLOCK_OFFSET
+from fusiond.models.blocks import CLOCK_OFFSET
 
 
 @dataclass(frozen=True, slots=True)

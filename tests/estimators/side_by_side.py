@@ -13,7 +13,7 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import ErrorStateFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
-from fusiond.models.model import make_model
+from fusiond.models.catalogue import make_model
 from tests import runs
 from tests.estimators.covariances import random_covariance
 

@@ -22,7 +22,8 @@ from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.gnss.constellation import EPOCH_S, Constellation, constellation
 from fusiond.gnss.orbit import WEEK_S
-from fusiond.models.model import CLOCK_OFFSET, clock_blocks, make_model
+from fusiond.models.blocks import CLOCK_OFFSET, clock_blocks
+from fusiond.models.catalogue import make_model
 from fusiond.navigator.filters import federated
 from tests import runs
 from tests.estimators.screened_ranges import Ranges, ranges

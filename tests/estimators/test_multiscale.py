@@ -16,7 +16,7 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
-from fusiond.models.model import make_model
+from fusiond.models.catalogue import make_model
 from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.timeline import Timeline
 from tests import runs

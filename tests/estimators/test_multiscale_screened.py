@@ -13,7 +13,8 @@ from fusiond.aiding.position import PositionAid
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
-from fusiond.models.model import CLOCK_OFFSET, clock_blocks, make_model
+from fusiond.models.blocks import CLOCK_OFFSET, clock_blocks
+from fusiond.models.catalogue import make_model
 from tests import runs
 from tests.estimators.screened_ranges import Ranges, ranges
 from tests.estimators.town_drive import IMU, begun, drive, run

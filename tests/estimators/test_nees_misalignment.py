@@ -17,7 +17,8 @@ from fusiond.aiding.base import Linearised
 from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.configuration.settings import ARCSEC, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import make_model, misalignment
+from fusiond.models.blocks import misalignment
+from fusiond.models.catalogue import make_model
 from fusiond.simulation.aid_sensors import SarOptions, SarRadar, StarTracker, StarTrackerOptions
 from tests import runs
 from tests.estimators.monte_carlo import FIRST_FIX_S, LEVER, MATCHED, RATE_HZ, drawn_aids, interval

@@ -18,7 +18,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import SPREAD, UnscentedEstimator
 from fusiond.estimators.unscented.sigma_points import linear_form
 from fusiond.estimators.update import feed_back
-from fusiond.models.model import make_model
+from fusiond.models.catalogue import make_model
 from tests import runs
 from tests.estimators.side_by_side import (
     GATE,

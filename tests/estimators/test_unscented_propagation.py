@@ -15,7 +15,8 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.filter import SPREAD, UnscentedEstimator
 from fusiond.estimators.unscented.propagation import error_of
 from fusiond.estimators.update import feed_back
-from fusiond.models.model import clock_blocks, make_model
+from fusiond.models.blocks import clock_blocks
+from fusiond.models.catalogue import make_model
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
 from fusiond.navigator.timeline import Timeline

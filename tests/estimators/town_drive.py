@@ -14,7 +14,8 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
-from fusiond.models.model import Model, make_model
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from tests import runs
 

@@ -14,7 +14,9 @@ from fusiond.commands.app import app
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import MODELS, Model, clock_blocks, make_model, misalignment
+from fusiond.models.blocks import clock_blocks, misalignment
+from fusiond.models.catalogue import MODELS, make_model
+from fusiond.models.model import Model
 from tests import runs
 
 IMU = Imu(rate_hz=50.0)

@@ -12,7 +12,7 @@ from scipy.special import j1
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import make_model
+from fusiond.models.catalogue import make_model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_from_dcm
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step

@@ -21,7 +21,8 @@ from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
 from fusiond.files.tables import read_solution, read_truth
-from fusiond.models.model import CLOCK_OFFSET, make_model
+from fusiond.models.blocks import CLOCK_OFFSET
+from fusiond.models.catalogue import make_model
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
 from fusiond.offline.compare import compare

@@ -43,7 +43,8 @@ from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection
 from fusiond.estimators.federated.options import FederatedOptions, local_of
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import normalised_innovation_squared, update
-from fusiond.models.model import CLOCK_OFFSET, Model
+from fusiond.models.blocks import CLOCK_OFFSET
+from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 

@@ -110,7 +110,6 @@ class UnscentedEstimator(KalmanEstimator):
         if not self.propagation:
             super().propagate(imu, target_ns, record)
             return
-        model = self.model
         first, self.t_ns = propagate_points(
             self.nav,
             self.xi,
@@ -118,22 +117,8 @@ class UnscentedEstimator(KalmanEstimator):
             self._dxs[0],
             self.step,
             self.spread,
-            model.hold_height,
-            model.active,
-            model.sensor_terms,
-            model.rate_terms,
-            model.noise,
-            imu.times,
-            imu.samples,
-            self.sample - imu.start,
-            imu.end,
-            self.t_ns,
-            target_ns,
-            self.gap_ns,
-            record,
-            imu.nav,
-            imu.sigmas,
+            *self._span(imu, target_ns, record),
             self._holding,
-            self._scratch[-work_size(model.width) :],
+            self._scratch[-work_size(self.model.width) :],
         )
         self.sample = first + imu.start

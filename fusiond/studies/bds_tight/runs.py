@@ -48,7 +48,8 @@ from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.ranges import SIGNAL_IN_SPACE_M, RangeModel, RangeOptions
 from fusiond.gnss.single_point import SinglePoint, single_point
 from fusiond.gnss.store import EphemerisStore
-from fusiond.models.model import Model, make_model
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.gnss.masks import canyon
 from fusiond.simulation.gnss.raw import START, GnssRaw, GnssRawOptions

@@ -23,7 +23,7 @@ from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import make_model
+from fusiond.models.catalogue import make_model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.filters import federated
 from fusiond.navigator.intake import Intake

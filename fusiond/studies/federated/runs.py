@@ -31,7 +31,8 @@ from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import Model, make_model
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.filters import federated
 from fusiond.navigator.timeline import Timeline

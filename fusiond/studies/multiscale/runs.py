@@ -43,7 +43,8 @@ from fusiond.estimators.federated.reset import ResetFilter
 from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
-from fusiond.models.model import Model, make_model
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.simulation.imu_truth import Truth

@@ -33,7 +33,8 @@ from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import Model, make_model
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import (

@@ -27,7 +27,9 @@ from fusiond.estimators.base import ErrorStateFilter
 from fusiond.gnss.constellation import EPOCH_S, Constellation, beidou_slots, constellation
 from fusiond.gnss.orbit import WEEK_S
 from fusiond.gnss.selection import best_four
-from fusiond.models.model import SAR_MISALIGNMENT, Model, make_model, misalignment
+from fusiond.models.blocks import SAR_MISALIGNMENT, misalignment
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.earth import meridian_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import quaternion_from_rpy

@@ -20,13 +20,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import State
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.models.model import (
-    CLOCK_DRIFT,
-    CLOCK_OFFSET,
-    SAR_MISALIGNMENT,
-    ClockNoise,
-    Model,
-)
+from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET, SAR_MISALIGNMENT, ClockNoise
+from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_SIZE

@@ -36,7 +36,9 @@ from fusiond.estimators.screening import KEPT
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.gnss.constellation import Constellation, constellation
 from fusiond.gnss.ecef import ned_axes, to_ecef
-from fusiond.models.model import ClockNoise, Model, clock_blocks, make_model
+from fusiond.models.blocks import ClockNoise, clock_blocks
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigator.timeline import Entry
 from fusiond.studies.live_filter import (
     DURATION_S,

@@ -72,6 +72,56 @@ def test_setting_the_system_clock_is_no_restart() -> None:
     assert len(line.samples) == 40
 
 
+def device_us(line: Line) -> list[int]:
+    stamps = [sample.stamp for sample in line.samples]
+    assert all(isinstance(s, DeviceStamp) and s.device == "imu" for s in stamps)
+    return [s.ticks_ns // 1000 for s in stamps if isinstance(s, DeviceStamp)]
+
+
+def timed(k: int) -> tuple[tuple[int, bytes], ...]:
+    return sbg_time(900_000_000 + 5000 * k), sbg_accel(k), sbg_gyro(k)
+
+
+def test_a_stalled_reader_sees_a_burst_and_no_restart() -> None:
+    """Nothing for 3.5 and 4 s, then all that was queued; the bus gives no stamps."""
+    line = Line(SBG, kernel=False)
+    for k in range(3000):
+        due_ms = 5 * k
+        for stalled, again in ((500, 4000), (6000, 10_000)):
+            due_ms = again if stalled <= due_ms < again else due_ms
+        line.burst(T0 + due_ms * MS, *timed(k))
+    assert line.counters["device_restarts"] == 0
+    assert device_us(line) == [900_000_000 + 5000 * k for k in range(3000)]
+    assert line.counters["lost_samples"] == 0
+
+
+def test_repeated_and_overtaken_frames_are_no_restart() -> None:
+    """Every sample ten times; old ones again, seconds later, one by one and in a burst."""
+    line = Line(SBG)
+    for k in range(1200):
+        for _ in range(10 if k % 50 == 0 else 1):
+            line.burst(T0 + 5 * MS * k, *timed(k))
+        if k % 100 == 99:
+            line.burst(T0 + 5 * MS * k, *timed(max(0, k - 600)))
+        if k == 1000:
+            for old in range(100, 200):
+                line.burst(T0 + 5 * MS * k, *timed(old))
+    assert line.counters["device_restarts"] == 0
+    assert device_us(line) == [900_000_000 + 5000 * k for k in range(1200)]
+    assert line.counters["time_backward"] > 0
+
+
+def test_a_restart_to_a_later_time_is_told_by_lateness_that_stays() -> None:
+    """Two minutes dark, then a clock that goes on ten seconds behind where it was."""
+    line = Line(SBG)
+    for k in range(200):
+        line.burst(T0 + 5 * MS * k, *timed(k))
+    for k in range(1000):
+        line.burst(T0 + 120_000 * MS + 5 * MS * k, *timed(2200 + k))
+    assert line.counters["device_restarts"] == 1
+    assert line.samples[-1].stamp == DeviceStamp("imu/1", (900_000_000 + 5000 * 3199) * 1000)
+
+
 def test_device_time_that_goes_back_is_refused() -> None:
     line = Line(SBG)
     for k, us in enumerate([0, 5000, 10_000, 15_000, 20_000, 12_000, 30_000]):

@@ -151,6 +151,15 @@ def test_sigma_without_numbers_is_none() -> None:
         ([changed(GGA, "E,4", "E,8")], "simulator_refused"),
         ([GGA, changed(RMC, "R,V", "S,V")], "simulator_refused"),
         ([changed(GGA, "E,4", "E,9")], "unknown_quality"),
+        ([changed(GGA, "45.300", "1e300")], "height_implausible"),
+        ([changed(GGA, "45.300", "-6371000")], "height_implausible"),
+        ([changed(GGA, "-9.100", "100000")], "height_implausible"),
+        ([GGA, changed(RMC, "19.438", "1e300")], "speed_implausible"),
+        ([GGA, changed(RMC, "19.438", "2000.0")], "speed_implausible"),
+        ([GGA, changed(VTG, "19.438", "1945.0")], "speed_implausible"),
+        ([GGA, changed(GST, "0.014", "inf")], "sigma_too_large"),
+        ([GGA, changed(GST, "0.031", "nan")], "sigma_too_large"),
+        ([GGA, changed(GST, "0.012", "1e9")], "sigma_too_large"),
     ],
 )
 def test_epochs_refused_by_name(sentences: list[str], name: str) -> None:
@@ -158,6 +167,26 @@ def test_epochs_refused_by_name(sentences: list[str], name: str) -> None:
     assert not fixes(found)
     assert one.counters[name] == 1
     assert one.refusal == name
+
+
+@pytest.mark.parametrize("sigma", ["1e-9", "0.000", "0.0009"])
+def test_a_sigma_that_nothing_reaches_is_left_out(sigma: str) -> None:
+    found, one = decode(GGA, changed(GST, "0.012", sigma))
+    (fix,) = fixes(found)
+    assert fix.sd_ned_m is None
+    assert one.counters["sigma_too_small"] == 1
+
+
+def test_the_limits_of_what_is_plausible_pass() -> None:
+    found, one = decode(
+        changed(GGA, "45.300", "100009.1"),
+        changed(RMC, "19.438", "1943.8"),
+        changed(GST, "0.014,0.012,0.031", "0.001,100000,0.001"),
+    )
+    (fix,) = fixes(found)
+    assert fix.height_m == pytest.approx(1e5)
+    assert fix.sd_ned_m == (0.001, 1e5, 0.001)
+    assert one.refusal == ""
 
 
 def test_simulator_where_allowed() -> None:

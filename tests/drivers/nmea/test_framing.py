@@ -16,9 +16,10 @@ from drivers.nmea.framing import (
     MAX_UBX_PAYLOAD,
     NmeaSplitter,
     Sentence,
-    crc24q,
+    StreamSplitter,
     is_rdss_sentence,
 )
+from drivers.nmea.running_checks import LONGEST_RTCM, RunningCrc24q, RunningFletcher, crc24q
 
 
 def nmea(body: str) -> bytes:
@@ -136,6 +137,59 @@ def test_endless_streams_stay_bounded() -> None:
         splitter.feed(b"\xb5\x62\x02\x15\x00\x20" * 200)
         assert splitter.waiting <= MAX_UBX_PAYLOAD + 8
     assert [s.raw for s in splitter.feed(HDT)] == [HDT.rstrip()]
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"\xb5\x62\x02\x15\x00\x20",  # UBX, 8192 bytes to come
+        b"\xb5\x62\x01\x07\x20\x00",  # 32 bytes
+        b"\xd3\x03\xff\x46\x70",  # RTCM 3, 1023 bytes
+        b"\xd3\x00\x13\x3e\xd0",
+        b"\xb5\x62\x02\x15\x00\x20\xd3\x03\xff\x46\x70",
+    ],
+)
+@pytest.mark.parametrize("piece", [1, 7, 100_000])
+def test_false_headers_cost_a_byte_thrice_at_most(head: bytes, piece: int) -> None:
+    """However many headers claim a byte, the sums take it in twice, the CRC once."""
+    splitter = StreamSplitter()
+    stream = head * (60_000 // len(head))
+    for start in range(0, len(stream), piece):
+        splitter.feed(stream[start : start + piece])
+    splitter.finish()
+    assert splitter.summed <= 3 * len(stream)
+    assert splitter.counters["garbage_bytes"] == len(stream)
+
+
+@given(st.binary(max_size=400), st.lists(st.integers(0, 400), min_size=2, max_size=12))
+@settings(max_examples=100, deadline=None)
+def test_running_checks_say_what_the_whole_check_says(data: bytes, ends: list[int]) -> None:
+    """Of any stretch, in any order, with bytes leaving in front."""
+    sums, remainders = RunningFletcher(), RunningCrc24q()
+    buffer = bytearray(data)
+    for a, b in itertools.pairwise(ends):
+        start, end = sorted((min(a, len(buffer)), min(b, len(buffer))))
+        stretch = bytes(buffer[start:end])
+        assert remainders.holds(buffer, start, end) is (crc24q(stretch) == 0)
+        if len(stretch) >= 2:
+            good = ubx(stretch[4:-2], stretch[:2])[2:] if len(stretch) >= 6 else b""
+            first = second = 0
+            for byte in stretch[:-2]:
+                first = (first + byte) % 256
+                second = (second + first) % 256
+            assert sums.holds(buffer, start, end) is (stretch[-2:] == bytes([first, second]))
+            assert not good or RunningFletcher().holds(bytearray(good), 0, len(good))
+        gone = start // 2
+        del buffer[:gone]
+        sums.drop(gone)
+        remainders.drop(gone)
+
+
+def test_longest_rtcm_frame_passes() -> None:
+    frame = rtcm(MSM_1127 + bytes(1021))
+    assert len(frame) == LONGEST_RTCM
+    splitter = StreamSplitter()
+    assert [item.raw for item in splitter.feed(b"\xd3\x00" + frame)] == [frame]
 
 
 def test_a_cut_frame_at_the_end_gives_up_what_is_inside() -> None:

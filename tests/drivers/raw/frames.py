@@ -6,7 +6,7 @@ import random
 import struct
 from typing import Any
 
-from drivers.nmea.framing import crc24q
+from drivers.nmea.running_checks import crc24q
 from drivers.raw.lnav import parity
 from drivers.raw.messages import Ephemeris
 

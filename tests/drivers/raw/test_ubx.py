@@ -22,7 +22,7 @@ GGA = b"$GNGGA,021429.00,3958.12345,N,11619.54321,E,4,18,0.62,45.300,M,-9.100,M,
 MEASURED = ("measured_G", "measured_E", "measured_C", "measured_sbas", "measured_qzss")
 MEASURED += ("measured_glonass", "measured_navic", "measured_unknown_system")
 REFUSED = ("signal_unknown", "prn_unknown", "pseudorange_invalid", "not_finite")
-REFUSED += ("pseudorange_implausible", "signal_repeated")
+REFUSED += ("pseudorange_implausible", "rate_implausible", "signal_repeated")
 
 
 def epoch(*measurements: tuple[Any, ...], **head: Any) -> tuple[RawGnssEpoch, Counter[str]]:
@@ -101,6 +101,26 @@ def test_signals_and_their_carriers(gnss: int, sig: int, signal: str, mhz: float
     assert one.range_rate_m_s == pytest.approx(-1e-3 * C / mhz, rel=1e-12)
 
 
+@pytest.mark.parametrize("leap", [-100, 0, 9, 31, 127])
+def test_leap_seconds_that_cannot_be_are_not_known(leap: int) -> None:
+    decoder = RawDecoder("gnss")
+    (found,) = decoder.feed(rawx(measurement(), leap=leap), 7)
+    (usual,) = RawDecoder("gnss").feed(rawx(measurement()), 7)
+    assert isinstance(found, RawGnssEpoch)
+    assert isinstance(usual, RawGnssEpoch)
+    assert found.stamp == usual.stamp
+    assert decoder.leap_seconds is None
+    assert decoder.counters["leap_seconds_implausible"] == 1
+
+
+def test_an_epoch_after_2099_is_refused() -> None:
+    decoder = RawDecoder("gnss")
+    assert len(decoder.feed(rawx(measurement(), week=6260), 7)) == 1
+    assert decoder.feed(rawx(measurement(), week=6261), 8) == []
+    assert decoder.feed(rawx(measurement(), week=65_535), 9) == []
+    assert decoder.counters["time_implausible"] == 2
+
+
 @pytest.mark.parametrize(
     ("change", "name"),
     [
@@ -114,6 +134,8 @@ def test_signals_and_their_carriers(gnss: int, sig: int, signal: str, mhz: float
         ({"range": 1e6}, "pseudorange_implausible"),
         ({"range": -2.2e7}, "pseudorange_implausible"),
         ({"range": 6e7}, "pseudorange_implausible"),
+        ({"doppler": 3e38}, "rate_implausible"),
+        ({"doppler": -53_000.0}, "rate_implausible"),
         ({"prn": 6}, "signal_repeated"),
         ({"gnss": 1, "prn": 131}, "measured_sbas"),
         ({"gnss": 5}, "measured_qzss"),

@@ -171,6 +171,14 @@ def test_a_fix_of_a_refused_request_is_unsolicited() -> None:
     assert bench.cycle.counters["unsolicited"] == 1
 
 
+def test_a_height_that_nobody_is_at_is_refused_by_name() -> None:
+    high = replace(FIX, height_m=2e5, high_altitude=True)
+    bench = Bench(answer=say((0.2, OK), (1.0, high), (1.5, FIX)))
+    bench.run(20)
+    assert len(bench.fixes) == 1
+    assert bench.cycle.counters["height_implausible"] == 1
+
+
 @pytest.mark.parametrize(
     "foreign",
     [

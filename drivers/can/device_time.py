@@ -1,0 +1,145 @@
+"""A device's own time out of a counter that wraps: unwrapped, and known to begin anew. No I/O.
+
+    lateness l(k) = l(k-1) + (arrival(k) - arrival(k-1)) - (device(k) - device(k-1)) >= 0
+
+A frame cannot arrive before it was sent, and may arrive at any time after: a reader that stalls
+makes the next frames late, then sees them in one burst. So the wraps are those that make a frame
+least late, and a burst, a repeated or an overtaken frame is not a restart; device time that goes
+back by more than frames can overtake each other, at the pace of the arrivals, is one, and so is a
+lateness that stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+RESTART_S = 1.0
+"""Frames of one device overtake each other by less than this, and a clock of arrivals is stepped by
+less without notice; a boot takes longer."""
+DEVICE_DRIFT = 1e-3
+"""Bound of the rate error of a device's clock; crystals have 100 ppm at worst, RC oscillators ten
+times that."""
+RESTART_SAMPLES = 3
+"""Samples that must go on from a new time before it is believed: two may be one damaged frame and
+its repetition."""
+LEAST_PACE = 0.5
+"""Arrivals of a device that restarted take at least this part of its own time; frames of the past
+that come again come in a burst."""
+SETTLE_S = 2.0
+BACKLOG_PACE = 0.1
+"""A backlog that is being read shrinks, or the reader would never be in time again. A lateness
+above RESTART_S that over SETTLE_S shrank by less than this part of it is a clock that was set."""
+
+Arrivals = tuple[int, int]
+
+
+@dataclass(slots=True)
+class _Doubt:
+    """A new time that may be a restart: where it began, and what went on from there."""
+
+    ticks: int
+    arrivals_ns: Arrivals
+    first_ticks: int
+    first_ns: Arrivals
+    samples: int = 1
+
+
+class DeviceTime:
+    """Unwraps a device's time; `restarts` counts how often it began anew."""
+
+    def __init__(self, modulus: int, tick_ns: Fraction) -> None:
+        self.restarts = 0
+        self._modulus = modulus
+        self._tick_ns = tick_ns
+        per_tick = 1e9 / float(tick_ns)
+        # Half a period tells forth from back; a short one cannot tell of a restart.
+        self._slack = min(RESTART_S * per_tick, modulus / 4)
+        self._restart = RESTART_S * per_tick
+        self._settle = SETTLE_S * per_tick
+        self._ticks: int | None = None
+        self._arrivals_ns: Arrivals = (0, 0)
+        self._late = 0.0
+        self._doubt: _Doubt | None = None
+        self._lag: tuple[float, float] | None = None
+        """The lateness above RESTART_S that is watched, and for how long (ticks)."""
+
+    def unwrap(self, raw: int, arrivals_ns: Arrivals) -> int | None:
+        """Ticks in ns since the clock's own zero; None for a time that did not advance, or that
+        jumped and is not yet known for a restart.
+
+        `arrivals_ns`: instant of arrival on two clocks (kernel stamp, monotonic). The one that
+        explains the time best counts, for the one can be set and the other can stall.
+        """
+        if self._ticks is None:
+            return self._begin(raw, arrivals_ns)
+        advance, late, elapsed = self._explain(raw, arrivals_ns)
+        if advance < -self._slack or (advance <= 0 and self._doubt is not None):
+            return self._confirm(raw, arrivals_ns)
+        if advance <= 0:
+            return None
+        self._doubt = None
+        if self._stays_late(late, elapsed):
+            self.restarts += 1
+            return self._begin(raw, arrivals_ns)
+        self._ticks, self._arrivals_ns = self._ticks + advance, arrivals_ns
+        self._late = max(0.0, late)
+        return self._ns()
+
+    def _begin(self, raw: int, arrivals_ns: Arrivals) -> int:
+        self._ticks, self._arrivals_ns = raw, arrivals_ns
+        self._late, self._lag, self._doubt = 0.0, None, None
+        return self._ns()
+
+    def _explain(self, raw: int, arrivals_ns: Arrivals) -> tuple[int, float, float]:
+        """Ticks since the last sample, the lateness they mean, and what passed meanwhile."""
+        assert self._ticks is not None
+        step = (raw - self._ticks) % self._modulus
+        found: tuple[int, float, float] | None = None
+        for now, before in zip(arrivals_ns, self._arrivals_ns, strict=True):
+            elapsed = (now - before) / float(self._tick_ns)
+            drift = DEVICE_DRIFT * abs(elapsed)
+            most = self._late + elapsed + self._slack + drift
+            advance = step + self._modulus * int((most - step) // self._modulus)
+            late = max(self._late + elapsed - advance - drift, -self._slack)
+            if found is None or abs(late) < abs(found[1]):
+                found = advance, late, elapsed
+        assert found is not None
+        return found
+
+    def _confirm(self, raw: int, arrivals_ns: Arrivals) -> int | None:
+        """The device's time jumped; whether it goes on from there at the pace of the arrivals."""
+        doubt = self._doubt
+        if doubt is not None:
+            advance = (raw - doubt.ticks) % self._modulus
+            gone = (raw - doubt.first_ticks) % self._modulus
+            passed = [
+                (now - first) / float(self._tick_ns)
+                for now, first in zip(arrivals_ns, doubt.first_ns, strict=True)
+            ]
+            on_pace = any(LEAST_PACE * gone <= p <= gone + self._slack for p in passed)
+            if 0 < advance < self._modulus // 2:
+                doubt.ticks, doubt.arrivals_ns = raw, arrivals_ns
+                doubt.samples += 1
+                if on_pace and doubt.samples >= RESTART_SAMPLES:
+                    self.restarts += 1
+                    return self._begin(raw, arrivals_ns)
+                return None
+        self._doubt = _Doubt(raw, arrivals_ns, raw, arrivals_ns)
+        return None
+
+    def _stays_late(self, late: float, elapsed: float) -> bool:
+        if late <= self._restart or self._slack < self._restart:
+            self._lag = None
+            return False
+        first, passed = self._lag or (late, 0.0)
+        passed += max(0.0, elapsed) if self._lag else 0.0
+        self._lag = first, passed
+        if passed <= self._settle:
+            return False
+        self._lag = late, 0.0
+        return late > first - BACKLOG_PACE * passed
+
+    def _ns(self) -> int:
+        assert self._ticks is not None
+        return self._ticks * self._tick_ns.numerator // self._tick_ns.denominator

@@ -1,0 +1,25 @@
+"""What no receiver on a vehicle can mean: ranges that a number of a device is held against.
+
+A sentence or frame whose check is right can still hold any number: a receiver that restarts, a line
+that was edited, a decoder of somebody else's. What lies outside is refused by the counter's name.
+"""
+
+from __future__ import annotations
+
+HEIGHT_M = (-1_000.0, 100_000.0)
+"""Ellipsoidal. The lowest dry land, the shore of the Dead Sea, is at -430 m, and the geoid down to
+106 m below the ellipsoid (EGM96); above 100 km (FAI's limit of space) nothing drives or flies."""
+SPEED_M_S = 1_000.0
+"""A receiver without an export licence stops at 515 m/s (1,000 knots, the CoCom rule) or 600 m/s
+(Wassenaar Arrangement, 7.A.5); the rest is room for one that has it."""
+SIGMA_M = (1e-3, 1e5)
+"""One sigma of a position. Below a millimetre no phase is measured (GST prints millimetres, and a
+0 where it has none); one beyond a degree of latitude says that there is no position."""
+LEAP_SECONDS = (10, 30)
+"""GPS time minus UTC: 18 since 2017, changed by one in years, and not at all from 2035 on (CGPM
+2022, resolution 4)."""
+
+
+def within(value: float, limits: tuple[float, float]) -> bool:
+    """Whether `value` lies in the range; not a number lies in none."""
+    return limits[0] <= value <= limits[1]

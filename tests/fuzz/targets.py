@@ -1,0 +1,330 @@
+"""What is fuzzed: one function a parser, which raises where arbitrary bytes break a promise.
+
+No exception escapes; every byte is accounted for; bytes in any split give the same; false headers
+do not multiply the work. The first byte of an input chooses the split and whether checks are mended
+first, so that a fuzzer reaches what stands behind them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from drivers.can.imu import CanImuDecoder, CanImuOptions
+from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
+from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
+from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.nmea.running_checks import crc24q
+from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
+from drivers.raw.decoder import RawDecoder
+from drivers.raw.messages import Ephemeris, RawGnssEpoch
+from drivers.rdss import binary_4_0, text_2_1
+from drivers.rdss.framing import FrameDecoder, checksum
+from drivers.rdss.messages import Message
+from fusiond.files import tables
+from fusiond.files.csv_tables import TableError
+from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
+from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, sfrbx, ubx
+
+EARLIEST = date(2014, 1, 1)
+
+
+def _input(data: bytes) -> tuple[int, bytes]:
+    return (data[0], data[1:]) if data else (0, b"")
+
+
+def _pieces(choice: int, stream: bytes) -> Iterator[bytes]:
+    size = (1, 2, 3, 7, 16, 61, 255, 5000)[choice & 7]
+    return (stream[i : i + size] for i in range(0, len(stream), size))
+
+
+# --------------------------------------------------------------------------- NMEA, UBX, RTCM 3
+
+
+def _mended(stream: bytes) -> bytes:
+    """Lines as sentences and what starts as a frame as one, with good checks."""
+    mended = []
+    for line in stream.split(b"\n"):
+        body, star, _ = line[1:].partition(b"*")
+        if line[:1] == b"$" and star:
+            mended.append(b"$%b*%02X\r\n" % (body, checksum(body)))
+        elif line[:2] == b"\xb5\x62" and len(line) > 6:
+            mended.append(ubx(line[2:4], line[6:]))
+        elif line[:1] == b"\xd3" and len(line) > 4:
+            frame = b"\xd3" + (len(line[3:]) & 0x3FF).to_bytes(2, "big") + line[3:1026]
+            mended.append(frame + crc24q(frame).to_bytes(3, "big"))
+        else:
+            mended.append(line + b"\n")
+    return b"".join(mended)
+
+
+def _split(pieces: Iterator[bytes]) -> tuple[list[bytes], Counter[str], int]:
+    splitter = StreamSplitter()
+    items = [item for piece in pieces for item in splitter.feed(piece)] + splitter.finish()
+    assert splitter.waiting == 0
+    return [item.raw for item in items], splitter.counters, splitter.summed
+
+
+def _ends(data: bytes) -> int:
+    return data.count(b"\r") + data.count(b"\n")
+
+
+def splitter(data: bytes) -> None:
+    """Sentences and frames out of a stream: the same for any split, every byte accounted for."""
+    choice, stream = _input(data)
+    stream = _mended(stream) if choice & 8 else stream
+    items, counters, summed = _split(iter((stream,)))
+    assert (items, counters) == _split(_pieces(choice, stream))[:2]
+    used = b"".join(items)
+    garbage = len(stream) - _ends(stream) - (len(used) - _ends(used))
+    assert counters["garbage_bytes"] == garbage
+    verified = ("sentences", "ubx_frames", "rtcm_frames")
+    assert sum(counters[name] for name in verified) == len(items)
+    assert summed <= 3 * len(stream)  # Fletcher's sums twice, the CRC once
+
+
+def nmea(data: bytes) -> None:
+    """Measurements out of NMEA: the same for any split, finite and plausible."""
+    choice, stream = _input(data)
+    stream = _mended(stream) if choice & 8 else stream
+    found = []
+    for pieces in (iter((stream,)), _pieces(choice, stream)):
+        decoder = NmeaDecoder("fuzz", NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True))
+        events = [event for piece in pieces for event in decoder.feed(piece, 7)]
+        found.append((events + decoder.flush(), decoder.counters))
+        assert not decoder.epoch_open
+    assert found[0] == found[1]
+    for event in found[0][0]:
+        if isinstance(event, PositionFix):
+            assert abs(event.lat_rad) <= math.pi / 2
+            assert abs(event.lon_rad) <= math.pi
+            assert event.height_m is None or within(event.height_m, HEIGHT_M)
+            assert all(within(sd, SIGMA_M) for sd in event.sd_ned_m or ())
+            if event.v_ned_m_s is not None:
+                assert math.hypot(*event.v_ned_m_s[:2]) <= SPEED_M_S * (1.0 + 1e-12)
+        elif isinstance(event, Heading):
+            assert abs(event.yaw_rad) <= math.pi
+
+
+# --------------------------------------------------------------------------- raw observations
+
+
+def _check_raw(events: Sequence[object]) -> None:
+    for event in events:
+        if isinstance(event, RawGnssEpoch):
+            for signal in event.signals:
+                rate = signal.range_rate_m_s
+                assert math.isfinite(signal.pseudorange_m)
+                assert rate is None or abs(rate) <= 1e4
+        elif isinstance(event, Ephemeris):
+            assert 0.0 <= event.eccentricity < 1.0
+            assert math.isfinite(event.sqrt_a + event.mean_anomaly + event.clock_bias_s)
+
+
+def raw(data: bytes) -> None:
+    """UBX and RTCM 3 payloads: the same for any split, finite and plausible."""
+    choice, stream = _input(data)
+    stream = _mended(stream) if choice & 8 else stream
+    found = []
+    for pieces in (iter((stream,)), _pieces(choice, stream)):
+        decoder = RawDecoder("fuzz", earliest=EARLIEST)
+        decoder.note_utc(1_500_000_000_000_000_000)
+        events = [event for piece in pieces for event in decoder.feed(piece, 7)]
+        found.append((events + decoder.flush(), decoder.counters))
+        assert not decoder.epoch_open
+    assert found[0] == found[1]
+    _check_raw(found[0][0])
+
+
+_WORDS: tuple[tuple[int, int, int, Callable[[int], list[int]]], ...] = (
+    (0, 0, 30, lnav_words),
+    (3, 0, 28, beidou_words),
+    (3, 1, 28, beidou_words),
+    (2, 1, 16, inav_words),
+)
+"""gnssId, sigId, bytes of information, words with good parity."""
+
+
+def words(data: bytes) -> None:
+    """LNAV, D1, D2 and I/NAV words, with good parities or bits turned: each frame ends in one
+    counter or is used."""
+    decoder = RawDecoder("fuzz", earliest=EARLIEST)
+    while len(data) >= 2:
+        gnss, sig, size, make = _WORDS[data[0] & 3]
+        prn, turned = 1 + (data[0] >> 2) % 37, data[1]
+        information = int.from_bytes(data[2 : 2 + size].ljust(size, b"\0"), "big")
+        data = data[2 + size :]
+        if make is beidou_words:
+            information &= (1 << 224) - 1
+        try:
+            made = make(information)
+        except (IndexError, ValueError):
+            continue
+        if turned & 1:
+            made[turned % len(made)] ^= 1 << (turned >> 3)
+        if turned & 2 and turned & 4:
+            made = made[: turned % len(made)]
+        frame = Frame("ubx", sfrbx(gnss, prn, sig, made))
+        before = decoder.counters.total()
+        events = decoder.take(frame, 7)
+        assert decoder.counters.total() == before + 1 + len(events)
+        _check_raw(events)
+
+
+# --------------------------------------------------------------------------- RDSS
+
+
+def _rdss(family: type[FrameDecoder], between: bytes, stream: bytes, choice: int) -> None:
+    taken: list[bytes] = []
+    work = Counter[str]()
+
+    class Watched(family):  # type: ignore[misc, valid-type]
+        def _extent(self, buffer: bytearray, at: int) -> Any:
+            work["extent"] += 1
+            return super()._extent(buffer, at)
+
+        def _read(self, whole: bytes) -> Message | None:
+            work["read"] += len(whole)
+            message = super()._read(whole)
+            if message is not None:
+                taken.append(whole)
+            return message
+
+    found = []
+    for pieces in ((stream,), tuple(_pieces(choice, stream))):
+        taken.clear()
+        work.clear()
+        decoder = Watched()
+        messages = [message for piece in pieces for message in decoder.feed(piece)]
+        while decoder.awaited_bytes:
+            messages += decoder.expire()
+        used = b"".join(taken)
+        rest = len(stream) - len(used)
+        spaces = sum(stream.count(byte) - used.count(byte) for byte in between)
+        assert rest - spaces <= decoder.counters["garbage_bytes"] <= rest
+        assert (
+            len(messages) == len(taken) == decoder.counters["frames"] + decoder.counters["unknown"]
+        )
+        starts = stream.count(b"$")
+        assert work["extent"] <= 2 * starts + len(pieces) + 1
+        assert work["read"] <= 512 * starts
+        found.append((messages, decoder.counters))
+    assert found[0] == found[1]
+
+
+def rdss_binary(data: bytes) -> None:
+    """RDSS family 4.0: the same for any split, every byte accounted for."""
+    choice, stream = _input(data)
+    if choice & 8 and len(stream) > 6 and stream[:1] == b"$":
+        head = stream[:5] + (len(stream) + 1 & 0xFFFF).to_bytes(2, "big") + stream[7:]
+        stream = head + bytes((checksum(head),))
+    _rdss(binary_4_0.Decoder, b"", stream, choice)
+
+
+def rdss_text(data: bytes) -> None:
+    """RDSS family 2.1: the same for any split, every byte accounted for."""
+    choice, stream = _input(data)
+    _rdss(text_2_1.Decoder, b"\r\n", _mended(stream) if choice & 8 else stream, choice)
+
+
+# --------------------------------------------------------------------------- CAN
+
+_SBG = CanImuOptions(
+    dbc="sbg_ellipse",
+    gyro=("IMU_GYRO.GYRO_X", "IMU_GYRO.GYRO_Y", "IMU_GYRO.GYRO_Z"),
+    accel=("IMU_ACCEL.ACCEL_X", "IMU_ACCEL.ACCEL_Y", "IMU_ACCEL.ACCEL_Z"),
+    device_time="IMU_INFO.TIME_STAMP",
+)
+_RACELOGIC = CanImuOptions(
+    dbc="racelogic_imu04",
+    gyro=("IMU_602.ROLL_RATE", "IMU_602.PITCH_RATE", "IMU_600.YAW_RATE"),
+    accel=("IMU_600.ACCEL_X", "IMU_601.ACCEL_Y", "IMU_603.ACCEL_Z"),
+)
+_REFUSED = ("other_frames", "wrong_length", "undecodable", "not_finite", "out_of_range")
+
+
+def can(data: bytes) -> None:
+    """Frames of an IMU, ten bytes each: identifier, time and data; every frame accounted for."""
+    choice, data = _input(data)
+    decoder = CanImuDecoder("imu", _SBG if choice & 1 else _RACELOGIC)
+    ids = [plan.message.frame_id for plan in decoder.plans]
+    t_ns, frames, samples = 1_000_000_000, 0, 0
+    last: dict[str, int] = {}
+    for at in range(0, len(data) - 1, 10):
+        head, step = data[at], data[at + 1]
+        t_ns += (0, 300_000, 5_000_000, 1 << 32)[step & 3] + step
+        can_id = ids[head % len(ids)] if head < 240 else head
+        sample = decoder.feed(
+            can_id, False, data[at + 2 : at + 10], t_ns, t_ns if choice & 2 else None
+        )
+        frames += 1
+        if isinstance(sample, ImuSample):
+            samples += 1
+            assert all(map(math.isfinite, sample.gyro_rad_s + sample.accel_m_s2))
+            if isinstance(sample.stamp, DeviceStamp):
+                assert sample.stamp.ticks_ns > last.get(sample.stamp.device, -1)
+                last[sample.stamp.device] = sample.stamp.ticks_ns
+    decoder.reset()
+    counters, parts = decoder.counters, len(decoder.plans)
+    accounted = sum(counters[name] for name in (*_REFUSED, "duplicates", "unpaired"))
+    assert counters["samples"] == samples
+    # A sample is made of one frame a message at least.
+    whole = parts * (samples + counters["time_backward"])
+    assert accounted + whole <= frames
+
+
+# --------------------------------------------------------------------------- commands, tables
+
+
+def commands(data: bytes) -> None:
+    """A command's payload is one, or BadCommandError says why not."""
+    choice, payload = _input(data)
+    name = sorted(COMMANDS)[choice % len(COMMANDS)]
+    try:
+        command = parse(name, payload)
+    except BadCommandError as bad:
+        request_id = bad.id
+    else:
+        request_id = command.id
+        numbers = [value for value in command.model_dump().values() if isinstance(value, float)]
+        assert all(map(math.isfinite, numbers))
+    assert request_id is None or len(request_id) <= 64
+
+
+_READERS: tuple[Callable[[Path], Any], ...] = (
+    tables.read_imu,
+    tables.read_gnss,
+    tables.read_rdss,
+    tables.read_attitude,
+    tables.read_bearing,
+    tables.read_wheel,
+    tables.read_truth,
+)
+_SCRATCH = tempfile.TemporaryDirectory(prefix="fuzz-")
+
+
+def csv(data: bytes) -> None:
+    """A table is read with what is wrong named by line, or TableError says why not."""
+    choice, text = _input(data)
+    path = Path(_SCRATCH.name, "table.csv")
+    path.write_bytes(text)
+    try:
+        table = _READERS[choice % len(_READERS)](path)
+    except TableError:
+        return
+    t_s = table.t_s.tolist()
+    assert all(map(math.isfinite, t_s))
+    assert all(a < b for a, b in itertools.pairwise(t_s))
+    assert all(rejection.line >= 2 and rejection.reason for rejection in table.rejected)
+
+
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    one.__name__: one
+    for one in (splitter, nmea, raw, words, rdss_binary, rdss_text, can, commands, csv)
+}
