@@ -244,7 +244,7 @@ def schema(
     vehicle: Annotated[str, typer.Option(help="The name in the topics.")] = "vehicle",
 ) -> None:
     """Print the MQTT topics and messages as an AsyncAPI document."""
-    from fusiond.outputs.messages import asyncapi  # noqa: PLC0415
+    from fusiond.outputs.asyncapi import asyncapi  # noqa: PLC0415
 
     typer.echo(json.dumps(asyncapi(vehicle), indent=2))
 

@@ -38,14 +38,11 @@ from fusiond.outputs.commands import (
     ResetFilter,
     SetPosition,
 )
-from fusiond.outputs.messages import (
-    Level,
-    consistency_message,
-    event_message,
-    health_message,
-    nav_message,
-    status_message,
-)
+from fusiond.outputs.messages.consistency import consistency_message
+from fusiond.outputs.messages.event import Level, event_message
+from fusiond.outputs.messages.health import health_message
+from fusiond.outputs.messages.nav import nav_message
+from fusiond.outputs.messages.status import status_message
 from fusiond.outputs.mqtt import MqttPublisher
 
 log = logging.getLogger("fusiond")

@@ -22,7 +22,7 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.navigator.navigator import Navigator
-from fusiond.outputs.messages import SkyHealth, SourceHealth
+from fusiond.outputs.messages.health import SkyHealth, SourceHealth
 
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]

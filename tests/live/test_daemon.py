@@ -28,7 +28,7 @@ from fusiond.configuration.load import load_config
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.saved_state import SavedState, save_state
-from fusiond.outputs.messages import SourceHealth
+from fusiond.outputs.messages.health import SourceHealth
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss.receiver import sentence
