@@ -13,8 +13,9 @@ import asyncio
 import gc
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from math import ceil, log10
+
+from fusiond.outputs.messages.health import SchedulerStatus
 
 SECOND_NS = 1_000_000_000
 
@@ -54,20 +55,6 @@ class LatenessHistogram:
                 edge_ns = _FIRST_BIN_NS * pow(10.0, index / _BINS_PER_DECADE)
                 return min(float(edge_ns), self.max_ns) / 1e6
         return 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class SchedulerStatus:
-    """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
-
-    ticks: int
-    overruns: int
-    lateness_p50_ms: float
-    lateness_p99_ms: float
-    lateness_max_ms: float
-    gc_collections: int
-    gc_forced: int
-    gc_max_ms: float
 
 
 class _Collector:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.base import State
 from fusiond.clock.clock import ClockStatus
 from fusiond.integrity.consistency import Verdict
-from fusiond.live.scheduler import SchedulerStatus
 from fusiond.outputs.messages.base import Count, Message, Number, stamp
 
 
@@ -49,6 +49,20 @@ class SourceHealth(BaseModel):
     )
     verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerStatus:
+    """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
+
+    ticks: int
+    overruns: int
+    lateness_p50_ms: float
+    lateness_p99_ms: float
+    lateness_max_ms: float
+    gc_collections: int
+    gc_forced: int
+    gc_max_ms: float
 
 
 class HealthMessage(Message):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fusiond.live.scheduler import SchedulerStatus
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.base import Count, Message, stamp
+from fusiond.outputs.messages.health import SchedulerStatus
 
 
 class StatusMessage(Message):
