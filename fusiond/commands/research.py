@@ -84,10 +84,13 @@ def model(
     write_json(report, json_path)
 
 
-def bench() -> None:
-    """Time the kernels against one numpy product; prints JSON."""
+def bench(json_path: JsonPath = None) -> None:
+    """Time the kernels against one numpy product."""
     from fusiond.bench.bench import bench as run_bench  # noqa: PLC0415
+    from fusiond.commands.bench_report import print_bench  # noqa: PLC0415
 
     with spinner("timing"):
         figures = run_bench()
-    write_json(figures, "-")
+    if json_path != "-":
+        print_bench(figures)
+    write_json(figures, json_path)
