@@ -25,8 +25,9 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
+from fusiond.live.process_usage import ProcessUsage, release_compiler_pages
 from fusiond.live.scheduler import Scheduler
-from fusiond.live.service_manager import ProcessUsage, ServiceManager, release_compiler_pages
+from fusiond.live.service_manager import ServiceManager
 from fusiond.live.sources import Sources
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
