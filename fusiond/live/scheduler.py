@@ -29,6 +29,23 @@ _GC_THRESHOLDS = (700, 10, 10)
 """CPython's own thresholds of its three generations (gc.get_threshold)."""
 
 
+class Every:
+    """Due once a period, on the tick's own time."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._next_ns = 0
+
+    def due(self, t_ns: int) -> bool:
+        """Whether a period has passed; those missed altogether are not made up for."""
+        behind_ns = t_ns - self._next_ns
+        if behind_ns < 0:
+            return False
+        start_ns = t_ns if behind_ns > self._period_ns else self._next_ns
+        self._next_ns = start_ns + self._period_ns
+        return True
+
+
 class LatenessHistogram:
     """Lateness in fixed log-spaced bins, ten a decade from 10 us to 10 s; constant memory."""
 
