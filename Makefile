@@ -70,7 +70,7 @@ format: $(STAMP) ## let ruff lay out the code
 picture: $(STAMP) ## docs/house.svg, from the imports
 	$(BIN)/python tools/house.py
 
-bench: $(STAMP) ## figures as JSON
+bench: $(STAMP) ## what the kernels cost; ARGS="--json F.json" keeps the figures
 	$(BIN)/fusiond bench $(ARGS)
 
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON

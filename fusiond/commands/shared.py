@@ -1,4 +1,4 @@
-"""What the commands share: their arguments, their exit codes, what they print."""
+"""What the commands share: their arguments, their exit codes, what they write."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    from drivers.raw.messages import System
     from fusiond.configuration.schema import Config
 
 EXIT_DATA = 65
 EXIT_UNAVAILABLE = 69
 EXIT_IO = 74
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration (TOML).")]
+JsonPath = Annotated[
+    str | None, typer.Option("--json", metavar="F.json", help="Write JSON; - is standard output.")
+]
 
 
 @contextmanager
@@ -57,38 +59,6 @@ def data_errors() -> Iterator[None]:
     except OSError as error:
         typer.echo(f"fusiond: {error.filename or 'output'}: {error.strerror or error}", err=True)
         raise typer.Exit(EXIT_IO) from error
-
-
-def aid_argument(text: str) -> tuple[str, Path]:
-    """KIND=FILE."""
-    kind, equals, path = text.partition("=")
-    if not equals or not path or kind not in AID_KINDS:
-        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(AID_KINDS)}")
-    return kind, Path(path)
-
-
-def outage_argument(text: str) -> tuple[float, float]:
-    """START:LENGTH."""
-    start, _, length = text.partition(":")
-    try:
-        window = float(start), float(length)
-    except ValueError:
-        window = (0.0, 0.0)
-    if not (isfinite(window[0]) and isfinite(window[1]) and window[1] > 0.0):
-        raise typer.BadParameter(f"--outage {text}: START:LENGTH in seconds, LENGTH above 0")
-    return window
-
-
-def systems_argument(text: str | None) -> tuple[System, ...] | None:
-    """C,G,E."""
-    if text is None:
-        return None
-    from drivers.raw.messages import SYSTEMS  # noqa: PLC0415
-
-    letters = [letter.strip().upper() for letter in text.split(",")]
-    if not set(letters) <= set(SYSTEMS) or len(set(letters)) < len(letters):
-        raise typer.BadParameter(f"--systems {text}: G GPS, E Galileo, C BeiDou, each once")
-    return tuple(s for s in SYSTEMS if s in letters)
 
 
 def spinner(text: str) -> AbstractContextManager[object]:
@@ -137,20 +107,3 @@ def write_json(value: object, path: str | None) -> None:
         return
     with data_errors():
         Path(path).write_text(text + "\n", encoding="utf-8")
-
-
-def print_file(name: str, report: dict[str, Any], err: bool) -> None:
-    """One file as `csv_tables.file_report` describes it."""
-    rejected = sum(report["rejected"].values())
-    typer.echo(f"{name}: {report['rows']} rows, {rejected} rejected", err=err)
-    for row in report["first_rejected"]:
-        typer.echo(f"  {row}", err=err)
-
-
-def print_summary(result: dict[str, Any], err: bool) -> None:
-    """`files`: what was read; `sources`: each aid's measurements by outcome."""
-    for name, report in result["files"].items():
-        print_file(name, report, err)
-    for name, outcomes in result["sources"].items():
-        counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
-        typer.echo(f"{name}: {counts or 'nothing'}", err=err)

@@ -13,8 +13,9 @@ import asyncio
 import gc
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from math import ceil, log10
+
+from fusiond.outputs.messages.health import SchedulerStatus
 
 SECOND_NS = 1_000_000_000
 
@@ -26,6 +27,23 @@ _FORCE_AFTER_NS = 10 * SECOND_NS
 """Cycles hold memory: if no slack was long enough for this time, collect all the same."""
 _GC_THRESHOLDS = (700, 10, 10)
 """CPython's own thresholds of its three generations (gc.get_threshold)."""
+
+
+class Every:
+    """Due once a period, on the tick's own time."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._next_ns = 0
+
+    def due(self, t_ns: int) -> bool:
+        """Whether a period has passed; those missed altogether are not made up for."""
+        behind_ns = t_ns - self._next_ns
+        if behind_ns < 0:
+            return False
+        start_ns = t_ns if behind_ns > self._period_ns else self._next_ns
+        self._next_ns = start_ns + self._period_ns
+        return True
 
 
 class LatenessHistogram:
@@ -54,20 +72,6 @@ class LatenessHistogram:
                 edge_ns = _FIRST_BIN_NS * pow(10.0, index / _BINS_PER_DECADE)
                 return min(float(edge_ns), self.max_ns) / 1e6
         return 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class SchedulerStatus:
-    """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
-
-    ticks: int
-    overruns: int
-    lateness_p50_ms: float
-    lateness_p99_ms: float
-    lateness_max_ms: float
-    gc_collections: int
-    gc_forced: int
-    gc_max_ms: float
 
 
 class _Collector:

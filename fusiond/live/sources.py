@@ -7,27 +7,26 @@ stamp becomes an instant, an IMU sample waits for the next tick, a time report g
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections import Counter, deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import Backoff, Driver, Emitted
+from drivers.base import Driver, Emitted
 from drivers.measurements import DeviceEvent, ImuSample, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
+from fusiond.live.supervision import supervise
 from fusiond.navigator.navigator import Navigator
-from fusiond.outputs.messages import SkyHealth, SourceHealth
+from fusiond.outputs.messages.health import SkyHealth, SourceHealth
 
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]
-
-log = logging.getLogger("fusiond")
 
 # Samples that may wait for a tick: 2 s at 1 kHz. A tick comes every 10 ms; a full queue means that
 # the loop stood still, and the newest samples are the ones worth keeping.
@@ -70,20 +69,13 @@ class Sources:
         """Serve every device until cancelled."""
         async with asyncio.TaskGroup() as group:
             for source in self.all.values():
-                group.create_task(self._supervise(source), name=f"driver {source.name}")
+                name = f"driver {source.name}"
+                serve = supervise(name, source.driver.run, partial(self._fell, source))
+                group.create_task(serve, name=name)
 
-    async def _supervise(self, source: Source) -> None:
-        backoff = Backoff()
-        while True:
-            try:
-                await source.driver.run()
-                reason = "it ended by itself"
-            except Exception as error:
-                log.exception("driver %s failed", source.name)
-                reason = repr(error)
-            source.faults += 1
-            self._on_event(source.name, "driver_fault", f"{reason}: restarting it")
-            await asyncio.sleep(backoff.next())
+    def _fell(self, source: Source, text: str) -> None:
+        source.faults += 1
+        self._on_event(source.name, "driver_fault", text)
 
     # ------------------------------------------------------------------ arrivals
 

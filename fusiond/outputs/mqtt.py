@@ -27,24 +27,14 @@ from fusiond.outputs.commands import (
     Handler,
     parse,
 )
-from fusiond.outputs.messages import (
-    CONSISTENCY,
-    EVENT,
-    HEALTH,
-    NAV,
-    REPLY,
-    STATUS,
-    ConsistencyMessage,
-    EventMessage,
-    HealthMessage,
-    Message,
-    NavMessage,
-    ReplyMessage,
-    StatusMessage,
-    Topic,
-    base_topic,
-    stamp,
-)
+from fusiond.outputs.messages.base import Message, stamp
+from fusiond.outputs.messages.consistency import ConsistencyMessage
+from fusiond.outputs.messages.event import EventMessage
+from fusiond.outputs.messages.health import HealthMessage
+from fusiond.outputs.messages.nav import NavMessage
+from fusiond.outputs.messages.reply import ReplyMessage
+from fusiond.outputs.messages.status import StatusMessage
+from fusiond.outputs.topics import CONSISTENCY, EVENT, HEALTH, NAV, REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""

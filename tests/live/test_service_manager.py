@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fusiond.live.service_manager import ProcessUsage, ServiceManager
+from fusiond.live.service_manager import ServiceManager
 
 
 @pytest.fixture(params=["path", "abstract"])
@@ -82,27 +80,3 @@ def test_nobody_listening_is_counted_not_raised(tmp_path: Path) -> None:
     manager.ready()
     assert manager.failed == 1
     manager.close()
-
-
-def test_process_usage() -> None:
-    usage = ProcessUsage()
-    sum(i * i for i in range(200_000))
-    percent, resident_mb = usage.sample()
-    assert 0.0 < percent <= 400.0
-    assert 5.0 < resident_mb < 4000.0
-
-
-def test_the_compiler_gives_its_pages_back_and_still_works() -> None:
-    """In a process of its own, since this one may have compiled anything."""
-    script = """
-import numba
-from fusiond.navigation.rotation import quaternion_from_rpy
-from fusiond.live.service_manager import ProcessUsage, release_compiler_pages
-before = ProcessUsage().sample()[1]
-release_compiler_pages()
-after = ProcessUsage().sample()[1]
-assert after < before - 20.0, (before, after)
-assert abs(quaternion_from_rpy(0.0, 0.0, 0.0)[0] - 1.0) < 1e-15
-assert numba.njit(lambda x: x * 2.0 + 1.0)(3.0) == 7.0
-"""
-    subprocess.run([sys.executable, "-c", script], check=True, timeout=300)

@@ -7,18 +7,14 @@ from typing import Any
 
 from fusiond.clock.clock import ClockStatus
 from fusiond.integrity.consistency import judge
-from fusiond.live.scheduler import SchedulerStatus
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.outputs.messages import (
-    ReplyMessage,
-    SourceHealth,
-    consistency_message,
-    event_message,
-    health_message,
-    nav_message,
-    stamp,
-    status_message,
-)
+from fusiond.outputs.messages.base import stamp
+from fusiond.outputs.messages.consistency import consistency_message
+from fusiond.outputs.messages.event import event_message
+from fusiond.outputs.messages.health import SchedulerStatus, SourceHealth, health_message
+from fusiond.outputs.messages.nav import nav_message
+from fusiond.outputs.messages.reply import ReplyMessage
+from fusiond.outputs.messages.status import status_message
 
 UTC_NS = 1_795_217_587_123_456_789
 

@@ -12,8 +12,11 @@ from pydantic import ValidationError
 from fusiond.configuration.schema import Mqtt
 from fusiond.files.solution_csv import COLUMNS
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.asyncapi import asyncapi
 from fusiond.outputs.commands import COMMANDS, MAX_PAYLOAD_BYTES, BadCommandError, parse
-from fusiond.outputs.messages import TOPICS, NavMessage, asyncapi, nav_message, stamp
+from fusiond.outputs.messages.base import stamp
+from fusiond.outputs.messages.nav import NavMessage, nav_message
+from fusiond.outputs.topics import TOPICS
 from tests.outputs.messages_examples import EXAMPLES, SOLUTION, UTC_NS
 from tests.places import REPOSITORY
 

@@ -16,8 +16,10 @@ import pytest
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Mqtt
 from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
-from fusiond.outputs.messages import EVENT, HEALTH, NAV, STATUS, EventMessage, NavMessage
+from fusiond.outputs.messages.event import EventMessage
+from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.topics import EVENT, HEALTH, NAV, STATUS
 from tests.broker import Broker, Listener, listening
 from tests.outputs.messages_examples import EXAMPLES
 from tests.patience import PATIENCE_S

@@ -1,0 +1,72 @@
+"""Commands around the daemon: run, demo, check, doctor."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated
+
+import typer
+
+from fusiond.commands.shared import EXIT_UNAVAILABLE, ConfigPath, config_errors, load, plain
+
+
+def run(config: ConfigPath) -> None:
+    """Run the daemon."""
+    loaded = load(config)
+    from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
+
+    run_daemon(loaded, config)
+
+
+def demo(
+    duration: Annotated[float, typer.Option(min=1.0, help="Seconds.")] = 60.0,
+    headless: Annotated[bool, typer.Option("--headless", help="No live view.")] = False,
+) -> None:
+    """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
+    from fusiond.demo.broker import DemoError  # noqa: PLC0415
+    from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
+
+    try:
+        summary = run_demo(duration, headless or not sys.stdout.isatty())
+    except DemoError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    typer.echo(json.dumps(plain(summary), allow_nan=False))
+
+
+def check(
+    config: ConfigPath,
+    compile_kernels: Annotated[
+        bool, typer.Option("--compile", help="Also compile what the daemon would compile at start.")
+    ] = False,
+) -> None:
+    """Validate a configuration: 0, or 78 with every mistake.
+
+    With --compile also that the model, with all that its aids add, fits the kernels.
+    """
+    loaded = load(config)
+    if compile_kernels:
+        import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
+        from fusiond.commands.model_report import model_report  # noqa: PLC0415
+
+        with config_errors():
+            model_report(loaded.estimator.model, loaded)
+    typer.echo(f"{config}: ok, vehicle {loaded.vehicle}")
+    for name, source in loaded.sources.items():
+        aid = loaded.aiding.get(name)
+        typer.echo(f"  {name}: driver {source.driver}" + (f", aids as {aid.kind}" if aid else ""))
+    for name, aid in loaded.aiding.items():
+        if name not in loaded.sources:
+            typer.echo(f"  {name}: aids as {aid.kind}, no source (for `process`)")
+
+
+def doctor(
+    config: ConfigPath,
+    seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen.")] = 5.0,
+) -> None:
+    """Open every port for some seconds: what arrives, how often, how old, what is wrong."""
+    loaded = load(config)
+    from fusiond.doctor.doctor import doctor as run_doctor  # noqa: PLC0415
+
+    raise typer.Exit(run_doctor(loaded, seconds))

@@ -1,0 +1,172 @@
+"""Commands on files: process, simulate, compare."""
+
+from __future__ import annotations
+
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from fusiond.commands.shared import (
+    EXIT_DATA,
+    ConfigPath,
+    JsonPath,
+    config_errors,
+    data_errors,
+    load,
+    spinner,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from drivers.raw.messages import System
+
+AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
+
+
+def process(
+    config: ConfigPath,
+    imu: Annotated[Path, typer.Option(metavar="F.csv", help="IMU samples.")],
+    aid: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
+    ] = None,
+    outage: Annotated[
+        list[str] | None,
+        typer.Option(metavar="START:LENGTH", help="Withhold aids, in s of the files; repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="F.csv", help="Write the solution; - is standard output.")
+    ] = None,
+    systems: Annotated[
+        str | None,
+        typer.Option(metavar="C,G,E", help="Satellite systems of raw data to use."),
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Navigate through recorded files with the daemon's own navigator."""
+    aids = [_aid_argument(text) for text in aid or []]
+    outages = [_outage_argument(text) for text in outage or []]
+    if out is not None and str(out) == "-" == json_path:
+        raise typer.BadParameter("--out and --json cannot both be standard output")
+    loaded = load(config)
+    from fusiond.offline.process import process as run_process  # noqa: PLC0415
+
+    with config_errors(), data_errors(), spinner("processing"):
+        result = run_process(loaded, imu, aids, outages, out, _systems_argument(systems))
+    _print_summary(result, err="-" in (json_path, str(out)))
+    write_json(result, json_path)
+
+
+def simulate(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="static, drive, flight.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of the random streams.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(min=1.0, help="Seconds; the scenario's own by default.")
+    ] = None,
+    gnss_raw: Annotated[
+        Literal["ubx", "rtcm3"] | None, typer.Option(help="Write the raw GNSS stream too.")
+    ] = None,
+    gnss_mask: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND:START:LENGTH", help="canyon, canyon2 to canyon4, tunnel; s."),
+    ] = None,
+) -> None:
+    """Write imu.csv, gnss.csv, rdss.csv, truth.csv, gnss.ubx of a simulated vehicle."""
+    from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
+    from fusiond.simulation.gnss.masks import parse_mask  # noqa: PLC0415
+    from fusiond.simulation.scenarios import SCENARIOS  # noqa: PLC0415
+
+    if scenario not in SCENARIOS:
+        raise typer.BadParameter(f"{scenario!r}: there are {', '.join(SCENARIOS)}")
+    try:
+        masked = SCENARIOS[scenario].masked([parse_mask(text) for text in gnss_mask or ()])
+    except ValueError as error:
+        raise typer.BadParameter(f"--gnss-mask: {error}") from error
+    with data_errors(), spinner("simulating"):
+        written = run_simulate(masked, out, seed, duration, gnss_raw=gnss_raw)
+    for name, path in written.files.items():
+        typer.echo(f"{path}: {written.rows[name]} rows")
+
+
+def compare(
+    solution: Annotated[Path, typer.Argument(metavar="SOLUTION.csv")],
+    truth: Annotated[
+        Path, typer.Argument(metavar="TRUTH.csv", help="truth.csv, or a gnss.csv as a track.")
+    ],
+    after: Annotated[
+        float, typer.Option(min=0.0, help="Leave out the solution's first seconds.")
+    ] = 0.0,
+    json_path: JsonPath = None,
+) -> None:
+    """Errors of a solution, and how they sit with its stated sigma."""
+    from fusiond.commands.compare_report import print_report  # noqa: PLC0415
+    from fusiond.files.csv_tables import file_report  # noqa: PLC0415
+    from fusiond.files.tables import read_solution, read_truth  # noqa: PLC0415
+    from fusiond.offline.compare import NothingToCompareError  # noqa: PLC0415
+    from fusiond.offline.compare import compare as run_compare  # noqa: PLC0415
+
+    with data_errors():
+        tables = read_solution(solution), read_truth(truth)
+        for path, table in zip((solution, truth), tables, strict=True):
+            if table.rejected:
+                _print_file(str(path), file_report(len(table.t_s), table.rejected), err=True)
+        try:
+            report = run_compare(*tables, after_s=after)
+        except NothingToCompareError as error:
+            typer.echo(f"fusiond: {error}", err=True)
+            raise typer.Exit(EXIT_DATA) from error
+    if json_path != "-":
+        print_report(report)
+    write_json(report, json_path)
+
+
+def _aid_argument(text: str) -> tuple[str, Path]:
+    """KIND=FILE."""
+    kind, equals, path = text.partition("=")
+    if not equals or not path or kind not in AID_KINDS:
+        raise typer.BadParameter(f"--aid {text}: KIND=FILE with KIND of {', '.join(AID_KINDS)}")
+    return kind, Path(path)
+
+
+def _outage_argument(text: str) -> tuple[float, float]:
+    """START:LENGTH."""
+    start, _, length = text.partition(":")
+    try:
+        window = float(start), float(length)
+    except ValueError:
+        window = (0.0, 0.0)
+    if not (isfinite(window[0]) and isfinite(window[1]) and window[1] > 0.0):
+        raise typer.BadParameter(f"--outage {text}: START:LENGTH in seconds, LENGTH above 0")
+    return window
+
+
+def _systems_argument(text: str | None) -> tuple[System, ...] | None:
+    """C,G,E."""
+    if text is None:
+        return None
+    from drivers.raw.messages import SYSTEMS  # noqa: PLC0415
+
+    letters = [letter.strip().upper() for letter in text.split(",")]
+    if not set(letters) <= set(SYSTEMS) or len(set(letters)) < len(letters):
+        raise typer.BadParameter(f"--systems {text}: G GPS, E Galileo, C BeiDou, each once")
+    return tuple(s for s in SYSTEMS if s in letters)
+
+
+def _print_summary(result: dict[str, Any], err: bool) -> None:
+    """`files`: what was read; `sources`: each aid's measurements by outcome."""
+    for name, report in result["files"].items():
+        _print_file(name, report, err)
+    for name, outcomes in result["sources"].items():
+        counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
+        typer.echo(f"{name}: {counts or 'nothing'}", err=err)
+
+
+def _print_file(name: str, report: dict[str, Any], err: bool) -> None:
+    """One file as `csv_tables.file_report` describes it."""
+    rejected = sum(report["rejected"].values())
+    typer.echo(f"{name}: {report['rows']} rows, {rejected} rejected", err=err)
+    for row in report["first_rejected"]:
+        typer.echo(f"  {row}", err=err)

@@ -1,0 +1,105 @@
+"""What is published when: the solution, the status, health and the verdicts, each at its rate."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.load import config_digest
+from fusiond.configuration.schema import Config
+from fusiond.live.process_usage import ProcessUsage
+from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
+from fusiond.live.sources import Sources
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.navigator import Navigator
+from fusiond.outputs.messages.consistency import consistency_message
+from fusiond.outputs.messages.health import health_message
+from fusiond.outputs.messages.nav import nav_message
+from fusiond.outputs.messages.status import status_message
+from fusiond.outputs.mqtt import MqttPublisher
+
+STATUS_EVERY_S = 1
+
+
+class Publishing:
+    """Makes a vehicle's messages in the tick and puts them into their places at the publisher."""
+
+    def __init__(
+        self,
+        config: Config,
+        clock: Clock,
+        navigator: Navigator,
+        sources: Sources,
+        scheduler: Scheduler,
+        mqtt: MqttPublisher,
+    ) -> None:
+        self._clock = clock
+        self._navigator = navigator
+        self._sources = sources
+        self._scheduler = scheduler
+        self._mqtt = mqtt
+        self._usage = ProcessUsage()
+        self._version = version("fusiond")
+        self._digest = config_digest(config)
+        self._started_ns = self._since_ns = clock.now_ns()
+        self._mode: Mode | None = None
+        self._nav = Every(round(SECOND_NS / config.mqtt.nav_rate_hz))
+        self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
+        self._status = Every(STATUS_EVERY_S * SECOND_NS)
+
+    def tick(self, t_ns: int, solution: Solution) -> None:
+        """Publish what is due at the tick of `t_ns`, the status at every change of mode too."""
+        changed = solution.mode is not self._mode
+        if changed:
+            self._mode, self._since_ns = solution.mode, t_ns
+        utc_ns = self._clock.utc_ns(t_ns)
+        if self._nav.due(t_ns):
+            self._mqtt.publish_nav(nav_message(solution, utc_ns))
+        if self._status.due(t_ns) or changed:
+            self._publish_status(t_ns, utc_ns, solution)
+        if self._health.due(t_ns):
+            self._publish_health(t_ns, utc_ns)
+
+    def _publish_status(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
+        fused, rejected = _totals(self._navigator)
+        self._mqtt.publish_status(
+            status_message(
+                solution,
+                utc_ns,
+                since_utc_ns=self._clock.utc_ns(self._since_ns),
+                version=self._version,
+                config_digest=self._digest,
+                uptime_s=(t_ns - self._started_ns) * 1e-9,
+                scheduler=self._scheduler.status(),
+                fused=fused,
+                rejected=rejected,
+                mqtt=self._mqtt.counters,
+            )
+        )
+
+    def _publish_health(self, t_ns: int, utc_ns: int | None) -> None:
+        cpu_percent, memory_mb = self._usage.sample()
+        self._mqtt.publish_health(
+            health_message(
+                utc_ns,
+                sources=self._sources.health(t_ns),
+                scheduler=self._scheduler.status(),
+                clock=self._clock.status(),
+                cpu_percent=cpu_percent,
+                memory_mb=memory_mb,
+            )
+        )
+        reports = self._navigator.verdicts.reports()
+        if reports:
+            self._mqtt.publish_consistency(consistency_message(utc_ns, reports))
+
+
+def _totals(navigator: Navigator) -> tuple[int, int]:
+    """Measurements fused and rejected, of all sources since the start."""
+    fused = rejected = 0
+    for outcomes in navigator.timeline.counters.outcomes.values():
+        fused += outcomes["fused"]
+        rejected += outcomes.total() - outcomes["fused"]
+    for refused in navigator.refused.values():
+        rejected += refused.total()
+    return fused, rejected

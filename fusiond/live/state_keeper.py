@@ -1,0 +1,119 @@
+"""The state on disk: kept while the vehicle stands, forgotten once it drives.
+
+Only a solution at rest is worth keeping, for only then its heading lasts until the next start.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import Config
+from fusiond.live.scheduler import SECOND_NS, Every
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.saved_state import SavedState, load_state, save_state
+
+log = logging.getLogger("fusiond")
+
+# The state on disk is renewed this often while the vehicle stands: a power cut loses a minute.
+SAVE_EVERY_S = 60
+# Beyond this speed (m/s) the vehicle does not stand, and its heading is not worth keeping.
+SAVE_MAX_SPEED_M_S = 0.2
+# Beyond this one (m/s) it drives for certain, whatever the velocity's sigma (0.05 m/s aided): the
+# heading on disk is no longer its own, and a power cut must not bring it back.
+FORGET_SPEED_M_S = 1.0
+
+
+class StateKeeper:
+    """Keeps one vehicle's state in `state_file`, else in systemd's state directory, else not.
+
+    Files are written and removed in a thread: a tick never waits for a disk. One that cannot be
+    is told in the log.
+    """
+
+    def __init__(
+        self, config: Config, clock: Clock, environ: Mapping[str, str] = os.environ
+    ) -> None:
+        self._path = _state_file(config, environ)
+        self._max_age_s = config.alignment.saved_max_age_s
+        self._clock = clock
+        self._kept = False
+        self._working: asyncio.Task[None] | None = None
+        self._save = Every(SAVE_EVERY_S * SECOND_NS)
+
+    def load(self) -> SavedState | None:
+        """The state of the last run, None if there is none that can be used."""
+        if self._path is None:
+            return None
+        utc_ns = self._clock.utc_ns(self._clock.now_ns())
+        state, why = load_state(self._path, (utc_ns or 0) * 1e-9, self._max_age_s)
+        log.info("%s: %s", self._path, why)
+        self._kept = state is not None
+        return state
+
+    def keep(self, t_ns: int, solution: Solution) -> None:
+        """Renew the file while the vehicle stands; remove it once the vehicle drives."""
+        if self._path is None or (self._working is not None and not self._working.done()):
+            return
+        if self._save.due(t_ns):
+            state = self._state(solution)
+            if state is not None:
+                self._kept = True
+                self._working = asyncio.create_task(asyncio.to_thread(_write, self._path, state))
+        elif self._kept and _speed_m_s(solution) > FORGET_SPEED_M_S:
+            self._kept = False
+            self._working = asyncio.create_task(asyncio.to_thread(_remove, self._path))
+
+    async def close(self, solution: Solution | None) -> None:
+        """Keep the last solution, after what is under way has ended."""
+        if self._working is not None:
+            await asyncio.wait([self._working])
+        state = None if solution is None else self._state(solution)
+        if self._path is not None and state is not None:
+            await asyncio.to_thread(_write, self._path, state)
+
+    def _state(self, solution: Solution) -> SavedState | None:
+        utc_ns = self._clock.utc_ns(solution.t_ns)
+        if utc_ns is None or not _speed_m_s(solution) <= SAVE_MAX_SPEED_M_S:
+            return None
+        s = solution
+        return SavedState(
+            utc_ns * 1e-9,
+            (s.lat_rad, s.lon_rad, s.height_m),
+            math.hypot(s.sd_ned_m[0], s.sd_ned_m[1]),
+            s.rpy_rad[2],
+            s.sd_rpy_rad[2],
+        )
+
+
+def _speed_m_s(solution: Solution) -> float:
+    """NaN where nothing is navigated."""
+    if solution.mode not in (Mode.NAVIGATING, Mode.COASTING):
+        return math.nan
+    return math.hypot(*solution.v_ned_m_s)
+
+
+def _state_file(config: Config, environ: Mapping[str, str]) -> Path | None:
+    if config.state_file is not None:
+        return config.state_file
+    directory = environ.get("STATE_DIRECTORY")
+    return Path(directory.split(":")[0]) / f"{config.vehicle}.json" if directory else None
+
+
+def _write(path: Path, state: SavedState) -> None:
+    try:
+        save_state(path, state)
+    except OSError as error:
+        log.warning("state not saved: %s", error)
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        log.warning("state not removed: %s", error)

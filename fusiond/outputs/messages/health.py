@@ -1,0 +1,113 @@
+"""`health`: the devices by name, the scheduler, the clock and the process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.base import State
+from fusiond.clock.clock import ClockStatus
+from fusiond.integrity.consistency import Verdict
+from fusiond.outputs.messages.base import Count, Message, Number, stamp
+
+
+class SkyHealth(BaseModel):
+    """The last epoch of a receiver's raw data."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    used: tuple[str, ...] = Field(default=(), description="satellites, such as C21")
+    refused: dict[str, str] = Field(default_factory=dict, description="satellite to reason")
+    gdop: Number = None
+    pdop: Number = None
+    hdop: Number = None
+    vdop: Number = None
+    tdop: Number = None
+    innovation_rms: Number = Field(
+        default=None, description="of the ranges used, normalised; 1 is expected"
+    )
+
+
+class SourceHealth(BaseModel):
+    """One device: what it is doing, and what became of its measurements."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    state: State
+    detail: str = ""
+    received: Count = 0
+    fused: Count = 0
+    rejected: dict[str, Count] = Field(default_factory=dict, description="by reason")
+    age_s: Number = Field(default=None, description="since the last measurement came in")
+    fused_age_s: Number = Field(default=None, description="since the last one was fused")
+    latency_s: Number = Field(default=None, description="from validity to arrival, the last one")
+    counters: dict[str, Count] = Field(default_factory=dict, description="of the driver")
+    isolated: str | None = Field(
+        default=None, description="why the fault detection leaves it out; null: it does not"
+    )
+    verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
+    sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerStatus:
+    """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
+
+    ticks: int
+    overruns: int
+    lateness_p50_ms: float
+    lateness_p99_ms: float
+    lateness_max_ms: float
+    gc_collections: int
+    gc_forced: int
+    gc_max_ms: float
+
+
+class HealthMessage(Message):
+    """Devices by name; the scheduler, the clock and the process."""
+
+    sources: dict[str, SourceHealth]
+    ticks: Count
+    overruns: Count
+    lateness_p50_ms: float
+    lateness_p99_ms: float
+    lateness_max_ms: float
+    gc_max_ms: float
+    utc_source: str
+    utc_settled: bool
+    system_clock_error_s: Number
+    clock_counters: dict[str, Count]
+    cpu_percent: float = Field(description="of one core")
+    memory_mb: float = Field(description="resident, 10^6 bytes")
+
+
+def health_message(
+    utc_ns: int | None,
+    *,
+    sources: Mapping[str, SourceHealth],
+    scheduler: SchedulerStatus,
+    clock: ClockStatus,
+    cpu_percent: float,
+    memory_mb: float,
+) -> HealthMessage:
+    """`health` from the parts' own snapshots."""
+    t_utc, t_ms = stamp(utc_ns)
+    return HealthMessage(
+        t_utc=t_utc,
+        t_ms=t_ms,
+        sources=dict(sources),
+        ticks=scheduler.ticks,
+        overruns=scheduler.overruns,
+        lateness_p50_ms=round(scheduler.lateness_p50_ms, 3),
+        lateness_p99_ms=round(scheduler.lateness_p99_ms, 3),
+        lateness_max_ms=round(scheduler.lateness_max_ms, 3),
+        gc_max_ms=round(scheduler.gc_max_ms, 3),
+        utc_source=clock.utc_source,
+        utc_settled=clock.settled,
+        system_clock_error_s=clock.system_error_s,
+        clock_counters=clock.counters,
+        cpu_percent=round(cpu_percent, 1),
+        memory_mb=round(memory_mb, 1),
+    )

@@ -1,0 +1,63 @@
+"""`nav`: the solution with its sigma."""
+
+from __future__ import annotations
+
+from math import degrees
+
+from pydantic import Field
+
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.messages.base import Message, Number, stamp
+
+
+class NavMessage(Message):
+    """The solution of the body origin: WGS 84, north-east-down, one sigma each."""
+
+    mode: Mode
+    lat_deg: Number
+    lon_deg: Number
+    height_m: Number = Field(description="above the ellipsoid")
+    v_n_m_s: Number
+    v_e_m_s: Number
+    v_d_m_s: Number
+    roll_deg: Number
+    pitch_deg: Number
+    yaw_deg: Number = Field(description="true heading, 0 to 360, clockwise from north")
+    sd_n_m: Number
+    sd_e_m: Number
+    sd_d_m: Number
+    sd_vn_m_s: Number
+    sd_ve_m_s: Number
+    sd_vd_m_s: Number
+    sd_roll_deg: Number
+    sd_pitch_deg: Number
+    sd_yaw_deg: Number
+
+
+def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
+    """`nav` of a solution whose instant is `utc_ns`; 1e-9 deg is 0.1 mm."""
+    t_utc, t_ms = stamp(utc_ns)
+    s = solution
+    return NavMessage(
+        t_utc=t_utc,
+        t_ms=t_ms,
+        mode=s.mode,
+        lat_deg=round(degrees(s.lat_rad), 9),
+        lon_deg=round(degrees(s.lon_rad), 9),
+        height_m=round(s.height_m, 4),
+        v_n_m_s=round(s.v_ned_m_s[0], 4),
+        v_e_m_s=round(s.v_ned_m_s[1], 4),
+        v_d_m_s=round(s.v_ned_m_s[2], 4),
+        roll_deg=round(degrees(s.rpy_rad[0]), 5),
+        pitch_deg=round(degrees(s.rpy_rad[1]), 5),
+        yaw_deg=round(degrees(s.rpy_rad[2]), 5) % 360.0,
+        sd_n_m=round(s.sd_ned_m[0], 4),
+        sd_e_m=round(s.sd_ned_m[1], 4),
+        sd_d_m=round(s.sd_ned_m[2], 4),
+        sd_vn_m_s=round(s.sd_v_ned_m_s[0], 4),
+        sd_ve_m_s=round(s.sd_v_ned_m_s[1], 4),
+        sd_vd_m_s=round(s.sd_v_ned_m_s[2], 4),
+        sd_roll_deg=round(degrees(s.sd_rpy_rad[0]), 5),
+        sd_pitch_deg=round(degrees(s.sd_rpy_rad[1]), 5),
+        sd_yaw_deg=round(degrees(s.sd_rpy_rad[2]), 5),
+    )

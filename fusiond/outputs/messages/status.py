@@ -1,0 +1,64 @@
+"""`status`: what the solution is worth, and the counters since the daemon started."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs.messages.base import Count, Message, stamp
+from fusiond.outputs.messages.health import SchedulerStatus
+
+
+class StatusMessage(Message):
+    """What the solution is worth, why, and since when; counters since the daemon started."""
+
+    mode: Mode
+    why: str
+    since_utc: str | None
+    since_ms: int | None
+    version: str
+    config_digest: str
+    uptime_s: float
+    ticks: Count
+    overruns: Count
+    fused: Count
+    rejected: Count
+    mqtt_published: Count
+    mqtt_dropped: Count
+    mqtt_reconnects: Count
+
+
+def status_message(
+    solution: Solution,
+    utc_ns: int | None,
+    *,
+    since_utc_ns: int | None,
+    version: str,
+    config_digest: str,
+    uptime_s: float,
+    scheduler: SchedulerStatus,
+    fused: int,
+    rejected: int,
+    mqtt: Mapping[str, int],
+) -> StatusMessage:
+    """`status`; `mqtt` are the publisher's counters."""
+    t_utc, t_ms = stamp(utc_ns)
+    since_utc, since_ms = stamp(since_utc_ns)
+    return StatusMessage(
+        t_utc=t_utc,
+        t_ms=t_ms,
+        mode=solution.mode,
+        why=solution.reason,
+        since_utc=since_utc,
+        since_ms=since_ms,
+        version=version,
+        config_digest=config_digest,
+        uptime_s=round(uptime_s, 3),
+        ticks=scheduler.ticks,
+        overruns=scheduler.overruns,
+        fused=fused,
+        rejected=rejected,
+        mqtt_published=mqtt.get("mqtt_published", 0),
+        mqtt_dropped=mqtt.get("mqtt_dropped", 0),
+        mqtt_reconnects=mqtt.get("mqtt_reconnects", 0),
+    )

@@ -1,0 +1,36 @@
+"""`fusiond bench` prints its figures for people, and writes them as JSON where it is asked to."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from fusiond.bench import bench as timing
+from fusiond.commands.app import app
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The real benchmark, short, and run once."""
+    whole = timing.bench
+    monkeypatch.setattr(timing, "bench", cache(lambda: whole(repetitions=2, process_s=90.0)))
+
+
+@pytest.mark.usefixtures("short")
+def test_bench_prints_a_table_and_writes_json(tmp_path: Path) -> None:
+    path = tmp_path / "bench.json"
+    printed = CliRunner().invoke(app, ["bench", "--json", str(path)])
+    assert printed.exit_code == 0, printed.output
+    figures = json.loads(path.read_text())
+    for name, value in figures.items():
+        shown = f"{value:.4g}" if name.endswith("_ratio") else str(value)
+        assert shown in printed.output, name
+        assert name in printed.output or not name.endswith("_ratio"), name
+    assert "\x1b" not in printed.output
+    piped = CliRunner().invoke(app, ["bench", "--json", "-"])
+    assert json.loads(piped.output) == figures
+    assert CliRunner().invoke(app, ["bench"]).output == printed.output
