@@ -10,7 +10,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit hil format picture bench load lock clean test-packages
+.PHONY: help install demo test lint unit hil format picture bench faults load lock clean test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -61,6 +61,9 @@ picture: $(STAMP) ## docs/house.svg, from the imports
 
 bench: $(STAMP) ## figures as JSON
 	$(BIN)/fusiond bench $(ARGS)
+
+faults: $(STAMP) ## fault matrix as a table; ARGS="--only step_500m --phase coasting"
+	$(BIN)/python -m fusiond.studies.faults $(ARGS)
 
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)
