@@ -31,7 +31,7 @@ from fusiond.aiding.base import State
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.navigation.strapdown import STEP_SIZE
-from fusiond.studies.rdss.runs import nav_error
+from fusiond.studies.navigation_error import nav_error
 from fusiond.studies.rdss.study import nees_interval
 from fusiond.studies.reduced_order import flight
 from fusiond.studies.reduced_order.cost import IMU_RATE_HZ, Cost, costs

@@ -39,7 +39,7 @@ from fusiond.studies.federated.runs import (
     initial_sd,
     truth,
 )
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 

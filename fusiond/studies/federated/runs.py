@@ -38,7 +38,7 @@ from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 FaultKind = Literal["", "step", "drift", "frozen"]

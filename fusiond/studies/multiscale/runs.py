@@ -49,7 +49,7 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
-from fusiond.studies.rdss.runs import metres, nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 

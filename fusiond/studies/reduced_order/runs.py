@@ -32,7 +32,8 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.sensor_errors import imu_output
-from fusiond.studies.rdss.runs import CHECKPOINT_S, HISTORY_S, nav_error, with_error
+from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.navigation_error import nav_error, with_error
 from fusiond.studies.reduced_order import flight
 
 Array = NDArray[np.float64]

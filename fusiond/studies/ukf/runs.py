@@ -47,7 +47,7 @@ from fusiond.studies.live_filter import (
     drive_truth,
     on_processes,
 )
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
