@@ -17,10 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from os import cpu_count
 from typing import Literal
 
 import numpy as np
@@ -40,6 +38,8 @@ from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.sensor_errors import gauss_markov, imu_output
 from fusiond.simulation.trajectories import Path as Trajectory
+from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import on_processes
 from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
@@ -54,9 +54,6 @@ NEES_EVERY = 8
 """Grid points from one NEES to the next."""
 GATE = 1.0 - 1e-12
 """So wide that no strategy hides its errors by refusing fixes."""
-HISTORY_S, CHECKPOINT_S = 15.0, 0.5
-"""As the daemon has them."""
-WORKERS = 2
 
 PAPER_IMU = Imu(
     rate_hz=20.0,
@@ -345,12 +342,4 @@ def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """All runs of a case, in order; on two processes when there are enough of them."""
-    results = []
-    work = partial(simulate, case, seed)
-    workers = min(WORKERS, cpu_count() or 1, runs)
-    with ProcessPoolExecutor(workers) as pool:
-        for traces in pool.map(work, range(runs)):
-            results.append(traces)
-            if progress is not None:
-                progress()
-    return results
+    return on_processes(partial(simulate, case, seed), runs, progress)
