@@ -11,8 +11,8 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench load lock clean kernels \
-	test-packages
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults load lock clean \
+	kernels test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -72,6 +72,9 @@ picture: $(STAMP) ## docs/house.svg, from the imports
 
 bench: $(STAMP) ## what the kernels cost; ARGS="--json F.json" keeps the figures
 	$(BIN)/fusiond bench $(ARGS)
+
+faults: $(STAMP) ## fault matrix as a table; ARGS="--only step_500m --phase coasting"
+	$(BIN)/python -m fusiond.studies.faults $(ARGS)
 
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)

@@ -13,17 +13,32 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import (
-    dcm_from_quaternion,
-    quaternion_from_rpy,
-    rotate_quaternion,
-    rotation_vector_from_dcm,
-)
+from fusiond.navigation.rotation import quaternion_from_rpy
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
+from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+
+__all__ = [
+    "ORIGIN",
+    "SECOND",
+    "TOWN",
+    "Array",
+    "ImuRun",
+    "filled_buffer",
+    "imu_run",
+    "initial_sd",
+    "level_nav",
+    "make_estimator",
+    "metres",
+    "nav_error",
+    "random_attitude",
+    "sample_times",
+    "town_truth",
+    "true_nav",
+    "with_error",
+]
 
 Array = NDArray[np.float64]
 ORIGIN = (math.radians(30.5), math.radians(114.3), 40.0)
@@ -55,40 +70,6 @@ def town_truth(seconds: float, rate_hz: float, climb_deg: float = 3.0) -> Truth:
 def sample_times(truth: Truth, start_ns: int = 0) -> NDArray[np.int64]:
     """Stamps (n,) in ns of the truth's samples."""
     return start_ns + np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
-
-
-def true_nav(truth: Truth, t_s: Array) -> Array:
-    """Navigation states (n, 10) at the instants (n,)."""
-    states = truth.at(t_s)
-    q = np.array([quaternion_from_rpy(*rpy) for rpy in states.rpy])
-    return np.column_stack([states.position, states.v_ned, q])
-
-
-def metres(lat: float, height: float) -> Array:
-    """Metres north, east, down a unit of latitude, longitude (rad) and height (m)."""
-    return np.array(
-        [
-            meridian_radius(lat) + height,
-            (transverse_radius(lat) + height) * math.cos(lat),
-            -1.0,
-        ]
-    )
-
-
-def nav_error(computed: Array, true: Array) -> Array:
-    """Error state (9,), computed minus true as the filter has it: phi (rad), dv (m/s), dr (m)."""
-    turn = dcm_from_quaternion(computed[6:]) @ dcm_from_quaternion(true[6:]).T
-    dr = (computed[:3] - true[:3]) * metres(float(true[0]), float(true[2]))
-    return np.concatenate([-rotation_vector_from_dcm(turn), computed[3:6] - true[3:6], dr])
-
-
-def with_error(true: Array, error: Array) -> Array:
-    """The computed state (10,) that is off from `true` by `error` (9,)."""
-    nav = true.copy()
-    rotate_quaternion(nav[6:], -float(error[0]), -float(error[1]), -float(error[2]), True)
-    nav[3:6] += error[3:6]
-    nav[:3] += error[6:9] / metres(float(true[0]), float(true[2]))
-    return nav
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,10 @@ from scipy.stats import beta, binomtest
 
 from fusiond.integrity.consistency import FEWEST, LAGS, ConsistencyOptions, judge
 from fusiond.studies.level_axis import Aided, Fault, innovations
+from fusiond.studies.monte_carlo import Progress, step_counter
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Progress = Callable[[int, int], None]
 
 DEFAULT_RUNS = 20_000
 DIMENSIONS = (1, 2, 3)
@@ -191,14 +191,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     drives = max(50, windows // 40)
     options = ConsistencyOptions()
     steps = len(WINDOWS) * (len(DIMENSIONS) + len(SOURCES)) + len(SOURCES) * (1 + len(FAULTS))
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, steps)
-
+    step = step_counter(progress, steps)
     rows = false_alarms(windows, options.alpha, np.random.default_rng([seed, 0]), step)
     hits = round(sum(row["rate"] for row in rows) * windows)
     total = _rate(hits, windows * len(rows))

@@ -20,7 +20,6 @@ nine over sigma, `sigma_change` the greatest change of a sigma to that at the fi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,8 @@ from fusiond.aiding.base import State
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE
 from fusiond.navigation.strapdown import STEP_SIZE
-from fusiond.studies.rdss.runs import nav_error
-from fusiond.studies.rdss.study import nees_interval
+from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
+from fusiond.studies.navigation_error import nav_error
 from fusiond.studies.reduced_order import flight
 from fusiond.studies.reduced_order.cost import IMU_RATE_HZ, Cost, costs
 from fusiond.studies.reduced_order.report import (
@@ -49,7 +48,6 @@ from fusiond.studies.reduced_order.report import (
 from fusiond.studies.reduced_order.runs import Flown, live, monte_carlo, nees, started
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 DEFAULT_RUNS = 50
 CHECKED_S = 50
@@ -72,14 +70,7 @@ def run(
     count = DEFAULT_RUNS if runs is None else runs
     if count < 2:
         raise ValueError("runs must be at least 2")
-    steps, done = 2 * count + 1, 0
-
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, steps)
-
+    advance = step_counter(progress, 2 * count + 1)
     models = {name: of for name, of in flight.filters().items() if name in STATES}
     instants = np.arange(CHECKED_S, round(seconds) + 1, CHECKED_S)
     counted = instants >= COUNTED_FROM * seconds

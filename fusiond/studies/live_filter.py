@@ -1,15 +1,12 @@
-"""One filter of a study, fed as the daemon feeds it; a drive to feed it on; runs on two processes.
+"""One filter of a study, fed as the daemon feeds it; a drive to feed it on.
 
 The vehicle is the drive of `fusiond simulate`, 500 s as in paper 003, on IMU samples at `RATE_HZ`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable
 from functools import lru_cache
-from os import cpu_count
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +29,6 @@ ORIGIN_DEG_M = (30.5, 114.3, 40.0)
 RATE_HZ = 50.0
 HISTORY_S, CHECKPOINT_S = 15.0, 0.5
 """As the daemon has them."""
-WORKERS = 2
-
-R = TypeVar("R")
 
 
 @lru_cache(maxsize=1)
@@ -82,14 +76,3 @@ class LiveFilter:
         for aid in aids:
             self._timeline.insert(aid)
         self._timeline.run()
-
-
-def on_processes(
-    work: Callable[[int], R], runs: int, progress: Callable[[], None] | None = None
-) -> Iterator[R]:
-    """`work` of 0 to `runs` - 1, in order, on two processes."""
-    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
-        for result in pool.map(work, range(runs)):
-            yield result
-            if progress is not None:
-                progress()

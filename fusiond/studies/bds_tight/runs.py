@@ -59,9 +59,9 @@ from fusiond.studies.live_filter import (
     LiveFilter,
     drive_samples,
     drive_truth,
-    on_processes,
 )
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 
@@ -349,4 +349,4 @@ def monte_carlo(
     runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[list[dict[str, CaseRun]]]:
     """All runs, in order, on two processes."""
-    return list(on_processes(partial(simulate, seed), runs, progress))
+    return on_processes(partial(simulate, seed), runs, progress)

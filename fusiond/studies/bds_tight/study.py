@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fusiond.studies.bds_tight.runs import (
     CASES,
@@ -41,6 +40,7 @@ from fusiond.studies.bds_tight.runs import (
     monte_carlo,
 )
 from fusiond.studies.live_filter import DURATION_S
+from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 
 Array = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -66,21 +66,12 @@ PAPER = {
 }
 
 
-def run(
-    runs: int | None = None, seed: int = 0, progress: Callable[[int, int], None] | None = None
-) -> dict[str, Any]:
+def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 50) of each case. Repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, count)
-
+    step = step_counter(progress, count)
     results = monte_carlo(count, seed, step)
     cases = {case: _case(case, [r[0][case] for r in results]) for case in CASES}
     growth = {row: cases["canyon3"][row]["growth_m"] for row in ("tight_ekf", "coasting")}
@@ -108,20 +99,15 @@ def run(
         "availability_limit_m": LIMIT_M,
         "nees_dof": DOF,
         "nav_nees_dof": NAV_DOF,
-        "nees_interval": _interval(DOF, count),
-        "nav_nees_interval": _interval(NAV_DOF, count),
+        "nees_interval": nees_interval(count, DOF, 0.025),
+        "nav_nees_interval": nees_interval(count, NAV_DOF, 0.025),
         "cases": cases,
         "sky": {case: _sky([r[0][case] for r in results]) for case in CASES},
         "three_satellites": three,
         "orbit_errors": orbits,
         "series": {case: _series([r[0][case] for r in results]) for case in CASES},
-        "finding": _finding(cases, three, orbits, _interval(DOF, count)[1]),
+        "finding": _finding(cases, three, orbits, nees_interval(count, DOF, 0.025)[1]),
     }
-
-
-def _interval(dof: int, count: int) -> list[float]:
-    """95 % interval of the mean over the runs at one instant."""
-    return [float(chi2.ppf(q, count * dof)) / count for q in (0.025, 0.975)]
 
 
 # --------------------------------------------------------------------------- figures

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.federated.fusion import fuse_correlated, fuse_uncorrelated
-from fusiond.studies.rdss.study import nees_interval
+from fusiond.studies.monte_carlo import nees_interval
 
 Array = NDArray[np.float64]
 

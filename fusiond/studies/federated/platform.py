@@ -30,16 +30,9 @@ from fusiond.navigator.intake import Intake
 from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.imu_truth import metres_to_geodetic
 from fusiond.simulation.sensor_errors import imu_output
-from fusiond.studies.federated.runs import (
-    CHECKPOINT_S,
-    DURATION_S,
-    HISTORY_S,
-    ORIGIN_DEG_M,
-    STUDY_IMU,
-    initial_sd,
-    truth,
-)
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.federated.runs import DURATION_S, ORIGIN_DEG_M, STUDY_IMU, initial_sd, truth
+from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 

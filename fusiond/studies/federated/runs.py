@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from os import cpu_count
 from typing import Literal
 
 import numpy as np
@@ -39,7 +37,9 @@ from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import drive
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 FaultKind = Literal["", "step", "drift", "frozen"]
@@ -57,10 +57,8 @@ GATE = 0.9999
 DURATION_S, FAULT_START_S, FAULT_END_S = 240.0, 70.0, 170.0
 """At the start the car drives at 20 m/s, from 100 to 125 s it stands."""
 STEP_M, DRIFT_M_S = 50.0, 0.5
-HISTORY_S, CHECKPOINT_S = 15.0, 0.5
 NEES_EVERY_S, NEES_DOF = 20, 15
 SD_ATTITUDE_DEG, SD_VELOCITY_M_S, SD_POSITION_M = (0.3, 0.3, 2.0), 0.2, 5.0
-WORKERS = 2
 
 REST_S = 10.0
 STUDY_IMU = Imu(
@@ -235,11 +233,4 @@ def monte_carlo(
     progress: Callable[[], None] | None = None,
 ) -> list[dict[str, Trace]]:
     """All runs, in order; on two processes when there are enough of them."""
-    results = []
-    work = partial(simulate, filters, fault, sd_m, seed)
-    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
-        for traces in pool.map(work, range(runs)):
-            results.append(traces)
-            if progress is not None:
-                progress()
-    return results
+    return on_processes(partial(simulate, filters, fault, sd_m, seed), runs, progress)

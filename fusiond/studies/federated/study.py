@@ -13,10 +13,7 @@ fault enters a centralised filter that way. `rms_centralised_gate_only_m` is wit
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from os import cpu_count
 from pathlib import Path
 from typing import Any
 
@@ -34,17 +31,15 @@ from fusiond.studies.federated.runs import (
     NEES_DOF,
     STEP_M,
     UNEQUAL_M,
-    WORKERS,
     FaultKind,
     Filter,
     Trace,
     grid,
     monte_carlo,
 )
-from fusiond.studies.rdss.study import nees_interval
+from fusiond.studies.monte_carlo import Progress, nees_interval, on_processes, step_counter
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 DEFAULT_RUNS = 50
 PAPER = {
@@ -72,14 +67,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
-    done, total = 0, count * (len(FAULTS) + 3)
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
+    step = step_counter(progress, count * (len(FAULTS) + 3))
     honest = {
         name: _honesty(monte_carlo(FILTERS, "", sd_m, count, seed, step))
         for name, sd_m in (("equal", EQUAL_M), ("unequal", UNEQUAL_M))
@@ -97,7 +85,9 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
             "1_random_truth": papers.random_truth(count, seed),
             "2_constant_truth": papers.constant_truth(count, seed),
             "3_two_sensors": papers.two_sensors(count, seed),
-            "4_active_and_passive": platform.platform(_platform(count, seed, step)),
+            "4_active_and_passive": platform.platform(
+                on_processes(partial(platform.simulate, seed), count, step)
+            ),
         },
         "sources_sd_m": {"equal": list(EQUAL_M), "unequal": list(UNEQUAL_M)},
         "fault": {
@@ -112,15 +102,6 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
         "series": {"t_s": grid()[0].tolist(), "horizontal_rms_m": series},
     }
     return {**result, "finding": _finding(result)}
-
-
-def _platform(count: int, seed: int, step: Callable[[], None]) -> list[dict[str, Array]]:
-    found = []
-    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, count)) as pool:
-        for one in pool.map(partial(platform.simulate, seed), range(count)):
-            found.append(one)
-            step()
-    return found
 
 
 def _horizontal(found: list[dict[str, Trace]], name: str) -> Array:

@@ -22,11 +22,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import chain, repeat
-from os import cpu_count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +48,8 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
-from fusiond.studies.rdss.runs import metres, nav_error, true_nav, with_error
+from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 
@@ -60,7 +59,6 @@ DURATION_S, COUNTED_FROM_S = 400.0, 60.0
 """The first minute, in which the start's errors go down, does not count."""
 GPS_M, GPS_M_S, TRACKER_RAD = 8.0, 0.5, 200.0 / 3600.0 * DEG
 BIAS_MG = 1.0
-WORKERS = 2
 GATE = 1.0 - 1e-12
 """So wide that no filter hides its errors by refusing aids."""
 TIMED_S, TIMED_REPEATS = 60, 5
@@ -240,14 +238,7 @@ def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """All runs of a case, in order; on two processes when there are enough of them."""
-    results = []
-    work = partial(simulate, case, seed)
-    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
-        for traces in pool.map(work, range(runs)):
-            results.append(traces)
-            if progress is not None:
-                progress()
-    return results
+    return on_processes(partial(simulate, case, seed), runs, progress)
 
 
 def times_per_step_us(case: Case, seed: int) -> dict[str, float]:

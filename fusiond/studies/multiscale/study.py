@@ -12,13 +12,14 @@ run by run. What is simulated: `fusiond.studies.multiscale.runs`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import norm
 
+from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.multiscale.runs import (
     BIAS_MG,
     COUNTED_FROM_S,
@@ -34,11 +35,9 @@ from fusiond.studies.multiscale.runs import (
     monte_carlo,
     times_per_step_us,
 )
-from fusiond.studies.rdss.study import nees_interval
 
 __all__ = ["plot", "run", "tables"]
 
-Progress = Callable[[int, int], None]
 
 DEFAULT_RUNS = 100
 STATES = 10
@@ -71,14 +70,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, count * len(CASES))
-
+    step = step_counter(progress, count * len(CASES))
     found = {case.name: _figures(monte_carlo(case, count, seed, step)) for case in CASES}
     spent = times_per_step_us(CASES[0], seed)
     for case in found.values():

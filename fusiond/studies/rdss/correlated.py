@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.dynamic import level_drive
 from fusiond.studies.rdss.runs import Case, Filter
-from fusiond.studies.rdss.study import Progress, plot, run_cases, tables
+from fusiond.studies.rdss.study import plot, run_cases, tables
 
 __all__ = ["CASES", "plot", "run", "tables"]
 

@@ -15,8 +15,9 @@ from dataclasses import replace
 from typing import Any
 
 from fusiond.simulation.trajectories import Path, Profile, drive
+from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.runs import Case
-from fusiond.studies.rdss.study import Progress, add_times, plot, run_cases, tables
+from fusiond.studies.rdss.study import add_times, plot, run_cases, tables
 
 __all__ = ["CASES", "level_drive", "plot", "run", "tables"]
 DEFAULT_RUNS = 100

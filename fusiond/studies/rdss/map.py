@@ -9,7 +9,6 @@ itself, and three readings of the paper's ranging error are compared with its "3
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from fusiond.navigation.earth import (
     meridian_radius,
     transverse_radius,
 )
+from fusiond.studies.monte_carlo import Progress
 
 SATELLITE_M = 8.0
 RANGING_M = 13.0
@@ -54,8 +54,6 @@ DRAWS = 2000
 CONFIDENCE = 0.99
 CENTRE_DEG = (39.9, 116.4)
 """Any place that sees both satellites does: the centre's own legs are known and drop out."""
-
-Progress = Callable[[int, int], None]
 
 
 def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:

@@ -17,10 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from os import cpu_count
 from typing import Literal
 
 import numpy as np
@@ -35,19 +33,15 @@ from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import (
-    dcm_from_quaternion,
-    quaternion_from_rpy,
-    rotate_quaternion,
-    rotation_vector_from_dcm,
-)
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
 from fusiond.simulation.sensor_errors import gauss_markov, imu_output
 from fusiond.simulation.trajectories import Path as Trajectory
+from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 
@@ -61,9 +55,6 @@ NEES_EVERY = 8
 """Grid points from one NEES to the next."""
 GATE = 1.0 - 1e-12
 """So wide that no strategy hides its errors by refusing fixes."""
-HISTORY_S, CHECKPOINT_S = 15.0, 0.5
-"""As the daemon has them."""
-WORKERS = 2
 
 PAPER_IMU = Imu(
     rate_hz=20.0,
@@ -167,13 +158,6 @@ def grid(case: Case) -> tuple[Array, Array]:
     """Instants (m,) and the true navigation states (m, 10) at them."""
     t_s: Array = np.arange(round(case.duration_s / GRID_S) + 1, dtype=np.float64) * GRID_S
     return t_s, true_nav(_truth(case), t_s)
-
-
-def true_nav(truth: Truth, t_s: Array) -> Array:
-    """Navigation states (n, 10) at the instants (n,)."""
-    states = truth.at(t_s)
-    q = np.array([quaternion_from_rpy(*rpy) for rpy in states.rpy])
-    return np.column_stack([states.position, states.v_ned, q])
 
 
 def fix_covariance() -> Array:
@@ -304,28 +288,6 @@ def initial_sd(case: Case, model: Model) -> Array:
     return sd
 
 
-def metres(lat: float, height: float) -> Array:
-    """Metres north, east, down a unit of latitude, longitude (rad) and height (m)."""
-    east = (transverse_radius(lat) + height) * math.cos(lat)
-    return np.array([meridian_radius(lat) + height, east, -1.0])
-
-
-def nav_error(computed: Array, true: Array) -> Array:
-    """Error state (9,), computed minus true: phi (rad), dv (m/s), dr (m)."""
-    turn = dcm_from_quaternion(computed[6:]) @ dcm_from_quaternion(true[6:]).T
-    dr = (computed[:3] - true[:3]) * metres(float(true[0]), float(true[2]))
-    return np.concatenate([-rotation_vector_from_dcm(turn), computed[3:6] - true[3:6], dr])
-
-
-def with_error(true: Array, error: Array) -> Array:
-    """The computed state (10,) that is off from `true` by `error` (9,)."""
-    nav = true.copy()
-    rotate_quaternion(nav[6:], -float(error[0]), -float(error[1]), -float(error[2]), True)
-    nav[3:6] += error[3:6]
-    nav[:3] += error[6:9] / metres(float(true[0]), float(true[2]))
-    return nav
-
-
 # --------------------------------------------------------------------------- one run
 
 
@@ -381,12 +343,4 @@ def monte_carlo(
     case: Case, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """All runs of a case, in order; on two processes when there are enough of them."""
-    results = []
-    work = partial(simulate, case, seed)
-    workers = min(WORKERS, cpu_count() or 1, runs)
-    with ProcessPoolExecutor(workers) as pool:
-        for traces in pool.map(work, range(runs)):
-            results.append(traces)
-            if progress is not None:
-                progress()
-    return results
+    return on_processes(partial(simulate, case, seed), runs, progress)

@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 from fusiond.simulation.trajectories import static
+from fusiond.studies.monte_carlo import Progress
 from fusiond.studies.rdss.runs import Case
-from fusiond.studies.rdss.study import Progress, add_times, plot, run_cases, tables
+from fusiond.studies.rdss.study import add_times, plot, run_cases, tables
 
 __all__ = ["CASE", "plot", "run", "tables"]
 

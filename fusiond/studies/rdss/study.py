@@ -14,15 +14,16 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from fusiond.integrity.consistency import LAGS, Consistency, judge
+from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.rdss.runs import (
     NEES_DOF,
     RDSS_ALONE,
@@ -38,7 +39,6 @@ from fusiond.studies.rdss.runs import (
     monte_carlo,
 )
 
-Progress = Callable[[int, int], None]
 Runs = Sequence[dict[str, Trace]]
 
 CONFIDENCE = 0.95
@@ -65,14 +65,7 @@ def run_cases(
     """What the result begins with, and `figures` of each case over `count` runs."""
     if count < 2:
         raise ValueError("runs must be at least 2")
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, count * len(cases))
-
+    step = step_counter(progress, count * len(cases))
     found = [figures(case, monte_carlo(case, count, seed, step)) for case in cases]
     sd = np.sqrt(np.diag(fix_covariance()))
     head = {
@@ -151,12 +144,6 @@ def _course(results: Runs, name: str) -> Array:
     """Horizontal RMS over the runs at each grid point; nan where there is no solution yet."""
     square = np.array([np.square(traces[name].error).sum(axis=-1) for traces in results])
     return np.asarray(np.sqrt(square.mean(axis=0)))
-
-
-def nees_interval(runs: int, dof: int) -> list[float]:
-    """Interval of the average over `runs` independent NEES of a matched filter."""
-    tail = (1.0 - CONFIDENCE) / 2.0
-    return [float(chi2.ppf(p, runs * dof)) / runs for p in (tail, 1.0 - tail)]
 
 
 def _consistency(results: Runs, name: str, k: int) -> dict[str, Any]:

@@ -10,10 +10,8 @@ with all of itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from os import cpu_count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +25,12 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_SIZE
 from fusiond.navigator.timeline import Timeline
 from fusiond.simulation.sensor_errors import imu_output
-from fusiond.studies.rdss.runs import CHECKPOINT_S, HISTORY_S, nav_error, with_error
+from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
+from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.navigation_error import nav_error, with_error
 from fusiond.studies.reduced_order import flight
 
 Array = NDArray[np.float64]
-
-WORKERS = 2
 
 
 def combinations(of: Model) -> Array:
@@ -171,12 +169,8 @@ def monte_carlo(
     all_in_view: bool = False,
 ) -> dict[str, Flown]:
     """All runs of `fly`, stacked: error (runs, k, 20) and belief (runs, k, 20, 20) by filter."""
-    found = []
-    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
-        one_run = partial(fly, models, seconds, every_s, all_in_view, seed)
-        for one in pool.map(one_run, range(runs)):
-            found.append(one)
-            progress()
+    one_run = partial(fly, models, seconds, every_s, all_in_view, seed)
+    found = on_processes(one_run, runs, progress)
     return {
         name: Flown(
             np.array([one[name].error for one in found]),

@@ -9,17 +9,16 @@ the real thing. Sigmas are those of the *true* error at the end of the flight, e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fusiond.configuration.settings import DEG
 from fusiond.models.model import Model
 from fusiond.studies.covariance_analysis import Result, System, analyse
+from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.observability import Epoch, Observability, observability
 from fusiond.studies.reduced_order import flight
 from fusiond.studies.reduced_order.cost import IMU_RATE_HZ, costs
@@ -38,7 +37,6 @@ from fusiond.studies.reduced_order.report import (
 from fusiond.studies.reduced_order.runs import Flown, combinations, monte_carlo, nees
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 DEFAULT_RUNS = 40
 CONFIDENCE = 0.99
@@ -59,14 +57,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     count = DEFAULT_RUNS if runs is None else runs
     if count < 2:
         raise ValueError("runs must be at least 2")
-    steps, done = 3 + count, 0
-
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, steps)
-
+    advance = step_counter(progress, 3 + count)
     models = flight.filters()
     fine = _analysis(models, flight.DURATION_S)
     advance()
@@ -206,14 +197,11 @@ def _validation(
     runs = len(next(iter(flown.values())).error)
     tail = 0.5 * (1.0 - CONFIDENCE)
 
-    def interval(dof: int) -> list[float]:
-        return [float(chi2.ppf(q, runs * dof)) / runs for q in (tail, 1.0 - tail)]
-
     found: dict[str, Any] = {
         "seconds": VALIDATION_S,
         "nees_dof": len(project),
-        "nees_interval": interval(len(project)),
-        "rms_to_sigma_interval": [math.sqrt(x) for x in interval(1)],
+        "nees_interval": nees_interval(runs, len(project), tail),
+        "rms_to_sigma_interval": [math.sqrt(x) for x in nees_interval(runs, 1, tail)],
         "models": {},
     }
     for name, of in models.items():

@@ -47,9 +47,9 @@ from fusiond.studies.live_filter import (
     LiveFilter,
     drive_samples,
     drive_truth,
-    on_processes,
 )
-from fusiond.studies.rdss.runs import nav_error, true_nav, with_error
+from fusiond.studies.monte_carlo import on_processes
+from fusiond.studies.navigation_error import nav_error, true_nav, with_error
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -340,4 +340,4 @@ def monte_carlo(
     problem: Problem, runs: int, seed: int, progress: Callable[[], None] | None = None
 ) -> list[dict[str, Trace]]:
     """All runs of a problem, in order, on two processes."""
-    return list(on_processes(partial(simulate, problem, seed), runs, progress))
+    return on_processes(partial(simulate, problem, seed), runs, progress)

@@ -11,14 +11,14 @@ of freedom; `nees_interval` is the 95 % interval of its average over the runs at
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from fusiond.studies.live_filter import DURATION_S
+from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
 from fusiond.studies.ukf.runs import (
     COUNTED_S,
     FILTERS,
@@ -42,21 +42,12 @@ PAPER = {
 }
 
 
-def run(
-    runs: int | None = None, seed: int = 0, progress: Callable[[int, int], None] | None = None
-) -> dict[str, Any]:
+def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None) -> dict[str, Any]:
     """The study with `runs` Monte Carlo runs (default 50) of each problem. Repeats exactly."""
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, count * len(PROBLEMS))
-
+    step = step_counter(progress, count * len(PROBLEMS))
     problems = {}
     for problem in PROBLEMS:
         results = monte_carlo(problem, count, seed, step)
@@ -72,7 +63,7 @@ def run(
         "duration_s": DURATION_S,
         "counted_from_s": COUNTED_S,
         "nees_dof": DOF,
-        "nees_interval": [float(chi2.ppf(q, count * DOF)) / count for q in (0.025, 0.975)],
+        "nees_interval": nees_interval(count, DOF, 0.025),
         "problems": problems,
         "finding": _finding(problems),
     }

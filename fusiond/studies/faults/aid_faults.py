@@ -1,0 +1,231 @@
+"""Faults of what aids the IMU: fixes of receiver and RDSS terminal, wheel speeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from drivers.measurements import DelayedFix, Measurement, MonotonicStamp, PositionFix, WheelSpeed
+from fusiond.simulation.imu_truth import metres_to_geodetic
+from fusiond.studies.faults.recording import Received, Recording
+
+STEP_M = 500.0
+DRIFT_M_S = 0.5
+BURST_M = 450.0
+BURST_EVERY_NS = 1_000_000
+MULTIPATH_M = 80.0
+MULTIPATH_S, TUNNEL_S = 0.6, 60.0
+TINY_SD_M = 1e-9
+HUGE = 1e300
+FAST_M_S = 2000.0 * 1852.0 / 3600.0
+"""2,000 knots."""
+AHEAD_NS = 5_000_000_000
+WHEEL_SCALE = 1.2
+
+M = TypeVar("M", bound=Measurement)
+
+
+def _changed(
+    r: Recording, begin_s: float, length_s: float, kind: type[M], change: Callable[[M, float], M]
+) -> Recording:
+    """`change(measurement, seconds since begin)` of each of a kind that is valid in the window."""
+    received = []
+    for item in r.received:
+        m, since_s = item.measurement, item.t_ns * 1e-9 - begin_s
+        if isinstance(m, kind) and 0.0 <= since_s < length_s:
+            received.append(replace(item, measurement=change(m, since_s)))
+        else:
+            received.append(item)
+    return r.with_received(received)
+
+
+def _fixes(r: Recording, begin_s: float, end_s: float) -> list[Received]:
+    """The receiver's fixes that are valid from `begin_s` to before `end_s`."""
+    return [
+        item
+        for item in r.received
+        if isinstance(item.measurement, PositionFix) and begin_s * 1e9 <= item.t_ns < end_s * 1e9
+    ]
+
+
+def _north_of(lat_rad: float, height_m: float | None, north_m: float) -> float:
+    place, height, away = [lat_rad], [height_m or 0.0], [[north_m, 0.0, 0.0]]
+    moved = metres_to_geodetic(np.array(place), np.array(height), np.array(away))
+    return lat_rad + float(moved[0, 0])
+
+
+def _north(fix: PositionFix, north_m: float) -> PositionFix:
+    return replace(fix, lat_rad=_north_of(fix.lat_rad, fix.height_m, north_m))
+
+
+def step(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Positions 500 m to the north."""
+    return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, STEP_M))
+
+
+def null_island(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Position 0 N 0 E."""
+    return _changed(
+        r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, lat_rad=0.0, lon_rad=0.0)
+    )
+
+
+def frozen(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Position and velocity of the first fix of the window, at new instants."""
+    first: list[PositionFix] = []
+
+    def repeat(fix: PositionFix, _: float) -> PositionFix:
+        first.append(fix)
+        return replace(first[0], t_seen_ns=fix.t_seen_ns, stamp=fix.stamp)
+
+    return _changed(r, begin_s, length_s, PositionFix, repeat)
+
+
+def velocity_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Horizontal velocity with the wrong sign, position honest."""
+
+    def turned(fix: PositionFix, _: float) -> PositionFix:
+        assert fix.v_ned_m_s is not None
+        north, east, down = fix.v_ned_m_s
+        return replace(fix, v_ned_m_s=(-north, -east, down))
+
+    return _changed(r, begin_s, length_s, PositionFix, turned)
+
+
+def drift(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Positions drift to the north at 0.5 m/s, velocity honest."""
+    return _changed(
+        r, begin_s, length_s, PositionFix, lambda fix, since_s: _north(fix, DRIFT_M_S * since_s)
+    )
+
+
+def false_burst(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """A thousand positions a second, 450 m off, each at its own instant."""
+    like = _fixes(r, begin_s, math.inf)[0].measurement
+    assert isinstance(like, PositionFix)
+    false = []
+    for t in range(round(begin_s * 1e9), round((begin_s + length_s) * 1e9), BURST_EVERY_NS):
+        fix = replace(_north(like, BURST_M), t_seen_ns=t, stamp=MonotonicStamp(t))
+        false.append(Received(t, t, fix))
+    return r.with_received([*r.received, *false])
+
+
+def tiny_sigma(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Errors as always, and a stated sigma of 1e-9 m."""
+    return _changed(
+        r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(TINY_SD_M,) * 3)
+    )
+
+
+def infinite_sigma(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """A stated sigma that is infinite."""
+    return _changed(
+        r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(math.inf,) * 3)
+    )
+
+
+def nan_latitude(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Latitude is not a number."""
+    return _changed(
+        r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, lat_rad=math.nan)
+    )
+
+
+def huge_height(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """A height of 1e300 m."""
+    return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, height_m=HUGE))
+
+
+def _at_speed(r: Recording, begin_s: float, length_s: float, north_m_s: float) -> Recording:
+    return _changed(
+        r,
+        begin_s,
+        length_s,
+        PositionFix,
+        lambda fix, _: replace(fix, v_ned_m_s=(north_m_s, 0.0, 0.0)),
+    )
+
+
+def huge_speed(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """A velocity of 1e300 m/s to the north."""
+    return _at_speed(r, begin_s, length_s, HUGE)
+
+
+def fast(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """A velocity of 2,000 knots to the north."""
+    return _at_speed(r, begin_s, length_s, FAST_M_S)
+
+
+def repeated(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Every fix comes twice."""
+    return r.with_received([*r.received, *_fixes(r, begin_s, begin_s + length_s)])
+
+
+def from_future(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Fixes whose stamps lie 5 s ahead."""
+    moved = set(_fixes(r, begin_s, begin_s + length_s))
+    return r.with_received(
+        [replace(item, t_ns=item.t_ns + AHEAD_NS) if item in moved else item for item in r.received]
+    )
+
+
+def multipath_tunnel_jump(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Fixes 80 m off for 0.6 s, a tunnel for the rest of the window, and the first fix behind it
+    80 m off."""
+    burst = _changed(r, begin_s, MULTIPATH_S, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M))
+    out_s = begin_s + length_s
+    tunnel = burst.withheld(begin_s + MULTIPATH_S, out_s)
+    first_s = _fixes(tunnel, out_s, math.inf)[0].t_ns * 1e-9
+    return _changed(
+        tunnel, first_s - 1e-6, 2e-6, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M)
+    )
+
+
+def no_fix_yet(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Neither receiver nor terminal has a fix in the window."""
+    return r.withheld(begin_s, begin_s + length_s)
+
+
+def rdss_step(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """RDSS fixes 500 m to the north."""
+
+    def moved(fix: DelayedFix, _: float) -> DelayedFix:
+        return replace(fix, lat_rad=_north_of(fix.lat_rad, fix.height_m, STEP_M))
+
+    return _changed(r, begin_s, length_s, DelayedFix, moved)
+
+
+def rdss_nan(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The latitude of RDSS fixes is not a number."""
+    return _changed(r, begin_s, length_s, DelayedFix, lambda fix, _: replace(fix, lat_rad=math.nan))
+
+
+def wheels_frozen(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The first speed of the window for all of it."""
+    first: list[float] = []
+
+    def repeat(m: WheelSpeed, _: float) -> WheelSpeed:
+        first.append(m.speed_m_s)
+        return replace(m, speed_m_s=first[0])
+
+    return _changed(r, begin_s, length_s, WheelSpeed, repeat)
+
+
+def _wheels_times(r: Recording, begin_s: float, length_s: float, factor: float) -> Recording:
+    return _changed(
+        r, begin_s, length_s, WheelSpeed, lambda m, _: replace(m, speed_m_s=factor * m.speed_m_s)
+    )
+
+
+def wheels_scaled(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Speeds a fifth too large."""
+    return _wheels_times(r, begin_s, length_s, WHEEL_SCALE)
+
+
+def wheels_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Speeds with the wrong sign."""
+    return _wheels_times(r, begin_s, length_s, -1.0)

@@ -1,0 +1,112 @@
+"""Faults of the inertial unit's samples and of their stamps; all in sensor axes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from fusiond.configuration.settings import DEG
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.studies.faults.recording import Recording
+
+RATE_RANGE_RAD_S = 2000.0 * DEG
+FORCE_RANGE_M_S2 = 10.0 * STANDARD_GRAVITY_M_S2
+"""Full scale, chosen as usual for a MEMS unit on a vehicle."""
+SPIKE_RAD_S = 99.0
+STAMP_AHEAD_S = 0.7
+BIAS_STEP_RAD_S = 1.0 * DEG
+TURNED_RAD = 30.0 * DEG
+YAW_AXIS = 2
+
+
+def saturated(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Every axis at its full scale."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s)] = [RATE_RANGE_RAD_S] * 3 + [FORCE_RANGE_M_S2] * 3
+    return replace(r, samples=samples)
+
+
+def stuck(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The sample that the window begins with, again and again."""
+    samples, window = r.samples.copy(), r.window(begin_s, length_s)
+    samples[window] = samples[np.flatnonzero(window)[0]]
+    return replace(r, samples=samples)
+
+
+def all_zero(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """All six axes say zero."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s)] = 0.0
+    return replace(r, samples=samples)
+
+
+def dead_axis(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The gyro of the yaw axis says zero."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s), YAW_AXIS] = 0.0
+    return replace(r, samples=samples)
+
+
+def bias_step(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The gyro of the yaw axis is off by another 1 deg/s."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s), YAW_AXIS] += BIAS_STEP_RAD_S
+    return replace(r, samples=samples)
+
+
+def mount_turned(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The unit has turned by 30 deg about its vertical axis."""
+    c, s = math.cos(TURNED_RAD), math.sin(TURNED_RAD)
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    samples, window = r.samples.copy(), r.window(begin_s, length_s)
+    samples[window] = np.hstack((samples[window, :3] @ turn.T, samples[window, 3:] @ turn.T))
+    return replace(r, samples=samples)
+
+
+def silent(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """No sample comes."""
+    return r.without(r.window(begin_s, length_s))
+
+
+def gyro_spike(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """One sample of the yaw gyro is far out of range."""
+    samples = r.samples.copy()
+    samples[np.flatnonzero(r.window(begin_s, length_s))[0], YAW_AXIS] = SPIKE_RAD_S
+    return replace(r, samples=samples)
+
+
+def not_numbers(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """No figure is a number."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s)] = np.nan
+    return replace(r, samples=samples)
+
+
+def stamp_ahead(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """One sample's stamp lies ahead."""
+    stamps = r.stamps.copy()
+    stamps[np.flatnonzero(r.window(begin_s, length_s))[0]] += round(STAMP_AHEAD_S * 1e9)
+    return replace(r, stamps=stamps)
+
+
+def stamps_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The stamps of the window run backwards."""
+    stamps, window = r.stamps.copy(), r.window(begin_s, length_s)
+    stamps[window] = stamps[window][::-1]
+    return replace(r, stamps=stamps)
+
+
+def force_in_g(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Specific force in standard gravities."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s), 3:] /= STANDARD_GRAVITY_M_S2
+    return replace(r, samples=samples)
+
+
+def rate_in_deg_s(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Rates in degrees a second."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s), :3] /= DEG
+    return replace(r, samples=samples)

@@ -1,0 +1,190 @@
+"""Every fault of the matrix by its name: what it alters, for how long, and in which phases.
+
+`aligning` begins at rest, before the first heading; `navigating` on a straight at 20 m/s with all
+aids; `coasting` in an outage of all fixes, where the faults of IMU and wheels begin in its midst
+and those of fixes with the first that come back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+from fusiond.configuration.aiding import WheelAiding
+from fusiond.configuration.schema import Config
+from fusiond.simulation.trajectories import Leg, Path, follow
+from fusiond.studies.faults import aid_faults as aid
+from fusiond.studies.faults import imu_faults as imu
+from fusiond.studies.faults.recording import BEND_S, DURATION_S, REST_S, Drive, Recording
+
+PhaseName = Literal["aligning", "navigating", "coasting"]
+Alter = Callable[[Recording, float, float], Recording]
+Configure = Callable[[Config], Config]
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """When faults of IMU and wheels and those of fixes begin, and the outage (start, end), in s."""
+
+    imu_s: float
+    fix_s: float
+    outage_s: tuple[float, float] | None = None
+
+
+PHASES: dict[PhaseName, Phase] = {
+    "aligning": Phase(5.0, 5.0),
+    "navigating": Phase(80.0, 80.0),
+    "coasting": Phase(82.0, 100.0, (60.0, 100.0)),
+}
+ALL: tuple[PhaseName, ...] = ("aligning", "navigating", "coasting")
+UNDER_WAY: tuple[PhaseName, ...] = ("navigating", "coasting")
+TO_THE_END = DURATION_S
+TOWN = Drive()
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """`alter` changes the recording for `length_s` from the phase's begin, or from `begin_s`.
+
+    `configure` changes the configuration that the navigator gets, not the vehicle. With neither the
+    drive itself is what may be taken for something else, and nothing is wrong.
+    """
+
+    alter: Alter | None = None
+    length_s: float = TO_THE_END
+    of_imu: bool = False
+    phases: tuple[PhaseName, ...] = ALL
+    begin_s: float | None = None
+    configure: Configure | None = None
+    drive: Drive = TOWN
+
+    def begins_s(self, phase: PhaseName) -> float:
+        """When it begins, s of the drive."""
+        if self.begin_s is not None:
+            return self.begin_s
+        return PHASES[phase].imu_s if self.of_imu else PHASES[phase].fix_s
+
+
+# --------------------------------------------------------------------------- drives
+
+
+_OFF = (Leg(REST_S), Leg(8, speed_m_s=14.0), Leg(12), Leg(8, turn_deg=90.0))
+
+
+def _creeping(speed_m_s: float, duration_s: float) -> Path:
+    """Town speed, and from 80 s on a crawl."""
+    legs = (*_OFF, Leg(17), Leg(20, speed_m_s=speed_m_s), Leg(duration_s))
+    return follow(legs, duration_s, course_deg=40.0)
+
+
+def _turning(rate_deg_s: float, duration_s: float) -> Path:
+    """Town speed, a stop at 80 s, and from 90 s a turn on the spot for a minute."""
+    legs = (
+        *_OFF,
+        Leg(27),
+        Leg(10, speed_m_s=0.0),
+        Leg(10),
+        Leg(60, turn_deg=60.0 * rate_deg_s),
+        Leg(10),
+        Leg(10, speed_m_s=10.0),
+        Leg(duration_s),
+    )
+    return follow(legs, duration_s, course_deg=40.0)
+
+
+def _reversing(duration_s: float) -> Path:
+    """Backwards at 5 m/s first, then forwards."""
+    legs = (Leg(REST_S), Leg(6, speed_m_s=-5.0), Leg(20), Leg(6, speed_m_s=0.0), *_OFF[1:])
+    return follow((*legs, Leg(duration_s)), duration_s, course_deg=40.0)
+
+
+def _smooth(duration_s: float) -> Path:
+    """After a bend straight on at a constant 20 m/s."""
+    legs = (*_OFF, Leg(8, speed_m_s=20.0), Leg(duration_s))
+    return follow(legs, duration_s, course_deg=40.0)
+
+
+# --------------------------------------------------------------------------- configurations
+
+
+def _axes(x: str, y: str, z: str, config: Config) -> Config:
+    section = type(config.imu).model_validate({**config.imu.model_dump(), "axes": (x, y, z)})
+    return config.model_copy(update={"imu": section})
+
+
+def _heading_off(config: Config) -> Config:
+    """The town drive starts with a heading of 40 deg."""
+    update = {"heading": ("config",), "heading_deg": 130.0, "heading_sd_deg": 5.0}
+    return config.model_copy(update={"alignment": config.alignment.model_copy(update=update)})
+
+
+def with_wheels(config: Config) -> Config:
+    """With wheel speeds of the point that does not slide."""
+    section = WheelAiding(lever_arm_m=config.constraints.non_holonomic.lever_arm_m)
+    return config.model_copy(update={"aiding": {**config.aiding, "wheel": section}})
+
+
+_of_imu = partial(Fault, of_imu=True)
+_in_bend = partial(_of_imu, imu.silent, phases=("navigating",), begin_s=BEND_S)
+_of_wheels = partial(_of_imu, length_s=30.0, phases=UNDER_WAY, drive=Drive(wheels=True))
+_from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
+_under_way = partial(Fault, phases=("navigating",))
+
+FAULTS: dict[str, Fault] = {
+    "none": Fault(),
+    # fixes of the receiver
+    "step_500m": Fault(aid.step, 20.0),
+    "position_0n_0e": Fault(aid.null_island, 20.0),
+    "fix_frozen": Fault(aid.frozen, 20.0),
+    "velocity_reversed": Fault(aid.velocity_reversed, 20.0),
+    "drift_0.5_m_s": Fault(aid.drift, 60.0),
+    "false_burst_1khz": Fault(aid.false_burst, 0.5),
+    "sigma_1e-9": Fault(aid.tiny_sigma, 20.0),
+    "sigma_infinite": Fault(aid.infinite_sigma, 1.0),
+    "latitude_nan": Fault(aid.nan_latitude, 1.0),
+    "height_1e300": Fault(aid.huge_height, 0.4),
+    "speed_1e300": Fault(aid.huge_speed, 0.4),
+    "speed_2000_knots": Fault(aid.fast, 20.0),
+    "fixes_twice": Fault(aid.repeated, 20.0),
+    "fixes_from_future": Fault(aid.from_future, 20.0),
+    "multipath_tunnel_jump": _under_way(aid.multipath_tunnel_jump, 60.6),
+    "first_fixes_at_90s": _from_start(aid.no_fix_yet, 90.0, drive=Drive(_smooth)),
+    # RDSS
+    "rdss_step_500m": Fault(aid.rdss_step, 60.0),
+    "rdss_latitude_nan": Fault(aid.rdss_nan, 30.0),
+    # wheels
+    "wheels_frozen": _of_wheels(aid.wheels_frozen),
+    "wheels_scaled": _of_wheels(aid.wheels_scaled),
+    "wheels_reversed": _of_wheels(aid.wheels_reversed),
+    # samples of the IMU
+    "imu_saturated_1s": _of_imu(imu.saturated, 1.0),
+    "imu_stuck_15s": _of_imu(imu.stuck, 15.0),
+    "imu_zero_15s": _of_imu(imu.all_zero, 15.0),
+    "gyro_axis_dead": _of_imu(imu.dead_axis),
+    "gyro_bias_1_deg_s": _of_imu(imu.bias_step),
+    "mount_turned_30_deg": _of_imu(imu.mount_turned),
+    "imu_nan_1s": _of_imu(imu.not_numbers, 1.0),
+    "gyro_spike": _of_imu(imu.gyro_spike, 0.1),
+    "imu_silent_5s_bend": _in_bend(5.0),
+    "imu_silent_15s_bend": _in_bend(15.0),
+    "imu_lost_0.3s_bend": _in_bend(0.3),
+    "imu_lost_0.45s_bend": _in_bend(0.45),
+    # stamps of the IMU
+    "imu_stamp_0.7s_ahead": _of_imu(imu.stamp_ahead, 0.1),
+    "imu_stamps_reversed": _from_start(imu.stamps_reversed),
+    # units, mounting and heading, wrong from the first sample on
+    "force_in_g": _from_start(imu.force_in_g),
+    "rate_in_deg_s": _from_start(imu.rate_in_deg_s),
+    "imu_upside_down": _from_start(configure=partial(_axes, "+x", "+y", "+z")),
+    "imu_backwards": _from_start(configure=partial(_axes, "-x", "+y", "-z")),
+    "heading_off_by_90_deg": _from_start(configure=_heading_off),
+    # drives that look like something else
+    "creeping_0.2_m_s": _under_way(drive=Drive(partial(_creeping, 0.2))),
+    "creeping_0.45_m_s": _under_way(drive=Drive(partial(_creeping, 0.45))),
+    "turning_0.6_deg_s": _under_way(drive=Drive(partial(_turning, 0.6))),
+    "turning_1.8_deg_s": _under_way(drive=Drive(partial(_turning, 1.8))),
+    "smooth_ride": Fault(phases=("coasting",), drive=Drive(_smooth)),
+    "start_in_reverse": Fault(phases=("aligning",), drive=Drive(_reversing)),
+}

@@ -1,0 +1,186 @@
+"""What the sensors of a drive said, and when it came: what a fault alters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.measurements import (
+    DelayedFix,
+    Measurement,
+    MonotonicStamp,
+    PositionFix,
+    WheelSpeed,
+)
+from fusiond.configuration.schema import Config
+from fusiond.configuration.settings import DEG
+from fusiond.simulation.gnss.receiver import GnssReceiver
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.rdss.centre import RdssCentre
+from fusiond.simulation.scenarios import SCENARIOS, random_streams
+from fusiond.simulation.trajectories import Leg, Path, follow
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+DURATION_S = 220.0
+REST_S = 15.0
+BEND_S = 90.0
+"""Start of the bend of 180 deg in `town`, which lasts 15 s at 20 m/s."""
+RDSS_EVERY_S = 11.0
+"""One second more than the service frequency of a 10 s card."""
+WHEEL_EVERY_S = 0.1
+WHEEL_SD_M_S = 0.1
+"""The default of `[aiding.wheel]`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A measurement, the instant it was true and the instant it came (ns)."""
+
+    t_ns: int
+    seen_ns: int
+    measurement: Measurement
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """IMU samples (n, 6) rate and force in sensor axes, their stamps (n,) and arrivals (n,) in ns,
+    and all else in order of arrival."""
+
+    stamps: Stamps
+    imu_seen: Stamps
+    samples: Array
+    received: tuple[Received, ...]
+
+    def window(self, begin_s: float, length_s: float) -> NDArray[np.bool_]:
+        """Which samples (n,) arrive in the window."""
+        begin, end = round(begin_s * 1e9), round((begin_s + length_s) * 1e9)
+        return (self.imu_seen >= begin) & (self.imu_seen < end)
+
+    def without(self, lost: NDArray[np.bool_]) -> Recording:
+        """Without some of the samples."""
+        kept = ~lost
+        return replace(
+            self,
+            stamps=self.stamps[kept],
+            imu_seen=self.imu_seen[kept],
+            samples=self.samples[kept],
+        )
+
+    def withheld(self, begin_s: float, end_s: float) -> Recording:
+        """Without the aids that are valid from `begin_s` to before `end_s`; wheels go on."""
+        begin, end = round(begin_s * 1e9), round(end_s * 1e9)
+        return replace(
+            self,
+            received=tuple(
+                r
+                for r in self.received
+                if isinstance(r.measurement, WheelSpeed) or not begin <= r.t_ns < end
+            ),
+        )
+
+    def with_received(self, received: list[Received]) -> Recording:
+        """With these measurements instead, in order of arrival."""
+        return replace(self, received=tuple(sorted(received, key=lambda r: r.seen_ns)))
+
+
+def town(duration_s: float) -> Path:
+    """Rest, town at 14 and 20 m/s with bends, a stop, and on."""
+    legs = (
+        Leg(REST_S),
+        Leg(8, speed_m_s=14.0),
+        Leg(12),
+        Leg(8, turn_deg=90.0),
+        Leg(8, speed_m_s=20.0),
+        Leg(12, turn_deg=-90.0),
+        Leg(27),
+        Leg(15, turn_deg=180.0),
+        Leg(10),
+        Leg(8, speed_m_s=0.0),
+        Leg(12),
+        Leg(8, speed_m_s=12.0),
+        Leg(10, turn_deg=-120.0),
+        Leg(20),
+        Leg(8, turn_deg=60.0),
+        Leg(duration_s),
+    )
+    return follow(legs, duration_s, course_deg=40.0, bank_ratio=-0.08)
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A motion and the sensors on board. No vibration: what is quiet need not be at rest."""
+
+    path: Callable[[float], Path] = town
+    wheels: bool = False
+    gnss_rate_hz: float = 5.0
+
+    def recorded(self, config: Config, seed: int) -> tuple[Truth, Recording]:
+        """The truth, and what the sensors of the car of `fusiond simulate` say of it, mounted as
+        the configuration has them; the same seed says the same."""
+        car = replace(SCENARIOS["drive"], path=self.path).fitted(config)
+        truth = car.truth(DURATION_S)
+        imu_rng, gnss_rng, rdss_rng, wheel_rng = random_streams(seed)
+        imu = car.imu_output(truth, imu_rng)
+        stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
+        receiver = replace(car.gnss, rate_hz=self.gnss_rate_hz)
+        received = _gnss(GnssReceiver(truth, receiver, gnss_rng))
+        received += _rdss(RdssCentre(truth, car.rdss, rdss_rng))
+        if self.wheels:
+            received += _wheels(truth, wheel_rng)
+        samples = np.hstack((imu.gyro, imu.accel))
+        return truth, Recording(stamps, stamps, samples, ()).with_received(received)
+
+
+def _gnss(receiver: GnssReceiver) -> list[Received]:
+    found = []
+    for k in range(len(receiver)):
+        t_ns, seen_ns = (round(float(t[k]) * 1e9) for t in (receiver.t_s, receiver.t_arrival_s))
+        lat, lon, height = receiver.position[k].tolist()
+        north, east, down = receiver.v_ned[k].tolist()
+        fix = PositionFix(
+            "gnss",
+            seen_ns,
+            MonotonicStamp(t_ns),
+            lat,
+            lon,
+            height,
+            satellites=receiver.options.satellites,
+            sd_ned_m=receiver.sd_ned_m,
+            v_ned_m_s=(north, east, down),
+            sd_v_ned_m_s=receiver.sd_v_ned_m_s,
+        )
+        found.append(Received(t_ns, seen_ns, fix))
+    return found
+
+
+def _rdss(centre: RdssCentre) -> list[Received]:
+    found = []
+    for t_s in np.arange(RDSS_EVERY_S, DURATION_S, RDSS_EVERY_S).tolist():
+        fix = centre.fix(t_s, None)
+        t_ns, seen_ns = round(fix.t_s * 1e9), round(fix.t_arrival_s * 1e9)
+        measured = DelayedFix(
+            "rdss",
+            seen_ns,
+            MonotonicStamp(t_ns),
+            fix.lat_deg * DEG,
+            fix.lon_deg * DEG,
+            fix.height_m,
+            fix.precision_class_m,
+        )
+        found.append(Received(t_ns, seen_ns, measured))
+    return found
+
+
+def _wheels(truth: Truth, rng: np.random.Generator) -> list[Received]:
+    """Speed of the point that follows the path."""
+    t_s = np.arange(WHEEL_EVERY_S, truth.duration_s, WHEEL_EVERY_S)
+    speed = truth.path.speed(t_s)[0] + WHEEL_SD_M_S * rng.standard_normal(len(t_s))
+    found = []
+    for t, v in zip(np.rint(t_s * 1e9).astype(int).tolist(), speed.tolist(), strict=True):
+        found.append(Received(t, t, WheelSpeed("wheel", t, MonotonicStamp(t), v, WHEEL_SD_M_S)))
+    return found

@@ -1,0 +1,166 @@
+"""One row of the matrix: a drive, its fault, the navigator that gets it, and what it says.
+
+The navigator is fed as the daemon feeds it: at each tick the samples that have come, then the
+measurements in order of arrival, then the filter as far as the IMU reaches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.configuration.schema import Config
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.navigator import Navigator
+from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
+from fusiond.studies.faults.judge import Course, Event, Sample, axis_ratio, judge
+from fusiond.studies.faults.library import FAULTS, PHASES, Fault, PhaseName, with_wheels
+from fusiond.studies.faults.recording import DURATION_S, Drive, Recording
+
+Array = NDArray[np.float64]
+
+TICKS_PER_S = 10
+"""The `nav_rate_hz` of `config/vehicle.toml`."""
+ANTENNA_M = (0.0, 0.0, -1.0)
+VEHICLE = Config.model_validate(
+    {
+        "imu": {
+            "axes": ("+x", "-y", "-z"),
+            "rate_hz": 100.0,
+            "gyro_noise_deg_sqrt_h": 0.3,
+            "accel_noise_m_s_sqrt_h": 0.1,
+            "gyro_bias_instability_deg_h": 10.0,
+            "accel_bias_instability_mg": 0.1,
+        },
+        "aiding": {
+            "gnss": {"lever_arm_m": ANTENNA_M, "range_error_m": 3.0},
+            "rdss": {"lever_arm_m": ANTENNA_M},
+        },
+        "constraints": {"non_holonomic": {"enabled": True, "lever_arm_m": (-1.0, 0.0, 0.5)}},
+        "estimator": {"model": "ins21"},
+    }
+)
+"""`config/vehicle.toml` without its devices; a test holds them together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A fault in a phase."""
+
+    fault: str
+    phase: PhaseName
+
+
+def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
+    """The matrix, or a part of it."""
+    return [
+        Row(name, p)
+        for name, fault in FAULTS.items()
+        for p in fault.phases
+        if only in (None, name) and phase in (None, p)
+    ]
+
+
+def run_row(row: Row, seed: int) -> dict[str, Any]:
+    """The figures of a row; the same seed gives the same."""
+    fault = FAULTS[row.fault]
+    begin_s = fault.begins_s(row.phase)
+    harmless = fault.alter is None and fault.configure is None
+    end_s = begin_s if harmless else min(begin_s + fault.length_s, DURATION_S)
+    reference = _unharmed(fault.drive, row.phase, seed)
+    course = reference if harmless else _driven(fault, row.phase, seed)
+    found = judge(course, reference, begin_s, end_s)
+    return {"fault": row.fault, "phase": row.phase, "begin_s": begin_s, "end_s": end_s, **found}
+
+
+@lru_cache(maxsize=8)
+def _unharmed(drive: Drive, phase: PhaseName, seed: int) -> Course:
+    """The same drive with nothing wrong."""
+    return _driven(Fault(drive=drive), phase, seed)
+
+
+def _driven(fault: Fault, phase: PhaseName, seed: int) -> Course:
+    vehicle = with_wheels(VEHICLE) if fault.drive.wheels else VEHICLE
+    truth, recording = fault.drive.recorded(vehicle, seed)
+    outage = PHASES[phase].outage_s
+    if outage is not None:
+        recording = recording.withheld(*outage)
+    if fault.alter is not None:
+        recording = fault.alter(recording, fault.begins_s(phase), fault.length_s)
+    config = vehicle if fault.configure is None else fault.configure(vehicle)
+    return navigate(config, recording, truth)
+
+
+def navigate(config: Config, recording: Recording, truth: Truth) -> Course:
+    """Feed a navigator with a recording; compare it with the truth at every second."""
+    samples: list[Sample] = []
+    events: list[Event] = []
+    now_s = 0.0
+
+    def hear(code: str, text: str) -> None:
+        events.append(Event(now_s, code, text))
+
+    navigator = Navigator(config, on_event=hear)
+    given = taken = 0
+    received = recording.received
+    for tick in range(1, round(truth.duration_s * TICKS_PER_S) + 1):
+        now_s = tick / TICKS_PER_S
+        now_ns = round(now_s * 1e9)
+        end = int(np.searchsorted(recording.imu_seen, now_ns, side="right"))
+        try:
+            if end > given:
+                navigator.add_imu(recording.stamps[given:end], recording.samples[given:end])
+            given = end
+            while taken < len(received) and received[taken].seen_ns <= now_ns:
+                item = received[taken]
+                taken += 1
+                navigator.add(item.measurement, item.t_ns, 0.0, item.seen_ns)
+            navigator.advance()
+            if tick % TICKS_PER_S == 0:
+                samples.append(compared(navigator.solution(now_ns), truth))
+        except Exception as error:  # whatever leaves the navigator ends the daemon: a finding
+            return Course(samples, events, f"{type(error).__name__} at {now_s:g} s: {error}")
+    return Course(samples, events)
+
+
+def compared(solution: Solution, truth: Truth) -> Sample:
+    """A solution against the truth at its instant."""
+    t_s = solution.t_ns * 1e-9
+    if solution.mode in (Mode.WAITING, Mode.ALIGNING):
+        return Sample(t_s, str(solution.mode))
+    true = truth.at(np.array([t_s]))
+    place = _position_error_m(solution, true)
+    velocity = [v - w for v, w in zip(solution.v_ned_m_s, true.v_ned[0].tolist(), strict=True)]
+    turn = [_wrapped(a - b) for a, b in zip(solution.rpy_rad, true.rpy[0].tolist(), strict=True)]
+    ratios = (
+        _ratio(place[:2], solution.sd_ned_m[:2]),
+        _ratio(place[2:], solution.sd_ned_m[2:]),
+        _ratio(velocity[:2], solution.sd_v_ned_m_s[:2]),
+        _ratio(turn[2:], solution.sd_rpy_rad[2:]),
+        _ratio(turn[:2], solution.sd_rpy_rad[:2]),
+    )
+    horizontal_m = math.hypot(place[0], place[1])
+    return Sample(t_s, str(solution.mode), ratios, horizontal_m, math.degrees(turn[2]))
+
+
+def _ratio(errors: Sequence[float], sigmas: Sequence[float]) -> float:
+    return max(axis_ratio(e, s) for e, s in zip(errors, sigmas, strict=True))
+
+
+def _wrapped(angle_rad: float) -> float:
+    """Into -pi to pi; not a number stays none."""
+    return math.remainder(angle_rad, 2.0 * math.pi) if math.isfinite(angle_rad) else math.nan
+
+
+def _position_error_m(solution: Solution, true: States) -> list[float]:
+    """North, east, down."""
+    unit = metres_to_geodetic(true.position[:, 0], true.position[:, 2], np.ones((1, 3)))[0]
+    lat, lon, height = true.position[0].tolist()
+    apart = solution.lat_rad - lat, _wrapped(solution.lon_rad - lon), solution.height_m - height
+    return [a / u for a, u in zip(apart, unit.tolist(), strict=True)]

@@ -1,0 +1,234 @@
+"""The fault matrix: its judge on made-up courses, its faults on a recording, a row end to end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix, WheelSpeed
+from fusiond.configuration.load import load_config
+from fusiond.studies.faults import aid_faults, imu_faults
+from fusiond.studies.faults.judge import (
+    QUANTITIES,
+    Course,
+    Event,
+    Sample,
+    axis_ratio,
+    judge,
+    longest_lie_s,
+    recovered_s,
+)
+from fusiond.studies.faults.library import FAULTS, PHASES
+from fusiond.studies.faults.recording import Received, Recording
+from fusiond.studies.faults.runs import VEHICLE, Row, rows, run_row
+
+GOOD = (1.0,) * len(QUANTITIES)
+BEGIN_S, END_S = 10.0, 20.0
+
+
+def course(
+    beyond: range = range(0), mode: str = "navigating", events: tuple[Event, ...] = ()
+) -> Course:
+    """Forty seconds; the yaw is six sigma off in the seconds of `beyond`, in that mode."""
+    bad = (1.0, 1.0, 1.0, 6.0, 1.0)
+    samples = [
+        Sample(float(t), mode, bad, 3.0, -7.0)
+        if t in beyond
+        else Sample(float(t), "navigating", GOOD, 1.0, 0.5)
+        for t in range(1, 41)
+    ]
+    return Course(samples, events)
+
+
+def verdict(of: Course) -> str:
+    return str(judge(of, course(), BEGIN_S, END_S)["verdict"])
+
+
+def test_two_seconds_beyond_are_no_lie_and_three_are() -> None:
+    assert verdict(course(range(12, 14))) == "survived"
+    assert verdict(course(range(12, 15))) == "silent lie"
+
+
+def test_seconds_beyond_that_are_apart_do_not_add_up() -> None:
+    samples = list(course(range(12, 14)).samples)
+    samples[14:16] = course(range(15, 17)).samples[14:16]  # one good second between
+    assert longest_lie_s(samples) == 2.0
+
+
+@pytest.mark.parametrize("quantity", range(len(QUANTITIES)))
+def test_each_quantity_can_lie(quantity: int) -> None:
+    ratios = tuple(5.1 if k == quantity else 0.0 for k in range(len(QUANTITIES)))
+    samples = [Sample(float(t), "navigating", ratios) for t in range(1, 5)]
+    found = judge(Course(samples, ()), course(), 1.0, 2.0)
+    assert found["verdict"] == "silent lie"
+    assert found["largest_ratio_of"] == QUANTITIES[quantity]
+
+
+def test_quantities_that_take_turns_are_one_lie() -> None:
+    samples = [
+        Sample(float(t), "navigating", tuple(9.0 if k == t else 0.0 for k in range(5)))
+        for t in range(4)
+    ]
+    assert longest_lie_s(samples) == 4.0
+
+
+def test_exactly_five_sigma_is_no_lie() -> None:
+    samples = [Sample(float(t), "navigating", (5.0,) * 5) for t in range(10)]
+    assert longest_lie_s(samples) == 0.0
+
+
+@pytest.mark.parametrize("mode", ["coasting", "invalid", "aligning"])
+def test_another_mode_does_not_vouch(mode: str) -> None:
+    found = judge(course(range(12, 30), mode), course(), BEGIN_S, END_S)
+    assert found["verdict"] == "degraded and said so"
+    assert found["noticed_s"] == 2.0
+    assert found["largest_horizontal_m"] == 1.0  # what no mode vouched for does not count
+
+
+def test_a_lie_with_an_event_is_a_lie() -> None:
+    event = Event(11.0, "verdict_too_small", "gnss")
+    found = judge(course(range(12, 30), events=(event,)), course(), BEGIN_S, END_S)
+    assert found["verdict"] == "silent lie"
+    assert found["noticed_s"] == 1.0
+
+
+def test_an_event_that_comes_without_the_fault_says_nothing() -> None:
+    usual = Event(15.0, "verdict_coloured", "gnss")
+    reference = course(events=(usual,))
+    assert judge(reference, reference, BEGIN_S, END_S)["verdict"] == "survived"
+    twice = course(events=(usual, replace(usual, t_s=18.0)))
+    assert judge(twice, reference, BEGIN_S, END_S)["noticed_s"] == 8.0
+
+
+def test_an_event_before_the_fault_does_not_notice_it() -> None:
+    assert verdict(course(events=(Event(9.0, "isolated", "gnss"),))) == "survived"
+
+
+def test_a_crash_comes_before_every_other_verdict() -> None:
+    assert verdict(replace(course(range(12, 30)), crash="ValueError")) == "crashed"
+
+
+def test_what_cannot_be_compared_is_beyond() -> None:
+    for error, sigma in ((math.nan, 1.0), (1.0, math.nan), (1.0, 0.0), (1.0, math.inf)):
+        assert axis_ratio(error, sigma) == math.inf
+    assert axis_ratio(-3.0, 2.0) == 1.5
+    samples = [Sample(float(t), "navigating", (math.inf,) * 5, math.nan) for t in range(1, 9)]
+    found = judge(Course(samples, ()), course(), 1.0, 2.0)
+    assert found["verdict"] == "silent lie"
+    assert found["largest_ratio"] is None
+    assert found["largest_horizontal_m"] is None
+
+
+def test_recovery_is_five_good_seconds() -> None:
+    assert recovered_s(course(range(12, 25)).samples, END_S) == 5.0
+    assert recovered_s(course(range(12, 40)).samples, END_S) is None
+
+
+# --------------------------------------------------------------------------- faults
+
+
+def recording() -> Recording:
+    """Thirty seconds at 10 Hz, a fix a second that comes 0.1 s late, RDSS and wheels."""
+    stamps = np.arange(1, 301, dtype=np.int64) * 100_000_000
+    samples = np.random.default_rng(0).standard_normal((300, 6))
+    received = []
+    for t in range(1_000_000_000, 30_000_000_000, 1_000_000_000):
+        fix = PositionFix(
+            "gnss", t, MonotonicStamp(t), 0.5, 2.0, 40.0, v_ned_m_s=(1.0, 2.0, float(t) * 1e-9)
+        )
+        late = DelayedFix("rdss", t, MonotonicStamp(t), 0.5, 2.0, 40.0, 20.0)
+        wheel = WheelSpeed("wheel", t, MonotonicStamp(t), t * 1e-9)
+        received += [Received(t, t + 100_000_000, m) for m in (fix, late, wheel)]
+    return Recording(stamps, stamps, samples, tuple(received))
+
+
+@pytest.mark.parametrize("name", sorted(FAULTS))
+def test_a_fault_alters_nothing_before_it_begins(name: str) -> None:
+    alter = FAULTS[name].alter
+    if alter is None:
+        assert (
+            FAULTS[name].configure is not None
+            or name in {"none", "start_in_reverse"}
+            or (FAULTS[name].drive != FAULTS["none"].drive)
+        )
+        return
+    whole = recording()
+    found = alter(whole, 10.0, 5.0)
+    early = whole.imu_seen < 10_000_000_000
+    np.testing.assert_array_equal(found.stamps[: early.sum()], whole.stamps[early])
+    np.testing.assert_array_equal(found.samples[: early.sum()], whole.samples[early])
+
+    def before(r: Recording) -> list[Received]:
+        return [item for item in r.received if item.t_ns < 9_999_000_000]
+
+    assert before(found) == before(whole)
+    same_imu = np.array_equal(found.samples, whole.samples, equal_nan=True)
+    same_stamps = np.array_equal(found.stamps, whole.stamps)
+    assert not (same_imu and same_stamps and found.received == whole.received)
+
+
+def test_a_step_is_500_m_to_the_north_in_the_window_alone() -> None:
+    whole = recording()
+    found = aid_faults.step(whole, 10.0, 5.0)
+    for was, now in zip(whole.received, found.received, strict=True):
+        assert now.seen_ns == was.seen_ns
+        if not isinstance(was.measurement, PositionFix):
+            assert now == was
+            continue
+        assert isinstance(now.measurement, PositionFix)
+        moved_m = (now.measurement.lat_rad - was.measurement.lat_rad) * 6.37e6
+        inside = 10_000_000_000 <= was.t_ns < 15_000_000_000
+        assert moved_m == pytest.approx(500.0 if inside else 0.0, rel=0.01)
+
+
+def test_silence_is_a_gap_and_a_turned_mount_keeps_lengths() -> None:
+    whole = recording()
+    quiet = imu_faults.silent(whole, 10.0, 5.0)
+    assert len(quiet.stamps) == len(whole.stamps) - 50
+    assert np.diff(quiet.stamps).max() == 5_100_000_000
+    turned = imu_faults.mount_turned(whole, 10.0, 5.0).samples
+    for part in (slice(0, 3), slice(3, 6)):
+        lengths = np.linalg.norm(turned[:, part], axis=1)
+        np.testing.assert_allclose(lengths, np.linalg.norm(whole.samples[:, part], axis=1))
+
+
+def test_multipath_jumps_again_behind_the_tunnel() -> None:
+    found = aid_faults.multipath_tunnel_jump(recording(), 10.0, 10.0)
+    moved = [
+        item.t_ns // 1_000_000_000
+        for item in found.received
+        if isinstance(item.measurement, PositionFix) and item.measurement.lat_rad != 0.5
+    ]
+    assert moved == [10, 20]
+    fixes = {
+        item.t_ns // 1_000_000_000
+        for item in found.received
+        if isinstance(item.measurement, PositionFix | DelayedFix)
+    }
+    assert fixes == {*range(1, 11), *range(20, 30)}
+
+
+def test_every_fault_has_rows_and_begins_inside_the_drive() -> None:
+    found = rows()
+    assert {row.fault for row in found} == set(FAULTS)
+    assert all(0.0 <= FAULTS[r.fault].begins_s(r.phase) < 220.0 for r in found)
+    assert rows("none", "coasting") == [Row("none", "coasting")]
+    begin, end = PHASES["coasting"].outage_s or (0.0, 0.0)
+    assert begin + 10.0 < PHASES["coasting"].imu_s < end == PHASES["coasting"].fix_s
+
+
+def test_the_vehicle_is_the_shipped_one() -> None:
+    shipped = load_config(Path(__file__).parents[2] / "config" / "vehicle.toml")
+    for section in ("imu", "aiding", "constraints", "alignment", "estimator", "consistency"):
+        assert getattr(VEHICLE, section) == getattr(shipped, section)
+
+
+def test_a_row_repeats_and_nothing_wrong_is_survived() -> None:
+    found = run_row(Row("none", "navigating"), seed=0)
+    assert found["verdict"] == "survived"
+    assert found["recovered_s"] is not None
+    assert found["crash"] is None
