@@ -29,7 +29,9 @@ for purpose in "$@"; do
         need iproute2 "sets up vcan0"
         need kmod "loads the CAN modules of the test kernel"
         need can-utils "candump, to look at a bus by hand"
-        command -v systemd-analyze >/dev/null || need systemd "systemd-analyze verifies the unit"
+        need systemd "verifies the unit, and installs and runs it in the test kernel"
+        need udev "udevadm, which the installation calls"
+        need openssl "certificates for the tests of the broker"
         if [ "$(dpkg --print-architecture)" = amd64 ]; then
             need user-mode-linux "a kernel with vcan, for hosts that have none"
             if grep -q amx_tile /proc/cpuinfo && ! command -v cc >/dev/null; then

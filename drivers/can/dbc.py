@@ -20,8 +20,9 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from drivers.base import PermanentDriverError
+from drivers.shipped import shipped
 
-SHIPPED = Path(__file__).resolve().parents[2] / "config" / "dbc"
+SHIPPED = shipped("dbc")
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 """Standard acceleration of gravity: 3rd CGPM (1901), the `g` of every data sheet."""
@@ -138,10 +139,10 @@ def find_dbc(name: str) -> Path:
     for path in (Path(name), SHIPPED / name, SHIPPED / f"{name}.dbc"):
         if path.is_file():
             return path
-    shipped = sorted(path.stem for path in SHIPPED.glob("*.dbc"))
+    names = sorted(path.stem for path in SHIPPED.glob("*.dbc"))
     raise PermanentDriverError(
         f"dbc: there is no file {name!r}, neither here ({Path.cwd()}) nor among the shipped ones: "
-        f"{', '.join(shipped)}"
+        f"{', '.join(names)}"
     )
 
 

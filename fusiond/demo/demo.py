@@ -25,9 +25,10 @@ import aiomqtt
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.shipped import shipped
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config, Source
-from fusiond.demo.broker import DemoBroker, DemoError
+from fusiond.demo.broker import DemoBroker
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -40,7 +41,7 @@ from fusiond.simulation.vehicle import SimulatedVehicle
 
 Array = NDArray[np.float64]
 
-CONFIG = Path(__file__).resolve().parents[2] / "config" / "vehicle.toml"
+CONFIG = shipped("vehicle.toml")
 VEHICLE = "demo"
 REST_S = 8.0
 OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S = 18.0, 12.0, 60.0
@@ -72,8 +73,6 @@ def demo(duration_s: float, headless: bool) -> dict[str, Any]:
     and `rejected` count aids (IMU samples stand in `fused_by_source`). Raises `DemoError` if
     something is not installed.
     """
-    if not CONFIG.is_file():
-        raise DemoError(f"{CONFIG} is not there: run the demo from a checkout (make demo)")
     with (
         DemoBroker() as broker,
         tempfile.TemporaryDirectory(prefix="fusiond-demo-") as folder,

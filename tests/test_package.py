@@ -1,0 +1,100 @@
+"""The package as a vehicle installs it: a wheel in a virtual environment, no checkout beside it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.places import REPOSITORY
+
+CONFIG = REPOSITORY / "config"
+
+
+def _run(*command: str | Path, folder: Path) -> str:
+    """Run in `folder`, where nothing of the checkout is found; standard output."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    run = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy of what `systemd/README.md` copies: a build leaves folders behind."""
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, folder)
+    for name in ("fusiond", "drivers", "config"):
+        shutil.copytree(
+            REPOSITORY / name,
+            folder / name,
+            symlinks=True,
+            ignore=shutil.ignore_patterns("__pycache__"),
+        )
+    options = ("--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir", "out")
+    _run(sys.executable, "-m", "pip", "wheel", *options, ".", folder=folder)
+    (built,) = (folder / "out").glob("fusiond-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`bin` of an environment with the wheel; its dependencies are those of the tests."""
+    folder = tmp_path_factory.mktemp("installed")
+    _run(sys.executable, "-m", "venv", "--without-pip", "venv", folder=folder)
+    python = folder / "venv" / "bin" / "python"
+    pip = (sys.executable, "-m", "pip", "--python", python)
+    _run(*pip, "install", "--no-deps", "--quiet", wheel, folder=folder)
+    # A line of a .pth file is only looked at after the environment's own packages, and editable
+    # installations of what it names do not follow along.
+    packages = _run(
+        python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", folder=folder
+    )
+    (Path(packages.strip()) / "tests.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return python.parent
+
+
+def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
+    shipped = {
+        f"drivers/config/{path.relative_to(CONFIG)}": path.read_bytes()
+        for path in CONFIG.rglob("*")
+        if path.is_file()
+    }
+    with zipfile.ZipFile(wheel) as archive:
+        held = {
+            name: archive.read(name)
+            for name in archive.namelist()
+            if name.startswith("drivers/config/")
+        }
+    assert held == shipped
+    assert {"drivers/config/vehicle.toml", "drivers/config/dbc/xsens_mti600.dbc"} < set(held)
+
+
+def test_shipped_files_are_the_installed_ones(installed: Path, tmp_path: Path) -> None:
+    where = _run(
+        installed / "python",
+        "-c",
+        "from drivers.can.dbc import find_dbc; print(find_dbc('xsens_mti600'))\n"
+        "from drivers.shipped import shipped; print(shipped('vehicle.toml'))",
+        folder=tmp_path,
+    )
+    for path in map(Path, where.split()):
+        assert path.is_file()
+        assert path.is_relative_to(installed.parent)
+
+
+def test_a_shipped_dbc_is_found_from_anywhere(installed: Path, tmp_path: Path) -> None:
+    example = tmp_path / "vehicle.toml"
+    shutil.copy(CONFIG / "vehicle.toml", example)
+    assert 'dbc = "xsens_mti600"' in example.read_text()
+    report = _run(installed / "fusiond", "check", example, folder=tmp_path)
+    assert f"{example}: ok" in report.replace("\n", "")
