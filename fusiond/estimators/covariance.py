@@ -46,7 +46,7 @@ def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
     unsigned = np.uint64  # an index that cannot be negative needs no check
     wide = np.uint64(width)
 
-    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])", forceinline=True)
+    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])", variant=width, forceinline=True)
     def gather(rows: Array, sensor_slot: Indices, weight: Array, sensor: Array) -> None:
         """sensor (6 rows): the parameters' rows of `rows`, two an axis error, weighted."""
         for k in range(6):
@@ -87,7 +87,8 @@ def covariance_for(width: int) -> Callable[..., None]:
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8,"
-        "f8[::1])"
+        "f8[::1])",
+        variant=width,
     )
     def propagate_covariance(
         cov: Array,
@@ -181,7 +182,8 @@ def transition_for(width: int) -> Callable[..., None]:
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "f8[::1])"
+        "f8[::1])",
+        variant=width,
     )
     def propagate_transition(
         phi: Array,

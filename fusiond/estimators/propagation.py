@@ -117,7 +117,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1],"
         "f8[::1], b1, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "i8[::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], b1)"
+        "i8[::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], b1)",
+        variant=width,
     )
     def propagate(
         nav: Array,

@@ -119,7 +119,7 @@ def coefficients(nav: Array, step: Array, h: float, c: Array) -> None:
 def apply_for(width: int) -> Callable[[Array, Array, Array, Array], None]:
     """`apply` for rows of `width` doubles: a constant, so that the loop becomes vector code."""
 
-    @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])", forceinline=True)
+    @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1])", variant=width, forceinline=True)
     def apply(rows: Array, sensor: Array, c: Array, out: Array) -> None:
         """out (9 rows) = transition times the nine rows of `rows` and the six of `sensor`.
 

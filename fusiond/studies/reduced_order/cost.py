@@ -61,7 +61,8 @@ def _recursions_for(width: int) -> Callable[..., None]:
 
     @compiled(
         "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])"
+        "f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])",
+        variant=width,
     )
     def recursions(
         count: int,

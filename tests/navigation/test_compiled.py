@@ -1,0 +1,207 @@
+"""The cache of compiled kernels: symbols of several processes side by side, and damage on disk.
+
+Each step is a process of its own, as it is for a user: what one compiles, the next one links. The
+kernels are a module made for the test, since the filters' take a minute to compile.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fusiond.navigation.compiled import compiled
+
+# `scaled` is too long to be inlined: a caller links to it by symbol.
+KERNELS = """
+import math
+from functools import cache
+
+from fusiond.navigation.compiled import compiled
+
+
+@compiled("f8(f8)")
+def halved(x):
+    return 0.5 * x
+
+
+@cache
+def scaled_for(factor):
+    @compiled("f8(f8)", variant=factor)
+    def scaled(x):
+        y = factor * halved(x)
+LONG
+        return y
+
+    return scaled
+""".replace("LONG", "\n".join(f"        y += 0.0 * math.sin({k}.0 * x)" for k in range(80)))
+
+
+Run = Callable[[str], subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """Runs Python code in a new process, with `kernels` to import and the cache of the test."""
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": path,
+    }
+
+    def in_a_process(code: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+
+    return in_a_process
+
+
+IN_ORDER = "import kernels; print([kernels.scaled_for(k)(1.0) for k in {}])"
+
+
+def _kept(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.kernel"))
+
+
+CALLER = """
+from fusiond.navigation.compiled import compiled
+from kernels import scaled_for
+scaled = scaled_for({factor})
+
+
+@compiled("f8(f8)")
+def called(x):
+    return 1.0 + scaled(x)
+"""
+
+
+def test_variants_compiled_by_different_processes_stay_apart(run: Run, tmp_path: Path) -> None:
+    """Each process counts its variant as the same one; a caller that was cached links by symbol."""
+    for name, factor in (("four", 4), ("six", 6)):
+        (tmp_path / f"{name}.py").write_text(CALLER.format(factor=factor))
+        result = run(f"import {name}; print({name}.called(1.0))")
+        assert result.stdout == f"{1.0 + 0.5 * factor}\n", result.stderr
+    code = (
+        "import kernels; kernels.scaled_for(4); kernels.scaled_for(6)\n"
+        "import four, six; print(four.called(1.0), six.called(1.0))"
+    )
+    result = run(code)
+    assert (result.returncode, result.stdout) == (0, "3.0 4.0\n"), result.stderr
+
+
+def test_names_do_not_depend_on_the_order_of_compiling(run: Run, tmp_path: Path) -> None:
+    def names(factors: tuple[int, ...]) -> set[str]:
+        run(IN_ORDER.format(factors))
+        files = _kept(tmp_path / "cache")
+        for file in files:
+            file.unlink()
+        return {file.name for file in files}
+
+    forward = names((4, 6, 8))
+    assert len(forward) == 4
+    assert names((8, 6, 4)) == forward
+
+
+def test_no_two_kernels_share_a_symbol_across_processes(run: Run, tmp_path: Path) -> None:
+    """The number that numba counts may repeat between processes; the rest of a name must not."""
+    code = (
+        "import kernels, itertools; from numba.core.bytecode import FunctionIdentity as f;"
+        "f._unique_ids = itertools.count(1); kernels.scaled_for({})"
+    )
+    for factor in (4, 6, 8):
+        assert run(code.format(factor)).returncode == 0
+    sys.path.insert(0, str(tmp_path))  # the descriptors name their module
+    try:
+        symbols = [
+            pickle.loads(file.read_bytes()[32:])[1].mangled_name
+            for file in _kept(tmp_path / "cache")
+        ]
+    finally:
+        sys.path.remove(str(tmp_path))
+    assert len(symbols) == 4
+    assert len(set(symbols)) == 4
+
+
+def test_counts_of_two_processes_do_not_meet(run: Run) -> None:
+    code = (
+        "import fusiond.navigation.compiled; from numba.core.bytecode import FunctionIdentity as f;"
+        "print(f.from_function(lambda: 0).unique_id)"
+    )
+    first, second = int(run(code).stdout), int(run(code).stdout)
+    assert abs(first - second) > 100_000
+
+
+def test_a_second_kernel_of_the_same_name_is_refused() -> None:
+    def make() -> None:
+        @compiled("f8(f8)")
+        def _again(x: float) -> float:
+            return x
+
+    make()
+    with pytest.raises(ValueError, match=r"two kernels of the name .*_again"):
+        make()
+
+
+def _cut_short(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def _empty(file: Path) -> None:
+    file.write_bytes(b"")
+
+
+def _flip(at: float) -> Callable[[Path], None]:
+    def flip(file: Path) -> None:
+        data = bytearray(file.read_bytes())
+        data[int(at * (len(data) - 1))] ^= 0x10
+        file.write_bytes(data)
+
+    return flip
+
+
+def _folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+    (file / "something").write_text("in the way")
+
+
+DAMAGES = (_cut_short, _empty, _flip(0.0), _flip(0.3), _flip(0.6), _flip(1.0), _folder)
+
+
+def test_damaged_kernels_are_compiled_anew(run: Run, tmp_path: Path) -> None:
+    """Each file in another way: digest, native code and bitcode among what is altered."""
+    code = IN_ORDER.format(range(6))
+    right = f"{[0.5 * k for k in range(6)]}\n"
+    assert run(code).stdout == right
+    for file, damage in zip(_kept(tmp_path / "cache"), DAMAGES, strict=True):
+        damage(file)
+    result = run(code)
+    assert (result.returncode, result.stdout) == (0, right), result.stderr
+    assert result.stderr.count("the kernel is compiled anew") == len(DAMAGES)
+    again = run(code)
+    assert (again.stdout, again.stderr) == (right, "")
+
+
+def test_kernels_run_where_nothing_can_be_kept(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "cache").write_text("no folder")  # holds for root as well, unlike permissions
+    result = run(IN_ORDER.format((4,)))
+    assert (result.returncode, result.stdout) == (0, "[2.0]\n"), result.stderr
+
+
+def test_a_process_killed_while_it_writes_leaves_no_half_kernel(run: Run, tmp_path: Path) -> None:
+    killed = run("import os; os.replace = lambda *_: os.kill(os.getpid(), 9)\nimport kernels")
+    assert killed.returncode == -9
+    assert not _kept(tmp_path / "cache")
+    assert run(IN_ORDER.format((4,))).stdout == "[2.0]\n"
