@@ -19,9 +19,10 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.screening import KEPT
 from fusiond.gnss.orbit import is_beidou_geo
 from fusiond.models.model import make_model
-from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.navigator.raw_gnss import RawGnss, raw_blocks
 from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
 from fusiond.simulation.scenarios import SCENARIOS
 
@@ -56,7 +57,7 @@ def raw_epoch(_: int) -> Callable[[], int]:
             assert outcome.name == "fused"
             assert len(outcome.rows) == 2 * SATELLITES
             raw.judged(aid, outcome)
-            per_system(aid, outcome)
+            aid.series(outcome.whitened, [code == KEPT for code in outcome.rows])
         return EPOCHS
 
     work()

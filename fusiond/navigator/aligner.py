@@ -8,17 +8,14 @@ No heading, no navigation: `reason` says what is missing.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.attitude import AttitudeAid, HeadingAid
-from fusiond.aiding.base import Linearised
-from fusiond.aiding.height import HeightAid
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.rdss_position import RdssPositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import HeadingOffer, HeightOffer, PositionOffer, VelocityOffer
 from fusiond.models.model import ImuNoise, Model
 from fusiond.navigation.alignment import (
     gyrocompass,
@@ -110,9 +107,9 @@ class Aligner:
         self._ever_moved = False
         self._pending: Window | None = None
         self._speed = 0.0
-        self._position: PositionAid | None = None
-        self._heading: tuple[int, float, float] | None = None
-        self._fixes: list[tuple[VelocityAid, PositionAid]] = []
+        self._position: PositionOffer | None = None
+        self._heading: HeadingOffer | None = None
+        self._fixes: list[tuple[VelocityOffer, PositionOffer]] = []
 
     def window(self, latest: Window) -> None:
         """A window of the standstill detector has ended.
@@ -143,37 +140,31 @@ class Aligner:
         s.rate_sum += w.mean_rate * self._window_s
         s.force_sum += w.mean_force * self._window_s
 
-    def aids(self, aids: list[Linearised]) -> None:
+    def aids(self, aids: Sequence[Aid]) -> None:
         """A measurement has arrived, as the aids it stands for."""
-        for aid in aids:
-            if isinstance(aid, RdssPositionAid):
-                height = next((a.height_m for a in aids if isinstance(a, HeightAid)), None)
-                sd_n, sd_e = math.sqrt(aid.covariance[0]), math.sqrt(aid.covariance[2])
-                sd_d = next((a.sd_m for a in aids if isinstance(a, HeightAid)), sd_n)
-                aid = PositionAid(  # noqa: PLW2901 - a horizontal fix is a fix
-                    aid.source,
-                    aid.t_ns,
-                    aid.gate,
-                    aid.lat_rad,
-                    aid.lon_rad,
-                    height,
-                    (sd_n, sd_e, sd_d),
-                    aid.lever,
-                )
-            if isinstance(aid, PositionAid):
-                if self._position is None or aid.t_ns >= self._position.t_ns:
-                    self._position = aid
-            elif isinstance(aid, HeadingAid):
-                self._heading = (aid.t_ns, aid.yaw_rad, aid.sd_rad)
-            elif isinstance(aid, AttitudeAid) and not (aid.block or math.isnan(aid.rpy[2])):
-                # Of a sensor that is mounted askew the start would have the misalignment itself,
-                # and the filter would then find the two to agree.
-                self._heading = (aid.t_ns, aid.rpy[2], aid.sd[2])
-            elif isinstance(aid, VelocityAid):
-                self._speed = math.hypot(*aid.v_ned[:2])
-                position = [a for a in aids if isinstance(a, PositionAid)]
-                if position:
-                    self._fixes = [*self._fixes, (aid, position[0])][-40:]
+        offers = [offer for aid in aids for offer in aid.offers()]
+        height = next((o for o in offers if isinstance(o, HeightOffer)), None)
+        position: PositionOffer | None = None
+        velocity: VelocityOffer | None = None
+        for offer in offers:
+            match offer:
+                case PositionOffer(height_m=None, sd=(n, e, _)) if height is not None:
+                    sd = n, e, height.sd_m
+                    position = offer._replace(height_m=height.height_m, sd=sd)
+                case PositionOffer():
+                    position = offer
+                case VelocityOffer():
+                    velocity = offer
+                case HeadingOffer():
+                    self._heading = offer
+        if position is not None and (
+            self._position is None or position.t_ns >= self._position.t_ns
+        ):
+            self._position = position
+        if velocity is not None:
+            self._speed = math.hypot(*velocity.v_ned[:2])
+            if position is not None:
+                self._fixes = [*self._fixes, (velocity, position)][-40:]
 
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""
@@ -242,9 +233,11 @@ class Aligner:
         )
 
     def _from_dual_antenna(self, imu: ImuBuffer, place: Place) -> Start | None:
-        if self._heading is None or imu.latest_ns - self._heading[0] > HEADING_AGE_NS:
+        if self._heading is None or imu.latest_ns - self._heading.t_ns > HEADING_AGE_NS:
             return None
-        return self._at_standstill(place, self._heading[1], self._heading[2], "dual antenna")
+        return self._at_standstill(
+            place, self._heading.yaw_rad, self._heading.sd_rad, "dual antenna"
+        )
 
     def _from_gyrocompass(self, imu: ImuBuffer, place: Place) -> Start | None:
         standing = self._levelled()
@@ -290,7 +283,7 @@ class Aligner:
         self,
         imu: ImuBuffer,
         standing: _Standing,
-        velocity: VelocityAid,
+        velocity: VelocityOffer,
         course: float,
         sd: float,
         place: Place,
@@ -331,7 +324,7 @@ class Aligner:
     def _on_the_move(
         self,
         imu: ImuBuffer,
-        velocity: VelocityAid,
+        velocity: VelocityOffer,
         course: float,
         sd: float,
         place: Place,
@@ -363,7 +356,7 @@ class Aligner:
 
     # ------------------------------------------------------------------ building the start
 
-    def _place_of(self, p: PositionAid, velocity: VelocityAid | None = None) -> Place:
+    def _place_of(self, p: PositionOffer, velocity: VelocityOffer | None = None) -> Place:
         """A fix's place; with a velocity, moved to the velocity's instant."""
         where = np.array([p.lat_rad, p.lon_rad, p.height_m or 0.0])
         if velocity is not None:

@@ -22,7 +22,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from fusiond.aiding.attitude import STAR_BLOCK, AttitudeAid, HeadingAid
-from fusiond.aiding.base import Linearised, NotApplicable
+from fusiond.aiding.base import Aid, NotApplicable
 from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
 from fusiond.aiding.body_velocity import WheelSpeedAid
 from fusiond.aiding.height import HeightAid
@@ -76,7 +76,7 @@ class Intake:
 
     def aids(
         self, m: Measurement, t_ns: int, sd_time_s: float, seen_ns: int = 0
-    ) -> list[Linearised] | str:
+    ) -> list[Aid] | str:
         """The aids that `m`, valid at `t_ns`, stands for, or the name of the refusal."""
         match m:
             case PositionFix():
@@ -174,7 +174,7 @@ class Intake:
         own = self._aiding.get(source) is section and source != section.kind
         return f"{block}_{source}" if own else block
 
-    def _attitude(self, m: Attitude, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+    def _attitude(self, m: Attitude, t_ns: int, sd_time_s: float) -> list[Aid] | str:
         own = self._aiding.get(m.source)
         tracker = isinstance(own, StarTrackerAiding) or (own is None and m.source == "star_tracker")
         stated, block = m.sd_rpy_rad, ""
@@ -192,7 +192,7 @@ class Intake:
             return "no_sigma"
         return [AttitudeAid(m.source, t_ns, o.gate_probability, m.rpy_rad, sd, sd_time_s, block)]
 
-    def _bearing(self, m: Bearing, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+    def _bearing(self, m: Bearing, t_ns: int, sd_time_s: float) -> list[Aid] | str:
         o = self._section(m.source, SarAiding)
         if not (math.isfinite(m.azimuth_rad) and math.isfinite(m.elevation_rad)):
             return "not_finite"
@@ -222,7 +222,7 @@ class Intake:
             )
         ]
 
-    def _gnss(self, m: PositionFix, t_ns: int, sd_time_s: float) -> list[Linearised] | str:
+    def _gnss(self, m: PositionFix, t_ns: int, sd_time_s: float) -> list[Aid] | str:
         o = self._section(m.source, GnssAiding)
         if not (math.isfinite(m.lat_rad) and math.isfinite(m.lon_rad)):
             return "not_finite"
@@ -239,7 +239,7 @@ class Intake:
         if n < least or e < least or d < least:
             n, e, d = max(n, least), max(e, least), max(d, least)
         sd_time = math.hypot(sd_time_s, o.time_sd_s)
-        aids: list[Linearised] = [
+        aids: list[Aid] = [
             PositionAid(
                 m.source,
                 t_ns,
@@ -279,9 +279,7 @@ class Intake:
                 )
         return aids
 
-    def _rdss(
-        self, m: DelayedFix, t_ns: int, sd_time_s: float, seen_ns: int
-    ) -> list[Linearised] | str:
+    def _rdss(self, m: DelayedFix, t_ns: int, sd_time_s: float, seen_ns: int) -> list[Aid] | str:
         o = self._section(m.source, RdssAiding)
         if m.multi_value:
             return "multi_value"
@@ -303,7 +301,7 @@ class Intake:
         when_ns = arrival_ns if at_arrival else t_ns
         moved_s = (arrival_ns - t_ns) * 1e-9 if o.strategy == "position_compensation" else 0.0
         gate = o.gate_probability
-        aids: list[Linearised] = [
+        aids: list[Aid] = [
             RdssPositionAid(
                 m.source,
                 when_ns,

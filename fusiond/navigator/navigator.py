@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.pseudorange import PseudorangeAid
-from fusiond.aiding.rdss_position import RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, quiet_limits, sensor_to_body
@@ -41,8 +40,6 @@ from fusiond.navigator.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
 
-# Aids that the filter makes by itself.
-CONSTRAINTS = frozenset({"zero_velocity", "zero_rate", "non_holonomic"})
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
 
@@ -72,7 +69,6 @@ class Navigator:
         self.verdicts = Verdicts(
             config.consistency.window,
             config.consistency.alpha,
-            CONSTRAINTS,
             lambda source, verdict: self._event(f"verdict_{verdict}", f"innovations of {source}"),
         )
         self.timeline = Timeline(
@@ -307,10 +303,12 @@ class Navigator:
     def _outcome(self, entry: Entry) -> None:
         outcome = entry.outcome
         if outcome is not None and outcome.name == "fused":
-            self.verdicts.judge(entry, outcome)
+            if outcome.whitened and not entry.judged:
+                entry.judged = True
+                self.verdicts.judge(entry.aid, outcome)
             source, t_ns = entry.aid.source, entry.key[0]
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
-            if isinstance(entry.aid, PositionAid | RdssPositionAid | PseudorangeAid):
+            if entry.aid.locates:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
         if isinstance(entry.aid, PseudorangeAid) and outcome is not None and outcome.rows:
             self.raw[entry.aid.source].judged(entry.aid, outcome)
@@ -344,7 +342,7 @@ class Navigator:
             )
         self._last_slide_cell = int(cells[-1])
 
-    def _standstill(self, w: Window) -> list[Linearised]:
+    def _standstill(self, w: Window) -> list[Aid]:
         z = self.config.constraints.zero_velocity
         rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
         return [

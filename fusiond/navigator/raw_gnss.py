@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch, System
-from fusiond.aiding.base import Linearised
+from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
 from fusiond.aiding.velocity import VelocityAid
@@ -82,7 +82,7 @@ class RawGnss:
         """Keep what a satellite has said."""
         self._store.add(message)
 
-    def start_aids(self, epoch: RawGnssEpoch, t_ns: int) -> list[Linearised]:
+    def start_aids(self, epoch: RawGnssEpoch, t_ns: int) -> list[Aid]:
         """Position and velocity of the epoch alone, for the alignment; none without a solution."""
         found = single_point(self._model, epoch, self._guess)
         if isinstance(found, str) or not found.consistent:
@@ -162,7 +162,7 @@ class RawGnss:
             math.sqrt(float(np.mean(squares))) if squares else None,
         )
 
-    def _fix(self, found: SinglePoint, t_ns: int) -> list[Linearised]:
+    def _fix(self, found: SinglePoint, t_ns: int) -> list[Aid]:
         x, y, z = (float(v) for v in found.position)
         lat, lon, height = to_geodetic(x, y, z)
         axes = ned_axes(lat, lon)
@@ -170,9 +170,7 @@ class RawGnss:
         n, e, d = np.sqrt(np.diag(covariance)).tolist()
         section = self._section
         lever, gate = section.lever_arm_m, section.gate_probability
-        aids: list[Linearised] = [
-            PositionAid(self.source, t_ns, gate, lat, lon, height, (n, e, d), lever)
-        ]
+        aids: list[Aid] = [PositionAid(self.source, t_ns, gate, lat, lon, height, (n, e, d), lever)]
         if found.velocity is not None:
             v_n, v_e, v_d = (axes.T @ found.velocity).tolist()
             sd = section.start_velocity_sd_m_s
@@ -182,22 +180,3 @@ class RawGnss:
                 )
             )
         return aids
-
-
-def per_system(aid: PseudorangeAid, outcome: Outcome) -> dict[System, tuple[float, float]]:
-    """Two standard normal figures a system for its verdict: the sums of the whitened innovations
-    of its ranges and of its rates over the root of their number. White innovations give N(0, 1)
-    whatever the number of satellites, so that epochs of any sky form one series."""
-    satellite_of = dict(zip(aid.clock.tolist(), aid.satellites, strict=True))
-    count = max(satellite_of) + 1
-    ranges, rates = aid.clock[np.isfinite(aid.ranges)], aid.clock[np.isfinite(aid.rates)] + count
-    kept = np.flatnonzero(np.array(outcome.rows) == KEPT)
-    series = np.concatenate((ranges, rates))[kept]
-    sums = np.bincount(series, np.array(outcome.whitened)[kept], 2 * count)
-    numbers = np.bincount(series, minlength=2 * count)
-    figures = (sums / np.sqrt(np.maximum(numbers, 1))).tolist()
-    return {
-        next(s for s in SYSTEMS if s == satellite[0]): (figures[k], figures[count + k])
-        for k, satellite in satellite_of.items()
-        if numbers[k] and numbers[count + k]
-    }

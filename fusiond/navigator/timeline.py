@@ -14,8 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from fusiond.aiding.base import Linearised
-from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
+from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.navigation.imu_buffer import ImuBuffer
 
@@ -37,7 +36,7 @@ class Entry:
     `judged` that its innovation has been looked at: a rewind applies it again."""
 
     key: Key
-    aid: Linearised
+    aid: Aid
     outcome: Outcome | None = None
     judged: bool = False
 
@@ -110,11 +109,11 @@ class Timeline:
         """The earliest instant that an aid may still be valid at."""
         return self._checkpoints[0].snapshot.t_ns if self._checkpoints else 0
 
-    def insert(self, aid: Linearised, serial: int = 0) -> Entry:
+    def insert(self, aid: Aid, serial: int = 0) -> Entry:
         """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
         # What is due to be fed back is fed back before anything of the same instant is applied: the
         # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
-        key = (aid.t_ns, "" if isinstance(aid, FeedBackAid) else aid.source, serial)
+        key = (aid.t_ns, "" if aid.feedback == "release" else aid.source, serial)
         entry = Entry(key, aid)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
@@ -162,10 +161,11 @@ class Timeline:
         source, t_ns = entry.aid.source, entry.key[0]
         since, count = self._failing.get(source, (t_ns, 0))
         recover = count >= RECOVERY_COUNT and t_ns - since >= RECOVERY_NS
-        if isinstance(entry.aid, FeedBackAid):
-            self.estimator.release()
-        elif isinstance(entry.aid, RdssPositionAid) and entry.aid.holds:
-            self.estimator.hold()
+        match entry.aid.feedback:
+            case "release":
+                self.estimator.release()
+            case "hold":
+                self.estimator.hold()
         outcome = self.estimator.update(entry.aid, inflate=recover)
         if outcome.name == "gated":
             self._failing[source] = (since, count + 1)

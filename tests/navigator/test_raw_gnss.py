@@ -23,7 +23,7 @@ from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.models.model import CLOCK_OFFSET, make_model
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.navigator.raw_gnss import RawGnss, raw_blocks
 from fusiond.offline.compare import compare
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
@@ -165,8 +165,8 @@ def test_figures_of_a_system_are_standard_normal() -> None:
     for _ in range(4000):
         codes = np.where(rng.random(rows) < 0.05, GATED, KEPT)
         whitened = np.where(codes == KEPT, rng.standard_normal(rows), 0.0)
-        outcome = Outcome("fused", 1.0, rows, tuple(whitened.tolist()), tuple(codes.tolist()))
-        figures.append([*per_system(aid, outcome)["G"], *per_system(aid, outcome)["C"]])
+        found = aid.series(whitened.tolist(), (codes == KEPT).tolist())
+        figures.append([*found["G"], *found["C"]])
     covariance = np.cov(np.array(figures).T)
     assert covariance == pytest.approx(np.eye(4), abs=0.1)
 
@@ -178,7 +178,7 @@ def test_a_system_without_rates_has_no_figure() -> None:
     rates = np.where([s[0] == "G" for s in aid.satellites], np.nan, aid.rates)
     silent = replace(aid, rates=rates)
     rows = len(silent.labels)
-    found = per_system(silent, Outcome("fused", 1.0, rows, (1.0,) * rows, (KEPT,) * rows))
+    found = silent.series((1.0,) * rows, (True,) * rows)
     assert set(found) == {"C"}
 
 

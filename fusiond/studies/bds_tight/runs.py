@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
@@ -308,7 +308,7 @@ def _filter_trace(
     for k, t in enumerate(t_s):
         t_ns = round(t * 1e9)
         live.advance(t)
-        aids: list[Linearised] = []
+        aids: list[Aid] = []
         found = solved[k]
         if raw is not None and not away[k]:
             aid = raw.aid(observed[k], t_ns, estimator.nav[:3])
