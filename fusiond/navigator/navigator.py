@@ -15,24 +15,21 @@ from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Aid
-from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.pseudorange import PseudorangeAid
-from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise, quiet_limits, sensor_to_body
-from fusiond.estimators.federated.options import local_of
+from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.propagation import compensate
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigation.standstill import StandstillDetector, Window
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
 from fusiond.navigator.aligner import Aligner, AlignmentOptions
+from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.intake import Intake
+from fusiond.navigator.isolation import Isolation
 from fusiond.navigator.raw_gnss import RawGnss
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.start import Start
@@ -75,12 +72,12 @@ class Navigator:
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
         self._on_outcome = on_outcome
-        self._detector = StandstillDetector(quiet_limits(config.constraints.zero_velocity))
+        self._constraints = ConstraintMaker(config.constraints)
+        names = e.federated.sources or tuple(config.aiding)
+        self._isolation = Isolation(self.estimator, names, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
-        self._last_slide_cell = -1
-        self._told_isolated: dict[str, str] = {}
         self.started: Start | None = None
         for name in config.aiding:
             receiver = self._intake.raw_receiver(name)
@@ -127,7 +124,12 @@ class Navigator:
             self.imu.restart()
             self.reset("IMU stamps went back")
         if taken:
-            self._constrain(max(0, self.imu.end - taken))
+            felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
+            if self.started is None:
+                for window in felt.windows:
+                    self._aligner.window(window)
+            for aid in felt.aids:
+                self.timeline.insert(aid)
         return taken
 
     def learn(self, message: Ephemeris | Klobuchar) -> None:
@@ -207,27 +209,11 @@ class Navigator:
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
-        self._tell_isolation()
-
-    def _tell_isolation(self) -> None:
-        """Events where the isolated sources are no longer those last told."""
-        now, told = self.estimator.isolated, self._told_isolated
-        for source, reason in now.items():
-            if source not in told:
-                self._event("isolated", f"{source} is left out of the solution: {reason}")
-        for source in told:
-            if source not in now:
-                self._event("readmitted", f"{source} is believed again")
-        self._told_isolated = now
+        self._isolation.tell()
 
     def isolated(self, source: str) -> str | None:
         """Why the fault detection leaves a source out; None if it does not."""
-        found = self.estimator.isolated
-        if not found:
-            return None
-        names = self.config.estimator.federated.sources or tuple(self.config.aiding)
-        local = local_of(source, names)
-        return None if local is None else found.get(names[local])
+        return self._isolation.reason(source)
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, carried ahead of the newest sample by holding its rates.
@@ -314,40 +300,3 @@ class Navigator:
             self.raw[entry.aid.source].judged(entry.aid, outcome)
         if self._on_outcome is not None:
             self._on_outcome(entry)
-
-    def _constrain(self, new: int) -> None:
-        """What the samples from row `new` on say by themselves: standstill, and no sliding."""
-        imu, c = self.imu, self.config.constraints
-        windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
-        for window in windows:
-            if self.started is None:
-                self._aligner.window(window)
-            if window.quiet and c.zero_velocity.enabled:
-                for aid in self._standstill(window):
-                    self.timeline.insert(aid)
-        slide = c.non_holonomic
-        if not slide.enabled:
-            return
-        cells = imu.times[new : imu.end] // round(slide.interval_s * 1e9)
-        for row in np.flatnonzero(np.diff(cells, prepend=self._last_slide_cell)):
-            self.timeline.insert(
-                NonHolonomicAid(
-                    "non_holonomic",
-                    int(imu.times[new + row]),
-                    0.9999,
-                    slide.sd_m_s,
-                    slide.min_speed_m_s,
-                    slide.lever_arm_m,
-                )
-            )
-        self._last_slide_cell = int(cells[-1])
-
-    def _standstill(self, w: Window) -> list[Aid]:
-        z = self.config.constraints.zero_velocity
-        rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
-        return [
-            ZeroVelocityAid("zero_velocity", w.end_ns, 0.9999, z.velocity_sd_m_s, z.max_speed_m_s),
-            ZeroRateAid(
-                "zero_rate", w.end_ns, 0.9999, rate, z.rate_sd_deg_s * DEG, z.max_speed_m_s
-            ),
-        ]
