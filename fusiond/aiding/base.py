@@ -95,9 +95,18 @@ class Aid:
         """When the estimate that it leads to is fed back."""
         return "at_once"
 
+    def at(self, place: Array) -> Aid:
+        """The aid as it is for a vehicle at `place` (lat, lon, height; rad, m), which is where the
+        filter is at the aid's instant: itself, unless its corrections depend on the place."""
+        return self
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
         raise NotImplementedError
+
+    def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
+        """How it ended, for a receiver that keeps count of its rows (fusiond.estimators.screening);
+        called again when a rewind brings it again."""
 
     def offers(self) -> Sequence[Offer]:
         """What alignment may start with."""

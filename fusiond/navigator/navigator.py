@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import PseudorangeAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.propagation import compensate
@@ -30,7 +29,6 @@ from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.isolation import Isolation
-from fusiond.navigator.raw_gnss import RawGnss
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.start import Start
 from fusiond.navigator.timeline import Entry, Timeline
@@ -57,7 +55,7 @@ class Navigator:
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding)
-        self.raw: dict[str, RawGnss] = {}
+        self.raw = self._intake.receivers
         self.model = model_of(config, *self._intake.extra_blocks())
         self.imu = ImuBuffer(
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
@@ -79,10 +77,6 @@ class Navigator:
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
         self.started: Start | None = None
-        for name in config.aiding:
-            receiver = self._intake.raw_receiver(name)
-            if receiver is not None:
-                self.raw[name] = receiver
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -143,8 +137,6 @@ class Navigator:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self._refuse(m.source, "from_future")
-        if isinstance(m, RawGnssEpoch):
-            return self._add_raw(m, t_ns)
         aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
@@ -152,21 +144,6 @@ class Navigator:
             self._aligner.aids(aids)
         for aid in aids:
             self.timeline.insert(aid)
-        return "accepted"
-
-    def _add_raw(self, epoch: RawGnssEpoch, t_ns: int) -> str:
-        receiver = self.raw.get(epoch.source)
-        if receiver is None:
-            return self._refuse(epoch.source, "raw_not_used")
-        place = None
-        if self.started is None:
-            self._aligner.aids(receiver.start_aids(epoch, t_ns))
-        else:
-            place = self.estimator.nav[:3]
-        aid = receiver.aid(epoch, t_ns, place)
-        if isinstance(aid, str):
-            return self._refuse(epoch.source, aid)
-        self.timeline.insert(aid)
         return "accepted"
 
     def reset(self, why: str) -> None:
@@ -296,7 +273,7 @@ class Navigator:
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
             if entry.aid.locates:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
-        if isinstance(entry.aid, PseudorangeAid) and outcome is not None and outcome.rows:
-            self.raw[entry.aid.source].judged(entry.aid, outcome)
+        if outcome is not None:
+            entry.aid.judged(outcome.rows, outcome.whitened)
         if self._on_outcome is not None:
             self._on_outcome(entry)

@@ -166,7 +166,8 @@ class Timeline:
                 self.estimator.release()
             case "hold":
                 self.estimator.hold()
-        outcome = self.estimator.update(entry.aid, inflate=recover)
+        aid = entry.aid.at(self.estimator.nav[:3])
+        outcome = self.estimator.update(aid, inflate=recover)
         if outcome.name == "gated":
             self._failing[source] = (since, count + 1)
         elif outcome.name == "fused":

@@ -298,7 +298,7 @@ def _filter_trace(
     start = with_error(nav[0], unit_error * sd[:9])
     live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, start, sd)
     estimator = live.estimator
-    raw = intake.raw_receiver("raw")
+    raw = intake.receivers.get("raw")
     if raw is not None:
         for message in broadcast(simulated):
             raw.learn(message)
@@ -311,11 +311,10 @@ def _filter_trace(
         aids: list[Aid] = []
         found = solved[k]
         if raw is not None and not away[k]:
-            aid = raw.aid(observed[k], t_ns, estimator.nav[:3])
-            aids = [] if isinstance(aid, str) else [aid]
+            aids = [raw.aid(observed[k], t_ns)]
         elif raw is None and found is not None:
             accepted = intake.aids(fix(found, t_ns), t_ns, 0.0)
-            aids = [] if isinstance(accepted, str) else accepted
+            aids = [] if isinstance(accepted, str) else list(accepted)
         live.advance(t, aids)
         x, p = nav_error(estimator.nav, nav[k + 1]), estimator.covariance[:9, :9]
         trace.error[k] = x[6:]
