@@ -6,7 +6,6 @@ filter as far as the IMU reaches, `solution` reads the state at an instant.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable
 
@@ -18,17 +17,15 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
-from fusiond.estimators.propagation import compensate
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
 from fusiond.navigator.aligner import Aligner, AlignmentOptions
 from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.isolation import Isolation
+from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.start import Start
 from fusiond.navigator.timeline import Entry, Timeline
@@ -193,49 +190,27 @@ class Navigator:
         return self._isolation.reason(source)
 
     def solution(self, t_ns: int) -> Solution:
-        """The solution at `t_ns`, carried ahead of the newest sample by holding its rates.
+        """The solution at `t_ns`, of all that has been run by `advance`.
 
-        At most for `gap_s`: beyond it the mode says that the IMU is silent.
+        Later than the newest sample it is carried ahead by holding that sample's rates, at most for
+        `gap_s`: beyond it the mode says that the IMU is silent. Earlier it is the filter's state at
+        that very instant, with the aids valid until then and no later ones; before the history that
+        is kept (`buffer_s`, and the start) nothing is known. The mode is always that of what is
+        known now.
         """
+        if self.started is None or t_ns >= self.estimator.t_ns:
+            return self._present(t_ns)
+        if t_ns < self.timeline.oldest_ns:
+            return Solution(t_ns, Mode.INVALID, "before the history that is kept")
+        with self.timeline.past(t_ns):
+            return self._present(t_ns)
+
+    def _present(self, t_ns: int) -> Solution:
         mode, reason = self.mode(t_ns)
         if self.started is None:
             return Solution(t_ns, mode, reason)
-        e = self.estimator
-        nav = e.nav
-        ahead = min(t_ns - e.t_ns, round(self.config.imu.gap_s * 1e9))
-        if ahead > 0 and self.imu.end:
-            nav = nav.copy()
-            rate, force, zero = np.zeros(3), np.zeros(3), np.zeros(3)
-            compensate(self.imu.samples, self.imu.end - 1, e.sensor_errors, rate, force)
-            strapdown_step(
-                nav,
-                rate,
-                force,
-                zero,
-                zero,
-                ahead * 1e-9,
-                self.model.hold_height,
-                np.zeros(STEP_SIZE),
-            )
-        sd = np.where(self.model.stated, e.sigmas(), np.nan).tolist()
-        values = [float(v) for v in nav]
-        bias = e.sensor_errors
-        lon = (values[1] + math.pi) % (2.0 * math.pi) - math.pi
-        return Solution(
-            t_ns,
-            mode,
-            reason,
-            values[0],
-            lon,
-            values[2],
-            (values[3], values[4], values[5]),
-            rpy_from_dcm(dcm_from_quaternion(nav[6:])),
-            (sd[0], sd[1], sd[2]),
-            (sd[3], sd[4], sd[5]),
-            (sd[6], sd[7], sd[8]),
-            (float(bias[0]), float(bias[1]), float(bias[2])),
-            (float(bias[3]), float(bias[4]), float(bias[5])),
-        )
+        gap_ns = round(self.config.imu.gap_s * 1e9)
+        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason)
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """What the solution is worth at `t_ns`, and why."""
