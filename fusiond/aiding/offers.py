@@ -1,6 +1,6 @@
 """What an aid can give a filter that has not started: position, velocity, heading, height.
 
-Alignment starts with these (fusiond.navigator.aligner). `sd` are one sigma, `lever` (3,) the way
+Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m.
 """
 

@@ -16,18 +16,19 @@ from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.settings import imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigator.aligner import Aligner, AlignmentOptions
+from fusiond.navigator.alignment.aligner import Aligner
+from fusiond.navigator.alignment.options import alignment_options
+from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.isolation import Isolation
 from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.start import Start
 from fusiond.navigator.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
@@ -77,23 +78,7 @@ class Navigator:
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
-        a = self.config.alignment
-        position = a.position_deg_m
-        options = AlignmentOptions(
-            heading=a.heading,
-            heading_rad=None if a.heading_deg is None else a.heading_deg * DEG,
-            heading_sd_rad=a.heading_sd_deg * DEG,
-            position=position and (position[0] * DEG, position[1] * DEG, position[2]),
-            position_sd_m=a.position_sd_m,
-            levelling_s=a.levelling_s,
-            rest_speed_m_s=self.config.constraints.zero_velocity.max_speed_m_s,
-            course_speed_m_s=a.course_speed_m_s,
-            course_sd_rad=a.course_sd_deg * DEG,
-            gyrocompass_s=a.gyrocompass_s,
-            gyrocompass_max_sd_rad=a.gyrocompass_max_sd_deg * DEG,
-        )
-        window_s = self.config.constraints.zero_velocity.window_s
-        return Aligner(options, self._noise, self.model, window_s, self._saved)
+        return Aligner(alignment_options(self.config), self._noise, self.model, self._saved)
 
     # ------------------------------------------------------------------ arrivals
 
@@ -118,7 +103,7 @@ class Navigator:
             felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
             if self.started is None:
                 for window in felt.windows:
-                    self._aligner.window(window)
+                    self._aligner.known.window(window)
             for aid in felt.aids:
                 self.timeline.insert(aid)
         return taken
@@ -138,7 +123,7 @@ class Navigator:
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
-            self._aligner.aids(aids)
+            self._aligner.known.aids(aids)
         for aid in aids:
             self.timeline.insert(aid)
         return "accepted"
@@ -164,7 +149,7 @@ class Navigator:
             (0.0, 0.0, 0.0),
         )
         if self.started is None:
-            self._aligner.aids([aid])
+            self._aligner.known.aids([aid])
         self.timeline.insert(aid)
 
     # ------------------------------------------------------------------ running
