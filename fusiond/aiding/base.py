@@ -95,9 +95,9 @@ class Aid:
         """When the estimate that it leads to is fed back."""
         return "at_once"
 
-    def at(self, place: Array) -> Aid:
-        """The aid as it is for a vehicle at `place` (lat, lon, height; rad, m), which is where the
-        filter is at the aid's instant: itself, unless its corrections depend on the place."""
+    def at(self, nav: Array) -> Aid:
+        """The aid as it is for a vehicle in the navigation state (10,), which is the filter's at
+        the aid's instant: itself, unless its corrections depend on the place."""
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -112,7 +112,7 @@ class Aid:
         """What alignment may start with."""
         return ()
 
-    def series(self, whitened: Sequence[float], kept: Sequence[bool]) -> Mapping[str, Array]:
+    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
         """The series of innovations that a verdict judges: of each by name this epoch's row (m,).
 
         `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows of a screened

@@ -235,7 +235,7 @@ class PseudorangeAid(Aid):
             self.clock_reset,
         )
 
-    def series(self, whitened: Sequence[float], kept: Sequence[bool]) -> dict[str, Array]:
+    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
         """A row (2,) for each satellite system of ranges with a clock, by its letter: the sums of
         the whitened innovations of its ranges and of its rates over the root of their number.
 

@@ -54,11 +54,11 @@ def raw_epoch(_: int) -> Callable[[], int]:
     def work() -> int:
         for _ in range(EPOCHS):
             aid = raw.aid(epoch, next(instants))
-            outcome = estimator.update(aid.at(place))
+            outcome = estimator.update(aid.at(nav))
             assert outcome.name == "fused"
             assert len(outcome.rows) == 2 * SATELLITES
             aid.judged(outcome.rows, outcome.whitened)
-            aid.series(outcome.whitened, [code == KEPT for code in outcome.rows])
+            aid.series(outcome.whitened, np.array(outcome.rows) == KEPT)
         return EPOCHS
 
     work()

@@ -40,7 +40,7 @@ class Verdicts:
         """An aid has been fused; to be called once for each, though a rewind brings it again."""
         if aid.constraint or not outcome.whitened:
             return
-        kept = [code == KEPT for code in outcome.rows]
+        kept = np.array(outcome.rows) == KEPT
         for name, row in aid.series(outcome.whitened, kept).items():
             if name:
                 self._add(f"{aid.source}_{name}", aid, row, float(row @ row))

@@ -47,9 +47,9 @@ class Sky:
 
 @dataclass(frozen=True, slots=True)
 class _Corrected:
-    """An epoch for a vehicle at about `guess` (ECEF, m), computed from `place`."""
+    """An epoch for a vehicle at about `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
 
-    place: bytes
+    place: tuple[float, float, float]
     guess: Array
     rows: Rows
     aid: PseudorangeAid
@@ -79,23 +79,24 @@ class RawEpochAid(Aid):
     picked: Picked
     memory: _Memory = field(default_factory=_Memory)
 
-    def at(self, place: Array) -> PseudorangeAid:
-        """The epoch's ranges for a vehicle at `place`; it may have no satellites left there."""
-        found, key = self.memory.corrected, place.tobytes()
+    def at(self, nav: Array) -> PseudorangeAid:
+        """The epoch's ranges for a vehicle there; it may have no satellites left."""
+        lat, lon, height = nav[:3].tolist()
+        found, key = self.memory.corrected, (lat, lon, height)
         if found is None or found.place != key:
-            guess = np.array(to_ecef(float(place[0]), float(place[1]), float(place[2])))
+            guess = np.array(to_ecef(lat, lon, height))
             found = _Corrected(key, guess, *self.receiver.correct(self, guess))
             self.memory.corrected = found
         return found.aid
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        return self.at(state.nav[:3]).innovation(state)
+        return self.at(state.nav).innovation(state)
 
     def offers(self) -> Sequence[Offer]:
         """Position and velocity of the epoch alone; none without a solution."""
         return self.receiver.alone(self)
 
-    def series(self, whitened: Sequence[float], kept: Sequence[bool]) -> Mapping[str, Array]:
+    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
         found = self.memory.corrected
         return {} if found is None else found.aid.series(whitened, kept)
 
@@ -179,7 +180,7 @@ class RawGnss:
     ) -> None:
         """The filter has looked at an epoch; one that a rewind brings again counts once."""
         self._judged = corrected, codes, whitened
-        self._guess, self._left_out = corrected.guess, dict(corrected.rows.refused)
+        self._guess = corrected.guess
         self._count(aid, corrected.rows)
         if not codes or aid.t_ns <= self._counted_ns:
             return
@@ -199,10 +200,10 @@ class RawGnss:
 
     def sky(self) -> Sky:
         """What the last epoch came to."""
-        used, refused, squares = [], dict(self._left_out), []
         if self._judged is None:
-            return Sky(refused=refused)
+            return Sky(refused=dict(self._left_out))
         corrected, codes, whitened = self._judged
+        used, refused, squares = [], dict(corrected.rows.refused), []
         aid = corrected.aid
         whitened = whitened or (0.0,) * len(codes)  # an epoch that failed as a whole
         for (satellite, what), code, innovation in zip(aid.labels, codes, whitened, strict=False):

@@ -188,12 +188,12 @@ class Timeline:
         source, t_ns = entry.aid.source, entry.key[0]
         since, count = failing.get(source, (t_ns, 0))
         recover = count >= RECOVERY_COUNT and t_ns - since >= RECOVERY_NS
-        match entry.aid.feedback:
-            case "release":
-                self.estimator.release()
-            case "hold":
-                self.estimator.hold()
-        outcome = self.estimator.update(entry.aid.at(self.estimator.nav[:3]), inflate=recover)
+        feedback = entry.aid.feedback
+        if feedback == "release":
+            self.estimator.release()
+        elif feedback == "hold":
+            self.estimator.hold()
+        outcome = self.estimator.update(entry.aid.at(self.estimator.nav), inflate=recover)
         if outcome.name == "gated":
             failing[source] = (since, count + 1)
         elif outcome.name == "fused":

@@ -162,7 +162,7 @@ def test_figures_of_a_system_are_standard_normal() -> None:
     for _ in range(4000):
         codes = np.where(rng.random(rows) < 0.05, GATED, KEPT)
         whitened = np.where(codes == KEPT, rng.standard_normal(rows), 0.0)
-        found = aid.series(whitened.tolist(), (codes == KEPT).tolist())
+        found = aid.series(whitened.tolist(), codes == KEPT)
         figures.append([*found["G"], *found["C"]])
     covariance = np.cov(np.array(figures).T)
     assert covariance == pytest.approx(np.eye(4), abs=0.1)
@@ -174,7 +174,7 @@ def test_a_system_without_rates_has_no_figure() -> None:
     rates = np.where([s[0] == "G" for s in aid.satellites], np.nan, aid.rates)
     silent = replace(aid, rates=rates)
     rows = len(silent.labels)
-    found = silent.series((1.0,) * rows, (True,) * rows)
+    found = silent.series((1.0,) * rows, np.ones(rows, dtype=bool))
     assert set(found) == {"C"}
 
 
@@ -197,13 +197,13 @@ def test_a_clock_set_by_a_millisecond_moves_nothing_but_the_clock() -> None:
         raw, estimator = informed(section, sim), started(section)
         epoch = sim.epoch(0)
         for _ in range(3):
-            aid = raw.aid(epoch, 0).at(estimator.nav[:3])
+            aid = raw.aid(epoch, 0).at(estimator.nav)
             assert estimator.update(aid).name == "fused"
         offset = estimator.xi[estimator.model.slots_of(CLOCK_OFFSET)].copy()
         before = off(estimator)
         jump = SPEED_OF_LIGHT_M_S * 1e-3
         set_clock = replace(moved(epoch, jump), clock_reset=flagged)
-        aid = raw.aid(set_clock, 0).at(estimator.nav[:3])
+        aid = raw.aid(set_clock, 0).at(estimator.nav)
         outcome = estimator.update(aid)
         assert outcome.name == "fused"
         assert set(outcome.rows) == {KEPT}
@@ -220,12 +220,12 @@ def test_fewer_than_four_satellites_help(count: int) -> None:
     raw, estimator = informed(section, sim), started(section)
     epoch = sim.epoch(0)
     for _ in range(3):  # clocks are known from a fuller sky
-        aid = raw.aid(epoch, 0).at(estimator.nav[:3])
+        aid = raw.aid(epoch, 0).at(estimator.nav)
         estimator.update(aid)
     for slot in range(6, 9):
         estimator.covariance[slot, slot] += 20.0**2
     before = estimator.sigmas()[:3].copy()
-    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0).at(estimator.nav[:3])
+    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0).at(estimator.nav)
     outcome = estimator.update(aid)
     assert (outcome.name, outcome.degrees) == ("fused", 2 * count)
     after = estimator.sigmas()[:3]
@@ -239,11 +239,11 @@ def test_one_bad_satellite_is_refused_alone() -> None:
     raw, estimator = informed(section, sim), started(section)
     epoch = sim.epoch(0)
     for _ in range(3):
-        aid = raw.aid(epoch, 0).at(estimator.nav[:3])
+        aid = raw.aid(epoch, 0).at(estimator.nav)
         estimator.update(aid)
     bad = epoch.signals[2].satellite
     epoch_aid = raw.aid(moved(epoch, 80.0, {bad}), 0)
-    aid = epoch_aid.at(estimator.nav[:3])
+    aid = epoch_aid.at(estimator.nav)
     outcome = estimator.update(aid)
     left_out = [label for label, code in zip(aid.labels, outcome.rows, strict=True) if code]
     assert left_out == [(bad, "range")]
