@@ -36,6 +36,7 @@ from typing import ClassVar
 import numpy as np
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, misaligned_axes
+from fusiond.aiding.offers import HeadingOffer
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
     rotation_vector_from_dcm,
@@ -85,6 +86,13 @@ class AttitudeAid(Aid):
         turned = whiten @ (state.dcm @ state.rate_b) * self.sd_time_s
         return Innovation(whiten @ z, h, np.square(sd) + np.square(turned))
 
+    def offers(self) -> tuple[HeadingOffer, ...]:
+        """The yaw, unless the sensor is mounted askew: the start would have the misalignment, and
+        the filter would then find the two to agree."""
+        if self.block or math.isnan(self.rpy[2]):
+            return ()
+        return (HeadingOffer(self.t_ns, self.rpy[2], self.sd[2]),)
+
 
 @dataclass(frozen=True, slots=True)
 class HeadingAid(Aid):
@@ -104,3 +112,6 @@ class HeadingAid(Aid):
         h[0, 0:3] = -tangent * math.cos(yaw), -tangent * math.sin(yaw), -1.0
         z = np.array([wrap_angle(yaw - self.yaw_rad)])
         return Innovation(z, h, np.array([self.sd_rad**2]))
+
+    def offers(self) -> tuple[HeadingOffer, ...]:
+        return (HeadingOffer(self.t_ns, self.yaw_rad, self.sd_rad),)

@@ -9,18 +9,23 @@ So a position row of z is "INS minus fix", as in the papers. H is dense, (m, n).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.offers import Offer
 from fusiond.models.model import Model
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import Q0, VE, VN
 
 Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
+Feedback = Literal["at_once", "hold", "release"]
+"""When the error estimate is fed back into the navigation state: right after the aid; not before an
+aid says so; or now, all that was held."""
 
 
 class State(NamedTuple):
@@ -65,21 +70,59 @@ class NotApplicable(NamedTuple):
 class Aid:
     """An aiding measurement at its instant of validity, in SI units, body axes for `lever` (3,).
 
-    `gate` is the probability with which a consistent innovation passes. The rows of a `screened`
-    aid are gated one by one, and a bad one goes alone (fusiond.estimators.screening). An innovation
-    that is an angle repeats with its `period`.
+    `gate` is the probability with which a consistent innovation passes. What an aid is, it says
+    itself: timeline, navigator, verdicts and alignment ask it and know no kind of aid by name.
     """
 
     screened: ClassVar[bool] = False
+    """Its rows are gated one by one, and a bad one goes alone (fusiond.estimators.screening)."""
     period: ClassVar[float] = math.inf
+    """An innovation that is an angle repeats with it."""
+    locates: ClassVar[bool] = False
+    """It bounds the horizontal position: a solution that has it is not coasting."""
+    constraint: ClassVar[bool] = False
+    """Not measured but known of the vehicle: its innovations are neither independent nor white, and
+    no verdict on a sigma follows from them."""
+    late: ClassVar[bool] = False
+    """It comes seldom and long after its instant, as what must be asked for does."""
 
     source: str
     t_ns: int
     gate: float
 
+    @property
+    def feedback(self) -> Feedback:
+        """When the estimate that it leads to is fed back."""
+        return "at_once"
+
+    def at(self, nav: Array) -> Aid:
+        """The aid as it is for a vehicle in the navigation state (10,), which is the filter's at
+        the aid's instant: itself, unless its corrections depend on the place."""
+        return self
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        """The innovation at `state`, or the name of why there is none."""
+        raise NotImplementedError
+
+    def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
+        """How it ended, for a receiver that keeps count of its rows (fusiond.estimators.screening);
+        called again when a rewind brings it again."""
+
+    def offers(self) -> Sequence[Offer]:
+        """What alignment may start with."""
+        return ()
+
+    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
+        """The series of innovations that a verdict judges: of each by name this epoch's row (m,).
+
+        `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows of a screened
+        aid were used. The series without a name is the source's own.
+        """
+        return {"": np.array(whitened)}
+
 
 class Linearised(Protocol):
-    """An aid that can say its innovation."""
+    """What an estimator knows of an aid."""
 
     @property
     def screened(self) -> bool: ...

@@ -13,6 +13,7 @@ T-RA 17 (2001), eq. 8; Groves, 2nd ed., section 15.4.1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +80,8 @@ def _body_velocity(
 @dataclass(frozen=True, slots=True)
 class NonHolonomicAid(Aid):
     """No sideways or vertical velocity (sigma `sd_m_s`) at `lever`, above `min_speed_m_s`."""
+
+    constraint: ClassVar[bool] = True
 
     sd_m_s: float
     min_speed_m_s: float

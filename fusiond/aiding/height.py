@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.offers import HeightOffer
 from fusiond.navigation.strapdown import HEIGHT
 
 
@@ -28,3 +29,6 @@ class HeightAid(Aid):
         return Innovation(
             np.array([self.height_m - state.nav[HEIGHT]]), h, np.array([self.sd_m**2])
         )
+
+    def offers(self) -> tuple[HeightOffer, ...]:
+        return (HeightOffer(self.height_m, self.sd_m),)

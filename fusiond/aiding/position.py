@@ -1,4 +1,4 @@
-r"""Position of an antenna: GNSS fix (3-D) or BeiDou RDSS fix (horizontal).
+r"""Position of an antenna: a GNSS fix, with or without height.
 
     z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l + b^
       = dr + (C l) x phi - db + v
@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
@@ -64,6 +66,8 @@ class PositionAid(Aid):
     `bias`: the blocks whose states north, east, down are the error that the fixes share.
     """
 
+    locates: ClassVar[bool] = True
+
     lat_rad: float
     lon_rad: float
     height_m: float | None
@@ -86,3 +90,7 @@ class PositionAid(Aid):
         if self.sd_time_s:
             r += np.square(nav[VN : VN + rows] * self.sd_time_s)
         return Innovation(z, h, r)
+
+    def offers(self) -> tuple[PositionOffer, ...]:
+        place = self.lat_rad, self.lon_rad, self.height_m
+        return (PositionOffer(self.t_ns, *place, self.sd, self.lever),)

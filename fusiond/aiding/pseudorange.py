@@ -174,6 +174,7 @@ class PseudorangeAid(Aid):
     """
 
     screened: ClassVar[bool] = True
+    locates: ClassVar[bool] = True
 
     satellites: tuple[str, ...]
     position: Array
@@ -233,6 +234,27 @@ class PseudorangeAid(Aid):
             self.lever,
             self.clock_reset,
         )
+
+    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> dict[str, Array]:
+        """A row (2,) for each satellite system of ranges with a clock, by its letter: the sums of
+        the whitened innovations of its ranges and of its rates over the root of their number.
+
+        White innovations give N(0, 1) whatever the number of satellites, so that epochs of any sky
+        form one series. A system without a range or without a rate in the epoch has none.
+        """
+        system_of = {k: s[0] for k, s in zip(self.clock.tolist(), self.satellites, strict=True)}
+        count = max(system_of) + 1
+        ranges, rates = self.clock[np.isfinite(self.ranges)], self.clock[np.isfinite(self.rates)]
+        used = np.flatnonzero(kept)
+        series = np.concatenate((ranges, rates + count))[used]
+        sums = np.bincount(series, np.array(whitened)[used], 2 * count)
+        numbers = np.bincount(series, minlength=2 * count)
+        figures = sums / np.sqrt(np.maximum(numbers, 1))
+        return {
+            system: np.array((figures[k], figures[count + k]))
+            for k, system in system_of.items()
+            if numbers[k] and numbers[count + k]
+        }
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model = state.model

@@ -15,8 +15,7 @@ How a fix that is late is used is its strategy:
                          are predicted to the instant of arrival, and x(k+1|k) is fed back
                          (paper 000, section 1.1). `FeedBackAid` marks that instant.
 `position_compensation`  at its arrival, moved forward by the computed velocity times the delay;
-what
-                         that leaves is the coloured noise b (paper 000, reference 2).
+                         what that leaves is the coloured noise b (paper 000, reference 2).
 `none`                   at its arrival, as if it were true then.
 
 Source: paper 000, eq. 2 to 4.
@@ -26,10 +25,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Feedback, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
@@ -42,9 +43,11 @@ class RdssPositionAid(Aid):
     """Fix (rad, rad) with `covariance` (nn, ne, ee) in m^2.
 
     `moved_s`: the computed velocity times this is added to the fix (position compensation).
-    `holds`: the
-    estimate is not fed back until a `FeedBackAid` comes (optimal prediction).
+    `holds`: the estimate is not fed back until a `FeedBackAid` comes (optimal prediction).
     """
+
+    locates: ClassVar[bool] = True
+    late: ClassVar[bool] = True
 
     lat_rad: float
     lon_rad: float
@@ -53,6 +56,10 @@ class RdssPositionAid(Aid):
     sd_time_s: float = 0.0
     moved_s: float = 0.0
     holds: bool = False
+
+    @property
+    def feedback(self) -> Feedback:
+        return "hold" if self.holds else "at_once"
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav = state.nav
@@ -75,10 +82,20 @@ class RdssPositionAid(Aid):
         whiten = np.linalg.inv(np.linalg.cholesky(r))
         return Innovation(whiten @ z, whiten @ h, np.ones(2))
 
+    def offers(self) -> tuple[PositionOffer, ...]:
+        """The fix without its height, which is an aid of its own where it is believed."""
+        sd_n, sd_e = math.sqrt(self.covariance[0]), math.sqrt(self.covariance[2])
+        place = self.lat_rad, self.lon_rad, None
+        return (PositionOffer(self.t_ns, *place, (sd_n, sd_e, sd_n), self.lever),)
+
 
 @dataclass(frozen=True, slots=True)
 class FeedBackAid(Aid):
     """The instant at which an estimate that was held is fed back."""
+
+    @property
+    def feedback(self) -> Feedback:
+        return "release"
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return NotApplicable("fed_back")

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from fusiond.navigation.strapdown import LAT, VN
 @dataclass(frozen=True, slots=True)
 class ZeroVelocityAid(Aid):
     """Zero velocity with `sd_m_s`."""
+
+    constraint: ClassVar[bool] = True
 
     sd_m_s: float
     max_speed_m_s: float
@@ -43,6 +46,8 @@ class ZeroVelocityAid(Aid):
 class ZeroRateAid(Aid):
     """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s` of what the vehicle may
     turn."""
+
+    constraint: ClassVar[bool] = True
 
     mean_rate: Vector3
     sd_rad_s: float

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements
@@ -77,3 +78,6 @@ class VelocityAid(Aid):
         _velocity(state.nav, state.step, state.model.column_of, *self.lever, z, h)
         z -= self.v_ned[:rows]
         return Innovation(z, h, np.square(self.sd[:rows]))
+
+    def offers(self) -> tuple[VelocityOffer, ...]:
+        return (VelocityOffer(self.t_ns, self.v_ned, self.sd),)

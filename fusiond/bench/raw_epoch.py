@@ -19,9 +19,11 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.screening import KEPT
 from fusiond.gnss.orbit import is_beidou_geo
 from fusiond.models.catalogue import make_model
-from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.navigator.intake import Intake
+from fusiond.navigator.raw_gnss import RawGnss
 from fusiond.simulation.gnss.raw import GnssRaw, GnssRawOptions
 from fusiond.simulation.scenarios import SCENARIOS
 
@@ -34,11 +36,12 @@ def raw_epoch(_: int) -> Callable[[], int]:
     truth = SCENARIOS["drive"].truth(10.0)
     receiver = GnssRaw(truth, GnssRawOptions(), np.random.default_rng(1))
     section = RawAiding(systems=("G", "C"))
-    raw = RawGnss("gnss", section)
+    intake = Intake({"gnss": section})
+    raw = intake.receivers["gnss"]
     epoch = _crowded(receiver, raw)
     start = truth.at(np.array([epoch.tow_s - receiver.start[1]]))
     imu = Imu()
-    model = make_model("ins21", imu_noise(imu), *raw_blocks(section))
+    model = make_model("ins21", imu_noise(imu), *intake.extra_blocks())
     estimator = KalmanEstimator(model, imu.gap_s)
     place = start.position[0]
     nav = np.array([*place, *start.v_ned[0], 1.0, 0.0, 0.0, 0.0])
@@ -50,13 +53,12 @@ def raw_epoch(_: int) -> Callable[[], int]:
 
     def work() -> int:
         for _ in range(EPOCHS):
-            aid = raw.aid(epoch, next(instants), place)
-            assert not isinstance(aid, str)
-            outcome = estimator.update(aid)
+            aid = raw.aid(epoch, next(instants))
+            outcome = estimator.update(aid.at(nav))
             assert outcome.name == "fused"
             assert len(outcome.rows) == 2 * SATELLITES
-            raw.judged(aid, outcome)
-            per_system(aid, outcome)
+            aid.judged(outcome.rows, outcome.whitened)
+            aid.series(outcome.whitened, np.array(outcome.rows) == KEPT)
         return EPOCHS
 
     work()

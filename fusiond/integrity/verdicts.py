@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.pseudorange import PseudorangeAid
-from fusiond.aiding.rdss_position import RdssPositionAid
+from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Outcome
+from fusiond.estimators.screening import KEPT
 from fusiond.integrity.consistency import (
     FEWEST,
     Consistency,
@@ -18,53 +18,40 @@ from fusiond.integrity.consistency import (
     Verdict,
 )
 from fusiond.integrity.monitor import ConsistencyMonitor
-from fusiond.navigator.raw_gnss import per_system
-from fusiond.navigator.timeline import Entry
 
 Array = NDArray[np.float64]
 
 
 class Verdicts:
-    """Feeds each fused innovation to its source's monitor, once, however often it is applied.
+    """Feeds the innovations that were fused to their sources' monitors.
 
-    A receiver's raw epochs have a monitor for each satellite system, `<source>_<system>`.
+    An aid may hold several series (`Aid.series`), each with a monitor of its own: a receiver's raw
+    epochs have one for each satellite system, `<source>_<system>`.
 
-    `on_change(source, verdict)` hears when a verdict turns. `ignored` sources are not measured (the
-    filter's own constraints): their innovations are neither independent nor white, and no verdict
-    on a sigma follows from them.
+    `on_change(source, verdict)` hears when a verdict turns. Constraints are not judged.
     """
 
-    def __init__(
-        self,
-        window: int,
-        alpha: float,
-        ignored: frozenset[str],
-        on_change: Callable[[str, str], None],
-    ) -> None:
+    def __init__(self, window: int, alpha: float, on_change: Callable[[str, str], None]) -> None:
         self._window, self._alpha = window, alpha
-        self._ignored = ignored
         self._on_change = on_change
         self._monitors: dict[str, ConsistencyMonitor] = {}
 
-    def judge(self, entry: Entry, outcome: Outcome) -> None:
-        """An aid has been applied."""
-        source = entry.aid.source
-        if entry.judged or not outcome.whitened or source in self._ignored:
+    def judge(self, aid: Aid, outcome: Outcome) -> None:
+        """An aid has been fused; to be called once for each, though a rewind brings it again."""
+        if aid.constraint or not outcome.whitened:
             return
-        entry.judged = True
-        if isinstance(entry.aid, PseudorangeAid):
-            for system, figures in per_system(entry.aid, outcome).items():
-                row = np.array(figures)
-                self._add(f"{source}_{system}", entry, row, float(row @ row))
-            return
-        self._add(source, entry, np.array(outcome.whitened), outcome.nis)
+        kept = np.array(outcome.rows) == KEPT
+        for name, row in aid.series(outcome.whitened, kept).items():
+            if name:
+                self._add(f"{aid.source}_{name}", aid, row, float(row @ row))
+            else:
+                self._add(aid.source, aid, row, outcome.nis)
 
-    def _add(self, source: str, entry: Entry, row: Array, nis: float) -> None:
+    def _add(self, source: str, aid: Aid, row: Array, nis: float) -> None:
         monitor = self._monitors.get(source)
         if monitor is None:
-            late = isinstance(entry.aid, RdssPositionAid)
-            window = max(FEWEST, self._window // 2) if late else self._window
-            options = ConsistencyOptions(window, self._alpha, gate=entry.aid.gate)
+            window = max(FEWEST, self._window // 2) if aid.late else self._window
+            options = ConsistencyOptions(window, self._alpha, gate=aid.gate)
             monitor = self._monitors[source] = ConsistencyMonitor(options)
         before = monitor.verdict
         monitor.add_whitened(row, nis)

@@ -31,8 +31,8 @@ class Solution:
 
     `t_ns` host monotonic. Position geodetic (rad, rad, m, WGS 84); velocity NED (m/s); attitude
     roll, pitch, yaw (rad, NED to body, 3-2-1). `sd_ned_m` metres north, east, down. Every figure is
-    NaN while `mode` is WAITING or ALIGNING and it is not known, a sigma also where the model holds
-    the figure.
+    NaN while it is not known: while `mode` is WAITING or ALIGNING, and for an instant before the
+    history that is kept; a sigma also where the model holds the figure.
     """
 
     t_ns: int

@@ -6,7 +6,6 @@ filter as far as the IMU reaches, `solution` reads the state at an instant.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable
 
@@ -15,34 +14,25 @@ from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Linearised
-from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import PseudorangeAid
-from fusiond.aiding.rdss_position import RdssPositionAid
-from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise, quiet_limits, sensor_to_body
-from fusiond.estimators.federated.options import local_of
-from fusiond.estimators.propagation import compensate
+from fusiond.configuration.settings import imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigation.standstill import StandstillDetector, Window
-from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
-from fusiond.navigator.aligner import Aligner, AlignmentOptions
+from fusiond.navigator.alignment.aligner import Aligner
+from fusiond.navigator.alignment.options import alignment_options
+from fusiond.navigator.alignment.start import Start
+from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.intake import Intake
-from fusiond.navigator.raw_gnss import RawGnss
+from fusiond.navigator.isolation import Isolation
+from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.start import Start
 from fusiond.navigator.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
 
-# Aids that the filter makes by itself.
-CONSTRAINTS = frozenset({"zero_velocity", "zero_rate", "non_holonomic"})
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
 
@@ -63,7 +53,7 @@ class Navigator:
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding)
-        self.raw: dict[str, RawGnss] = {}
+        self.raw = self._intake.receivers
         self.model = model_of(config, *self._intake.extra_blocks())
         self.imu = ImuBuffer(
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
@@ -72,44 +62,23 @@ class Navigator:
         self.verdicts = Verdicts(
             config.consistency.window,
             config.consistency.alpha,
-            CONSTRAINTS,
             lambda source, verdict: self._event(f"verdict_{verdict}", f"innovations of {source}"),
         )
         self.timeline = Timeline(
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
         self._on_outcome = on_outcome
-        self._detector = StandstillDetector(quiet_limits(config.constraints.zero_velocity))
+        self._constraints = ConstraintMaker(config.constraints)
+        names = e.federated.sources or tuple(config.aiding)
+        self._isolation = Isolation(self.estimator, names, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
-        self._last_slide_cell = -1
-        self._told_isolated: dict[str, str] = {}
         self.started: Start | None = None
-        for name in config.aiding:
-            receiver = self._intake.raw_receiver(name)
-            if receiver is not None:
-                self.raw[name] = receiver
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
-        a = self.config.alignment
-        position = a.position_deg_m
-        options = AlignmentOptions(
-            heading=a.heading,
-            heading_rad=None if a.heading_deg is None else a.heading_deg * DEG,
-            heading_sd_rad=a.heading_sd_deg * DEG,
-            position=position and (position[0] * DEG, position[1] * DEG, position[2]),
-            position_sd_m=a.position_sd_m,
-            levelling_s=a.levelling_s,
-            rest_speed_m_s=self.config.constraints.zero_velocity.max_speed_m_s,
-            course_speed_m_s=a.course_speed_m_s,
-            course_sd_rad=a.course_sd_deg * DEG,
-            gyrocompass_s=a.gyrocompass_s,
-            gyrocompass_max_sd_rad=a.gyrocompass_max_sd_deg * DEG,
-        )
-        window_s = self.config.constraints.zero_velocity.window_s
-        return Aligner(options, self._noise, self.model, window_s, self._saved)
+        return Aligner(alignment_options(self.config), self._noise, self.model, self._saved)
 
     # ------------------------------------------------------------------ arrivals
 
@@ -131,7 +100,12 @@ class Navigator:
             self.imu.restart()
             self.reset("IMU stamps went back")
         if taken:
-            self._constrain(max(0, self.imu.end - taken))
+            felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
+            if self.started is None:
+                for window in felt.windows:
+                    self._aligner.known.window(window)
+            for aid in felt.aids:
+                self.timeline.insert(aid)
         return taken
 
     def learn(self, message: Ephemeris | Klobuchar) -> None:
@@ -145,30 +119,13 @@ class Navigator:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self._refuse(m.source, "from_future")
-        if isinstance(m, RawGnssEpoch):
-            return self._add_raw(m, t_ns)
         aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
-            self._aligner.aids(aids)
+            self._aligner.known.aids(aids)
         for aid in aids:
             self.timeline.insert(aid)
-        return "accepted"
-
-    def _add_raw(self, epoch: RawGnssEpoch, t_ns: int) -> str:
-        receiver = self.raw.get(epoch.source)
-        if receiver is None:
-            return self._refuse(epoch.source, "raw_not_used")
-        place = None
-        if self.started is None:
-            self._aligner.aids(receiver.start_aids(epoch, t_ns))
-        else:
-            place = self.estimator.nav[:3]
-        aid = receiver.aid(epoch, t_ns, place)
-        if isinstance(aid, str):
-            return self._refuse(epoch.source, aid)
-        self.timeline.insert(aid)
         return "accepted"
 
     def reset(self, why: str) -> None:
@@ -192,7 +149,7 @@ class Navigator:
             (0.0, 0.0, 0.0),
         )
         if self.started is None:
-            self._aligner.aids([aid])
+            self._aligner.known.aids([aid])
         self.timeline.insert(aid)
 
     # ------------------------------------------------------------------ running
@@ -211,72 +168,34 @@ class Navigator:
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
-        self._tell_isolation()
-
-    def _tell_isolation(self) -> None:
-        """Events where the isolated sources are no longer those last told."""
-        now, told = self.estimator.isolated, self._told_isolated
-        for source, reason in now.items():
-            if source not in told:
-                self._event("isolated", f"{source} is left out of the solution: {reason}")
-        for source in told:
-            if source not in now:
-                self._event("readmitted", f"{source} is believed again")
-        self._told_isolated = now
+        self._isolation.tell()
 
     def isolated(self, source: str) -> str | None:
         """Why the fault detection leaves a source out; None if it does not."""
-        found = self.estimator.isolated
-        if not found:
-            return None
-        names = self.config.estimator.federated.sources or tuple(self.config.aiding)
-        local = local_of(source, names)
-        return None if local is None else found.get(names[local])
+        return self._isolation.reason(source)
 
     def solution(self, t_ns: int) -> Solution:
-        """The solution at `t_ns`, carried ahead of the newest sample by holding its rates.
+        """The solution at `t_ns`, of all that has been run by `advance`.
 
-        At most for `gap_s`: beyond it the mode says that the IMU is silent.
+        Later than the newest sample it is carried ahead by holding that sample's rates, at most for
+        `gap_s`: beyond it the mode says that the IMU is silent. Earlier it is the filter's state at
+        that very instant, with the aids valid until then and no later ones; before the history that
+        is kept (`buffer_s`, and the start) nothing is known. The mode is always that of what is
+        known now.
         """
+        if self.started is None or t_ns >= self.estimator.t_ns:
+            return self._present(t_ns)
+        if t_ns < self.timeline.oldest_ns:
+            return Solution(t_ns, Mode.INVALID, "before the history that is kept")
+        with self.timeline.past(t_ns):
+            return self._present(t_ns)
+
+    def _present(self, t_ns: int) -> Solution:
         mode, reason = self.mode(t_ns)
         if self.started is None:
             return Solution(t_ns, mode, reason)
-        e = self.estimator
-        nav = e.nav
-        ahead = min(t_ns - e.t_ns, round(self.config.imu.gap_s * 1e9))
-        if ahead > 0 and self.imu.end:
-            nav = nav.copy()
-            rate, force, zero = np.zeros(3), np.zeros(3), np.zeros(3)
-            compensate(self.imu.samples, self.imu.end - 1, e.sensor_errors, rate, force)
-            strapdown_step(
-                nav,
-                rate,
-                force,
-                zero,
-                zero,
-                ahead * 1e-9,
-                self.model.hold_height,
-                np.zeros(STEP_SIZE),
-            )
-        sd = np.where(self.model.stated, e.sigmas(), np.nan).tolist()
-        values = [float(v) for v in nav]
-        bias = e.sensor_errors
-        lon = (values[1] + math.pi) % (2.0 * math.pi) - math.pi
-        return Solution(
-            t_ns,
-            mode,
-            reason,
-            values[0],
-            lon,
-            values[2],
-            (values[3], values[4], values[5]),
-            rpy_from_dcm(dcm_from_quaternion(nav[6:])),
-            (sd[0], sd[1], sd[2]),
-            (sd[3], sd[4], sd[5]),
-            (sd[6], sd[7], sd[8]),
-            (float(bias[0]), float(bias[1]), float(bias[2])),
-            (float(bias[3]), float(bias[4]), float(bias[5])),
-        )
+        gap_ns = round(self.config.imu.gap_s * 1e9)
+        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason)
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """What the solution is worth at `t_ns`, and why."""
@@ -307,49 +226,14 @@ class Navigator:
     def _outcome(self, entry: Entry) -> None:
         outcome = entry.outcome
         if outcome is not None and outcome.name == "fused":
-            self.verdicts.judge(entry, outcome)
+            if outcome.whitened and not entry.judged:
+                entry.judged = True
+                self.verdicts.judge(entry.aid, outcome)
             source, t_ns = entry.aid.source, entry.key[0]
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
-            if isinstance(entry.aid, PositionAid | RdssPositionAid | PseudorangeAid):
+            if entry.aid.locates:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
-        if isinstance(entry.aid, PseudorangeAid) and outcome is not None and outcome.rows:
-            self.raw[entry.aid.source].judged(entry.aid, outcome)
+        if outcome is not None:
+            entry.aid.judged(outcome.rows, outcome.whitened)
         if self._on_outcome is not None:
             self._on_outcome(entry)
-
-    def _constrain(self, new: int) -> None:
-        """What the samples from row `new` on say by themselves: standstill, and no sliding."""
-        imu, c = self.imu, self.config.constraints
-        windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
-        for window in windows:
-            if self.started is None:
-                self._aligner.window(window)
-            if window.quiet and c.zero_velocity.enabled:
-                for aid in self._standstill(window):
-                    self.timeline.insert(aid)
-        slide = c.non_holonomic
-        if not slide.enabled:
-            return
-        cells = imu.times[new : imu.end] // round(slide.interval_s * 1e9)
-        for row in np.flatnonzero(np.diff(cells, prepend=self._last_slide_cell)):
-            self.timeline.insert(
-                NonHolonomicAid(
-                    "non_holonomic",
-                    int(imu.times[new + row]),
-                    0.9999,
-                    slide.sd_m_s,
-                    slide.min_speed_m_s,
-                    slide.lever_arm_m,
-                )
-            )
-        self._last_slide_cell = int(cells[-1])
-
-    def _standstill(self, w: Window) -> list[Linearised]:
-        z = self.config.constraints.zero_velocity
-        rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
-        return [
-            ZeroVelocityAid("zero_velocity", w.end_ns, 0.9999, z.velocity_sd_m_s, z.max_speed_m_s),
-            ZeroRateAid(
-                "zero_rate", w.end_ns, 0.9999, rate, z.rate_sd_deg_s * DEG, z.max_speed_m_s
-            ),
-        ]

@@ -1,34 +1,32 @@
 r"""Tight coupling: a receiver's raw epochs become aids of corrected ranges and rates.
 
 What a receiver broadcasts on (ephemerides, ionosphere) is kept; each epoch is corrected for the
-place where the vehicle is thought to be (100 m off moves a correction by 1 cm), and the solution of
-the epoch alone says that place before there is a filter, and starts its alignment.
+place where the filter is at its instant (100 m off moves a correction by 1 cm). Before there is a
+filter, the solution of the epoch alone starts the alignment.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch, System
-from fusiond.aiding.base import Linearised
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
-from fusiond.aiding.velocity import VelocityAid
+from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
+from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
 from fusiond.configuration.aiding import RawAiding
-from fusiond.configuration.settings import clock_noise
-from fusiond.estimators.base import Outcome
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
-from fusiond.gnss.ranges import RangeModel, RangeOptions, Rows
+from fusiond.gnss.ranges import Picked, RangeModel, RangeOptions, Rows
 from fusiond.gnss.selection import best_four
 from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
 from fusiond.gnss.store import EphemerisStore
-from fusiond.models.blocks import Block, clock_blocks, position_bias
 
 Array = NDArray[np.float64]
 
@@ -47,16 +45,64 @@ class Sky:
     innovation_rms: float | None = None
 
 
-def raw_blocks(section: RawAiding) -> list[Block]:
-    """The states that raw epochs need: a clock offset a system, drift, and errors that ranges
-    share."""
-    blocks = clock_blocks(section.systems, clock_noise(section))
-    if section.bias_sd_m > 0.0:
-        tau_s = section.bias_correlation_s
-        level, down = RANGE_BIAS
-        blocks.append(position_bias(level, section.bias_sd_m, tau_s))
-        blocks.append(position_bias(down, section.bias_down_sd_m, tau_s, "d"))
-    return blocks
+@dataclass(frozen=True, slots=True)
+class _Corrected:
+    """An epoch for a vehicle at about `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
+
+    place: tuple[float, float, float]
+    guess: Array
+    rows: Rows
+    aid: PseudorangeAid
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What an epoch came to last, and whether its refused satellites have been counted."""
+
+    corrected: _Corrected | None = None
+    counted: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawEpochAid(Aid):
+    """An epoch whose signals have been chosen, to be corrected where the filter is at its instant.
+
+    So the order of arrival leaves no trace: what an epoch comes to depends on the state at its own
+    instant, not on how far the filter had got when the epoch came in.
+    """
+
+    screened: ClassVar[bool] = True
+    locates: ClassVar[bool] = True
+
+    receiver: RawGnss
+    epoch: RawGnssEpoch
+    picked: Picked
+    memory: _Memory = field(default_factory=_Memory)
+
+    def at(self, nav: Array) -> PseudorangeAid:
+        """The epoch's ranges for a vehicle there; it may have no satellites left."""
+        lat, lon, height = nav[:3].tolist()
+        found, key = self.memory.corrected, (lat, lon, height)
+        if found is None or found.place != key:
+            guess = np.array(to_ecef(lat, lon, height))
+            found = _Corrected(key, guess, *self.receiver.correct(self, guess))
+            self.memory.corrected = found
+        return found.aid
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        return self.at(state.nav).innovation(state)
+
+    def offers(self) -> Sequence[Offer]:
+        """Position and velocity of the epoch alone; none without a solution."""
+        return self.receiver.alone(self)
+
+    def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
+        found = self.memory.corrected
+        return {} if found is None else found.aid.series(whitened, kept)
+
+    def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
+        if self.memory.corrected is not None:
+            self.receiver.judged(self, self.memory.corrected, codes, whitened)
 
 
 class RawGnss:
@@ -73,8 +119,8 @@ class RawGnss:
         clocks = [section.systems.index(s) if s in section.systems else NO_CLOCK for s in SYSTEMS]
         self._clock = np.array(clocks, dtype=np.int64)
         self._guess: Array | None = None
-        self._rows: Rows | None = None
-        self._judged: tuple[PseudorangeAid, Outcome] | None = None
+        self._left_out: dict[str, str] = {}
+        self._judged: tuple[_Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
         self.refused: Counter[str] = Counter()
 
@@ -82,36 +128,37 @@ class RawGnss:
         """Keep what a satellite has said."""
         self._store.add(message)
 
-    def start_aids(self, epoch: RawGnssEpoch, t_ns: int) -> list[Linearised]:
-        """Position and velocity of the epoch alone, for the alignment; none without a solution."""
-        found = single_point(self._model, epoch, self._guess)
+    def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
+        """The epoch as an aid, with the ephemerides that are known by now."""
+        gate = self._section.gate_probability
+        return RawEpochAid(self.source, t_ns, gate, self, epoch, self._model.pick(epoch))
+
+    def alone(self, aid: RawEpochAid) -> list[Offer]:
+        """Position and velocity of an epoch alone, for the alignment; none without a solution."""
+        found = single_point(self._model, aid.epoch, self._guess)
+        offers: list[Offer] = []
         if isinstance(found, str) or not found.consistent:
             self.refused[found if isinstance(found, str) else "inconsistent"] += 1
-            return []
-        self._guess = found.position
-        return self._fix(found, t_ns)
+        else:
+            self._guess = found.position
+            offers = self._fix(found, aid.t_ns)
+        if self._guess is not None:
+            rows = self._model.evaluate(aid.picked, self._guess)
+            self._judged, self._left_out = None, dict(rows.refused)
+            self._count(aid, rows)
+        return offers
 
-    def aid(self, epoch: RawGnssEpoch, t_ns: int, place: Array | None) -> PseudorangeAid | str:
-        """The epoch's ranges for a vehicle at about `place` (lat, lon, height: rad, m), or why
-        none serves: `no_position` before the first solution, `no_satellites`."""
-        if place is not None:
-            self._guess = np.array(to_ecef(float(place[0]), float(place[1]), float(place[2])))
-        if self._guess is None:
-            return "no_position"
-        rows = self._model.rows(epoch, self._guess)
-        for satellite, reason in rows.refused:
-            self.refused[f"{satellite[0]}_{reason}"] += 1
+    def correct(self, aid: RawEpochAid, guess: Array) -> tuple[Rows, PseudorangeAid]:
+        """An epoch's rows for a vehicle at about `guess` (ECEF, m), and what they are as an aid."""
+        rows = self._model.evaluate(aid.picked, guess)
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
-        self._rows = rows
-        if not rows.satellites:
-            return "no_satellites"
         scale = self._section.sigma_scale**2
-        return PseudorangeAid(
+        return rows, PseudorangeAid(
             self.source,
-            t_ns,
-            self._section.gate_probability,
+            aid.t_ns,
+            aid.gate,
             rows.satellites,
             rows.position,
             rows.velocity,
@@ -121,31 +168,45 @@ class RawGnss:
             rows.rate_variance * scale,
             self._clock[rows.system],
             self._section.lever_arm_m,
-            epoch.clock_reset,
+            aid.epoch.clock_reset,
         )
 
-    def judged(self, aid: PseudorangeAid, outcome: Outcome) -> None:
+    def judged(
+        self,
+        aid: RawEpochAid,
+        corrected: _Corrected,
+        codes: Sequence[int],
+        whitened: Sequence[float],
+    ) -> None:
         """The filter has looked at an epoch; one that a rewind brings again counts once."""
-        self._judged = aid, outcome
-        if aid.t_ns <= self._counted_ns:
+        self._judged = corrected, codes, whitened
+        self._guess = corrected.guess
+        self._count(aid, corrected.rows)
+        if not codes or aid.t_ns <= self._counted_ns:
             return
         self._counted_ns = aid.t_ns
-        refused = [(k, code) for k, code in enumerate(outcome.rows) if code != KEPT]
-        labels = aid.labels if refused else []
+        refused = [(k, code) for k, code in enumerate(codes) if code != KEPT]
+        labels = corrected.aid.labels if refused else []
         for k, code in refused:
             satellite, what = labels[k]
             self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
+    def _count(self, aid: RawEpochAid, rows: Rows) -> None:
+        """Satellites that do not serve, once an epoch."""
+        if not aid.memory.counted:
+            aid.memory.counted = True
+            for satellite, reason in rows.refused:
+                self.refused[f"{satellite[0]}_{reason}"] += 1
+
     def sky(self) -> Sky:
         """What the last epoch came to."""
-        if self._judged is None or self._rows is None or self._guess is None:
-            return Sky(refused=dict(self._rows.refused) if self._rows is not None else {})
-        aid, outcome = self._judged
-        used, refused, squares = [], dict(self._rows.refused), []
-        whitened = outcome.whitened or (0.0,) * len(outcome.rows)  # an epoch that failed as a whole
-        for (satellite, what), code, innovation in zip(
-            aid.labels, outcome.rows, whitened, strict=False
-        ):
+        if self._judged is None:
+            return Sky(refused=dict(self._left_out))
+        corrected, codes, whitened = self._judged
+        used, refused, squares = [], dict(corrected.rows.refused), []
+        aid = corrected.aid
+        whitened = whitened or (0.0,) * len(codes)  # an epoch that failed as a whole
+        for (satellite, what), code, innovation in zip(aid.labels, codes, whitened, strict=False):
             if what == "range":
                 if code == KEPT:
                     used.append(satellite)
@@ -153,51 +214,25 @@ class RawGnss:
                 else:
                     refused[satellite] = REASONS.get(code, "gated")
         here = [k for k, name in enumerate(aid.satellites) if name in used]
-        sight = aid.position[here] - self._guess
+        sight = aid.position[here] - corrected.guess
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
         return Sky(
             tuple(used),
             refused,
-            dops(sight, aid.clock[here], self._guess) if used else None,
+            dops(sight, aid.clock[here], corrected.guess) if used else None,
             math.sqrt(float(np.mean(squares))) if squares else None,
         )
 
-    def _fix(self, found: SinglePoint, t_ns: int) -> list[Linearised]:
+    def _fix(self, found: SinglePoint, t_ns: int) -> list[Offer]:
         x, y, z = (float(v) for v in found.position)
         lat, lon, height = to_geodetic(x, y, z)
         axes = ned_axes(lat, lon)
         covariance = axes.T @ found.covariance @ axes
         n, e, d = np.sqrt(np.diag(covariance)).tolist()
-        section = self._section
-        lever, gate = section.lever_arm_m, section.gate_probability
-        aids: list[Linearised] = [
-            PositionAid(self.source, t_ns, gate, lat, lon, height, (n, e, d), lever)
-        ]
+        lever = self._section.lever_arm_m
+        offers: list[Offer] = [PositionOffer(t_ns, lat, lon, height, (n, e, d), lever)]
         if found.velocity is not None:
             v_n, v_e, v_d = (axes.T @ found.velocity).tolist()
-            sd = section.start_velocity_sd_m_s
-            aids.append(
-                VelocityAid(
-                    f"{self.source}_velocity", t_ns, gate, (v_n, v_e, v_d), (sd, sd, sd), lever
-                )
-            )
-        return aids
-
-
-def per_system(aid: PseudorangeAid, outcome: Outcome) -> dict[System, tuple[float, float]]:
-    """Two standard normal figures a system for its verdict: the sums of the whitened innovations
-    of its ranges and of its rates over the root of their number. White innovations give N(0, 1)
-    whatever the number of satellites, so that epochs of any sky form one series."""
-    satellite_of = dict(zip(aid.clock.tolist(), aid.satellites, strict=True))
-    count = max(satellite_of) + 1
-    ranges, rates = aid.clock[np.isfinite(aid.ranges)], aid.clock[np.isfinite(aid.rates)] + count
-    kept = np.flatnonzero(np.array(outcome.rows) == KEPT)
-    series = np.concatenate((ranges, rates))[kept]
-    sums = np.bincount(series, np.array(outcome.whitened)[kept], 2 * count)
-    numbers = np.bincount(series, minlength=2 * count)
-    figures = (sums / np.sqrt(np.maximum(numbers, 1))).tolist()
-    return {
-        next(s for s in SYSTEMS if s == satellite[0]): (figures[k], figures[count + k])
-        for k, satellite in satellite_of.items()
-        if numbers[k] and numbers[count + k]
-    }
+            sd = self._section.start_velocity_sd_m_s
+            offers.append(VelocityOffer(t_ns, (v_n, v_e, v_d), (sd, sd, sd)))
+        return offers

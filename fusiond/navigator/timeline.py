@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from fusiond.aiding.base import Linearised
-from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
+from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.navigation.imu_buffer import ImuBuffer
 
@@ -37,7 +37,7 @@ class Entry:
     `judged` that its innovation has been looked at: a rewind applies it again."""
 
     key: Key
-    aid: Linearised
+    aid: Aid
     outcome: Outcome | None = None
     judged: bool = False
 
@@ -110,11 +110,11 @@ class Timeline:
         """The earliest instant that an aid may still be valid at."""
         return self._checkpoints[0].snapshot.t_ns if self._checkpoints else 0
 
-    def insert(self, aid: Linearised, serial: int = 0) -> Entry:
+    def insert(self, aid: Aid, serial: int = 0) -> Entry:
         """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
         # What is due to be fed back is fed back before anything of the same instant is applied: the
         # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
-        key = (aid.t_ns, "" if isinstance(aid, FeedBackAid) else aid.source, serial)
+        key = (aid.t_ns, "" if aid.feedback == "release" else aid.source, serial)
         entry = Entry(key, aid)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
@@ -145,11 +145,37 @@ class Timeline:
             if entry.key[0] > estimator.t_ns:
                 estimator.propagate(self.imu, entry.key[0], record)
                 self._checkpoint()
-            self._count(entry, self._apply(entry))
+            self._count(entry, self._apply(entry, self._failing))
             self._next += 1
         estimator.propagate(self.imu, latest, record)
         self._checkpoint()
         self._forget(latest - self._keep_ns)
+
+    @contextmanager
+    def past(self, t_ns: int) -> Iterator[None]:
+        """Within it the estimator is as it was at `t_ns`, from `oldest_ns` on, after every aid that
+        was valid until then; afterwards it is as before, bit for bit.
+
+        It is run from the checkpoint before, so it costs as much as a rewind to that instant, but
+        not beyond it: nothing is counted and nobody is told.
+        """
+        estimator = self.estimator
+        present = estimator.snapshot()
+        checkpoint = next(c for c in reversed(self._checkpoints) if c.snapshot.t_ns <= t_ns)
+        failing = dict(checkpoint.failing)
+        estimator.restore(checkpoint.snapshot)
+        try:
+            for row in range(self._following(checkpoint), len(self._entries)):
+                at_ns = self._keys[row][0]
+                if at_ns > t_ns:
+                    break
+                if at_ns > estimator.t_ns:
+                    estimator.propagate(self.imu, at_ns)
+                self._apply(self._entries[row], failing)
+            estimator.propagate(self.imu, t_ns)
+            yield
+        finally:
+            estimator.restore(present)
 
     def _give_up(self, count: int, name: str) -> None:
         """Drop the first `count` of those that wait."""
@@ -158,19 +184,20 @@ class Timeline:
             self._count(entry, Outcome(name))
         del self._entries[rows], self._keys[rows]
 
-    def _apply(self, entry: Entry) -> Outcome:
+    def _apply(self, entry: Entry, failing: dict[str, tuple[int, int]]) -> Outcome:
         source, t_ns = entry.aid.source, entry.key[0]
-        since, count = self._failing.get(source, (t_ns, 0))
+        since, count = failing.get(source, (t_ns, 0))
         recover = count >= RECOVERY_COUNT and t_ns - since >= RECOVERY_NS
-        if isinstance(entry.aid, FeedBackAid):
+        feedback = entry.aid.feedback
+        if feedback == "release":
             self.estimator.release()
-        elif isinstance(entry.aid, RdssPositionAid) and entry.aid.holds:
+        elif feedback == "hold":
             self.estimator.hold()
-        outcome = self.estimator.update(entry.aid, inflate=recover)
+        outcome = self.estimator.update(entry.aid.at(self.estimator.nav), inflate=recover)
         if outcome.name == "gated":
-            self._failing[source] = (since, count + 1)
+            failing[source] = (since, count + 1)
         elif outcome.name == "fused":
-            self._failing.pop(source, None)
+            failing.pop(source, None)
         return outcome
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
@@ -198,11 +225,14 @@ class Timeline:
         checkpoint = self._checkpoints[-1]
         self.estimator.restore(checkpoint.snapshot)
         self._failing = dict(checkpoint.failing)
-        self._next = (
-            0 if checkpoint.last_key is None else bisect_left(self._keys, checkpoint.last_key) + 1
-        )
+        self._next = self._following(checkpoint)
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])
+
+    def _following(self, checkpoint: _Checkpoint) -> int:
+        """Row of the first entry that the checkpoint has not seen."""
+        last_key = checkpoint.last_key
+        return 0 if last_key is None else bisect_left(self._keys, last_key) + 1
 
     @staticmethod
     def _precedes(checkpoint: _Checkpoint, key: Key) -> bool:

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG
 from fusiond.estimators.kalman import KalmanEstimator
@@ -68,7 +68,7 @@ class LiveFilter:
         estimator.initialise(0, 0, nav.copy(), np.zeros(estimator.model.size), np.diag(sd**2))
         self._timeline.start()
 
-    def advance(self, t_s: float, aids: Iterable[Linearised] = ()) -> None:
+    def advance(self, t_s: float, aids: Iterable[Aid] = ()) -> None:
         """IMU samples up to `t_s` and then `aids` arrive."""
         end = round(t_s * RATE_HZ)
         self._buffer.append(self._times[self._given : end], self._samples[self._given : end])

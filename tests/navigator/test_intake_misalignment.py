@@ -146,4 +146,4 @@ def test_a_start_does_not_take_its_heading_from_a_tracker_that_is_mounted_askew(
         config = Config.model_validate({"aiding": {"star_tracker": {"misalignment_sd_arcsec": sd}}})
         navigator = Navigator(config)
         assert navigator.add(attitude("star_tracker"), 7) == "accepted"
-        assert (navigator._aligner._heading is not None) is taken
+        assert (navigator._aligner.known.heading is not None) is taken

@@ -11,20 +11,18 @@ import pytest
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import PseudorangeAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.catalogue import make_model
+from fusiond.navigator.intake import Intake
 from fusiond.navigator.navigator import Navigator
-from fusiond.navigator.raw_gnss import RawGnss, per_system, raw_blocks
+from fusiond.navigator.raw_gnss import RawGnss
 from fusiond.offline.compare import compare
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
@@ -56,7 +54,7 @@ def place(k: int) -> Any:
 
 def started(section: RawAiding) -> KalmanEstimator:
     """A filter at rest at the true place of epoch 0."""
-    model = make_model("ins15", imu_noise(Imu()), *raw_blocks(section))
+    model = make_model("ins15", imu_noise(Imu()), *Intake({"raw": section}).extra_blocks())
     estimator = KalmanEstimator(model, Imu().gap_s)
     sigma = model.initial.copy()
     sigma[:9] = [0.01] * 2 + [0.05] + [0.1] * 3 + [5.0] * 3
@@ -76,11 +74,14 @@ def off(estimator: KalmanEstimator) -> float:
 # --------------------------------------------------------------------------- epochs to aids
 
 
-def test_without_a_place_or_satellites_there_is_no_aid() -> None:
+def test_without_ephemerides_an_epoch_does_not_apply_and_says_why() -> None:
     epoch = receiver().epoch(0)
-    assert informed().aid(epoch, 0, None) == "no_position"
     deaf = RawGnss("raw", RawAiding())
-    assert deaf.aid(epoch, 0, place(0)) == "no_satellites"
+    aid = deaf.aid(epoch, 0)
+    outcome = started(RawAiding()).update(aid.at(place(0)))
+    assert outcome.name == "no_satellites"
+    for _ in range(2):  # a rewind brings it again
+        aid.judged(outcome.rows, outcome.whitened)
     assert sum(deaf.refused.values()) == len(epoch.signals)
     assert set(deaf.refused) == {"G_no_ephemeris", "C_no_ephemeris"}
     assert set(deaf.sky().refused.values()) == {"no_ephemeris"}
@@ -88,30 +89,27 @@ def test_without_a_place_or_satellites_there_is_no_aid() -> None:
 
 def test_an_epoch_alone_starts_the_alignment() -> None:
     raw, sim = informed(), receiver()
-    position, velocity = raw.start_aids(sim.epoch(0), 7)
-    assert isinstance(position, PositionAid)
-    assert isinstance(velocity, VelocityAid)
-    assert (position.t_ns, velocity.source) == (7, "raw_velocity")
+    position, velocity = raw.aid(sim.epoch(0), 7).offers()
+    assert isinstance(position, PositionOffer)
+    assert isinstance(velocity, VelocityOffer)
+    assert (position.t_ns, velocity.t_ns) == (7, 7)
     lat, lon, height = place(0)
     assert abs(position.lat_rad - lat) * 6.37e6 < 5.0 * position.sd[0]
     assert abs(position.lon_rad - lon) * 6.37e6 < 5.0 * position.sd[1]
     assert position.height_m is not None
     assert abs(position.height_m - height) < 5.0 * position.sd[2]
     few = replace(sim.epoch(1), signals=sim.epoch(1).signals[:3])
-    assert raw.start_aids(few, 8) == []
+    assert raw.aid(few, 8).offers() == []
     assert raw.refused["too_few"] == 1
-    assert isinstance(raw.aid(few, 8, None), PseudorangeAid), "the first epoch told the place"
 
 
 def test_options() -> None:
     epoch = receiver().epoch(0)
-    usual = informed().aid(epoch, 0, place(0))
-    wide = informed(RawAiding(sigma_scale=2.0)).aid(epoch, 0, place(0))
-    four = informed(RawAiding(best_four=True)).aid(epoch, 0, place(0))
-    gps = informed(RawAiding(systems=("G",))).aid(epoch, 0, place(0))
-    high = informed(RawAiding(elevation_mask_deg=40.0)).aid(epoch, 0, place(0))
-    for aid in (usual, wide, four, gps, high):
-        assert isinstance(aid, PseudorangeAid)
+    usual = informed().aid(epoch, 0).at(place(0))
+    wide = informed(RawAiding(sigma_scale=2.0)).aid(epoch, 0).at(place(0))
+    four = informed(RawAiding(best_four=True)).aid(epoch, 0).at(place(0))
+    gps = informed(RawAiding(systems=("G",))).aid(epoch, 0).at(place(0))
+    high = informed(RawAiding(elevation_mask_deg=40.0)).aid(epoch, 0).at(place(0))
     assert wide.range_variance == pytest.approx(4.0 * usual.range_variance)
     assert wide.rate_variance == pytest.approx(4.0 * usual.rate_variance)
     assert len(four.satellites) == 4
@@ -126,12 +124,12 @@ def test_sky_names_every_satellite() -> None:
     sim = receiver()
     raw = informed(sim=sim)
     epoch = sim.epoch(0)
-    aid = raw.aid(epoch, 0, place(0))
-    assert isinstance(aid, PseudorangeAid)
+    epoch_aid = raw.aid(epoch, 0)
+    aid = epoch_aid.at(place(0))
     n = len(aid.satellites)
     codes = [KEPT] * (2 * n)
     codes[0], codes[1], codes[n + 2] = GATED, RESIDUAL, GATED
-    raw.judged(aid, Outcome("fused", 1.0, 2 * n - 3, (0.5,) * (2 * n), tuple(codes)))
+    epoch_aid.judged(codes, (0.5,) * (2 * n))
     sky = raw.sky()
     assert set(sky.used) | set(sky.refused) == {s.satellite for s in epoch.signals}
     assert not set(sky.used) & set(sky.refused)
@@ -148,9 +146,9 @@ def test_sky_names_every_satellite() -> None:
 
 def test_an_epoch_refused_as_a_whole_names_its_satellites() -> None:
     raw = informed()
-    aid = raw.aid(receiver().epoch(0), 0, place(0))
-    assert isinstance(aid, PseudorangeAid)
-    raw.judged(aid, Outcome("gated", 900.0, 0, (), (GATED,) * (2 * len(aid.satellites))))
+    epoch_aid = raw.aid(receiver().epoch(0), 0)
+    aid = epoch_aid.at(place(0))
+    epoch_aid.judged((GATED,) * (2 * len(aid.satellites)), ())
     sky = raw.sky()
     assert sky.used == ()
     assert {sky.refused[s] for s in aid.satellites} == {"gated"}
@@ -159,27 +157,25 @@ def test_an_epoch_refused_as_a_whole_names_its_satellites() -> None:
 def test_figures_of_a_system_are_standard_normal() -> None:
     rng = np.random.default_rng(2)
     raw = informed()
-    aid = raw.aid(receiver().epoch(0), 0, place(0))
-    assert isinstance(aid, PseudorangeAid)
+    aid = raw.aid(receiver().epoch(0), 0).at(place(0))
     rows = 2 * len(aid.satellites)
     figures = []
     for _ in range(4000):
         codes = np.where(rng.random(rows) < 0.05, GATED, KEPT)
         whitened = np.where(codes == KEPT, rng.standard_normal(rows), 0.0)
-        outcome = Outcome("fused", 1.0, rows, tuple(whitened.tolist()), tuple(codes.tolist()))
-        figures.append([*per_system(aid, outcome)["G"], *per_system(aid, outcome)["C"]])
+        found = aid.series(whitened.tolist(), codes == KEPT)
+        figures.append([*found["G"], *found["C"]])
     covariance = np.cov(np.array(figures).T)
     assert covariance == pytest.approx(np.eye(4), abs=0.1)
 
 
 def test_a_system_without_rates_has_no_figure() -> None:
     raw = informed()
-    aid = raw.aid(receiver().epoch(0), 0, place(0))
-    assert isinstance(aid, PseudorangeAid)
+    aid = raw.aid(receiver().epoch(0), 0).at(place(0))
     rates = np.where([s[0] == "G" for s in aid.satellites], np.nan, aid.rates)
     silent = replace(aid, rates=rates)
     rows = len(silent.labels)
-    found = per_system(silent, Outcome("fused", 1.0, rows, (1.0,) * rows, (KEPT,) * rows))
+    found = silent.series((1.0,) * rows, np.ones(rows, dtype=bool))
     assert set(found) == {"C"}
 
 
@@ -202,15 +198,13 @@ def test_a_clock_set_by_a_millisecond_moves_nothing_but_the_clock() -> None:
         raw, estimator = informed(section, sim), started(section)
         epoch = sim.epoch(0)
         for _ in range(3):
-            aid = raw.aid(epoch, 0, estimator.nav[:3])
-            assert isinstance(aid, PseudorangeAid)
+            aid = raw.aid(epoch, 0).at(estimator.nav)
             assert estimator.update(aid).name == "fused"
         offset = estimator.xi[estimator.model.slots_of(CLOCK_OFFSET)].copy()
         before = off(estimator)
         jump = SPEED_OF_LIGHT_M_S * 1e-3
         set_clock = replace(moved(epoch, jump), clock_reset=flagged)
-        aid = raw.aid(set_clock, 0, estimator.nav[:3])
-        assert isinstance(aid, PseudorangeAid)
+        aid = raw.aid(set_clock, 0).at(estimator.nav)
         outcome = estimator.update(aid)
         assert outcome.name == "fused"
         assert set(outcome.rows) == {KEPT}
@@ -227,14 +221,12 @@ def test_fewer_than_four_satellites_help(count: int) -> None:
     raw, estimator = informed(section, sim), started(section)
     epoch = sim.epoch(0)
     for _ in range(3):  # clocks are known from a fuller sky
-        aid = raw.aid(epoch, 0, estimator.nav[:3])
-        assert isinstance(aid, PseudorangeAid)
+        aid = raw.aid(epoch, 0).at(estimator.nav)
         estimator.update(aid)
     for slot in range(6, 9):
         estimator.covariance[slot, slot] += 20.0**2
     before = estimator.sigmas()[:3].copy()
-    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0, estimator.nav[:3])
-    assert isinstance(aid, PseudorangeAid)
+    aid = raw.aid(replace(epoch, signals=epoch.signals[:count]), 0).at(estimator.nav)
     outcome = estimator.update(aid)
     assert (outcome.name, outcome.degrees) == ("fused", 2 * count)
     after = estimator.sigmas()[:3]
@@ -248,16 +240,15 @@ def test_one_bad_satellite_is_refused_alone() -> None:
     raw, estimator = informed(section, sim), started(section)
     epoch = sim.epoch(0)
     for _ in range(3):
-        aid = raw.aid(epoch, 0, estimator.nav[:3])
-        assert isinstance(aid, PseudorangeAid)
+        aid = raw.aid(epoch, 0).at(estimator.nav)
         estimator.update(aid)
     bad = epoch.signals[2].satellite
-    aid = raw.aid(moved(epoch, 80.0, {bad}), 0, estimator.nav[:3])
-    assert isinstance(aid, PseudorangeAid)
+    epoch_aid = raw.aid(moved(epoch, 80.0, {bad}), 0)
+    aid = epoch_aid.at(estimator.nav)
     outcome = estimator.update(aid)
     left_out = [label for label, code in zip(aid.labels, outcome.rows, strict=True) if code]
     assert left_out == [(bad, "range")]
-    raw.judged(aid, outcome)
+    epoch_aid.judged(outcome.rows, outcome.whitened)
     assert set(raw.sky().refused) >= {bad}
 
 

@@ -16,7 +16,6 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.gnss.ecef import ned_axes, to_geodetic
 from fusiond.gnss.single_point import SinglePoint
 from fusiond.navigator.intake import Intake
-from fusiond.navigator.raw_gnss import raw_blocks
 from fusiond.studies import STUDIES
 from fusiond.studies.bds_tight import runs
 from fusiond.studies.bds_tight import study as bds_tight
@@ -104,7 +103,9 @@ def test_tables_and_picture(tmp_path: Path) -> None:
 def test_the_clock_is_the_papers_and_as_restless_as_the_filters() -> None:
     o = runs.OPTIONS
     assert o.clock_drift_constant_sd_m_s == 0.0
-    drift_block = next(b for b in raw_blocks(runs.RAW) if b.name == "clock_drift")
+    drift_block = next(
+        b for b in Intake({"raw": runs.RAW}).extra_blocks() if b.name == "clock_drift"
+    )
     density = 2.0 * o.clock_drift_sd_m_s**2 / o.clock_drift_correlation_s
     assert density == pytest.approx(drift_block.white)
     steps = []

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
@@ -299,7 +299,7 @@ def _filter_trace(
     start = with_error(nav[0], unit_error * sd[:9])
     live = LiveFilter(row.make(model, IMU.gap_s), IMU.gap_s, samples, start, sd)
     estimator = live.estimator
-    raw = intake.raw_receiver("raw")
+    raw = intake.receivers.get("raw")
     if raw is not None:
         for message in broadcast(simulated):
             raw.learn(message)
@@ -309,14 +309,13 @@ def _filter_trace(
     for k, t in enumerate(t_s):
         t_ns = round(t * 1e9)
         live.advance(t)
-        aids: list[Linearised] = []
+        aids: list[Aid] = []
         found = solved[k]
         if raw is not None and not away[k]:
-            aid = raw.aid(observed[k], t_ns, estimator.nav[:3])
-            aids = [] if isinstance(aid, str) else [aid]
+            aids = [raw.aid(observed[k], t_ns)]
         elif raw is None and found is not None:
             accepted = intake.aids(fix(found, t_ns), t_ns, 0.0)
-            aids = [] if isinstance(accepted, str) else accepted
+            aids = [] if isinstance(accepted, str) else list(accepted)
         live.advance(t, aids)
         x, p = nav_error(estimator.nav, nav[k + 1]), estimator.covariance[:9, :9]
         trace.error[k] = x[6:]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from fusiond.aiding.base import Linearised, NotApplicable
+from fusiond.aiding.base import Aid, NotApplicable
 from fusiond.aiding.height import HeightAid
 from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
 from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
@@ -210,14 +210,14 @@ def draw_clock(rng: np.random.Generator) -> tuple[Array, Array]:
     return offset, drift
 
 
-def _pseudoranges(rng: np.random.Generator, number: int) -> tuple[list[list[Linearised]], float]:
+def _pseudoranges(rng: np.random.Generator, number: int) -> tuple[list[list[Aid]], float]:
     names, position, velocity = _satellites()
     chosen, hdop = draw_satellites(rng, number)
     offset, drift = draw_clock(rng)
     t_s = epochs(PROBLEMS[2])
     _, place, moving = _true_states(PROBLEMS[2].every_s)
     n = len(chosen)
-    found: list[list[Linearised]] = []
+    found: list[list[Aid]] = []
     for k, t in enumerate(t_s):
         sample = round(t * IMU.rate_hz) - 1
         apart = position[k, chosen] - place[k + 1]
@@ -244,13 +244,13 @@ def _pseudoranges(rng: np.random.Generator, number: int) -> tuple[list[list[Line
     return found, hdop * RANGE_SD_M
 
 
-def _double_star(rng: np.random.Generator) -> tuple[list[list[Linearised]], float]:
+def _double_star(rng: np.random.Generator) -> tuple[list[list[Aid]], float]:
     satellites, nothing = _geostationary(), np.full(2, np.nan)
     lat, lon, height = ORIGIN_DEG_M
     fix = RdssGeometry().covariance(lat * DEG, lon * DEG, height, SLANT_SD_M, HEIGHT_SD_M)
     assert not isinstance(fix, NotApplicable)
     nav, place, _ = _true_states(PROBLEMS[0].every_s)
-    found: list[list[Linearised]] = []
+    found: list[list[Aid]] = []
     for k, t in enumerate(epochs(PROBLEMS[0])):
         t_ns = round(t * 1e9)
         slant = np.linalg.norm(satellites - place[k + 1], axis=1)

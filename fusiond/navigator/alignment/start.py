@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, meridian_radius, transverse_radius
@@ -27,7 +26,7 @@ LEAST_VELOCITY_SD = 0.05
 # One sigma of a road's slope: main roads are built to 3 to 6 %, streets in hills to 12 %.
 SLOPE_SD = 0.06
 
-Place = tuple[PositionAid | None, Array, float]
+Place = tuple[PositionOffer | None, Array, float]
 """The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
 
 
@@ -37,14 +36,14 @@ def as_geodetic(metres: Array, lat: float) -> Array:
     return np.array([n / meridian_radius(lat), e / (transverse_radius(lat) * math.cos(lat)), -d])
 
 
-def velocity_of(aid: VelocityAid) -> tuple[Array, Array]:
+def velocity_of(offer: VelocityOffer) -> tuple[Array, Array]:
     """Velocity NED (3,) and one sigma (3,). NMEA measures no vertical velocity: it is then 0, give
     or take what a road's slope makes of the speed."""
-    if len(aid.v_ned) == 3:
-        return np.array(aid.v_ned), np.full(3, max(aid.sd))
-    sd = max(aid.sd)
-    climb = math.hypot(sd, SLOPE_SD * math.hypot(*aid.v_ned))
-    return np.array([*aid.v_ned, 0.0]), np.array([sd, sd, climb])
+    if len(offer.v_ned) == 3:
+        return np.array(offer.v_ned), np.full(3, max(offer.sd))
+    sd = max(offer.sd)
+    climb = math.hypot(sd, SLOPE_SD * math.hypot(*offer.v_ned))
+    return np.array([*offer.v_ned, 0.0]), np.array([sd, sd, climb])
 
 
 @dataclass(frozen=True, slots=True)

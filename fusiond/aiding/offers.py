@@ -1,0 +1,49 @@
+"""What an aid can give a filter that has not started: position, velocity, heading, height.
+
+Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
+from the IMU to the point that was measured, body axes, m.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+Vector3 = tuple[float, float, float]
+
+
+class PositionOffer(NamedTuple):
+    """Geodetic position (rad, rad, m above the ellipsoid), `sd` (m) north, east, down; without a
+    height where it is None."""
+
+    t_ns: int
+    lat_rad: float
+    lon_rad: float
+    height_m: float | None
+    sd: Vector3
+    lever: Vector3
+
+
+class VelocityOffer(NamedTuple):
+    """Velocity (m/s) with `sd`: north, east, and down where it was measured."""
+
+    t_ns: int
+    v_ned: tuple[float, ...]
+    sd: tuple[float, ...]
+
+
+class HeadingOffer(NamedTuple):
+    """True heading (rad) of the body's forward axis."""
+
+    t_ns: int
+    yaw_rad: float
+    sd_rad: float
+
+
+class HeightOffer(NamedTuple):
+    """Ellipsoidal height (m), for a position of the same measurement that has none."""
+
+    height_m: float
+    sd_m: float
+
+
+Offer = PositionOffer | VelocityOffer | HeadingOffer | HeightOffer

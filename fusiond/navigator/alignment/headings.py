@@ -1,0 +1,91 @@
+"""Headings of a vehicle that stands: saved, configured, of two antennas, of the Earth's rate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
+from fusiond.navigation.earth import EARTH_RATE_RAD_S
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import dcm_from_rpy
+from fusiond.navigator.alignment.basis import Basis, rest_bias
+from fusiond.navigator.alignment.start import Place, Start, build_start
+
+# A heading that came this long ago no longer describes a body at rest that may have been moved.
+HEADING_AGE_NS = 2_000_000_000
+# One sigma of velocity (m/s) of a vehicle that stands.
+REST_VELOCITY_SD = np.full(3, 0.1)
+
+
+def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> Start | None:
+    standing = by.known.levelled()
+    if standing is None:
+        return None
+    roll, pitch = level(standing.mean_force)
+    dcm = dcm_from_rpy(roll, pitch, yaw)
+    return build_start(
+        by.model,
+        standing.end_ns,
+        place,
+        dcm,
+        sd,
+        np.zeros(3),
+        REST_VELOCITY_SD,
+        how,
+        bias=rest_bias(by.noise, standing, dcm, place[1][0]),
+        levelled=True,
+    )
+
+
+def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """What the vehicle knew when it was parked, while it has not moved since."""
+    if by.saved is None or by.known.ever_moved:
+        return None
+    return _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, "saved state")
+
+
+def from_config(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """The configured heading, while the vehicle has not moved."""
+    if by.options.heading_rad is None or by.known.ever_moved:
+        return None
+    return _at_standstill(
+        by, place, by.options.heading_rad, by.options.heading_sd_rad, "configured heading"
+    )
+
+
+def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """What an aid said last, while it is fresh."""
+    if by.known.heading is None or imu.latest_ns - by.known.heading.t_ns > HEADING_AGE_NS:
+        return None
+    return _at_standstill(
+        by, place, by.known.heading.yaw_rad, by.known.heading.sd_rad, "dual antenna"
+    )
+
+
+def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """The direction of the Earth's rate, once the standstill is long enough for it."""
+    standing = by.known.levelled()
+    if standing is None or standing.seconds < by.options.gyrocompass_s:
+        return None
+    lat = float(place[1][0])
+    bias = math.hypot(by.noise.rate_bias_initial, by.noise.rate_bias_instability)
+    sd = gyrocompass_sd(lat, bias, by.noise.rate_noise, standing.seconds)
+    if sd > by.options.gyrocompass_max_sd_rad:
+        return None
+    roll, pitch = level(standing.mean_force)
+    yaw = gyrocompass(standing.mean_rate, roll, pitch)
+    white = by.noise.rate_noise / math.sqrt(standing.seconds)
+    return build_start(
+        by.model,
+        standing.end_ns,
+        place,
+        dcm_from_rpy(roll, pitch, yaw),
+        white / (EARTH_RATE_RAD_S * math.cos(lat)),
+        np.zeros(3),
+        REST_VELOCITY_SD,
+        "gyrocompass",
+        levelled=True,
+        compassed=True,
+    )

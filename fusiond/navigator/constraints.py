@@ -1,0 +1,73 @@
+"""What the IMU's samples say by themselves: the vehicle stands, or at least does not slide."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
+from fusiond.configuration.schema import Constraints
+from fusiond.configuration.settings import DEG, quiet_limits
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.standstill import StandstillDetector, Window
+
+GATE = 0.9999
+"""Gate probability, as the measured aids' default."""
+
+
+class Felt(NamedTuple):
+    """The windows that have ended, and the aids that hold."""
+
+    windows: list[Window]
+    aids: list[Aid]
+
+
+class ConstraintMaker:
+    """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in."""
+
+    def __init__(self, options: Constraints) -> None:
+        self._options = options
+        self._detector = StandstillDetector(quiet_limits(options.zero_velocity))
+        self._last_cell = -1
+
+    def feed(self, imu: ImuBuffer, new: int) -> Felt:
+        """The samples from row `new` on have come."""
+        windows = self._detector.feed(imu.times, imu.samples, imu.start, new, imu.end)
+        aids: list[Aid] = []
+        if self._options.zero_velocity.enabled:
+            for window in windows:
+                if window.quiet:
+                    aids += self._standstill(window)
+        if self._options.non_holonomic.enabled:
+            aids += self._no_sliding(imu, new)
+        return Felt(windows, aids)
+
+    def _standstill(self, w: Window) -> list[Aid]:
+        z = self._options.zero_velocity
+        rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
+        sd_rate = z.rate_sd_deg_s * DEG
+        return [
+            ZeroVelocityAid("zero_velocity", w.end_ns, GATE, z.velocity_sd_m_s, z.max_speed_m_s),
+            ZeroRateAid("zero_rate", w.end_ns, GATE, rate, sd_rate, z.max_speed_m_s),
+        ]
+
+    def _no_sliding(self, imu: ImuBuffer, new: int) -> list[Aid]:
+        """One at the first sample of each interval."""
+        o = self._options.non_holonomic
+        cells = imu.times[new : imu.end] // round(o.interval_s * 1e9)
+        rows = np.flatnonzero(np.diff(cells, prepend=self._last_cell))
+        self._last_cell = int(cells[-1])
+        return [
+            NonHolonomicAid(
+                "non_holonomic",
+                int(imu.times[new + row]),
+                GATE,
+                o.sd_m_s,
+                o.min_speed_m_s,
+                o.lever_arm_m,
+            )
+            for row in rows
+        ]

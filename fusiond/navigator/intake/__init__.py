@@ -1,0 +1,59 @@
+"""The door of the navigator: a driver's measurement becomes aids, or is refused by name.
+
+Here the configuration meets the measurement: lever arm, sigma where the device states none, floors
+and gates. Behind it everything is in SI units with a settled instant. Each kind of measurement has
+a module of its own, which `KINDS` lists; nothing else knows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from drivers.measurements import Measurement
+from drivers.raw.messages import RawGnssEpoch
+from fusiond.aiding.base import Aid
+from fusiond.configuration.aiding import AnyAiding
+from fusiond.models.blocks import Block
+from fusiond.navigator.intake import attitude, bearing, gnss, heading, height, raw, rdss, wheel
+from fusiond.navigator.intake.kind import Instants, Kind, Sections
+
+KINDS: tuple[Kind, ...] = (
+    gnss.KIND,
+    raw.KIND,
+    rdss.KIND,
+    wheel.KIND,
+    heading.KIND,
+    attitude.KIND,
+    height.KIND,
+    bearing.KIND,
+)
+
+
+class Intake:
+    """Holds `aiding` by source name; a source without a section takes its kind's defaults."""
+
+    def __init__(self, aiding: Mapping[str, AnyAiding]) -> None:
+        self._sections = Sections(aiding)
+        self.receivers = self._sections.receivers
+
+    def aids(
+        self, m: Measurement | RawGnssEpoch, t_ns: int, sd_time_s: float, seen_ns: int = 0
+    ) -> Sequence[Aid] | str:
+        """The aids that `m`, valid at `t_ns`, stands for, or the name of the refusal."""
+        when = Instants(t_ns, sd_time_s, seen_ns)
+        for kind in KINDS:
+            if isinstance(m, kind.measurement):
+                return kind.aids(m, self._sections, when)
+        return "not_an_aid"
+
+    def extra_blocks(self) -> list[Block]:
+        """What the aids need in the model beside its own blocks: errors that successive
+        measurements share. Of a block that two sources need, the first says the noise."""
+        blocks: dict[str, Block] = {}
+        for source, section in self._sections.aiding.items():
+            for kind in KINDS:
+                found = kind.blocks.get(type(section))
+                if found is not None:
+                    for block in found(source, section, self._sections):
+                        blocks.setdefault(block.name, block)
+        return list(blocks.values())

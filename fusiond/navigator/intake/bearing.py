@@ -1,0 +1,48 @@
+"""Bearings of known points, as a radar sees them."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.measurements import Bearing
+from fusiond.aiding.base import Aid
+from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
+from fusiond.configuration.aiding import SarAiding
+from fusiond.configuration.settings import ARCSEC, DEG
+from fusiond.navigator.intake.kind import Instants, Kind, Sections
+from fusiond.navigator.intake.misalignment import misalignment_block, misalignment_blocks
+
+
+def aids(m: Bearing, sections: Sections, when: Instants) -> list[Aid] | str:
+    """The bearing; `unknown_target` where neither it nor the configuration says the place."""
+    o = sections.of(m.source, SarAiding)
+    if not (math.isfinite(m.azimuth_rad) and math.isfinite(m.elevation_rad)):
+        return "not_finite"
+    point = m.point
+    if point is None:
+        known = o.targets_deg_m.get(m.target)
+        if known is None:
+            return "unknown_target"
+        point = (known[0] * DEG, known[1] * DEG, known[2])
+    default = o.sd_arcsec * ARCSEC
+    azimuth, elevation = (s * o.sigma_scale for s in m.sd_rad or (default, default))
+    if not (azimuth > 0.0 and elevation > 0.0):
+        return "no_sigma"
+    return [
+        BearingAid(
+            m.source,
+            when.t_ns,
+            o.gate_probability,
+            m.azimuth_rad,
+            m.elevation_rad,
+            (azimuth, elevation),
+            point,
+            o.lever_arm_m,
+            o.min_range_m,
+            when.sd_time_s,
+            misalignment_block(SAR_BLOCK, m.source, o, sections),
+        )
+    ]
+
+
+KIND = Kind(Bearing, aids, {SarAiding: misalignment_blocks(SAR_BLOCK)})

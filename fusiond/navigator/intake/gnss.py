@@ -1,0 +1,108 @@
+"""Fixes of a GNSS receiver: position and velocity."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.measurements import PositionFix
+from fusiond.aiding.base import Aid
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.configuration.aiding import GnssAiding, RawAiding
+from fusiond.models.blocks import Block, position_bias
+from fusiond.navigator.intake.kind import Instants, Kind, Sections
+
+# Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
+ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
+# RTK divides the ranging error by far more than code does; these factors scale the DOP rule only
+# when the receiver sends no GST (typical: 0.5 m differential, 0.3 m float, 0.02 m fixed for 3 m
+# code).
+RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
+RTK = (4, 5)
+"""Quality of fixes by carrier phase against a base station."""
+FIX_BIAS = "gnss_bias"
+# Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
+VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
+
+
+def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
+    """Position, and velocity where it is measured and used.
+
+    `raw_is_used`: the receiver's raw data are the aid, not its fixes.
+    """
+    if isinstance(sections.aiding.get(m.source), RawAiding):
+        return "raw_is_used"
+    o = sections.of(m.source, GnssAiding)
+    if not (math.isfinite(m.lat_rad) and math.isfinite(m.lon_rad)):
+        return "not_finite"
+    if m.sd_ned_m is not None:
+        sd = m.sd_ned_m
+    else:
+        error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
+        horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
+        sd = (horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP))
+    if not (sd[0] > 0.0 and sd[1] > 0.0 and sd[2] > 0.0):
+        return "no_sigma"
+    scale, least = o.sigma_scale, o.min_position_sd_m
+    n, e, d = (max(s * scale, least) for s in sd)
+    found: list[Aid] = [
+        PositionAid(
+            m.source,
+            when.t_ns,
+            o.gate_probability,
+            m.lat_rad,
+            m.lon_rad,
+            m.height_m,
+            (n, e, d),
+            o.lever_arm_m,
+            math.hypot(when.sd_time_s, o.time_sd_s),
+            () if m.quality in RTK else _fix_bias(m.source, o, sections),
+        )
+    ]
+    velocity = _velocity(m, o, when) if o.use_velocity else None
+    return found if velocity is None else [*found, velocity]
+
+
+def _velocity(m: PositionFix, o: GnssAiding, when: Instants) -> VelocityAid | None:
+    if m.v_ned_m_s is None:
+        return None
+    north, east, down = m.v_ned_m_s
+    sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
+    scale, horizontal, least = o.sigma_scale, o.velocity_sd_m_s, o.min_velocity_sd_m_s
+    v: tuple[float, ...] = (north, east)
+    sd_v: tuple[float, ...] = (
+        max((sd_n or horizontal) * scale, least),
+        max((sd_e or horizontal) * scale, least),
+    )
+    if down is not None:
+        v = (north, east, down)
+        vertical = horizontal * VERTICAL_VELOCITY_FACTOR
+        sd_v = (*sd_v, max((sd_d or vertical) * scale, least))
+    if not math.isfinite(sum(v)):
+        return None
+    t_ns = when.t_ns - round(o.velocity_delay_s * 1e9)
+    return VelocityAid(f"{m.source}_velocity", t_ns, o.gate_probability, v, sd_v, o.lever_arm_m)
+
+
+def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:
+    """The blocks of the error that a receiver's fixes share; none where it is not estimated."""
+    if section.bias_sd_m == 0.0:
+        return ()
+    level = sections.own(FIX_BIAS, source, section)
+    return level, f"{level}_down"
+
+
+def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
+    """North and east, and down, of the error that a receiver's fixes share."""
+    names = _fix_bias(source, section, sections)
+    if not names:
+        return []
+    level, down = names
+    lasts_s = section.bias_correlation_s
+    return [
+        position_bias(level, section.bias_sd_m, lasts_s),
+        position_bias(down, section.bias_down_sd_m, lasts_s, "d"),
+    ]
+
+
+KIND = Kind(PositionFix, aids, {GnssAiding: blocks})

@@ -1,0 +1,22 @@
+"""Heading, as two antennas or a compass measure it."""
+
+from __future__ import annotations
+
+from drivers.measurements import Heading
+from fusiond.aiding.attitude import HeadingAid
+from fusiond.aiding.base import Aid
+from fusiond.configuration.aiding import HeadingAiding
+from fusiond.configuration.settings import DEG
+from fusiond.navigator.intake.kind import Instants, Kind, Sections
+
+
+def aids(m: Heading, sections: Sections, when: Instants) -> list[Aid]:
+    """The heading, with the section's sigma where the device states none."""
+    o = sections.of(m.source, HeadingAiding)
+    sd_rad = (m.sd_rad or o.sd_deg * DEG) * o.sigma_scale
+    # One receiver may send position and heading of the same instant: two names.
+    name = m.source if m.source == o.kind else f"{m.source}_heading"
+    return [HeadingAid(name, when.t_ns, o.gate_probability, m.yaw_rad, sd_rad)]
+
+
+KIND = Kind(Heading, aids, {})

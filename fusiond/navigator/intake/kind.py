@@ -1,0 +1,67 @@
+"""What a kind of measurement brings to the door: its sections, its aids, its blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+from fusiond.aiding.base import Aid
+from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
+from fusiond.models.blocks import Block
+from fusiond.navigator.raw_gnss import RawGnss
+
+S = TypeVar("S", bound=Aiding)
+
+
+class Instants(NamedTuple):
+    """Of a measurement: valid at `t_ns`, give or take `sd_time_s`, seen at `seen_ns` (0: then)."""
+
+    t_ns: int
+    sd_time_s: float
+    seen_ns: int
+
+
+class Sections:
+    """The configuration's `[aiding.NAME]` by source name; `receivers` are those whose raw data are
+    the aid, not their fixes."""
+
+    def __init__(self, aiding: Mapping[str, AnyAiding]) -> None:
+        self.aiding = aiding
+        self.receivers = {
+            name: RawGnss(name, section)
+            for name, section in aiding.items()
+            if isinstance(section, RawAiding)
+        }
+        self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
+
+    def of(self, source: str, kind: type[S]) -> S:
+        """The source's own section, else the one named after the kind, else its defaults."""
+        section = self._found.get((source, kind))
+        if not isinstance(section, kind):
+            names = (source, str(kind.model_fields["kind"].default))
+            named = (self.aiding.get(name) for name in names)
+            section = next((s for s in named if isinstance(s, kind)), None) or kind()
+            self._found[source, kind] = section
+        return section
+
+    def own(self, block: str, source: str, section: Aiding) -> str:
+        """The block's name: with the source's, where that has a section of its own that is not
+        simply named after its kind."""
+        kind = type(section).model_fields["kind"].default
+        own = self.aiding.get(source) is section and source != kind
+        return f"{block}_{source}" if own else block
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of measurement.
+
+    `measurement`: its class. `aids(measurement, sections, instants)`: the aids that it stands for,
+    or the name of its refusal. `blocks`: by class of section, what `blocks(source, section,
+    sections)` adds to the model: errors that successive measurements share.
+    """
+
+    measurement: type
+    aids: Callable[[Any, Sections, Instants], Sequence[Aid] | str]
+    blocks: Mapping[type[Aiding], Callable[[str, Any, Sections], list[Block]]]

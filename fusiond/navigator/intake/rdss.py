@@ -1,0 +1,80 @@
+"""Fixes of an RDSS terminal, with one of four strategies for their delay
+(fusiond.aiding.rdss_position)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.measurements import DelayedFix
+from fusiond.aiding.base import Aid, NotApplicable
+from fusiond.aiding.height import HeightAid
+from fusiond.aiding.rdss_geometry import RdssGeometry, with_floor
+from fusiond.aiding.rdss_position import BIAS_BLOCK, FeedBackAid, RdssPositionAid
+from fusiond.configuration.aiding import RdssAiding
+from fusiond.models.blocks import Block, position_bias
+from fusiond.navigator.intake.kind import Instants, Kind, Sections
+
+# What a fix moved forward by the computed velocity is wrong by: an acceleration of 2.5 m/s^2 over a
+# delay of 1.5 s, which lasts as long as a manoeuvre. The velocity's own error is in the Jacobian.
+COMPENSATION_SD_M, COMPENSATION_TAU_S = 3.0, 5.0
+
+
+def aids(m: DelayedFix, sections: Sections, when: Instants) -> list[Aid] | str:
+    """The fix; the instant of its feedback where that waits; its height where it says anything new.
+
+    Refused: `multi_value`, `no_sigma`, and by name a place without geometry.
+    """
+    o = sections.of(m.source, RdssAiding)
+    if m.multi_value:
+        return "multi_value"
+    if not m.precision_class_m > 0.0:
+        return "no_sigma"
+    class_m = m.precision_class_m
+    r = np.eye(2) * class_m**2
+    if o.noise == "geometry":
+        geometry = RdssGeometry(o.satellites_deg).covariance(
+            m.lat_rad, m.lon_rad, m.height_m, o.range_sd_m, o.height_sd_m
+        )
+        if isinstance(geometry, NotApplicable):
+            return geometry.outcome
+        r = with_floor(geometry.total, class_m)
+    r *= o.sigma_scale**2
+    arrival_ns = max(when.t_ns, when.seen_ns)
+    at_arrival = o.strategy in {"position_compensation", "none"}
+    holds = o.strategy == "optimal_prediction" and arrival_ns > when.t_ns
+    t_ns = arrival_ns if at_arrival else when.t_ns
+    compensated = o.strategy == "position_compensation"
+    gate = o.gate_probability
+    found: list[Aid] = [
+        RdssPositionAid(
+            m.source,
+            t_ns,
+            gate,
+            m.lat_rad,
+            m.lon_rad,
+            (float(r[0, 0]), float(r[0, 1]), float(r[1, 1])),
+            o.lever_arm_m,
+            when.sd_time_s,
+            (arrival_ns - when.t_ns) * 1e-9 if compensated else 0.0,
+            holds,
+        )
+    ]
+    if holds:
+        found.append(FeedBackAid(f"{m.source}_feedback", arrival_ns, gate))
+    if o.fix_height_sd_m is not None and not m.height_given:
+        sd_m = o.fix_height_sd_m * o.sigma_scale
+        found.append(HeightAid(f"{m.source}_height", t_ns, gate, m.height_m, sd_m))
+    return found
+
+
+def blocks(source: str, section: RdssAiding, sections: Sections) -> list[Block]:
+    """North and east of the error that fixes share; position compensation needs it for what the
+    moved fix is wrong by. One block, whatever the number of terminals: the first says its noise."""
+    if section.bias_sd_m > 0.0:
+        return [position_bias(BIAS_BLOCK, section.bias_sd_m, section.bias_correlation_s)]
+    if section.strategy == "position_compensation":
+        return [position_bias(BIAS_BLOCK, COMPENSATION_SD_M, COMPENSATION_TAU_S)]
+    return []
+
+
+KIND = Kind(DelayedFix, aids, {RdssAiding: blocks})
