@@ -15,19 +15,17 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import logging
 import os
 import pickle
 import secrets
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
-
-log = logging.getLogger("fusiond")
 
 # numba's functions have no types.
 _rebuild: Any = CompileResult._rebuild
@@ -60,7 +58,7 @@ class KernelCache(NullCache):
             _discard(path, "a folder")
             return None
         except OSError as error:
-            log.warning("%s cannot be read (%s): the kernel is compiled anew", path, error)
+            _tell(f"{path} cannot be read ({error})")
             return None
         payload = memoryview(data)[_DIGEST_SIZE:]
         if hashlib.sha256(payload).digest() != data[:_DIGEST_SIZE]:
@@ -71,8 +69,7 @@ class KernelCache(NullCache):
     def save_overload(self, signature: object, data: Any) -> None:
         """Write what was compiled; where that fails it is compiled again at the next start."""
         if data.library.has_dynamic_globals:
-            log.debug("kernel %s is not kept: it holds addresses of this process", self._name)
-            return
+            return  # it holds addresses of this process
         payload: bytes = _dumps(data._reduce())
         path = self._path(signature, data.codegen)
         written = path.with_suffix(f".{secrets.token_hex(8)}")
@@ -82,8 +79,7 @@ class KernelCache(NullCache):
                 file.write(hashlib.sha256(payload).digest())
                 file.write(payload)
             os.replace(written, path)
-        except OSError as error:
-            log.debug("kernel %s is not kept: %s", self._name, error)
+        except OSError:
             with contextlib.suppress(OSError):
                 written.unlink()
 
@@ -94,9 +90,13 @@ class KernelCache(NullCache):
 
 
 def _discard(path: Path, reason: str) -> None:
-    log.warning("%s is damaged (%s): the kernel is compiled anew", path, reason)
+    _tell(f"{path} is damaged ({reason})")
     with contextlib.suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
             path.unlink()
+
+
+def _tell(what: str) -> None:
+    warnings.warn(f"{what}: the kernel is compiled anew", RuntimeWarning, stacklevel=2)
