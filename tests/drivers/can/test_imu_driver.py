@@ -108,7 +108,11 @@ def multicast_route() -> Iterator[None]:
         subprocess.run(["ip", "route", "del", GROUP, "dev", "lo"], check=True)
 
 
-@pytest.mark.parametrize(("interface", "channel"), [("virtual", "t-e2e"), ("udp_multicast", GROUP)])
+@pytest.mark.parametrize(
+    ("interface", "channel"),
+    [("virtual", "t-e2e"), ("udp_multicast", GROUP)],
+    ids=["virtual", "udp_multicast"],  # the group is each process's own, the test's name is not
+)
 async def test_samples_silence_and_recovery(interface: str, channel: str) -> None:
     """An IMU that counts its samples: when frames arrive, on a busy host, pairs nothing wrongly."""
     counted = {**SIM_IMU.model_dump(), "interface": interface, "channel": channel, "timeout_s": 0.2}
