@@ -1,1 +1,1 @@
-"""Estimators: models of the error state and the filters that run on them."""
+"""Estimators: filters over one error state, with one interface."""
