@@ -144,8 +144,8 @@ class TimeTrust:
         """Whether this time is to be trusted; None when it was reported already."""
         if self._last is not None:
             step, elapsed = utc_ns - self._last[0], t_seen_ns - self._last[1]
-            if step == 0:
-                return None
+            if step == 0 and elapsed < STEP_TOLERANCE_NS:
+                return None  # another sentence of the epoch; later, UTC has turned back
             even = step == self._step_ns or abs(step - elapsed) < STEP_TOLERANCE_NS
             good = valid and even and 0 < step <= MAX_STEP_NS
             self._even = self._even + 1 if good else 0

@@ -7,6 +7,10 @@ Three relations are kept, each on its own evidence:
     UTC            lower envelope of arrival minus reported UTC, less `serial_latency_s`;
                    the system clock until a receiver has reported
 
+A device's own stamps are mapped by what its own reports say, whatever its date: a receiver that
+lives in the year 2100 is late by as much as any. UTC itself is another matter: it changes only when
+a plausible date has lasted for minutes, and with an event.
+
 It is the only place that knows leap seconds and weeks: UTC is POSIX nanoseconds, a leap second
 repeats the second before, and shows here as a jump of UTC that is learnt again and counted. Dates
 from before the last rollover of the ten-bit GPS week are moved by 1024 weeks (IS-GPS-200,
@@ -17,10 +21,11 @@ Host time is injected; with the same host time and the same calls the answers ar
 
 from __future__ import annotations
 
-import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol, assert_never
+from math import hypot
+from typing import NamedTuple, assert_never
 
 from drivers.measurements import (
     ArrivalStamp,
@@ -32,52 +37,44 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from fusiond.clock.offset_filter import MILLISECOND_NS, SECOND_NS, DeviceClock, UtcEnvelope
+from fusiond.clock.device_clock import DeviceClock
+from fusiond.clock.host import MILLISECOND_NS, SECOND_NS, HostTime, SystemClock, SystemTime
 from fusiond.clock.time_of_day import RdssTimeOfDay, nearest
+from fusiond.clock.utc_envelope import UtcEnvelope
 from fusiond.configuration.schema import ClockOptions
 
-_STEP_NS = MILLISECOND_NS
-"""NTP slews at 500 ppm at most (adjtimex(2)); with 1000 ppm and 1 ms allowed the rest are steps."""
-_SLEW_PER_NS = 1000
-_BRACKET_NS = 50_000
-"""Reading realtime between two monotonic readings further apart than this was interrupted."""
-_AFTER_STEP_NS = 2 * SECOND_NS
-"""Frames stamped before a step of the system clock are out of the kernel's queue by then."""
 _KERNEL_MAX_AGE_NS = SECOND_NS
 _KERNEL_FUTURE_NS = MILLISECOND_NS
 _UTC_MAX_AGE_NS = 10 * SECOND_NS
-"""The timeline's least history: a UTC stamp older than that says the mapping is wrong."""
+"""The timeline's least history: a UTC stamp older than that by another's UTC says that one of the
+two is wrong."""
+_UTC_MAX_LATE_NS = 60 * SECOND_NS
+"""Longer than a tty's queue holds: a stamp older by its own source's UTC belongs to another UTC."""
 _UTC_FUTURE_NS = 100 * MILLISECOND_NS
+_SYSTEM_LATENCY_NS = SECOND_NS
+"""Every fix of a receiver older than this by the system clock: the system clock is wrong."""
 _SOURCE_SILENT_NS = 60 * SECOND_NS
 _SAME_UTC_NS = 3 * SECOND_NS
 """Sources this close state the same UTC: whole seconds, and delays up to 2 s."""
 _BETTER_NS = 5 * MILLISECOND_NS
-_WEEKS_1024_NS = 1024 * 7 * 86400 * SECOND_NS
+_TOLD_NS = 500 * MILLISECOND_NS
+"""A change of UTC this large is an event when another source becomes the reference."""
+WEEKS_1024_NS = 1024 * 7 * 86400 * SECOND_NS
 EARLIEST_UTC_NS = 1554595200 * SECOND_NS
 """2019-04-07, the last rollover of the ten-bit GPS week: earlier dates are mistakes."""
+LATEST_UTC_NS = 1793491200 * SECOND_NS + WEEKS_1024_NS
+"""1024 weeks (19.6 years) after this release, 2026-11-01: no date is believed that has come out of
+a rollover moved once too often, nor one beyond the service life of this code."""
 
 _KERNEL_SD_S = 1e-4
 _DEVICE_SD_S = 5e-4
-_UTC_SD_S = 3e-3
 _SYSTEM_SD_S = 1e-2
 _ARRIVAL_SD_S = 5e-3
 """A USB serial read arrives 1 to 16 ms late: uniform, 16 ms / sqrt(12)."""
-_GUESSED_SD_S = 0.05
-"""Sentences come 50 to 200 ms after their epoch: uniform, 150 ms / sqrt(12)."""
-
-
-class HostTime(Protocol):
-    """The host's two clocks: CLOCK_MONOTONIC and CLOCK_REALTIME, in ns."""
-
-    def monotonic_ns(self) -> int: ...
-    def realtime_ns(self) -> int: ...
-
-
-class SystemTime:
-    """The clocks of this machine."""
-
-    monotonic_ns = staticmethod(time.monotonic_ns)
-    realtime_ns = staticmethod(time.time_ns)
+_GUESSED_SD_S = 0.5
+"""Sentences come 20 to 200 ms after their epoch, and with one receiver always alike. A filter takes
+the error of a fix for independent of the next one's and averages it: hence three times the most
+that it can be (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 
 
 class Instant(NamedTuple):
@@ -105,61 +102,58 @@ class ClockStatus:
     counters: dict[str, int] = field(default_factory=dict)
 
 
-class _Realtime:
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC, before and after the last step of the system clock."""
-
-    def __init__(self, host: HostTime, counters: Counter[str]) -> None:
-        self._host = host
-        self._counters = counters
-        self._sampled_ns, self.offset_ns = self._read()
-        self.before_step_ns: int | None = None
-        self._stepped_ns = 0
-
-    def _read(self) -> tuple[int, int]:
-        best: tuple[int, int, int] | None = None
-        for _ in range(3):
-            before = self._host.monotonic_ns()
-            realtime = self._host.realtime_ns()
-            after = self._host.monotonic_ns()
-            middle = (before + after) // 2
-            if best is None or after - before < best[0]:
-                best = (after - before, middle, realtime - middle)
-            if best[0] <= _BRACKET_NS:
-                break
-        assert best is not None
-        return best[1], best[2]
-
-    def sample(self) -> int:
-        """Read the offset again, notice steps; realtime minus monotonic in ns."""
-        now, offset = self._read()
-        slew = max(0, now - self._sampled_ns) // _SLEW_PER_NS
-        if abs(offset - self.offset_ns) > _STEP_NS + slew:
-            self._counters["system_clock_stepped"] += 1
-            self.before_step_ns = self.offset_ns
-            self._stepped_ns = now
-        elif self.before_step_ns is not None and now - self._stepped_ns > _AFTER_STEP_NS:
-            self.before_step_ns = None
-        self._sampled_ns, self.offset_ns = now, offset
-        return offset
-
-
 class Clock:
-    """Turns stamps into instants. `counters` names everything it refused, guessed or learnt."""
+    """Turns stamps into instants. `counters` names everything it refused, guessed or learnt.
+
+    `on_event(code, text)` hears of `utc_jumped`, `system_clock_stepped` and `host_resumed`.
+    """
 
     def __init__(self, options: ClockOptions, host: HostTime | None = None) -> None:
         self._options = options
         self._host: HostTime = SystemTime() if host is None else host
         self._serial_latency_ns = round(options.serial_latency_s * SECOND_NS)
         self.counters: Counter[str] = Counter()
-        self._realtime = _Realtime(self._host, self.counters)
+        self.on_event: Callable[[str, str], None] | None = None
+        self._system = SystemClock(self._host, self.counters)
+        self._slept_ns = 0
         self._devices: dict[str, DeviceClock] = {}
         self._utc: dict[str, UtcEnvelope] = {}
+        self._stamped: dict[str, UtcEnvelope] = {}
         self._reference: str | None = None
         self._rdss: dict[str, RdssTimeOfDay] = {}
 
     def now_ns(self) -> int:
         """The host's monotonic clock, ns."""
         return self._host.monotonic_ns()
+
+    def _look(self) -> int:
+        """Sample the host's clocks; realtime minus monotonic, ns."""
+        changes = self._system.changes
+        offset_ns = self._system.sample()
+        if self._system.changes != changes:
+            self._changed()
+        return offset_ns
+
+    def _changed(self) -> None:
+        """The host has slept, or its clock was set, or both."""
+        stepped_ns = self._system.last_step_ns
+        slept_ns = self._system.slept_ns - self._slept_ns
+        if slept_ns:
+            self._slept_ns = self._system.slept_ns
+            for envelope in (*self._utc.values(), *self._stamped.values()):
+                envelope.slept(slept_ns)
+            # Whether a device counted on is not known; it is learnt at its next sample. One that
+            # sends before this is noticed has its counts held back, if it did.
+            self._devices.clear()
+            self.counters["host_resumed"] += 1
+            self._event("host_resumed", f"the host was suspended for {slept_ns / SECOND_NS:.1f} s")
+        if stepped_ns:
+            text = f"the system clock was set by {stepped_ns / SECOND_NS:+.3f} s"
+            self._event("system_clock_stepped", text)
+
+    def _event(self, code: str, text: str) -> None:
+        if self.on_event is not None:
+            self.on_event(code, text)
 
     # ------------------------------------------------------------------ stamps
 
@@ -193,10 +187,10 @@ class Clock:
 
     def _from_kernel(self, stamp: KernelStamp, t_seen_ns: int) -> Instant:
         latency_ns = round(stamp.latency_s * SECOND_NS)
-        t_ns = stamp.realtime_ns - self._realtime.sample()
+        t_ns = stamp.realtime_ns - self._look()
         # After a step, frames stamped before it are still queued: of the two readings that one
         # is right which is the younger without lying in the future.
-        before = self._realtime.before_step_ns
+        before = self._system.before_step_ns
         if before is not None:
             other = stamp.realtime_ns - before
             ages = [(t_seen_ns - t, t) for t in (t_ns, other)]
@@ -214,22 +208,49 @@ class Clock:
         return Instant(t_seen_ns - latency_ns, _ARRIVAL_SD_S, "arrival")
 
     def _from_utc(self, utc_ns: int, source: str, t_seen_ns: int) -> Instant:
-        own = self._utc.get(source)
-        if own is not None and not own.settled:
+        self._look()
+        own = self._utc.get(source) if self._options.utc == "gnss" else None
+        if own is None:
+            return self._from_others_utc(utc_ns, source, t_seen_ns)
+        if own.open:
             self.counters["utc_stamp_unsettled"] += 1
-            return self._guessed(t_seen_ns)
-        offset_ns, sd_s, how = self._mapping(source)
-        t_ns = utc_ns + offset_ns
+            return self._by_arrival(t_seen_ns, own.sd_s)
+        stamped = own.stamp(utc_ns, t_seen_ns)
+        t_ns = stamped.t_ns - self._serial_latency_ns
         if t_ns > t_seen_ns + _UTC_FUTURE_NS:
             self.counters["utc_stamp_future"] += 1
-            return self._guessed(t_seen_ns)
-        if t_ns < t_seen_ns - _UTC_MAX_AGE_NS:
+            return self._by_arrival(t_seen_ns, stamped.sd_s)
+        if t_ns < t_seen_ns - _UTC_MAX_LATE_NS:
             self.counters["utc_stamp_old"] += 1
-            return self._guessed(t_seen_ns)
-        return Instant(min(t_ns, t_seen_ns), sd_s, how)
+            return self._by_arrival(t_seen_ns, own.sd_s)
+        return Instant(min(t_ns, t_seen_ns), stamped.sd_s, "utc")
 
-    def _guessed(self, t_seen_ns: int) -> Instant:
-        return Instant(t_seen_ns - self._serial_latency_ns, _GUESSED_SD_S, "arrival")
+    def _from_others_utc(self, utc_ns: int, source: str, t_seen_ns: int) -> Instant:
+        """By the reference's UTC or the system's; by the source's own stamps if that cannot be."""
+        own = self._stamped.get(source)
+        if own is None:
+            own = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
+            self._stamped[source] = own
+        own.update(utc_ns, t_seen_ns)
+        offset_ns, sd_s, how = self._mapping(source)
+        t_ns = utc_ns + offset_ns
+        least_age_ns = own.offset_ns - offset_ns
+        if t_ns > t_seen_ns + _UTC_FUTURE_NS:
+            self.counters["utc_stamp_future"] += 1
+        elif t_ns < t_seen_ns - _UTC_MAX_AGE_NS or (
+            how == "system" and least_age_ns > _SYSTEM_LATENCY_NS
+        ):
+            self.counters["utc_stamp_old"] += 1
+        else:
+            return Instant(min(t_ns, t_seen_ns), sd_s, how)
+        if own.open:
+            return self._by_arrival(t_seen_ns, own.sd_s)
+        stamped = own.stamp(utc_ns, t_seen_ns)
+        t_ns = min(stamped.t_ns, t_seen_ns) - self._serial_latency_ns
+        return Instant(t_ns, hypot(stamped.sd_s, _GUESSED_SD_S), "arrival")
+
+    def _by_arrival(self, t_seen_ns: int, sd_s: float) -> Instant:
+        return Instant(t_seen_ns - self._serial_latency_ns, hypot(sd_s, _GUESSED_SD_S), "arrival")
 
     def _from_time_of_day(self, stamp: TimeOfDayStamp, source: str, t_seen_ns: int) -> Instant:
         offset_ns, sd_s, _ = self._mapping(source)
@@ -251,22 +272,32 @@ class Clock:
         """Take a device's statement of UTC in; one that the device does not trust moves nothing.
 
         Counters: `utc_report_untrusted`, `utc_report_implausible`, `gps_week_rollover`,
-        `utc_source_changed`, and those of `UtcEnvelope`.
+        `utc_source_changed`, `utc_jumped`, and those of `UtcEnvelope`.
         """
+        self._look()
         if not report.trusted:
             self.counters["utc_report_untrusted"] += 1
+            if report.source in self._utc:
+                utc_ns = _rolled_over(report.utc_ns)
+                self._utc[report.source].untrusted(utc_ns, report.t_seen_ns)
             return
         utc_ns = _rolled_over(report.utc_ns)
-        if utc_ns < EARLIEST_UTC_NS:
-            self.counters["utc_report_implausible"] += 1
-            return
+        plausible = EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS
+        self.counters["utc_report_implausible"] += not plausible
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
         envelope = self._utc.get(report.source)
         if envelope is None:
             envelope = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
             self._utc[report.source] = envelope
-        envelope.update(utc_ns, report.t_seen_ns)
-        self._choose_reference(report.source, envelope)
+        jumped_ns = -envelope.update(utc_ns, report.t_seen_ns, plausible=plausible)
+        if jumped_ns and report.source == self._reference:
+            self._jumped(jumped_ns, f"{report.source} has said so for minutes")
+        if plausible:
+            self._choose_reference(report.source, envelope)
+
+    def _jumped(self, jumped_ns: int, why: str) -> None:
+        self.counters["utc_jumped"] += 1
+        self._event("utc_jumped", f"UTC jumped by {jumped_ns / SECOND_NS:+.3f} s: {why}")
 
     def _choose_reference(self, source: str, envelope: UtcEnvelope) -> None:
         """Prefer the source that is heard, and of those that agree the least delayed."""
@@ -277,27 +308,44 @@ class Clock:
             return
         incumbent = self._utc[self._reference]
         silent = envelope.t_seen_ns - incumbent.t_seen_ns > _SOURCE_SILENT_NS
-        gain = incumbent.offset_ns - envelope.offset_ns
+        gain = incumbent.believed_offset_ns - envelope.believed_offset_ns
         if silent or _BETTER_NS < gain < _SAME_UTC_NS:
             self.counters["utc_source_changed"] += 1
+            if abs(gain) > _TOLD_NS and self._options.utc == "gnss":
+                self._jumped(gain, f"{source} tells it in place of {self._reference}")
             self._reference = source
 
     def _mapping(self, source: str | None) -> tuple[int, float, str]:
-        """Monotonic minus UTC (ns), its sigma (s) and its name, for what `source` says."""
+        """Monotonic minus UTC (ns), its sigma (s) and its name, for what `source` says.
+
+        With `utc = "system"` a step of the system clock says that its reference changed, and not
+        whether for the better: stamps are mapped as before it for two minutes, and sigma is the
+        step, or what it is without any UTC. UTC itself (None) is what the system clock says.
+        """
+        system_ns = self._look()
         if self._options.utc == "gnss":
-            name = source if source in self._utc else self._reference
-            if name is not None:
-                return self._utc[name].offset_ns - self._serial_latency_ns, _UTC_SD_S, "utc"
-        return -self._realtime.sample(), _SYSTEM_SD_S, "system"
+            own = self._utc.get(source) if source is not None else None
+            if own is not None:
+                return own.offset_ns - self._serial_latency_ns, own.sd_s, "utc"
+            if self._reference is not None:
+                reference = self._utc[self._reference]
+                offset_ns = reference.believed_offset_ns
+                doubt_s = (reference.offset_ns - offset_ns) / SECOND_NS
+                return offset_ns - self._serial_latency_ns, hypot(reference.sd_s, doubt_s), "utc"
+        if source is None:
+            return -system_ns, _SYSTEM_SD_S, "system"
+        step_s = min(_GUESSED_SD_S, abs(system_ns - self._system.held_ns) / SECOND_NS)
+        return -self._system.held_ns, hypot(_SYSTEM_SD_S, step_s), "system"
 
     def utc_ns(self, t_ns: int) -> int | None:
         """POSIX UTC (ns) of a monotonic instant; None while no plausible UTC is known.
 
         From the receiver once it has reported, before that from the system clock if its date is
-        later than `EARLIEST_UTC_NS` (a computer without a battery starts in 1970).
+        later than `EARLIEST_UTC_NS` (a computer without a battery starts in 1970) and before
+        `LATEST_UTC_NS`.
         """
         utc_ns = t_ns - self._mapping(None)[0]
-        return utc_ns if utc_ns >= EARLIEST_UTC_NS else None
+        return utc_ns if EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS else None
 
     def status(self) -> ClockStatus:
         """A snapshot for `health`."""
@@ -307,7 +355,7 @@ class Clock:
             utc_source = self._reference
             settled = self._utc[self._reference].settled
             offset_ns = self._mapping(None)[0]
-            system_error_s = (self._realtime.sample() + offset_ns) / SECOND_NS
+            system_error_s = (self._look() + offset_ns) / SECOND_NS
         else:
             utc_source = "none" if self.utc_ns(self.now_ns()) is None else "system"
         return ClockStatus(
@@ -322,6 +370,6 @@ class Clock:
 
 def _rolled_over(utc_ns: int) -> int:
     """The date moved by 1024 weeks once if it lies before the last rollover and then is not."""
-    if utc_ns < EARLIEST_UTC_NS <= utc_ns + _WEEKS_1024_NS:
-        return utc_ns + _WEEKS_1024_NS
+    if utc_ns < EARLIEST_UTC_NS <= utc_ns + WEEKS_1024_NS:
+        return utc_ns + WEEKS_1024_NS
     return utc_ns

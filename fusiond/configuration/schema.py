@@ -243,7 +243,8 @@ class ClockOptions(Section):
     """Where UTC comes from.
 
     `gnss`: the receiver's time, as the lower envelope of arrival minus `serial_latency_s`, and the
-    system clock until that is known. `system`: always CLOCK_REALTIME (NTP or PPS keeps it).
+    system clock until that is known. `system`: always CLOCK_REALTIME (NTP or PPS keeps it); a step
+    of it moves measurements only after two minutes, and sigma knows it meanwhile.
     """
 
     utc: Literal["gnss", "system"] = "gnss"

@@ -25,6 +25,9 @@ WARNINGS = (
     "passive",
     "suppressed",
     "refused",
+    "jumped",
+    "stepped",
+    "resumed",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 

@@ -55,6 +55,7 @@ class Sources:
         self._clock = clock
         self._navigator = navigator
         self._on_event = on_event
+        clock.on_event = lambda code, text: on_event("clock", code, text)
         self._imu: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=IMU_QUEUE)
         self._imu_source: str | None = None
         self.counters: Counter[str] = Counter()

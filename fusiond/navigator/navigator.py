@@ -35,6 +35,9 @@ Array = NDArray[np.float64]
 
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
+# An instant that may be off by a second or more has the error of a jump of UTC, alike in all
+# measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
+UNKNOWN_TIME_S = 0.9
 
 
 class Navigator:
@@ -119,6 +122,8 @@ class Navigator:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self._refuse(m.source, "from_future")
+        if sd_time_s > UNKNOWN_TIME_S:
+            return self._refuse(m.source, "time_unknown")
         aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
         if isinstance(aids, str):
             return self._refuse(m.source, aids)

@@ -22,12 +22,21 @@ class Host:
     mono: int = 5_000 * S
     true_utc_at_zero: int = utc("2026-11-20T23:00:00") - 5_000 * S
     system_error: int = 0
+    slept: int = 0
 
     def monotonic_ns(self) -> int:
         return self.mono
 
     def realtime_ns(self) -> int:
         return self.mono + self.true_utc_at_zero + self.system_error
+
+    def boottime_ns(self) -> int:
+        return self.mono + self.slept
+
+    def suspend(self, ns: int) -> None:
+        """Monotonic time stands still, all others go on."""
+        self.slept += ns
+        self.true_utc_at_zero += ns
 
     def utc(self, mono: int | None = None) -> int:
         return (self.mono if mono is None else mono) + self.true_utc_at_zero

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from fusiond.clock.clock import Clock
+from fusiond.clock.host import SystemTime
 from fusiond.configuration.schema import Config
 from fusiond.doctor import devices as doctor_devices
 from fusiond.doctor.doctor import doctor, examine
@@ -269,10 +270,8 @@ async def test_broker_that_wants_a_password(tmp_path: Path) -> None:
 
 
 async def test_system_clock_that_is_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Late:
+    class Late(SystemTime):
         """The system clock an hour behind."""
-
-        monotonic_ns = staticmethod(time.monotonic_ns)
 
         @staticmethod
         def realtime_ns() -> int:

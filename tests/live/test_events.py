@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+from typing import Any, cast
 
 import pytest
 
 from fusiond.clock.clock import Clock
-from fusiond.configuration.schema import ClockOptions
+from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.live.events import Events, level_of
+from fusiond.live.sources import Sources
 from fusiond.outputs.messages.event import EventMessage
+from tests.clock.host_time import Host, S
 
 
 @pytest.mark.parametrize(
@@ -21,6 +24,9 @@ from fusiond.outputs.messages.event import EventMessage
         ("imu_gap", "warning"),
         ("rdss_suppressed", "warning"),
         ("isolated", "warning"),
+        ("utc_jumped", "warning"),
+        ("system_clock_stepped", "warning"),
+        ("host_resumed", "warning"),
         ("driver_fault", "error"),
         ("bus_open_failed", "error"),
         ("bus_off", "error"),
@@ -44,4 +50,20 @@ def test_an_event_is_logged_and_every_listener_hears_it(caplog: pytest.LogCaptur
     assert [(r.levelno, r.getMessage()) for r in caplog.records] == [
         (logging.INFO, "gnss: early: before there is a listener"),
         (logging.ERROR, "imu: driver_fault: a defect: restarting it"),
+    ]
+
+
+def test_what_happens_to_the_clock_is_an_event() -> None:
+    host = Host()
+    clock = Clock(ClockOptions(), host)
+    events = Events(clock)
+    heard: list[EventMessage] = []
+    events.listeners.append(heard.append)
+    Sources(Config(), clock, cast(Any, None), events.report)
+    host.suspend(20 * S)
+    host.system_error = 2 * S
+    clock.utc_ns(host.mono)
+    assert [(e.source, e.code, e.text) for e in heard] == [
+        ("clock", "host_resumed", "the host was suspended for 20.0 s"),
+        ("clock", "system_clock_stepped", "the system clock was set by +2.000 s"),
     ]

@@ -109,6 +109,8 @@ def test_refusals_are_named_and_counted() -> None:
     for m, t_ns, name in cases:
         assert navigator.add(m, t_ns, seen_ns=now) == name
         expected.setdefault(m.source, Counter())[name] += 1
+    assert navigator.add(fix, now, sd_time_s=1.0, seen_ns=now) == "time_unknown"
+    expected["gnss"]["time_unknown"] += 1
     assert navigator.refused == expected
     before = state_bytes(navigator)
     navigator.advance()

@@ -254,3 +254,12 @@ def test_posix_time_and_trust_of_a_repeated_report() -> None:
     trust = TimeTrust()
     assert trust.report(0, 0, valid=True) is False
     assert trust.report(0, 50, valid=True) is None
+
+
+def test_a_second_that_comes_twice_is_told_and_not_trusted() -> None:
+    """A leap second at 1 Hz, or a receiver that learns its leap seconds: the clock must hear."""
+    trust = TimeTrust()
+    said = [trust.report(t * SECOND_NS, t * SECOND_NS, valid=True) for t in range(5)]
+    assert said == [False, False, True, True, True]
+    said = [trust.report((t - 1) * SECOND_NS, t * SECOND_NS, valid=True) for t in range(5, 9)]
+    assert said == [False, False, True, True]

@@ -1,0 +1,129 @@
+"""The host's clocks: what a step of the system clock and a suspended host do to them.
+
+    CLOCK_MONOTONIC   never steps, stands still while the host is suspended
+    CLOCK_BOOTTIME    the same, but goes on in suspend (clock_gettime(2), time_namespaces(7))
+    CLOCK_REALTIME    follows UTC, is slewed and stepped by whoever sets it
+
+When realtime gains on monotonic by more than a slew can, what boottime has gained is sleep, and the
+rest is a step. Host time is injected.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Protocol
+
+SECOND_NS = 1_000_000_000
+MILLISECOND_NS = 1_000_000
+
+_STEP_NS = MILLISECOND_NS
+"""NTP slews at 500 ppm at most (adjtimex(2)); with 1000 ppm and 1 ms allowed the rest are steps."""
+_SLEW_PER_NS = 1000
+_BRACKET_NS = 50_000
+"""Reading realtime between two monotonic readings further apart than this was interrupted."""
+_SLEPT_NS = 10 * MILLISECOND_NS
+"""Boottime minus monotonic is constant while the host runs; reading both takes microseconds."""
+_AFTER_STEP_NS = 2 * SECOND_NS
+"""Frames stamped before a step of the system clock are out of the kernel's queue by then."""
+_BELIEVE_STEP_NS = 120 * SECOND_NS
+"""A step that is taken back within two minutes was a mistake (chrony makes its own at start)."""
+
+
+class HostTime(Protocol):
+    """The host's clocks, CLOCK_MONOTONIC, CLOCK_REALTIME and CLOCK_BOOTTIME, in ns."""
+
+    def monotonic_ns(self) -> int: ...
+    def realtime_ns(self) -> int: ...
+    def boottime_ns(self) -> int: ...
+
+
+class SystemTime:
+    """The clocks of this machine."""
+
+    monotonic_ns = staticmethod(time.monotonic_ns)
+
+    @staticmethod
+    def realtime_ns() -> int:
+        return time.time_ns()
+
+    @staticmethod
+    def boottime_ns() -> int:
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+class SystemClock:
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC: as it is, before its last step, and as it is held.
+
+    `held_ns` follows slews and sleep at once, a step only after two minutes: a step does not move
+    the instants of measurements. Counters: `system_clock_stepped`.
+    """
+
+    def __init__(self, host: HostTime, counters: Counter[str]) -> None:
+        self._host = host
+        self._counters = counters
+        self._sampled_ns, self.offset_ns = self._read(host.realtime_ns)
+        self._boot_ns = self._read(host.boottime_ns)[1]
+        self.before_step_ns: int | None = None
+        self.held_ns = self.offset_ns
+        self.slept_ns = 0
+        self.changes = 0
+        self.last_step_ns = 0
+        self._queued_ns = self._stepped_ns = self._sampled_ns
+
+    def _read(self, other_ns: Callable[[], int]) -> tuple[int, int]:
+        """Monotonic time and how far the other clock is ahead of it, ns."""
+        best: tuple[int, int, int] | None = None
+        for _ in range(3):
+            before = self._host.monotonic_ns()
+            other = other_ns()
+            after = self._host.monotonic_ns()
+            middle = (before + after) // 2
+            if best is None or after - before < best[0]:
+                best = (after - before, middle, other - middle)
+            if best[0] <= _BRACKET_NS:
+                break
+        assert best is not None
+        return best[1], best[2]
+
+    def sample(self) -> int:
+        """Read the clock again, notice sleep and steps; realtime minus monotonic in ns.
+
+        `slept_ns` is the sleep since this was made, `changes` the number of sleeps and steps,
+        `last_step_ns` the step that was part of the last one.
+        """
+        now, offset = self._read(self._host.realtime_ns)
+        slack = _STEP_NS + max(0, now - self._sampled_ns) // _SLEW_PER_NS
+        change = offset - self.offset_ns
+        if abs(change) > slack:
+            self.changes += 1
+            self.last_step_ns = 0
+            # Frames stamped before it may be in the kernel's queue.
+            self.before_step_ns = self.offset_ns
+            self._queued_ns = now
+            slept = self._sleep()
+            self.held_ns += slept
+            change -= slept
+        if abs(change) > slack:
+            self._counters["system_clock_stepped"] += 1
+            self._stepped_ns = now
+            self.last_step_ns = change
+        else:
+            self.held_ns += change
+        if now - self._queued_ns > _AFTER_STEP_NS:
+            self.before_step_ns = None
+        if now - self._stepped_ns > _BELIEVE_STEP_NS:
+            self.held_ns = offset
+        self._sampled_ns, self.offset_ns = now, offset
+        return offset
+
+    def _sleep(self) -> int:
+        """What boottime has gained on monotonic since it was last asked, ns: 0 for no sleep."""
+        boot_ns = self._read(self._host.boottime_ns)[1]
+        slept = boot_ns - self._boot_ns
+        if slept < _SLEPT_NS:
+            return 0
+        self._boot_ns = boot_ns
+        self.slept_ns += slept
+        return slept

@@ -1,0 +1,302 @@
+"""One source's UTC on the host's monotonic clock, learnt from when its reports arrive.
+
+    d_i = t_seen_i - utc_i = offset + delay_i,    delay_i >= its least value
+
+Lateness is one-sided and monotonic time does not jump, so the offset is the lower envelope of d,
+which rises by the allowed drift alone, however late reports come:
+
+    offset_i = min(d_i, offset_{i-1} + drift * (t_seen_i - t_seen_{i-1}))
+
+What the envelope cannot explain is a change of the source's UTC. It is seen in two ways:
+
+* certain: a report before it was possible (UTC ahead); UTC that runs backwards or stands still in
+  the source's own sequence (a serial line keeps its order, so no lateness does that); or a second
+  that is missing where leap seconds are. Three
+  reports over a second that agree are followed at once, by whole seconds where that is what they
+  say: the device's stamps have changed, and its measurements with them.
+* possible: reports later than the envelope by whole seconds, after reports were missing (without
+  that, the sequence shows that UTC went on). They are stamped as late, with a sigma as large as the
+  doubt, until it has lasted for two minutes.
+
+Whoever asks for UTC itself hears of a change only when it has lasted for two minutes
+(`believed_offset_ns`): a receiver's mistake is no leap second.
+
+Everything is integer nanoseconds: UTC in ns does not fit a double. A pure function of its inputs.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime
+from math import hypot
+from typing import NamedTuple
+
+from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
+
+_EARLY_NS = 50 * MILLISECOND_NS
+"""Beyond the jitter of a serial line (1 to 16 ms for USB) an early report is held back."""
+_LATE_NS = 500 * MILLISECOND_NS
+"""UTC reports are at most 200 ms late on a healthy serial line."""
+_YOUNG_REPORTS = 10
+_YOUNG_EARLY_NS = 60 * SECOND_NS
+"""Of the first reports any may be the first that was not late; a tty's queue holds less."""
+_AGREE_NS = 100 * MILLISECOND_NS
+_CONFIRM_REPORTS = 3
+_CONFIRM_SPAN_NS = SECOND_NS
+_BELIEVE_NS = 120 * SECOND_NS
+_WHOLE_LOW_NS = 50 * MILLISECOND_NS
+_WHOLE_HIGH_NS = 200 * MILLISECOND_NS
+"""A jump by whole seconds shows as that, less the envelope's own error, plus a report's delay."""
+_SLEEP_ERROR_NS = 2 * SECOND_NS
+"""A battery-backed clock without a fraction of a second, read before and after the sleep."""
+_MAX_SPREAD_S = 1.0
+"""Reports of whole seconds come up to a second late."""
+_SCATTER_NS = 500 * MILLISECOND_NS
+"""Reports of a receiver that has jumped scatter like any; those of a busy host scatter more."""
+_AFTER_LEAP_NS = 5 * SECOND_NS
+_DAY_NS = 86400 * SECOND_NS
+
+SD_S = 3e-3
+_UNKNOWN_S = 0.15
+"""Sentences come 50 to 200 ms after their epoch."""
+
+
+class Stamped(NamedTuple):
+    """Monotonic ns of a stamp and one sigma of it (s)."""
+
+    t_ns: int
+    sd_s: float
+
+
+def whole_seconds_ns(late_ns: int, delay_ns: int = _WHOLE_HIGH_NS) -> int:
+    """The jump by whole seconds that explains `late_ns` with a delay up to `delay_ns`, else 0."""
+    jump = (late_ns + _WHOLE_LOW_NS) // SECOND_NS * SECOND_NS
+    return jump if late_ns - jump <= delay_ns else 0
+
+
+def _after_leap(utc_ns: int) -> bool:
+    """Whether a month has just begun: leap seconds come before it (ITU-R TF.460-6, annex 1)."""
+    if utc_ns % _DAY_NS > _AFTER_LEAP_NS:
+        return False
+    return datetime.fromtimestamp(utc_ns // SECOND_NS, UTC).day == 1
+
+
+class UtcEnvelope:
+    """The lower envelope of one source. Made empty; `update` takes its reports.
+
+    Counters: `utc_report_odd` (held back), `utc_report_late` (beyond 0.5 s), `utc_jump` (the
+    source's UTC changed), `utc_relearned` (all reports before had been late).
+    """
+
+    def __init__(self, drift_ppm: float, counters: Counter[str]) -> None:
+        self._ppb = round(drift_ppm * 1000)
+        self._counters = counters
+        self._offset_ns: int | None = None
+        self._utc_ns = 0
+        self._delay_ns = 0
+        self._interval_ns: int | None = None
+        self._turned_back = False
+        self._reports = 0
+        self._spread_s = _UNKNOWN_S
+        self._odd: list[int] = []
+        self._odd_since_ns = 0
+        self._unsupported: _Unsupported | None = None
+        self._supported_ns = 0
+        self._unbelieved_ns = 0
+        self._jumped_ns = 0
+        self._woke = False
+        self.t_seen_ns = 0
+        self.plausible = True
+
+    @property
+    def offset_ns(self) -> int:
+        """Host monotonic minus the UTC that the source states now, with its least delay."""
+        assert self._offset_ns is not None, "made from its first report"
+        return self._offset_ns
+
+    @property
+    def believed_offset_ns(self) -> int:
+        """The same, for UTC as it is believed: without changes of the last two minutes."""
+        return self.offset_ns - self._unbelieved_ns
+
+    @property
+    def open(self) -> bool:
+        """While reports that are held back are sure to say something, and not yet what."""
+        return bool(self._odd)
+
+    @property
+    def settled(self) -> bool:
+        """False while it is not known which is right: what reports say, or what is believed."""
+        return not (self._odd or self._unbelieved_ns or self._doubt_ns)
+
+    @property
+    def _doubt_ns(self) -> int:
+        """By how much UTC may have jumped while reports were missing, ns."""
+        run = self._unsupported
+        return whole_seconds_ns(run.least_ns) if run is not None and run.after_gap else 0
+
+    @property
+    def sd_s(self) -> float:
+        """One sigma of the offset (s): the least of n delays lies spread / n above the least."""
+        unsupported_ns = max(0, self.t_seen_ns - self._supported_ns)
+        drift_s = unsupported_ns * self._ppb / SECOND_NS / SECOND_NS
+        return hypot(max(SD_S, self._spread_s / (self._reports + 1)), drift_s)
+
+    def stamp(self, utc_ns: int, t_seen_ns: int) -> Stamped:
+        """The instant of the source's own stamp `utc_ns`, less its least delay.
+
+        A late one keeps its age; if a jump of UTC would explain that, sigma is the jump.
+        """
+        late_ns = t_seen_ns - utc_ns - self.offset_ns
+        doubt_s = 0.0
+        if late_ns > _LATE_NS and (
+            self._doubt_ns or self._missed(utc_ns) or self._turns_back(utc_ns, t_seen_ns)
+        ):
+            doubt_s = whole_seconds_ns(late_ns) / SECOND_NS
+        return Stamped(utc_ns + self.offset_ns, hypot(self.sd_s, doubt_s))
+
+    def _missed(self, utc_ns: int) -> bool:
+        """Whether reports are missing before `utc_ns`: a jump of UTC may hide there."""
+        if self._interval_ns is None:
+            return True
+        return 2 * (utc_ns - self._utc_ns) > 3 * self._interval_ns
+
+    def _turns_back(self, utc_ns: int, t_seen_ns: int) -> bool:
+        """Whether UTC stands still or goes back with `utc_ns`, and not because it is read twice."""
+        return utc_ns <= self._utc_ns and t_seen_ns - utc_ns > self._delay_ns + _LATE_NS
+
+    def untrusted(self, utc_ns: int, t_seen_ns: int) -> None:
+        """A report that the device does not trust: all it can say is that UTC turned back."""
+        if self._offset_ns is not None and self._turns_back(utc_ns, t_seen_ns):
+            self._turned_back = True
+
+    def slept(self, slept_ns: int) -> None:
+        """The host was suspended: monotonic time stood still, UTC did not.
+
+        A hardware clock counts sleep in whole seconds, so the next reports are learnt from anew.
+        """
+        if self._offset_ns is None:
+            return
+        self._offset_ns -= slept_ns
+        self._odd.clear()
+        self._unsupported = None
+        self._reports = 0
+        self._spread_s = _MAX_SPREAD_S
+        self._woke = True
+
+    def update(self, utc_ns: int, t_seen_ns: int, *, plausible: bool = True) -> int:
+        """Take one report in; by how much `believed_offset_ns` has jumped with it, in ns.
+
+        UTC of an implausible date maps the source's own stamps and is never believed.
+        """
+        d = t_seen_ns - utc_ns
+        self.plausible = plausible
+        if self._offset_ns is None or (self._woke and abs(d - self._offset_ns) < _SLEEP_ERROR_NS):
+            self._woke = False
+            self._offset_ns = d
+            self._supported_ns = t_seen_ns
+            self._accept(utc_ns, d, t_seen_ns)
+            return 0
+        drifted = self._offset_ns + max(0, t_seen_ns - self.t_seen_ns) * self._ppb // SECOND_NS
+        self._offset_ns = drifted
+        late = d - drifted
+        early_from = _YOUNG_EARLY_NS if self._reports < _YOUNG_REPORTS else _EARLY_NS
+        backward = self._turned_back or self._turns_back(utc_ns, t_seen_ns)
+        repeated = plausible and whole_seconds_ns(late) == SECOND_NS and _after_leap(utc_ns)
+        if late < -early_from or (late > _LATE_NS and (backward or repeated or self._odd)):
+            self.t_seen_ns = max(t_seen_ns, self.t_seen_ns)
+            self._hold(d, late, utc_ns, t_seen_ns)
+            return self._believe()
+        self._odd.clear()
+        if late < -_EARLY_NS:
+            self._spread_s = min(_MAX_SPREAD_S, max(self._spread_s, -late / SECOND_NS))
+            self._reports = 0
+        self._offset_ns = min(d, drifted)
+        if late <= _LATE_NS:
+            self._unsupported = None
+            self._supported_ns = t_seen_ns
+        else:
+            self._counters["utc_report_late"] += 1
+            run, missed = self._unsupported, self._missed(utc_ns)
+            if run is None or not run.take(late):
+                missed = missed or (run is not None and run.after_gap)
+                run = self._unsupported = _Unsupported(t_seen_ns, late)
+            run.after_gap = run.after_gap or missed
+        self._accept(utc_ns, d, t_seen_ns)
+        return self._outlasted() or self._believe()
+
+    def _accept(self, utc_ns: int, d: int, t_seen_ns: int) -> None:
+        if self._reports and utc_ns > self._utc_ns:
+            self._interval_ns = utc_ns - self._utc_ns
+        self._turned_back = False
+        self._utc_ns = utc_ns
+        self._delay_ns = d
+        self._reports += 1
+        self.t_seen_ns = max(t_seen_ns, self.t_seen_ns)
+
+    def _hold(self, d: int, late: int, utc_ns: int, t_seen_ns: int) -> None:
+        """What no lateness explains: a wrong report, or a change of UTC once three agree."""
+        self._counters["utc_report_odd"] += 1
+        if self._odd and abs(d - self._odd[0]) > max(_AGREE_NS, round(self._spread_s * SECOND_NS)):
+            self._odd.clear()
+        if not self._odd:
+            self._odd_since_ns = t_seen_ns
+        self._odd.append(d)
+        if len(self._odd) < _CONFIRM_REPORTS or t_seen_ns - self._odd_since_ns < _CONFIRM_SPAN_NS:
+            return
+        least = min(self._odd) - self.offset_ns
+        jump = whole_seconds_ns(least, _AGREE_NS)
+        if jump == 0 and -_YOUNG_EARLY_NS < least < 0:
+            self._counters["utc_relearned"] += 1
+        else:
+            self._counters["utc_jump"] += 1
+            self._unbelieved_ns += jump or least
+            self._jumped_ns = t_seen_ns
+        self._offset_ns = min(self._odd)
+        self._reports = 0
+        self._spread_s = _UNKNOWN_S
+        self._odd.clear()
+        self._unsupported = None
+        self._supported_ns = t_seen_ns
+        self._accept(utc_ns, d, t_seen_ns)
+
+    def _outlasted(self) -> int:
+        """Reports late by the same whole seconds for minutes: UTC has jumped back by them."""
+        late = self._unsupported
+        if late is None or self.t_seen_ns - late.since_ns < _BELIEVE_NS:
+            return 0
+        jump = self._doubt_ns
+        if jump == 0 or late.reports < _YOUNG_REPORTS or not self.plausible:
+            return 0
+        self._counters["utc_jump"] += 1
+        self._offset_ns = self.offset_ns + late.least_ns
+        self._unsupported = None
+        self._supported_ns = self.t_seen_ns
+        return jump
+
+    def _believe(self) -> int:
+        lasted = self.t_seen_ns - self._jumped_ns >= _BELIEVE_NS
+        if not (self._unbelieved_ns and lasted and self.plausible) or self._odd:
+            return 0
+        if self._unsupported is not None:
+            return 0
+        change, self._unbelieved_ns = self._unbelieved_ns, 0
+        return change
+
+
+class _Unsupported:
+    """Reports that have been late since the last one that was not."""
+
+    def __init__(self, since_ns: int, late_ns: int) -> None:
+        self.since_ns = since_ns
+        self.least_ns = late_ns
+        self.reports = 1
+        self.after_gap = False
+
+    def take(self, late_ns: int) -> bool:
+        """Take another one in; False if it does not fit, and a new run begins with it."""
+        if not -_AGREE_NS <= late_ns - self.least_ns <= _SCATTER_NS:
+            return False
+        self.least_ns = min(self.least_ns, late_ns)
+        self.reports += 1
+        return True
