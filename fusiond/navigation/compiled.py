@@ -54,8 +54,8 @@ def _cache_folder() -> Path:
     return (Path(given) if given else user) / f"kernels-{digest.hexdigest()[:16]}"
 
 
-_FOLDER = _cache_folder()
-remove_strays(_FOLDER)
+FOLDER = _cache_folder()
+remove_strays(FOLDER)
 _names: set[str] = set()
 
 # 2^48 starts: no two processes that filled a cache count through the same numbers.
@@ -80,7 +80,7 @@ def compiled(
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
         _names.add(name)
         kernel = numba.njit(error_model="numpy", **options)(function)
-        kernel._cache = KernelCache(_FOLDER, name)
+        kernel._cache = KernelCache(FOLDER, name)
         kernel.compile(signature)
         kernel.disable_compile()
         finished: Callable[P, R] = kernel
