@@ -26,7 +26,6 @@ from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import (
     CORE_SIZE,
     CORE_STRIDE,
-    WIDTHS,
     apply_for,
     apply_to_core,
 )
@@ -61,12 +60,40 @@ def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
     return gather
 
 
-# By name, not as variables of a closure: a kernel that closes over a kernel is never found in
-# numba's cache again. The branch on a closure's constant is gone when the code is compiled.
-_gather_core, _gather_narrow, _gather_middle, _gather_wide = (
-    _gather_for(w) for w in (CORE_STRIDE, *WIDTHS)
-)
-_apply_narrow, _apply_middle, _apply_wide = (apply_for(w) for w in WIDTHS)
+@cache
+def _advance_for(width: int) -> Callable[..., None]:
+    """`advance` for rows of `width` doubles."""
+    gather, apply = _gather_for(width), apply_for(width)
+
+    @compiled(
+        "void(f8[::1], i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[::1])",
+        variant=width,
+        forceinline=True,
+    )
+    def advance(
+        rows: Array,
+        sensor_slot: Indices,
+        weight: Array,
+        c: Array,
+        active: NDArray[np.bool_],
+        sensor: Array,
+        out: Array,
+    ) -> None:
+        """out (9 rows) = transition times `rows`; what is not `active` is zero.
+
+        All flat. `sensor` (6 rows) is work space.
+        """
+        gather(rows, sensor_slot, weight, sensor)
+        apply(rows, sensor, c, out)
+        for i in range(CORE_SIZE):
+            if not active[i]:
+                for j in range(width):
+                    out[i * width + j] = 0.0
+
+    return advance
+
+
+_advance_core = _advance_for(CORE_STRIDE)
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[::1])", forceinline=True)
@@ -83,7 +110,7 @@ def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
 @cache
 def covariance_for(width: int) -> Callable[..., None]:
     """`propagate_covariance` for matrices of `width` rows."""
-    size, rank = work_size(width), WIDTHS.index(width)
+    size, advance = work_size(width), _advance_for(width)
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8,"
@@ -122,19 +149,7 @@ def covariance_for(width: int) -> Callable[..., None]:
         for i in range(CORE_SIZE):
             flat[i * width + i] += half * white[i]
 
-        if rank == 0:
-            _gather_narrow(flat, sensor_slot, weight, sensor)
-            _apply_narrow(flat, sensor, c, top)
-        elif rank == 1:
-            _gather_middle(flat, sensor_slot, weight, sensor)
-            _apply_middle(flat, sensor, c, top)
-        else:
-            _gather_wide(flat, sensor_slot, weight, sensor)
-            _apply_wide(flat, sensor, c, top)
-        for i in range(CORE_SIZE):
-            if not active[i]:
-                for j in range(width):
-                    top[i * width + j] = 0.0
+        advance(flat, sensor_slot, weight, c, active, sensor, top)
         for j in range(width):
             for i in range(CORE_SIZE):
                 turned[j * CORE_STRIDE + i] = top[i * width + j]
@@ -145,12 +160,7 @@ def covariance_for(width: int) -> Callable[..., None]:
         for j in range(CORE_SIZE, width):
             for i in range(CORE_SIZE):
                 flat[j * width + i] = top[i * width + j]
-        _gather_core(turned, sensor_slot, weight, core_sensor)
-        apply_to_core(turned, core_sensor, c, core)
-        for i in range(CORE_SIZE):
-            if not active[i]:
-                for j in range(CORE_SIZE):
-                    core[i * CORE_STRIDE + j] = 0.0
+        _advance_core(turned, sensor_slot, weight, c, active, core_sensor, core)
         for i in range(CORE_SIZE):
             for j in range(CORE_SIZE):
                 lower, upper = core[i * CORE_STRIDE + j], core[j * CORE_STRIDE + i]
@@ -178,7 +188,7 @@ def covariance_for(width: int) -> Callable[..., None]:
 @cache
 def transition_for(width: int) -> Callable[..., None]:
     """`propagate_transition` for matrices of `width` rows."""
-    size, rank = work_size(width), WIDTHS.index(width)
+    size, advance = work_size(width), _advance_for(width)
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
@@ -202,18 +212,9 @@ def transition_for(width: int) -> Callable[..., None]:
         weight = work[size - 12 :]
         _weights(step, sensor_terms, weight)
         sensor, top = work[: 6 * width], work[6 * width : 15 * width]
-        if rank == 0:
-            _gather_narrow(flat, sensor_terms[0], weight, sensor)
-            _apply_narrow(flat, sensor, c, top)
-        elif rank == 1:
-            _gather_middle(flat, sensor_terms[0], weight, sensor)
-            _apply_middle(flat, sensor, c, top)
-        else:
-            _gather_wide(flat, sensor_terms[0], weight, sensor)
-            _apply_wide(flat, sensor, c, top)
-        for i in range(CORE_SIZE):
-            for j in range(width):
-                flat[i * width + j] = top[i * width + j] if active[i] else 0.0
+        advance(flat, sensor_terms[0], weight, c, active, sensor, top)
+        for i in range(CORE_SIZE * width):
+            flat[i] = top[i]
         for k in range(rate_terms.shape[1]):
             offset, rate = rate_terms[0, k], rate_terms[1, k]
             for j in range(width):
@@ -250,16 +251,14 @@ def propagate_error(
     work: Array,
 ) -> None:
     """dx (n,) <- Phi dx over h seconds: an estimate that is not fed back yet (paper 000, 1.1)."""
-    sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
     sensor = work[: 6 * CORE_STRIDE]
     rows = work[6 * CORE_STRIDE : 15 * CORE_STRIDE]
     out = work[15 * CORE_STRIDE : 24 * CORE_STRIDE]
+    weight = work[24 * CORE_STRIDE : 24 * CORE_STRIDE + 12]
+    _weights(step, sensor_terms, weight)
     sensor[:] = 0.0
     for i in range(12):
-        if sensor_kind[i] == PLAIN:
-            sensor[i // 2 * CORE_STRIDE] += dx[sensor_slot[i]]
-        elif sensor_kind[i] == SCALE:
-            sensor[i // 2 * CORE_STRIDE] += step[3 + i // 2] * dx[sensor_slot[i]]
+        sensor[i // 2 * CORE_STRIDE] += weight[i] * dx[sensor_terms[0, i]]
     rows[:] = 0.0
     for i in range(CORE_SIZE):
         rows[i * CORE_STRIDE] = dx[i]

@@ -66,6 +66,27 @@ def compensate(samples: Array, i: int, estimate: Array, rate: Array, force: Arra
         force[j] = (samples[i, 3 + j] - estimate[3 + j]) / (1.0 + estimate[9 + j])
 
 
+@compiled("b1(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1])", forceinline=True)
+def slopes(
+    times: Indices, samples: Array, i: int, gap_ns: int, rate_slope: Array, force_slope: Array
+) -> bool:
+    """Write the slopes (3,), a second, of rate and force over sample i; whether a gap precedes it.
+
+    Zero where the sample before holds over another length of time: beside a gap, at the start.
+    """
+    silent = i > 0 and times[i] - times[i - 1] > gap_ns
+    if i > 1 and not silent and times[i - 1] - times[i - 2] <= gap_ns:
+        between = 2e9 / (times[i] - times[i - 2])
+        for j in range(3):
+            rate_slope[j] = (samples[i, j] - samples[i - 1, j]) * between
+            force_slope[j] = (samples[i, 3 + j] - samples[i - 1, 3 + j]) * between
+    else:
+        for j in range(3):
+            rate_slope[j] = 0.0
+            force_slope[j] = 0.0
+    return silent
+
+
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")
 def sigmas(cov: Array, step: Array, out: Array) -> None:
     """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
@@ -105,14 +126,10 @@ def widen_for_gap(cov: Array, active: NDArray[np.bool_], whole: float, h: float)
             cov[r, r] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
 
 
-_covariance_narrow, _covariance_middle, _covariance_wide = (covariance_for(w) for w in WIDTHS)
-_transition_narrow, _transition_middle, _transition_wide = (transition_for(w) for w in WIDTHS)
-
-
 @cache
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
-    rank = WIDTHS.index(width)
+    propagate_covariance, propagate_transition = covariance_for(width), transition_for(width)
 
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1],"
@@ -176,34 +193,19 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             stop = min(times[i], target)
             if stop > now:
                 h = (stop - now) * 1e-9
-                silent = i > 0 and times[i] - times[i - 1] > gap_ns
+                silent = slopes(times, samples, i, gap_ns, rate_slope, force_slope)
                 compensate(samples, i, estimate, rate, force)
-                if i > 1 and not silent and times[i - 1] - times[i - 2] <= gap_ns:
-                    between = 2e9 / (times[i] - times[i - 2])
-                    for j in range(3):
-                        rate_slope[j] = (samples[i, j] - samples[i - 1, j]) * between
-                        force_slope[j] = (samples[i, 3 + j] - samples[i - 1, 3 + j]) * between
-                else:
-                    rate_slope[:] = 0.0
-                    force_slope[:] = 0.0
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
                 coefficients(nav, step, h, c)
                 for k in range(covs.shape[0]):
-                    arguments = (active, sensor_terms, rate_terms, noise, 1.0 / shares[k], work)
-                    if rank == 0:
-                        _covariance_narrow(covs[k], step, c, h, *arguments)
-                    elif rank == 1:
-                        _covariance_middle(covs[k], step, c, h, *arguments)
-                    else:
-                        _covariance_wide(covs[k], step, c, h, *arguments)
+                    q = 1.0 / shares[k]
+                    propagate_covariance(
+                        covs[k], step, c, h, active, sensor_terms, rate_terms, noise, q, work
+                    )
                 if phi.shape[0]:
-                    terms = (active, sensor_terms, rate_terms, noise, work)
-                    if rank == 0:
-                        _transition_narrow(phi, step, c, h, *terms)
-                    elif rank == 1:
-                        _transition_middle(phi, step, c, h, *terms)
-                    else:
-                        _transition_wide(phi, step, c, h, *terms)
+                    propagate_transition(
+                        phi, step, c, h, active, sensor_terms, rate_terms, noise, work
+                    )
                 if carry:
                     for k in range(dxs.shape[0]):
                         propagate_error(

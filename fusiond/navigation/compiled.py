@@ -5,8 +5,8 @@ never again: no compilation can happen inside the navigation loop. `error_model=
 zero-division checks that would keep loops from being vectorised; `fastmath` stays off because it
 would let results depend on the order that the compiler picks.
 
-The cache lies in a folder named by a digest of all the package's sources, since a kernel has
-inlined what it calls: any edit or upgrade starts a new one.
+The cache lies in a folder named by a digest of the sources of all rooms that a kernel takes code or
+constants from, since it has them inlined: any edit there or upgrade starts a new one.
 
 What is in the cache was compiled by several processes and is linked in one, by symbol. numba forms
 a symbol of module, qualified name, argument types and a number that counts the functions compiled
@@ -29,25 +29,33 @@ from typing import Any, ParamSpec, TypeVar
 import numba
 from numba.core.bytecode import FunctionIdentity
 
-from fusiond.navigation.kernel_cache import KernelCache
+from fusiond.navigation.kernel_cache import KernelCache, remove_strays
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+# Rooms of modules that compile, and of all that these import.
+ROOMS = (
+    *("navigation", "models", "gnss", "files", "aiding", "estimators"),
+    *("integrity", "simulation", "studies"),
+)
 
 
 def _cache_folder() -> Path:
     """`NUMBA_CACHE_DIR`, else the user's cache folder, with the digest of the sources below it."""
     digest = hashlib.sha256(f"{sys.implementation.cache_tag} {numba.__version__}".encode())
     package = Path(__file__).resolve().parents[1]
-    for source in sorted(package.rglob("*.py")):
-        if b"compiled(" in (text := source.read_bytes()) or source.name == "kernel_cache.py":
-            digest.update(text)
+    for room in ROOMS:
+        for source in sorted((package / room).rglob("*.py")):
+            digest.update(source.read_bytes())
     given = os.environ.get("NUMBA_CACHE_DIR")
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fusiond"
     return (Path(given) if given else user) / f"kernels-{digest.hexdigest()[:16]}"
 
 
-_FOLDER = _cache_folder()
+FOLDER = _cache_folder()
+remove_strays(FOLDER)
 _names: set[str] = set()
 
 # 2^48 starts: no two processes that filled a cache count through the same numbers.
@@ -72,7 +80,7 @@ def compiled(
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
         _names.add(name)
         kernel = numba.njit(error_model="numpy", **options)(function)
-        kernel._cache = KernelCache(_FOLDER, name)
+        kernel._cache = KernelCache(FOLDER, name)
         kernel.compile(signature)
         kernel.disable_compile()
         finished: Callable[P, R] = kernel

@@ -7,8 +7,8 @@ hands what it finds to the linker, which aborts the process.) The digest tells d
 whoever may write to the folder may run code here, as with any folder of Python modules.
 
 Files are written under a name of their own and renamed, so that processes that compile side by side
-or die while they write leave whole files. Where nothing can be written, kernels are compiled at
-each start.
+or die while they write leave whole files; a later start removes what a dead one left. Where nothing
+can be written, kernels are compiled at each start.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import os
 import pickle
 import secrets
 import shutil
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,9 @@ _rebuild: Any = CompileResult._rebuild
 _dumps: Any = dumps
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
+
+# A file is written in milliseconds. Who is robbed of one nevertheless compiles again next time.
+_STRAY_S = 60.0
 
 
 class KernelCache(NullCache):
@@ -72,7 +76,7 @@ class KernelCache(NullCache):
             return  # it holds addresses of this process
         payload: bytes = _dumps(data._reduce())
         path = self._path(signature, data.codegen)
-        written = path.with_suffix(f".{secrets.token_hex(8)}")
+        written = path.with_suffix(f".{secrets.token_hex(8)}.writing")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with written.open("xb") as file:
@@ -87,6 +91,15 @@ class KernelCache(NullCache):
         """Native code differs by signature, system, processor and its features."""
         made_for = hashlib.sha256(repr((str(signature), codegen.magic_tuple())).encode())
         return self._folder / f"{self._name}-{made_for.hexdigest()[:16]}.kernel"
+
+
+def remove_strays(folder: Path) -> None:
+    """Remove what processes left in `folder` that died while they wrote."""
+    oldest = time.time() - _STRAY_S
+    for written in folder.glob("*.writing"):
+        with contextlib.suppress(OSError):
+            if written.stat().st_mtime < oldest:
+                written.unlink()
 
 
 def _discard(path: Path, reason: str) -> None:

@@ -6,8 +6,11 @@ kernels are a module made for the test, since the filters' take a minute to comp
 
 from __future__ import annotations
 
+import ast
 import os
 import pickle
+import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,11 +18,10 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.navigation.compiled import compiled
+import fusiond
+from fusiond.navigation.compiled import ROOMS, compiled
 
-# `scaled` is too long to be inlined: a caller links to it by symbol.
 KERNELS = """
-import math
 from functools import cache
 
 from fusiond.navigation.compiled import compiled
@@ -34,12 +36,10 @@ def halved(x):
 def scaled_for(factor):
     @compiled("f8(f8)", variant=factor)
     def scaled(x):
-        y = factor * halved(x)
-LONG
-        return y
+        return factor * halved(x)
 
     return scaled
-""".replace("LONG", "\n".join(f"        y += 0.0 * math.sin({k}.0 * x)" for k in range(80)))
+"""
 
 
 Run = Callable[[str], subprocess.CompletedProcess[str]]
@@ -73,32 +73,6 @@ IN_ORDER = "import kernels; print([kernels.scaled_for(k)(1.0) for k in {}])"
 
 def _kept(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.kernel"))
-
-
-CALLER = """
-from fusiond.navigation.compiled import compiled
-from kernels import scaled_for
-scaled = scaled_for({factor})
-
-
-@compiled("f8(f8)")
-def called(x):
-    return 1.0 + scaled(x)
-"""
-
-
-def test_variants_compiled_by_different_processes_stay_apart(run: Run, tmp_path: Path) -> None:
-    """Each process counts its variant as the same one; a caller that was cached links by symbol."""
-    for name, factor in (("four", 4), ("six", 6)):
-        (tmp_path / f"{name}.py").write_text(CALLER.format(factor=factor))
-        result = run(f"import {name}; print({name}.called(1.0))")
-        assert result.stdout == f"{1.0 + 0.5 * factor}\n", result.stderr
-    code = (
-        "import kernels; kernels.scaled_for(4); kernels.scaled_for(6)\n"
-        "import four, six; print(four.called(1.0), six.called(1.0))"
-    )
-    result = run(code)
-    assert (result.returncode, result.stdout) == (0, "3.0 4.0\n"), result.stderr
 
 
 def test_names_do_not_depend_on_the_order_of_compiling(run: Run, tmp_path: Path) -> None:
@@ -205,3 +179,70 @@ def test_a_process_killed_while_it_writes_leaves_no_half_kernel(run: Run, tmp_pa
     assert killed.returncode == -9
     assert not _kept(tmp_path / "cache")
     assert run(IN_ORDER.format((4,))).stdout == "[2.0]\n"
+
+
+def test_a_later_start_removes_what_a_killed_writer_left(run: Run, tmp_path: Path) -> None:
+    run("import os; os.replace = lambda *_: os.kill(os.getpid(), 9)\nimport kernels")
+    (left,) = (tmp_path / "cache").rglob("*.writing")
+    run("import kernels")
+    assert left.exists()  # as long as it may still be written
+    os.utime(left, (0, 0))
+    run("import kernels")
+    assert not left.exists()
+    assert len(_kept(tmp_path / "cache")) == 1
+
+
+def _imports(source: Path) -> set[str]:
+    """Names of the modules of fusiond that a module takes something from."""
+    found = set()
+    for node in ast.walk(ast.parse(source.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+    return {name for name in found if name.startswith("fusiond.")}
+
+
+def test_the_cache_changes_with_all_that_kernels_import() -> None:
+    """A kernel has constants and code of other modules inlined: these are in the digest, too."""
+    package = Path(fusiond.__file__).parent
+    modules = {
+        ".".join(path.relative_to(package.parent).with_suffix("").parts): path
+        for path in package.rglob("*.py")
+    }
+    open_ = [name for name, path in modules.items() if "\n@compiled(" in path.read_text()]
+    assert len(open_) > 20
+    reached: set[str] = set()
+    while open_:
+        name = open_.pop()
+        if name in reached or name not in modules:
+            continue
+        reached.add(name)
+        open_ += _imports(modules[name])
+    rooms = {name.split(".")[1] for name in reached}
+    assert rooms <= set(ROOMS)
+
+
+def test_a_constant_of_another_module_makes_a_new_cache(tmp_path: Path) -> None:
+    """Of a copy of the package, in a process that compiles nothing."""
+    source = tmp_path / "fusiond"
+    shutil.copytree(Path(fusiond.__file__).parent, source, ignore=lambda *_: ["__pycache__"])
+
+    def folder() -> str:
+        return subprocess.run(
+            [sys.executable, "-c", "from fusiond.navigation.compiled import FOLDER; print(FOLDER)"],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=True,
+        ).stdout
+
+    before = folder()
+    assert folder() == before
+    model = source / "models" / "model.py"
+    changed = re.sub(r"(?m)^PLAIN.*$", "PLAIN, SCALE = 2, 1", model.read_text())
+    assert changed != model.read_text()
+    model.write_text(changed)
+    assert folder() != before

@@ -96,6 +96,16 @@ def _times(a: Array, b: Array, out: Array) -> None:
                     out[i, j] += c * b[k, j]
 
 
+@compiled("void(f8[:, ::1], f8[::1], f8[::1])", forceinline=True)
+def _times_vector(a: Array, x: Array, out: Array) -> None:
+    """out = a x."""
+    for i in range(a.shape[0]):
+        total = 0.0
+        for k in range(a.shape[1]):
+            total += a[i, k] * x[k]
+        out[i] = total
+
+
 @compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
 def _spread(phi: Array, cov: Array, q: Array) -> None:
     """cov <- phi cov phi^T + q, cov symmetric."""
@@ -142,11 +152,7 @@ def begin(
     cov[:n, :n] = here
     for e in range(1, m):
         at, before = e * n, (e - 1) * n
-        for i in range(n):
-            total = 0.0
-            for k in range(n):
-                total += phi[e - 1, i, k] * mean[before + k]
-            mean[at + i] = total
+        _times_vector(phi[e - 1], mean[before:at], mean[at : at + n])
         # Covariance with each element before: phi times that of the last one.
         for c in range(e):
             _times(phi[e - 1], cov[before:at, c * n : (c + 1) * n].copy(), across)
@@ -194,18 +200,14 @@ def predict(
     inner = np.zeros((n, n))
     for e in range(m - 1):
         _spread(phi[e], inner, ((e + 1) / m) ** 2 * q[e])
-    middle = np.zeros(n)
-    for i in range(n):
-        for k in range(m * n):
-            middle[i] += g[i, k] * last[k]
+    middle = np.empty(n)
+    _times_vector(g, last, middle)
     once, here = np.empty((n, m * n)), np.empty((n, n))
     _times(g, last_cov, once)
     _times(g, once.T.copy(), here)
     here += inner
-    first = np.zeros(n)
-    for i in range(n):
-        for k in range(n):
-            first[i] += phi[m - 1, i, k] * middle[k]
+    first = np.empty(n)
+    _times_vector(phi[m - 1], middle, first)
     _spread(phi[m - 1], here, q[m - 1])
     begin(w, first, here, phi[m:], q[m:], mean, cov)
 
@@ -282,9 +284,7 @@ def rebase(w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, me
     t = np.zeros(u.shape)
     t[0] = u[0]
     for e in range(1, len(u)):
-        for i in range(n):
-            for k in range(n):
-                t[e, i] += phi[e, i, k] * t[e - 1, k]
+        _times_vector(phi[e], t[e - 1], t[e])
     for e in range(len(u)):
         for row in range(ends[e - 1] if e else 0, ends[e]):
             for i in range(n):

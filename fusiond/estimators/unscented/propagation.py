@@ -31,7 +31,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.covariance import covariance_for, propagate_parameters
-from fusiond.estimators.propagation import compensate, sensor_estimates, sigmas, widen_for_gap
+from fusiond.estimators.propagation import (
+    compensate,
+    sensor_estimates,
+    sigmas,
+    slopes,
+    widen_for_gap,
+)
+from fusiond.estimators.unscented.sigma_points import NO_PIVOT
 from fusiond.estimators.update import feed_back
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -50,11 +57,10 @@ from fusiond.navigation.strapdown import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# A pivot this small a part of its variance is rounding: the state is known from those before it.
-_NO_PIVOT = 1e-15
 # Columns along which points are drawn: the attitude, slots 0 to 2.
 POINTS = 3
 
+# One kernel for all widths: it takes 4.6 s to compile, and a branch is nothing beside its points.
 _covariance_narrow, _covariance_middle, _covariance_wide = (covariance_for(w) for w in WIDTHS)
 
 
@@ -67,7 +73,7 @@ def split(cov: Array, root: Array) -> None:
         variance = cov[k, k]
         for i in range(k):
             variance += root[i, k] * root[i, k]
-        if cov[k, k] > _NO_PIVOT * variance:
+        if cov[k, k] > NO_PIVOT * variance:
             inverse = 1.0 / math.sqrt(cov[k, k])
             for j in range(width):
                 row[j] = cov[k, j] * inverse
@@ -196,15 +202,7 @@ def propagate_points(
         stop = min(times[i], target)
         if stop > now:
             h = (stop - now) * 1e-9
-            silent = i > 0 and times[i] - times[i - 1] > gap_ns
-            if i > 1 and not silent and times[i - 1] - times[i - 2] <= gap_ns:
-                between = 2e9 / (times[i] - times[i - 2])
-                for j in range(3):
-                    rate_slope[j] = (samples[i, j] - samples[i - 1, j]) * between
-                    force_slope[j] = (samples[i, 3 + j] - samples[i - 1, 3 + j]) * between
-            else:
-                rate_slope[:] = 0.0
-                force_slope[:] = 0.0
+            silent = slopes(times, samples, i, gap_ns, rate_slope, force_slope)
             split(cov, root)
             before[:] = nav
             sensor_estimates(xi, sensor_slot, sensor_kind, estimate)

@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # A pivot this small a part of its variance is rounding: the state is known from those before it.
-_NO_PIVOT = 1e-15
+NO_PIVOT = 1e-15
 
 
 @compiled("void(f8[:, ::1], i8[::1], f8[:, ::1])")
@@ -60,7 +60,7 @@ def factor(cov: Array, slots: Indices, root: Array) -> None:
         pivot = variance
         for k in range(i):
             pivot -= root[k, i] * root[k, i]
-        if not pivot > _NO_PIVOT * variance:
+        if not pivot > NO_PIVOT * variance:
             continue
         diagonal = math.sqrt(pivot)
         row = root[i]

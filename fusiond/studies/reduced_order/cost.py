@@ -44,8 +44,6 @@ RECURSIONS = 1000
 """Timed at once: some milliseconds, long against the resolution of the clock."""
 ROUNDS = 45
 
-_covariance_narrow, _covariance_middle = (covariance_for(w) for w in WIDTHS[:2])
-
 
 class Cost(NamedTuple):
     """CPU seconds of a recursion and of a live second."""
@@ -56,8 +54,8 @@ class Cost(NamedTuple):
 
 @cache
 def _recursions_for(width: int) -> Callable[..., None]:
-    """`recursions` for covariances of `width` rows, one of the first two of WIDTHS."""
-    narrow = width == WIDTHS[0]
+    """`recursions` for covariances of `width` rows."""
+    propagate_covariance = covariance_for(width)
 
     @compiled(
         "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
@@ -83,14 +81,9 @@ def _recursions_for(width: int) -> Callable[..., None]:
         """`count` times: `cov` over h seconds, then `rows` (m, n) with variances `r` (m,)."""
         z, y, dx = np.zeros(r.shape[0]), np.zeros(r.shape[0]), np.zeros(xi.shape[0])
         for _ in range(count):
-            if narrow:
-                _covariance_narrow(
-                    cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
-                )
-            else:
-                _covariance_middle(
-                    cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
-                )
+            propagate_covariance(
+                cov, step, c, h, active, sensor_terms, rate_terms, noise, 1.0, work
+            )
             fuse(nav, xi, cov, dx, z, rows, r, math.inf, False, y)
 
     return recursions
