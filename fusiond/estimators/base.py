@@ -131,8 +131,8 @@ class Estimator(Protocol):
     def look(self, aid: Linearised) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
 
-    def doubt(self, aid: Linearised, motion: bool) -> None:
-        """Widen P by an aid's innovation; with `motion`, attitude and sensor errors too."""
+    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""
@@ -299,11 +299,13 @@ class ErrorStateFilter:
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
 
-    def doubt(self, aid: Linearised, motion: bool) -> None:
-        """Widen P by an aid's innovation; with `motion`, attitude and sensor errors too."""
+    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
         rows = self._linearise(aid)
-        if not isinstance(rows, NotApplicable):
-            self._doubt(rows, motion)
+        if isinstance(rows, NotApplicable):
+            return
+        used = len(rows.z) if measured else 0
+        self._doubt(Innovation(rows.z[:used], rows.h[:used], rows.r[:used]), motion)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -92,6 +92,8 @@ FINE_M = 3.0
 SUPPORT_NS = 2_000_000_000
 
 
+# Before any instant that a clock can say.
+NEVER_NS = -(2**62)
 # So many doubts of the filter are remembered.
 DOUBTS = 4
 
@@ -102,8 +104,14 @@ class Action(Enum):
     NONE = "none"
     DOUBT_MEASURED = "doubt measured"
     """What the series has said was taken over in part: widen by its innovation."""
+    DOUBT_MOTION = "doubt motion"
+    """The series is left out, but attitude and sensor errors may be what is wrong: widen them."""
     DOUBT_FILTER = "doubt filter"
-    """Motion and sensor errors are not what they were: widen them."""
+    """Both."""
+
+
+MOTION = frozenset({Action.DOUBT_MOTION, Action.DOUBT_FILTER})
+MEASURED = frozenset({Action.DOUBT_MEASURED, Action.DOUBT_FILTER})
 
 
 class Offset(NamedTuple):
@@ -172,7 +180,7 @@ class Series:
     locates: bool
     moves: bool
     heard_ns: int
-    fused_ns: int
+    fused_ns: int = NEVER_NS
     sd_m: float = 0.0
     refused: int = 0
     """Failures of the gate in a row, the first at `refused_ns`."""
@@ -267,7 +275,7 @@ class Isolation:
         t_ns = aid.t_ns
         record = self._records.get(aid.source)
         if record is None:
-            record = Series(aid.device, aid.locates, aid.moves, t_ns, t_ns)
+            record = Series(aid.device, aid.locates, aid.moves, t_ns)
             self._records[aid.source] = record
         elif t_ns - record.heard_ns > FORGET_NS:
             record.count = record.repeats = record.passes = 0
@@ -296,7 +304,7 @@ class Isolation:
         return self._doubted(self._blame(record, aid, offer, nav), t_ns)
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
-        if action is Action.DOUBT_FILTER:
+        if action in MOTION:
             self._doubts = (*self._doubts, t_ns)[-DOUBTS:]
         return action
 
@@ -319,7 +327,7 @@ class Isolation:
         reason = "jumped" if record.jumped else "disagrees"
         self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
         # A jump is the source's. Else the motion may be what is wrong: positions shall decide.
-        return Action.NONE if record.jumped else Action.DOUBT_FILTER
+        return Action.NONE if record.jumped else Action.DOUBT_MOTION
 
     def _jumps(
         self, record: Series, t_ns: int, nis: float, offer: PositionOffer, nav: Array

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.integrity.isolation import Action, Isolation, Memory
+from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
 
 Key = tuple[int, str, int]
@@ -199,7 +199,7 @@ class Timeline:
         if outcome.name in JUDGED:
             action = isolation.judge(aid, outcome, estimator.nav)
             if action is not Action.NONE:
-                estimator.doubt(aid, action is Action.DOUBT_FILTER)
+                estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
