@@ -80,6 +80,8 @@ class Aid:
     """An innovation that is an angle repeats with it."""
     locates: ClassVar[bool] = False
     """It bounds the horizontal position: a solution that has it is not coasting."""
+    moves: ClassVar[bool] = False
+    """It bounds the horizontal velocity."""
     constraint: ClassVar[bool] = False
     """Not measured but known of the vehicle: its innovations are neither independent nor white, and
     no verdict on a sigma follows from them."""
@@ -89,6 +91,11 @@ class Aid:
     source: str
     t_ns: int
     gate: float
+
+    @property
+    def device(self) -> str:
+        """What measured it: a device may send positions and velocities under names of their own."""
+        return self.source
 
     @property
     def feedback(self) -> Feedback:

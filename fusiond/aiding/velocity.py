@@ -11,6 +11,7 @@ Source: Groves, 2nd ed., eq. 14.109.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import Q0, STEP_RATE_B, VN
 
 Array = NDArray[np.float64]
+
+SUFFIX = "_velocity"
+"""What the name of a receiver's velocity adds to that of the receiver."""
 Indices = NDArray[np.int64]
 
 
@@ -68,9 +72,15 @@ def _velocity(
 class VelocityAid(Aid):
     """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three."""
 
+    moves: ClassVar[bool] = True
+
     v_ned: tuple[float, ...]
     sd: tuple[float, ...]
     lever: Vector3
+
+    @property
+    def device(self) -> str:
+        return self.source.removesuffix(SUFFIX)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         rows = 2 if state.model.hold_height else len(self.v_ned)

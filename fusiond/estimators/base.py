@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from fusiond.aiding.base import Innovation, Linearised, State
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
 from fusiond.estimators.screening import KEPT, Codes, screened_update
-from fusiond.estimators.update import feed_back
+from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -40,9 +40,12 @@ Span = tuple[
     *tuple[bool, Array, Array],  # whether to record, and where
 ]
 
-# One sigma (rad) added to the attitude when a filter that rejects everything is opened again: what
-# a bad alignment on the move can be wrong by.
+# One sigma added when the motion is in doubt: to the attitude (rad) what an alignment on the move
+# can be wrong by, to the sensor errors what a damaged or loose unit shows, a hundred times the bias
+# of a data sheet.
 DOUBTED_ATTITUDE_RAD = math.radians(3.0)
+DOUBTED_RATE_RAD_S = math.radians(1.0)
+DOUBTED_FORCE_M_S2 = 0.5
 
 
 @lru_cache(maxsize=256)
@@ -122,8 +125,14 @@ class Estimator(Protocol):
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
 
-    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
-        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes."""
+    def update(self, aid: Linearised) -> Outcome:
+        """Fold one aid in, or name why not."""
+
+    def look(self, aid: Linearised) -> Outcome:
+        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
+
+    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""
@@ -275,11 +284,47 @@ class ErrorStateFilter:
                 return Screened(codes, y, nis, cov_out, dx_out)
             renew = True
 
-    def _widen(self, cov: Array, z: Array, h: Array) -> None:
-        """Add the innovation's own square to the states that it measures directly, and doubt the
-        attitude: a filter that was this wrong about position was wrong about more."""
-        for slot in range(3):
-            cov[slot, slot] += DOUBTED_ATTITUDE_RAD**2
+    def look(self, aid: Linearised) -> Outcome:
+        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
+        rows = self._linearise(aid)
+        if isinstance(rows, NotApplicable):
+            return Outcome(rows.outcome)
+        z, h, r = rows
+        cov, dx = self.covariance.copy(), self._dxs[0]
+        if aid.screened:
+            s = self._screen(aid, rows, cov, dx)
+            codes = tuple(s.codes.tolist())
+            return Outcome("isolated", s.nis, int((s.codes == KEPT).sum()), (), codes)
+        y = np.zeros(z.shape[0])
+        nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
+        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
+
+    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
+        rows = self._linearise(aid)
+        if isinstance(rows, NotApplicable):
+            return
+        used = len(rows.z) if measured else 0
+        self._doubt(Innovation(rows.z[:used], rows.h[:used], rows.r[:used]), motion)
+
+    def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
+        """The aid's innovation, linear in the error state."""
+        return aid.innovation(self.state)
+
+    def _doubt(self, rows: Innovation, motion: bool) -> None:
+        """Widen what is kept between updates by an innovation."""
+        self._widen(self._covs[0], rows.z - rows.h @ self._dxs[0], rows.h, motion)
+
+    def _widen(self, cov: Array, z: Array, h: Array, motion: bool) -> None:
+        """Add the innovation's own square to the states that it measures directly. With `motion`,
+        doubt attitude and sensor errors beyond what any data sheet says."""
+        if motion:
+            doubted = DOUBTED_ATTITUDE_RAD, DOUBTED_RATE_RAD_S, DOUBTED_FORCE_M_S2
+            for first, sd in zip((0, 9, 12), doubted, strict=True):
+                for axis in range(first, first + 3):
+                    slot = axis if first == 0 else self.model.parameters(axis)[0]
+                    if self.model.active[slot]:
+                        cov[slot, slot] += sd**2
         for row, value in zip(h, z, strict=True):
             # Position or velocity before the attitude that turns a lever arm.
             group = next(g for g in (slice(3, 9), slice(0, 3), slice(0, len(row))) if row[g].any())

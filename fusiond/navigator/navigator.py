@@ -26,9 +26,10 @@ from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.intake import Intake
-from fusiond.navigator.isolation import Isolation
+from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
+from fusiond.navigator.standing import Standing
 from fusiond.navigator.timeline import Entry, Timeline
 
 Array = NDArray[np.float64]
@@ -38,6 +39,9 @@ AHEAD_NS = 200_000_000
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
 # measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
 UNKNOWN_TIME_S = 0.9
+# Faster than any road vehicle (the land speed record stands at 341 m/s), slower than an aircraft's
+# cruise: what is beyond is a filter that has run away.
+MAX_SPEED_M_S = 400.0
 
 
 class Navigator:
@@ -73,7 +77,8 @@ class Navigator:
         self._on_outcome = on_outcome
         self._constraints = ConstraintMaker(config.constraints)
         names = e.federated.sources or tuple(config.aiding)
-        self._isolation = Isolation(self.estimator, names, self._event)
+        self._left_out = LeftOut(self.timeline, names, self._event)
+        self._standing = Standing(MAX_SPEED_M_S)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
@@ -171,13 +176,21 @@ class Navigator:
             self.verdicts.reset()
             self.started = start
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
+            self._standing.started(start.t_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
-        self._isolation.tell()
+        e = self.estimator
+        failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav, e.covariance)
+        if failure is not None:
+            self._standing.given_up()
+            self._event("diverged", f"{failure}: aligning anew")
+            self.reset(failure)
+            return
+        self._left_out.tell()
 
     def isolated(self, source: str) -> str | None:
         """Why the fault detection leaves a source out; None if it does not."""
-        return self._isolation.reason(source)
+        return self._left_out.reason(source)
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, of all that has been run by `advance`.
@@ -217,6 +230,11 @@ class Navigator:
         horizontal = float(np.hypot(*np.sqrt(np.diag(self.estimator.covariance)[6:8])))
         if not horizontal <= e.invalid_sd_m:
             return Mode.INVALID, f"horizontal sigma {horizontal:.0f} m"
+        if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
+            return Mode.INVALID, why
+        shaken = self._standing.shaken(self.estimator.t_ns, self.timeline.isolation)
+        if shaken is not None:
+            return Mode.COASTING, shaken
         unaided = (t_ns - self._last_position_ns) * 1e-9
         if unaided > e.coast_after_s:
             return Mode.COASTING, f"no position fused for {unaided:.0f} s"

@@ -17,15 +17,13 @@ from dataclasses import dataclass, field
 
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
+from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
 
 Key = tuple[int, str, int]
 
-# A source whose aids have failed the gate for this long, and this often, is believed again with the
-# covariance widened by the innovation: a filter that trusts nobody cannot recover. Ten seconds
-# are longer than any multipath burst at a street crossing; five fixes are more than chance.
-RECOVERY_NS = 10_000_000_000
-RECOVERY_COUNT = 5
+# Outcomes that say something of a source.
+JUDGED = frozenset({"fused", "gated", "isolated"})
 # Aids that may wait for the start or for the IMU: more than a minute of all that a well-equipped
 # vehicle sends. Beyond it the oldest are given up.
 MOST_WAITING = 4096
@@ -46,7 +44,7 @@ class Entry:
 class _Checkpoint:
     snapshot: Snapshot
     last_key: Key | None
-    failing: dict[str, tuple[int, int]]
+    memory: Memory
 
 
 @dataclass(slots=True)
@@ -82,13 +80,15 @@ class Timeline:
         self._keys: list[Key] = []
         self._next = 0
         self._checkpoints: list[_Checkpoint] = []
-        self._failing: dict[str, tuple[int, int]] = {}
+        self.isolation = Isolation()
 
     def start(self) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more."""
         self._next = 0
-        self._failing.clear()
-        self._checkpoints = [_Checkpoint(self.estimator.snapshot(), None, {})]
+        self.isolation.reset()
+        self._checkpoints = [
+            _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())
+        ]
         self._give_up(bisect_left(self._keys, (self.estimator.t_ns, "", 0)), "no_alignment")
         self.imu.needed = self.estimator.sample
 
@@ -145,7 +145,7 @@ class Timeline:
             if entry.key[0] > estimator.t_ns:
                 estimator.propagate(self.imu, entry.key[0], record)
                 self._checkpoint()
-            self._count(entry, self._apply(entry, self._failing))
+            self._count(entry, self._apply(entry))
             self._next += 1
         estimator.propagate(self.imu, latest, record)
         self._checkpoint()
@@ -162,7 +162,8 @@ class Timeline:
         estimator = self.estimator
         present = estimator.snapshot()
         checkpoint = next(c for c in reversed(self._checkpoints) if c.snapshot.t_ns <= t_ns)
-        failing = dict(checkpoint.failing)
+        memory = self.isolation.snapshot()
+        self.isolation.restore(checkpoint.memory)
         estimator.restore(checkpoint.snapshot)
         try:
             for row in range(self._following(checkpoint), len(self._entries)):
@@ -171,11 +172,12 @@ class Timeline:
                     break
                 if at_ns > estimator.t_ns:
                     estimator.propagate(self.imu, at_ns)
-                self._apply(self._entries[row], failing)
+                self._apply(self._entries[row])
             estimator.propagate(self.imu, t_ns)
             yield
         finally:
             estimator.restore(present)
+            self.isolation.restore(memory)
 
     def _give_up(self, count: int, name: str) -> None:
         """Drop the first `count` of those that wait."""
@@ -184,20 +186,20 @@ class Timeline:
             self._count(entry, Outcome(name))
         del self._entries[rows], self._keys[rows]
 
-    def _apply(self, entry: Entry, failing: dict[str, tuple[int, int]]) -> Outcome:
-        source, t_ns = entry.aid.source, entry.key[0]
-        since, count = failing.get(source, (t_ns, 0))
-        recover = count >= RECOVERY_COUNT and t_ns - since >= RECOVERY_NS
-        feedback = entry.aid.feedback
-        if feedback == "release":
-            self.estimator.release()
-        elif feedback == "hold":
-            self.estimator.hold()
-        outcome = self.estimator.update(entry.aid.at(self.estimator.nav), inflate=recover)
-        if outcome.name == "gated":
-            failing[source] = (since, count + 1)
-        elif outcome.name == "fused":
-            failing.pop(source, None)
+    def _apply(self, entry: Entry) -> Outcome:
+        estimator, isolation = self.estimator, self.isolation
+        match entry.aid.feedback:
+            case "release":
+                estimator.release()
+            case "hold":
+                estimator.hold()
+        aid = entry.aid.at(estimator.nav)
+        fold = estimator.update if isolation.believes(aid.source) else estimator.look
+        outcome = fold(aid)
+        if outcome.name in JUDGED:
+            action = isolation.judge(aid, outcome, estimator.nav)
+            if action is not Action.NONE:
+                estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
@@ -214,7 +216,7 @@ class Timeline:
         if self.estimator.t_ns - last.snapshot.t_ns >= self._checkpoint_ns:
             last_key = self._keys[self._next - 1] if self._next else last.last_key
             self._checkpoints.append(
-                _Checkpoint(self.estimator.snapshot(), last_key, dict(self._failing))
+                _Checkpoint(self.estimator.snapshot(), last_key, self.isolation.snapshot())
             )
 
     def _rewind(self, key: Key) -> None:
@@ -224,7 +226,7 @@ class Timeline:
             self._checkpoints.pop()
         checkpoint = self._checkpoints[-1]
         self.estimator.restore(checkpoint.snapshot)
-        self._failing = dict(checkpoint.failing)
+        self.isolation.restore(checkpoint.memory)
         self._next = self._following(checkpoint)
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])

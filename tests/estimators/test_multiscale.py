@@ -148,7 +148,7 @@ def test_a_gated_aid_leaves_nothing_behind(at: int) -> None:
     assert (clean.covariance == tried.covariance).all()
 
 
-def test_a_failed_gate_that_is_passed_widens_and_begins_anew() -> None:
+def test_a_filter_in_doubt_widens_and_begins_anew() -> None:
     model, buffer, aids, start, sd = drive()
     estimator = MultiscaleEstimator(model, IMU.gap_s, 2)
     begun(estimator, start, sd)
@@ -156,7 +156,12 @@ def test_a_failed_gate_that_is_passed_widens_and_begins_anew() -> None:
     lat, lon, height = (float(x) for x in estimator.nav[:3])
     far = PositionAid("far", estimator.t_ns, 0.999, lat + 1e-4, lon, height, SD, LEVER)
     assert estimator.update(far).name == "gated"
-    assert estimator.update(far, inflate=True).name == "fused"
+    looked = estimator.look(far)
+    assert looked.name == "isolated"
+    estimator.doubt(far, measured=True, motion=True)
+    passed = estimator.update(far)
+    assert passed.name == "fused"
+    assert passed.nis < 2.0 < looked.nis
     assert abs(estimator.nav[0] - lat - 1e-4) < 1e-6
     assert estimator.epochs == 1
     # Alike in the ordinary filter.
@@ -164,7 +169,8 @@ def test_a_failed_gate_that_is_passed_widens_and_begins_anew() -> None:
     for either in (one, ordinary):
         begun(either, start, sd)
         run(either, buffer, aids[:20])
-        assert either.update(far, inflate=True).name == "fused"
+        either.doubt(far, measured=True, motion=True)
+        assert either.update(far).name == "fused"
     np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(one.covariance, ordinary.covariance, rtol=1e-7, atol=1e-15)
 

@@ -122,8 +122,8 @@ class FederatedFilter(ErrorStateFilter):
 
     # ------------------------------------------------------------------ update
 
-    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
-        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes.
+    def update(self, aid: Linearised) -> Outcome:
+        """Fold one aid in, or name why not.
 
         NIS and whitened innovation of the outcome are those of what is published; those of a
         screened aid are of the filter that judges its rows.
@@ -139,7 +139,7 @@ class FederatedFilter(ErrorStateFilter):
         judge = None if isolated else local
         cov, dx = self._judge(judge)
         if aid.screened:
-            return self._update_by_rows(aid, i, local, cov, dx, inflate)
+            return self._update_by_rows(aid, i, local, cov, dx)
         degrees = i.z.shape[0]
         threshold = gate_threshold(aid.gate, degrees)
         y = np.zeros(degrees)
@@ -153,9 +153,7 @@ class FederatedFilter(ErrorStateFilter):
         if not self._believes(local, nis, degrees, threshold):
             return Outcome("isolated", published, degrees, whitened)
         if nis > threshold:
-            if not inflate:
-                return Outcome("gated", published, degrees)
-            self._doubt(local, i)
+            return Outcome("gated", published, degrees)
         return Outcome(self._fold(local, i), published, degrees, whitened)
 
     def _update_by_rows(
@@ -165,9 +163,8 @@ class FederatedFilter(ErrorStateFilter):
         local: int | None,
         cov: Array,
         dx: Array,
-        inflate: bool,
     ) -> Outcome:
-        """Rows that pass are folded in; none, or with `inflate` as many as a wider P lets.
+        """Rows that pass are folded in, or none.
 
         For the innovation test an epoch counts with the rows that pass, or as failed where most do
         not: single bad satellites are the screening's business.
@@ -181,11 +178,6 @@ class FederatedFilter(ErrorStateFilter):
         codes = tuple(s.codes.tolist())
         if not self._believes(local, nis, degrees, gate_threshold(aid.gate, degrees)):
             return Outcome("isolated", s.nis, count, (), codes)
-        if inflate and not most:
-            self._doubt(local, rows)
-            trial = cov.copy()
-            s = self._screen(aid, rows, trial, dx)
-            kept, codes = s.codes == KEPT, tuple(s.codes.tolist())
         if not kept.any():
             return Outcome("gated", s.nis, 0, (), codes)
         offsets = self.model.slots_of(CLOCK_OFFSET)
@@ -226,9 +218,13 @@ class FederatedFilter(ErrorStateFilter):
         """The covariances that are kept between updates, with their shares."""
         return [(self._covs[0], 1.0)]
 
-    def _doubt(self, local: int | None, i: Innovation) -> None:
-        """Open what an innovation has to pass, and go on."""
+    def _open(self, i: Innovation, motion: bool) -> None:
+        """Open the bank for an innovation that is in doubt."""
         raise NotImplementedError
+
+    def _doubt(self, rows: Innovation, motion: bool) -> None:
+        self._bring_up()
+        self._open(rows, motion)
 
     def _fold(self, local: int | None, i: Innovation) -> str:
         """Take an innovation that has passed in, of a local filter or of all; its outcome."""
@@ -244,9 +240,9 @@ class FederatedFilter(ErrorStateFilter):
 
     # ------------------------------------------------------------------ parts of an update
 
-    def _widen_by(self, cov: Array, dx: Array, i: Innovation) -> None:
-        """Open a filter for an innovation that it refuses."""
-        self._widen(cov, i.z - i.h @ dx, i.h)
+    def _widen_by(self, cov: Array, dx: Array, i: Innovation, motion: bool) -> None:
+        """Open a filter for an innovation that is in doubt."""
+        self._widen(cov, i.z - i.h @ dx, i.h, motion)
 
     @staticmethod
     def _fuse_into(cov: Array, dx: Array, i: Innovation, share: float = 1.0) -> None:

@@ -136,27 +136,21 @@ class MultiscaleEstimator(ErrorStateFilter):
         self._covs[0], self._dxs[1], self._carrying = 0.0, 0.0, False
         self._phi[:] = np.eye(len(self._phi))
 
-    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
-        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes:
-        blocks that were wrong are given up, and the start comes again."""
+    def update(self, aid: Linearised) -> Outcome:
+        """Fold one aid in, or name why not."""
         innovation = aid.innovation(self.state)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         if aid.screened:
-            return self._update_by_rows(aid, innovation, inflate)
-        z, h, _ = innovation
-        degrees = z.shape[0]
+            return self._update_by_rows(aid, innovation)
+        degrees = innovation.z.shape[0]
         threshold = gate_threshold(aid.gate, degrees)
         nis, y = self._fuse(innovation, threshold)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
             return Outcome("not_finite", nis, degrees)
-        if not inflate:
-            return Outcome("gated", nis, degrees)
-        self._begin_wide(z, h)
-        self._fuse(innovation, math.inf)
-        return Outcome("fused", nis, degrees)
+        return Outcome("gated", nis, degrees)
 
     def _fuse(self, rows: Innovation, threshold: float) -> tuple[float, Array]:
         """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
@@ -171,8 +165,8 @@ class MultiscaleEstimator(ErrorStateFilter):
             self._commit(o, total, h, r)
         return nis, y
 
-    def _update_by_rows(self, aid: Linearised, rows: Innovation, inflate: bool) -> Outcome:
-        """Rows that pass are folded in; none, or with `inflate` as many as a wider P lets.
+    def _update_by_rows(self, aid: Linearised, rows: Innovation) -> Outcome:
+        """Rows that pass are folded in, or none.
 
         They are judged on the newest element alone, which is all that they look at. Where the
         receiver has set its clock, blocks that reach back before it are given up.
@@ -182,12 +176,8 @@ class MultiscaleEstimator(ErrorStateFilter):
         mean, cov = self._newest(o)
         before, total = cov.copy(), z + h @ o.u
         s = self._screen(aid, Innovation(total, h, r), cov, mean)
-        wide = inflate and 2 * int((s.codes == KEPT).sum()) < len(s.codes)
-        if wide or not np.array_equal(cov, before):
-            if wide:
-                self._begin_wide(z, h)
-            else:
-                self._begin_anew(self.covariance)
+        if not np.array_equal(cov, before):
+            self._begin_anew(self.covariance)
             o = self._open()
             total = z + h @ o.u
             s = self._screen(aid, Innovation(total, h, r), o.block.cov, o.block.mean)
@@ -199,10 +189,10 @@ class MultiscaleEstimator(ErrorStateFilter):
         self._commit(o, total, h, r)
         return Outcome("fused", s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
 
-    def _begin_wide(self, z: Array, h: Array) -> None:
-        """Begin anew from P widened by an innovation that failed the gate."""
+    def _doubt(self, rows: Innovation, motion: bool) -> None:
+        """Blocks that were wrong are given up, and the start comes again from a wider P."""
         wide = self.covariance
-        self._widen(wide, z - h @ self._dxs[0], h)
+        self._widen(wide, rows.z - rows.h @ self._dxs[0], rows.h, motion)
         self._begin_anew(wide)
 
     def _open(self) -> _Open:

@@ -50,10 +50,10 @@ class UnscentedEstimator(KalmanEstimator):
         self.spread = spread
         self.propagation = propagation
 
-    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
-        """Fold one aid in, or name why not. With `inflate`, a failed gate widens P and passes."""
+    def update(self, aid: Linearised) -> Outcome:
+        """Fold one aid in, or name why not."""
         before = self.nav.copy()
-        outcome = super().update(aid, inflate)
+        outcome = super().update(aid)
         if self.propagation and outcome.name == "fused" and not self._holding:
             turn_attitude(self._covs[0], before, self.nav)
         return outcome

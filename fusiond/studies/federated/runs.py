@@ -22,13 +22,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.integrity.isolation import Action, Isolation
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -71,20 +72,20 @@ linearisation, not the filter, sets the NEES."""
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """A line of the result; no options: the centralised filter. `recovers`: a source that the gate
-    has refused for ten seconds is believed again, as the daemon does."""
+    """A line of the result; no options: the centralised filter. `isolates`: sources are judged by
+    the daemon's isolation too (`fusiond.integrity.isolation`)."""
 
     name: str
     options: FederatedOptions | None = None
-    recovers: bool = True
+    isolates: bool = False
 
 
-class _GateOnly(KalmanEstimator):
-    """The centralised filter that refuses for ever what its gate refuses."""
+class _Trusting(Isolation):
+    """Leaves all to the filter: its gate, and what detects faults in a federated one."""
 
-    def update(self, aid: Linearised, inflate: bool = False) -> Outcome:
-        """As the centralised filter, never widened."""
-        return super().update(aid, inflate=False)
+    def judge(self, aid: Aid, outcome: Outcome, nav: Array) -> Action:
+        """Nobody is ever suspected."""
+        return Action.NONE
 
 
 @dataclass(slots=True)
@@ -149,8 +150,7 @@ def fixes(
 def estimator_of(filter_: Filter, model: Model) -> Estimator:
     """A filter of the study."""
     if filter_.options is None:
-        kind = KalmanEstimator if filter_.recovers else _GateOnly
-        return kind(model, STUDY_IMU.gap_s)
+        return KalmanEstimator(model, STUDY_IMU.gap_s)
     return federated(model, STUDY_IMU.gap_s, SOURCES, filter_.options)
 
 
@@ -194,6 +194,8 @@ def _run(
     rate = STUDY_IMU.rate_hz
     imu = ImuBuffer(rate, HISTORY_S, np.eye(3), 0.0, STUDY_IMU.gap_s)
     timeline = Timeline(estimator, imu, HISTORY_S, CHECKPOINT_S)
+    if not filter_.isolates:
+        timeline.isolation = _Trusting()
     p = np.diag(initial_sd(model) ** 2)
     estimator.initialise(0, 0, start, np.zeros(model.size), p)
     timeline.start()

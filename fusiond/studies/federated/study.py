@@ -5,9 +5,8 @@ Faults and honesty: `fusiond.studies.federated.runs`. A fault lasts 100 s; error
 start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
 is the median over the runs; a run in which it is not detected counts as later than any.
 
-The daemon believes a source again that its gate has refused for ten seconds
-(`fusiond.navigator.timeline`), because a filter that trusts nobody cannot recover; a persistent
-fault enters a centralised filter that way. `rms_centralised_gate_only_m` is without that rule.
+`centralised` is the daemon's default: one filter, and sources judged by their innovations over time
+(`fusiond.integrity.isolation`). `rms_centralised_gate_only_m` has the gate alone.
 """
 
 from __future__ import annotations
@@ -53,12 +52,12 @@ _CENTRALISED, _UNISOLATED, _GATE_ONLY = "centralised", "unisolated", "centralise
 FILTERS = (
     *(Filter(mode, FederatedOptions(mode=mode)) for mode in MODES),  # type: ignore[arg-type]
     Filter("adaptive", FederatedOptions(adaptive=True)),
-    Filter(_CENTRALISED),
+    Filter(_CENTRALISED, isolates=True),
 )
 FAULT_FILTERS = (
     *FILTERS,
     Filter(_UNISOLATED, FederatedOptions(fault_detection=False)),
-    Filter(_GATE_ONLY, recovers=False),
+    Filter(_GATE_ONLY),
 )
 
 
@@ -172,7 +171,7 @@ def _finding(result: dict[str, Any]) -> str:
         parts.append(
             f"{name} {after}, {f['rms_isolated_m']:.2f} m with isolation, "
             f"{f['rms_unisolated_m']:.1f} m without, {f['rms_centralised_m']:.1f} m centralised "
-            f"({f['rms_centralised_gate_only_m']:.2f} m if its gate never gives in)"
+            f"({f['rms_centralised_gate_only_m']:.2f} m with its gate alone)"
         )
     unequal = result["honesty"]["unequal"]
     drift = result["faults"]["drift"]["modes"]["fusion_reset"]
@@ -257,7 +256,7 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
         rows.append(["no isolation", "", f"{fault['rms_unisolated_m']:.2f}"])
         rows.append(["centralised", "", f"{fault['rms_centralised_m']:.2f}"])
         gate_only = fault["rms_centralised_gate_only_m"]
-        rows.append(["centralised, gate for ever", "", f"{gate_only:.2f}"])
+        rows.append(["centralised, gate alone", "", f"{gate_only:.2f}"])
         found.append((f"fault: {name}", ["", "isolated after s", "horizontal RMS m"], rows))
     return found
 

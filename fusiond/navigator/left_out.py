@@ -6,23 +6,31 @@ from collections.abc import Callable
 
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import local_of
+from fusiond.navigator.timeline import Timeline
 
 
-class Isolation:
-    """What the estimator leaves out of `names`, its sources; `on_event(code, text)` hears of it."""
+class LeftOut:
+    """What timeline and estimator leave out; `on_event(code, text)` hears of it.
+
+    `names`: the estimator's own sources, of which a name may stand for several series.
+    """
 
     def __init__(
         self,
-        estimator: Estimator,
+        timeline: Timeline,
         names: tuple[str, ...],
         on_event: Callable[[str, str], None],
     ) -> None:
-        self._estimator, self._names, self._event = estimator, names, on_event
+        self._timeline, self._names, self._event = timeline, names, on_event
         self._told: dict[str, str] = {}
+
+    @property
+    def _estimator(self) -> Estimator:
+        return self._timeline.estimator
 
     def tell(self) -> None:
         """Events where the isolated sources are no longer those last told."""
-        now = self._estimator.isolated
+        now = self._estimator.isolated | self._timeline.isolation.excluded
         for source, reason in now.items():
             if source not in self._told:
                 self._event("isolated", f"{source} is left out of the solution: {reason}")
@@ -33,6 +41,8 @@ class Isolation:
 
     def reason(self, source: str) -> str | None:
         """Why a source of aids is left out; None if it is not."""
+        if (reason := self._timeline.isolation.excluded.get(source)) is not None:
+            return reason
         found = self._estimator.isolated
         if not found:
             return None

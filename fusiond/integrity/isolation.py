@@ -1,0 +1,450 @@
+r"""Which series of measurements may be believed: fault detection with memory, exclusion, return.
+
+A series is what one source says of one thing (`gnss`, `gnss_velocity`); a device may send several.
+Its whitened innovations y (d,), S = L L^T, y = L^-1 nu, are N(0, I) while series and filter agree.
+Three tests look at each, in order of validity:
+
+Gate          y^T y against the chi-square of the aid's gate. `REFUSED_IN_A_ROW` failures in a row,
+              and the series is excluded: single outliers are only left out.
+Mean          m <- (1 - a) m + a y at two paces a. |m|^2 / (a / (2 - a) + c) is chi-square of d for
+              innovations that share the part c of their variance, as the errors of a receiver
+              without corrections do; beyond the quantile 1 - p the series has a bias that the gate
+              cannot see: a ramp, a step inside the gate, a velocity of another instant.
+Repetition    a position that is the same to the bit while the filter moves.
+
+A series that fails the mean test is measured against the rest: where another position, or the
+velocity of the same device, is believed, the series is excluded; where nothing is left to compare
+with, the filter's own motion and sensor errors are doubted, which widens P.
+
+An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
+over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
+filter's own bound, grown as the IMU's errors let it, or another source then supports it. Patience
+does not.
+
+With all series of position refused nobody can say who is wrong from innovations alone; how it began
+can. An IMU's fault reaches the velocity before the position, and moves the position by no more than
+that velocity and a bounded acceleration allow; a receiver's jump does not ask. So `lost` names a
+cause: `source` where the position left its own velocity, or leaves the filter while the velocity
+of the same device still agrees with it; `filter` where position and velocity went together.
+
+Source: Lowry, Woodall, Champ, Rigdon, A multivariate exponentially weighted moving average control
+chart, Technometrics 34 (1992), eq. 2.2; Bar-Shalom, Li, Kirubarajan (2001), section 5.4; Brumback,
+Srinath, IEEE Trans. AC 32 (1987), 1133.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import PositionOffer
+from fusiond.estimators.base import Outcome, gate_threshold
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VE, VN
+
+Array = NDArray[np.float64]
+
+# Three failures of a gate of 0.9999 in a row are 1e-12 by chance; of one multipath burst in a
+# street they are the rule.
+REFUSED_IN_A_ROW = 3
+# Five in a row that pass a gate of 0.9999 while a fault of four sigma lasts: one case in 1000; and
+# over three seconds, so that no burst of a wrong stream is let in by its number.
+READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
+# A position comes back once its innovations are known not to run away by three times this (m/s):
+# a drift of 0.2 m/s is what a filter with an honest velocity still tells from its own.
+TREND_SD_M_S = 0.07
+# What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
+FORGET_NS = 5_000_000_000
+# Paces of the mean: some 11 and some 59 innovations deep, (2 - a) / a.
+PACES = (1.0 / 6.0, 1.0 / 30.0)
+# The variance of a mean at each pace, for white innovations of variance one; and what is assumed of
+# a series before it has shown its own: successive innovations share a fifth of their variance.
+WHITE = tuple(a / (2.0 - a) for a in PACES)
+ASSUMED = tuple(white + 0.2 for white in WHITE)
+# The variance that a series' means show by themselves is averaged over so many innovations: errors
+# that last (orbits, slip of a tyre) are ordinary, and a fault is what stands out of them.
+LEARN = 1.0 / 300.0
+# Probability of a false alarm of one mean test.
+FALSE_ALARM = 1e-6
+# A mean over fewer innovations than this is left to the gate.
+FEWEST = 4
+# Position repeated to the bit this often, at this speed and beyond (m/s): receivers print metres
+# to the centimetre or finer, so that two alike in motion are chance, three are not.
+REPEATED, MOVING_M_S = 2, 1.0
+# Beyond what gravity on the wrong axis can do to a position in the time (m/s^2).
+IMU_FAULT_M_S2 = 10.0
+# Without a velocity of the same device, the velocity error that an unnoticed IMU fault may have
+# brought before (m/s): ten times what an aided filter states, 0.1 to 1 m/s.
+IMU_FAULT_M_S = 10.0
+# A jump is beyond so many sigmas of its innovation, on top of the above.
+JUMP_SIGMAS = 6.0
+# Another position supports the filter for as long as `coasting` is not said.
+OTHERS_NS = 10_000_000_000
+# A position of this sigma (m) sees within seconds what a wrong velocity does to the filter.
+FINE_M = 3.0
+# While the velocity of the same device was fused this lately, the filter's motion is supported.
+SUPPORT_NS = 2_000_000_000
+
+
+# Before any instant that a clock can say.
+NEVER_NS = -(2**62)
+# So many doubts of the filter are remembered.
+DOUBTS = 4
+
+
+class Action(Enum):
+    """What the filter shall do after a judgement."""
+
+    NONE = "none"
+    DOUBT_MEASURED = "doubt measured"
+    """What the series has said was taken over in part: widen by its innovation."""
+    DOUBT_MOTION = "doubt motion"
+    """The series is left out, but attitude and sensor errors may be what is wrong: widen them."""
+    DOUBT_FILTER = "doubt filter"
+    """Both."""
+
+
+MOTION = frozenset({Action.DOUBT_MOTION, Action.DOUBT_FILTER})
+MEASURED = frozenset({Action.DOUBT_MEASURED, Action.DOUBT_FILTER})
+
+
+class Offset(NamedTuple):
+    """How far a filter is from a position that was measured, north and east (m), and one sigma of
+    the measurement (m)."""
+
+    north: float
+    east: float
+    sd: float
+
+
+class Lost(NamedTuple):
+    """No position is believed: since when, whether `source` or `filter` is to blame, and how the
+    first of them ended (`jumped`, `drifts`, ...)."""
+
+    since_ns: int
+    cause: str
+    device: str
+    reason: str
+
+
+class Trend(NamedTuple):
+    """Sums over innovations of a position (m) against time (s): does it still run away?"""
+
+    n: int = 0
+    t: float = 0.0
+    tt: float = 0.0
+    north: float = 0.0
+    east: float = 0.0
+    t_north: float = 0.0
+    t_east: float = 0.0
+    sd: float = 0.0
+
+    def with_one(self, z: Offset, t_s: float) -> Trend:
+        """With one innovation more."""
+        return Trend(
+            self.n + 1,
+            self.t + t_s,
+            self.tt + t_s * t_s,
+            self.north + z.north,
+            self.east + z.east,
+            self.t_north + t_s * z.north,
+            self.t_east + t_s * z.east,
+            max(self.sd, z.sd),
+        )
+
+    @property
+    def steady(self) -> bool:
+        """Whether the slope of a line through them is known to `TREND_SD_M_S`, and zero."""
+        spread = self.tt - self.t * self.t / self.n
+        if spread <= 0.0 or self.sd > TREND_SD_M_S * math.sqrt(spread):
+            return False
+        north = (self.t_north - self.t * self.north / self.n) / spread
+        east = (self.t_east - self.t * self.east / self.n) / spread
+        return math.hypot(north, east) <= 3.0 * TREND_SD_M_S
+
+
+NO_TREND = Trend()
+
+
+@dataclass(slots=True)
+class Series:
+    """What is known of one series: when it was heard and fused last, how it fails, its means."""
+
+    device: str
+    locates: bool
+    moves: bool
+    heard_ns: int
+    fused_ns: int = NEVER_NS
+    sd_m: float = 0.0
+    refused: int = 0
+    """Failures of the gate in a row, the first at `refused_ns`."""
+    refused_ns: int = 0
+    jumped: bool = False
+    """The first of them left the filter faster than the IMU can err."""
+    excluded: str = ""
+    passes: int = 0
+    """While excluded: innovations in a row that passed, the first at `passing_ns`."""
+    passing_ns: int = 0
+    trend: Trend = NO_TREND
+    count: int = 0
+    fast: tuple[float, ...] = ()
+    slow: tuple[float, ...] = ()
+    fast_spread: float = ASSUMED[0]
+    slow_spread: float = ASSUMED[1]
+    value: tuple[float, ...] | None = None
+    repeats: int = 0
+
+    def copied(self) -> Series:
+        """A copy for a checkpoint."""
+        return Series(*[getattr(self, name) for name in Series.__slots__])
+
+    @property
+    def believed(self) -> bool:
+        """Whether its last innovation was fused."""
+        return not (self.refused or self.excluded)
+
+
+class Memory(NamedTuple):
+    """All that a later restore needs."""
+
+    records: dict[str, Series]
+    doubts: tuple[int, ...]
+
+
+class Isolation:
+    """Judges each aid once it has been looked at; a function of the aids in order alone."""
+
+    def __init__(self, false_alarm: float = FALSE_ALARM) -> None:
+        self._records: dict[str, Series] = {}
+        self._doubts: tuple[int, ...] = ()
+        self._pass = 1.0 - false_alarm
+
+    # ------------------------------------------------------------------ what others ask
+
+    def believes(self, series: str) -> bool:
+        """Whether an aid of this series may be fused."""
+        record = self._records.get(series)
+        return record is None or not record.excluded
+
+    @property
+    def excluded(self) -> dict[str, str]:
+        """Series that are left out, and why."""
+        return {name: r.excluded for name, r in self._records.items() if r.excluded}
+
+    def lost(self, t_ns: int) -> Lost | None:
+        """Set while positions come and none is believed: since when, and who is to blame."""
+        heard = [r for r in self._records.values() if r.locates and t_ns - r.heard_ns <= FORGET_NS]
+        if not heard or any(r.believed for r in heard):
+            return None
+        first = min(heard, key=lambda r: r.refused_ns)
+        source = all(r.jumped or self._supported(r.device, t_ns) for r in heard)
+        reason = first.excluded or "refused"
+        return Lost(first.refused_ns, "source" if source else "filter", first.device, reason)
+
+    def doubts(self, t_ns: int, within_ns: int) -> int:
+        """How often, of the last `DOUBTS` times, the filter was in doubt within that time."""
+        return sum(t_ns - doubted_ns <= within_ns for doubted_ns in self._doubts)
+
+    def snapshot(self) -> Memory:
+        """A copy of everything."""
+        return Memory({name: r.copied() for name, r in self._records.items()}, self._doubts)
+
+    def restore(self, memory: Memory) -> None:
+        """Back to a snapshot."""
+        self._records = {name: r.copied() for name, r in memory.records.items()}
+        self._doubts = memory.doubts
+
+    def reset(self) -> None:
+        """The filter starts anew: nobody is suspected."""
+        self._records.clear()
+        self._doubts = ()
+
+    # ------------------------------------------------------------------ judgement
+
+    def judge(self, aid: Aid, outcome: Outcome, nav: Array) -> Action:
+        """Take in how an aid ended, fused, gated or only looked at; what the filter shall do.
+
+        `nav` (10,): the navigation state that it was compared with.
+        """
+        t_ns = aid.t_ns
+        record = self._records.get(aid.source)
+        if record is None:
+            record = Series(aid.device, aid.locates, aid.moves, t_ns)
+            self._records[aid.source] = record
+        elif t_ns - record.heard_ns > FORGET_NS:
+            record.count = record.repeats = record.passes = 0
+            if not record.excluded:
+                record.refused, record.jumped = 0, False
+        record.heard_ns = t_ns
+        passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
+        offer = next((o for o in aid.offers() if isinstance(o, PositionOffer)), None)
+        repeats = offer is not None and self._repeats(record, offer, nav)
+        if record.excluded:
+            offset = None if offer is None else _offset(offer, nav)
+            self._look(record, t_ns, passed and not repeats, outcome.whitened, offset)
+            return Action.NONE
+        if repeats:
+            self._exclude(record, t_ns, "repeats itself", jumped=True)
+            return self._doubted(Action.DOUBT_MEASURED if passed else Action.NONE, t_ns)
+        if outcome.name != "fused":
+            if aid.constraint or passed:
+                return Action.NONE
+            return self._doubted(self._refuse(record, t_ns, outcome.nis, offer, nav), t_ns)
+        record.fused_ns, record.refused, record.jumped = t_ns, 0, False
+        record.sd_m = 0.0 if offer is None else max(offer.sd[:2])
+        self._average(record, outcome.whitened)
+        if not self._biased(record):
+            return Action.NONE
+        return self._doubted(self._blame(record, aid, offer, nav), t_ns)
+
+    def _doubted(self, action: Action, t_ns: int) -> Action:
+        if action in MOTION:
+            self._doubts = (*self._doubts, t_ns)[-DOUBTS:]
+        return action
+
+    @staticmethod
+    def _repeats(record: Series, offer: PositionOffer, nav: Array) -> bool:
+        value = offer.lat_rad, offer.lon_rad
+        same = value == record.value and math.hypot(nav[VN], nav[VE]) > MOVING_M_S
+        record.value, record.repeats = value, record.repeats + 1 if same else 0
+        return record.repeats >= REPEATED
+
+    def _refuse(
+        self, record: Series, t_ns: int, nis: float, offer: PositionOffer | None, nav: Array
+    ) -> Action:
+        record.refused += 1
+        if record.refused == 1:
+            record.refused_ns = t_ns
+            record.jumped = offer is not None and self._jumps(record, t_ns, nis, offer, nav)
+        if record.refused < REFUSED_IN_A_ROW:
+            return Action.NONE
+        reason = "jumped" if record.jumped else "disagrees"
+        self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
+        # A jump is the source's. Else the motion may be what is wrong: positions shall decide.
+        return Action.NONE if record.jumped else Action.DOUBT_MOTION
+
+    def _jumps(
+        self, record: Series, t_ns: int, nis: float, offer: PositionOffer, nav: Array
+    ) -> bool:
+        """Whether a refused position left the filter faster than an IMU's fault can explain."""
+        if not math.isfinite(nis) or t_ns - record.fused_ns > FORGET_NS:
+            return False
+        apart_s = (t_ns - record.fused_ns) * 1e-9
+        before = 0.0 if self._supported(record.device, t_ns) else IMU_FAULT_M_S
+        felt = (before + 0.5 * IMU_FAULT_M_S2 * apart_s) * apart_s
+        z = _offset(offer, nav)
+        length = math.hypot(z.north, z.east)
+        return length > JUMP_SIGMAS * length / math.sqrt(nis) + felt
+
+    @staticmethod
+    def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
+        record.excluded, record.refused_ns, record.jumped = reason, since_ns, jumped
+        record.passes = record.count = 0
+
+    def _look(
+        self,
+        record: Series,
+        t_ns: int,
+        passed: bool,
+        whitened: tuple[float, ...],
+        offset: Offset | None,
+    ) -> None:
+        """An innovation of a series that is left out: what may bring it back."""
+        if not passed:
+            record.passes = record.count = 0
+            return
+        if not record.passes:
+            record.passing_ns, record.trend = t_ns, Trend()
+        record.passes += 1
+        self._average(record, whitened)
+        if offset is not None:
+            record.trend = record.trend.with_one(offset, (t_ns - record.passing_ns) * 1e-9)
+        if (
+            record.passes >= READMIT_COUNT
+            and t_ns - record.passing_ns >= READMIT_NS
+            and (offset is None or record.trend.steady)
+            and not self._biased(record)
+        ):
+            record.excluded, record.fused_ns = "", t_ns
+            record.refused, record.jumped, record.count = 0, False, 0
+
+    def _supported(self, device: str, t_ns: int) -> bool:
+        """Whether a velocity of the device agrees with the filter still."""
+        return any(
+            r.moves and r.device == device and r.believed and t_ns - r.fused_ns <= SUPPORT_NS
+            for r in self._records.values()
+        )
+
+    # ------------------------------------------------------------------ the mean test
+
+    @staticmethod
+    def _average(record: Series, whitened: tuple[float, ...]) -> None:
+        if not whitened:
+            return
+        if not record.count or len(record.slow) != len(whitened):
+            record.fast = record.slow = (0.0,) * len(whitened)
+            record.count = 0
+        a, b = PACES
+        record.fast = tuple([m + a * (y - m) for m, y in zip(record.fast, whitened, strict=True)])
+        record.slow = tuple([m + b * (y - m) for m, y in zip(record.slow, whitened, strict=True)])
+        record.count += 1
+
+    def _biased(self, record: Series) -> bool:
+        count = record.count
+        if count < FEWEST:
+            return False
+        degrees = len(record.slow)
+        fast = slow = 0.0
+        for f, s in zip(record.fast, record.slow, strict=True):
+            fast += f * f
+            slow += s * s
+        limit = gate_threshold(self._pass, degrees)
+        if fast > limit * record.fast_spread or slow > limit * record.slow_spread:
+            return True
+        record.fast_spread += LEARN * (max(fast / degrees, WHITE[0]) - record.fast_spread)
+        record.slow_spread += LEARN * (max(slow / degrees, WHITE[1]) - record.slow_spread)
+        return False
+
+    def _blame(self, record: Series, aid: Aid, offer: PositionOffer | None, nav: Array) -> Action:
+        """A bias inside the gate: the series', where something else supports the filter."""
+        record.count = 0
+        if offer is not None:
+            z = _offset(offer, nav)
+            seen_m = 0.5 * math.hypot(z.north, z.east)
+            source = self._supported(record.device, aid.t_ns) or self._others(record, aid, seen_m)
+        else:
+            source = self._others(record, aid, FINE_M)
+        if not source:
+            return Action.DOUBT_FILTER
+        self._exclude(record, aid.t_ns, "drifts", jumped=record.locates)
+        return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
+
+    def _others(self, record: Series, aid: Aid, sd_m: float) -> bool:
+        """Whether other positions, good to `sd_m`, have been believed lately: a coarse one cannot
+        say that a fine one is wrong."""
+        return any(
+            r.locates
+            and r is not record
+            and r.believed
+            and r.sd_m <= sd_m
+            and aid.t_ns - r.fused_ns <= OTHERS_NS
+            for r in self._records.values()
+        )
+
+
+def _offset(offer: PositionOffer, nav: Array) -> Offset:
+    """Of the body's origin; a lever arm of metres is left to the sigma."""
+    lat, height = float(nav[LAT]), float(nav[HEIGHT])
+    east = float(nav[LON]) - offer.lon_rad
+    east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
+    return Offset(
+        (lat - offer.lat_rad) * (meridian_radius(lat) + height),
+        east * (transverse_radius(lat) + height) * math.cos(lat),
+        math.hypot(max(offer.sd[:2]), *offer.lever[:2]),
+    )
