@@ -3,10 +3,10 @@ r"""Whether an inertial sample can be a measurement: judged in order, each by th
     |x_k - x_g| <= n L_j,    L_j = 30 max(a_j, floor_j)       a leap is a `spike`
     r >= ln(1e-9) / ln(p)                                      a value that comes too often
 
-x_g is the last sample that was taken, n how many have come since, a_j the running mean of |dx| of
-axis j. p is the running probability that a sample repeats the one before it to the bit, r how often
-it has done so now: by chance that comes once in 1e9 samples, four months at 100 Hz. p starts at 1,
-so that a sensor is condemned only for what it has shown not to do.
+x_g is the last sample that was taken, n how many have come since (three at most), a_j the running
+mean of |dx| of axis j. p is the running probability that a sample repeats the one before it to the
+bit, r how often it has done so now: by chance that comes once in 1e9 samples, four months at
+100 Hz. p starts at 1, so that a sensor is condemned only for what it has shown not to do.
 
 Figures, of four recordings of cars and a walker (MEMS units of 100 to 167 Hz; one with steps of
 0.25 deg/s and 0.125 m/s^2; one that sends each third sample twice):
@@ -44,6 +44,9 @@ TAKEN, SATURATED, REPEATED, NO_GRAVITY, SPIKE, STAMP_AHEAD, AXIS_DEAD = range(7)
 
 # Twice the largest leap of a car, and more than that of a walker.
 LEAP = 30.0
+# So many leaps may add up while samples are refused: then the new level must last for DEAD_S, in
+# which a sensor that is at its unknown full scale is seen to be dead.
+LEAPS_ALLOWED = 3.0
 # Mean leaps of a good sensor on a quiet ride; with LEAP they allow what a shock does from rest:
 # 0.9 rad/s and 15 m/s^2 from sample to sample. Cars showed 1.7 and 10, shaken long before.
 RATE_FLOOR_RAD_S, FORCE_FLOOR_M_S2 = 0.03, 0.5
@@ -148,9 +151,12 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
             continue
         if run >= _most(memory[_REPEATS + j], memory[_LONGEST + j]):
             return AXIS_DEAD
+    if memory[_REFUSED] > DEAD_S * rate_hz:
+        return TAKEN
+    since = min(memory[_REFUSED] + 1.0, LEAPS_ALLOWED)
     for j in range(6):
         floor = RATE_FLOOR_RAD_S if j < 3 else FORCE_FLOOR_M_S2
-        most = LEAP * max(floor, memory[_LEAP + j]) * (memory[_REFUSED] + 1.0)
+        most = LEAP * max(floor, memory[_LEAP + j]) * since
         if abs(samples[i, j] - memory[_GOOD + j]) > most:
             return SPIKE
     return TAKEN

@@ -92,6 +92,14 @@ def test_full_scale_of_an_unknown_range_never_gets_in() -> None:
     assert np.flatnonzero(checked.codes).tolist() == list(range(700, 800))
 
 
+def test_full_scale_of_one_axis_is_not_believed_by_patience() -> None:
+    times, samples = FINE.samples(20.0)
+    samples[700:1200, 2] = 5.0
+    checked = _feed(_check(), times, samples)
+    assert np.flatnonzero(checked.codes).tolist() == list(range(700, 1200))
+    assert _names(checked).keys() == {"spike", "axis_dead"}
+
+
 @pytest.mark.parametrize(("sensor", "soon"), [(FINE, 15), (COARSE, 60)])
 def test_stuck(sensor: Sensor, soon: int) -> None:
     times, samples = sensor.samples(30.0)
