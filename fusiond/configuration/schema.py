@@ -60,6 +60,10 @@ class Imu(Section):
     time_offset_s: float = 0.0
     """Added to the sensor's stamps; negative where they are late."""
     rate_hz: PositiveFloat = 100.0
+    gyro_range_deg_s: PositiveFloat | None = None
+    """Full scale of the data sheet: a rate that reaches it is refused as `saturated`."""
+    accel_range_g: PositiveFloat | None = None
+    """The same for specific force."""
     gyro_noise_deg_sqrt_h: PositiveFloat = 0.3
     """Angle random walk."""
     accel_noise_m_s_sqrt_h: PositiveFloat = 0.1
@@ -79,7 +83,8 @@ class Imu(Section):
     accel_scale_ppm: PositiveFloat = 2000.0
     """One sigma of the scale factors' errors."""
     gap_s: PositiveFloat = 0.5
-    """A pause longer than this is a gap: the solution says so and the covariance grows for it."""
+    """A pause longer than this is a gap: the solution says so. The covariance grows for any that is
+    longer than 3.5 samples."""
 
 
 class ZeroVelocity(Section):

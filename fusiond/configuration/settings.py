@@ -39,6 +39,15 @@ def imu_noise(imu: Imu) -> ImuNoise:
     )
 
 
+def imu_range(imu: Imu) -> tuple[float, float]:
+    """Full scale of rate (rad/s) and force (m/s^2); infinite where none is configured."""
+    rate, force = imu.gyro_range_deg_s, imu.accel_range_g
+    return (
+        math.inf if rate is None else rate * DEG,
+        math.inf if force is None else force * STANDARD_GRAVITY_M_S2,
+    )
+
+
 def clock_noise(raw: RawAiding) -> ClockNoise:
     """The receiver clock's error model."""
     return ClockNoise(

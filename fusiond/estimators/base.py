@@ -229,7 +229,7 @@ class ErrorStateFilter:
             imu.end,
             self.t_ns,
             target_ns,
-            self.gap_ns,
+            min(self.gap_ns, imu.hold_ns),
             record,
             imu.nav,
             imu.sigmas,

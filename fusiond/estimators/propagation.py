@@ -33,8 +33,10 @@ from fusiond.navigation.strapdown import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# What the vehicle may do while the IMU is silent, one sigma of the unknown mean rate (rad/s) and
-# force (m/s^2): a car that turns or brakes at a comfortable limit.
+# What the vehicle may do while the IMU is silent, one sigma of the mean rate (rad/s) and force
+# (m/s^2) against the sample that is held: a car that turns or brakes at a comfortable limit. Real
+# drives showed up to 0.09 rad/s (pitch, an engine that shakes the IMU) and 0.12 rad/s (yaw, 4 s in
+# town) and 0.4 to 0.8 m/s^2 RMS over silences of 0.05 to 4 s, with single ones of four times that.
 GAP_RATE_RAD_S = 0.1
 GAP_FORCE_M_S2 = 1.0
 

@@ -28,6 +28,15 @@ WARNINGS = (
     "jumped",
     "stepped",
     "resumed",
+    "saturated",
+    "repeated",
+    "no_gravity",
+    "spike",
+    "stamp_ahead",
+    "axis_dead",
+    "not_finite",
+    "out_of_range",
+    "imu_time",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 

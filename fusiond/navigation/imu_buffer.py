@@ -19,8 +19,21 @@ Array = NDArray[np.float64]
 # Beyond any vehicle and any sensor sold for one: such a row is damage, not motion.
 MAX_RATE_RAD_S = 100.0
 MAX_FORCE_M_S2 = 1000.0
+# A pause beyond this many sample periods is more than jitter and a lost sample or two: what the
+# vehicle did in it is unknown.
+HOLD_PERIODS = 3.5
+# Intervals whose median is the sample period as seen, and how far from the present one it must be
+# (1) to count: a few seconds, whatever single intervals do.
+PERIOD_WINDOW, PERIOD_CHANGE = 256, 0.5
 # Rows kept before the oldest needed one: the slopes of a sample use the two before it.
 MARGIN = 3
+
+
+def sound(samples: Array) -> NDArray[np.bool_]:
+    """Which of samples (m, 6) are finite and within what any sensor can say."""
+    found: NDArray[np.bool_] = np.abs(samples[:, :3]).max(axis=1, initial=0.0) <= MAX_RATE_RAD_S
+    found &= np.abs(samples[:, 3:]).max(axis=1, initial=0.0) <= MAX_FORCE_M_S2
+    return found
 
 
 class ImuBuffer:
@@ -53,6 +66,8 @@ class ImuBuffer:
         self.counters: Counter[str] = Counter()
         self._keep_ns = round(keep_s * 1e9)
         self._gap_ns = round(gap_s * 1e9)
+        self._configured_ns = self._period_ns = 1e9 / rate_hz
+        self._intervals: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._offset_ns = round(time_offset_s * 1e9)
         self._turn = np.zeros((6, 6))
         self._turn[:3, :3] = self._turn[3:, 3:] = sensor_to_body.T
@@ -61,6 +76,16 @@ class ImuBuffer:
     def next_sample(self) -> int:
         """Absolute number of the sample that will come next."""
         return self.start + self.end
+
+    @property
+    def hold_ns(self) -> int:
+        """A sample may stand for this long at most; beyond it the covariance grows as for a gap.
+
+        The slower of the configured rate and the one seen counts: a bus that hands over samples in
+        bursts does not make its sensor fast.
+        """
+        slower = max(self._period_ns, self._configured_ns)
+        return min(self._gap_ns, round(HOLD_PERIODS * slower))
 
     @property
     def latest_ns(self) -> int:
@@ -81,20 +106,23 @@ class ImuBuffer:
         self.start, self.end, self.needed = self.next_sample, 0, None
         self.backward_in_a_row = 0
 
+    def refuse(self, bad: Array) -> dict[str, int]:
+        """Count samples (m, 6) that are not `sound`, by name."""
+        finite = int(np.isfinite(bad).all(axis=1).sum())
+        names = {"out_of_range": finite, "not_finite": len(bad) - finite}
+        self.counters.update(names)
+        return {name: count for name, count in names.items() if count}
+
     def append(self, times: NDArray[np.int64], samples: Array) -> int:
         """Append samples (m,) ns and (m, 6) in sensor axes; return how many were taken.
 
         Refused and counted: `not_finite`, `out_of_range`, `duplicate_stamp`, `backward_stamp`.
         Counted and taken: `gap`.
         """
-        sound = np.abs(samples[:, :3]).max(axis=1, initial=0.0) <= MAX_RATE_RAD_S
-        sound &= np.abs(samples[:, 3:]).max(axis=1, initial=0.0) <= MAX_FORCE_M_S2
-        if not sound.all():
-            bad = samples[~sound]
-            finite = int(np.isfinite(bad).all(axis=1).sum())
-            self.counters["out_of_range"] += finite
-            self.counters["not_finite"] += len(bad) - finite
-            times, samples = times[sound], samples[sound]
+        good = sound(samples)
+        if not good.all():
+            self.refuse(samples[~good])
+            times, samples = times[good], samples[good]
         if not len(times):
             return 0
         times = times + self._offset_ns
@@ -110,7 +138,9 @@ class ImuBuffer:
             if not len(times):
                 return 0
             before = np.concatenate(([before[0]], times))
-        gaps = int((np.diff(before) > self._gap_ns).sum())
+        intervals = np.diff(before)
+        self._learn_period(intervals)
+        gaps = int((intervals > self._gap_ns).sum())
         if gaps:
             self.counters["gap"] += gaps
         taken = len(times)
@@ -120,6 +150,16 @@ class ImuBuffer:
             part = slice(first, first + room)
             self._store(times[part], samples[part])
         return taken
+
+    def _learn_period(self, intervals: NDArray[np.int64]) -> None:
+        """Intervals (m,) ns of samples taken; judged by whole windows, however they come."""
+        intervals = np.concatenate((self._intervals, intervals))
+        while len(intervals) >= PERIOD_WINDOW:
+            seen = float(np.median(intervals[:PERIOD_WINDOW]))
+            if abs(seen - self._period_ns) > PERIOD_CHANGE * self._period_ns:
+                self._period_ns = seen
+            intervals = intervals[PERIOD_WINDOW:]
+        self._intervals = intervals
 
     def _store(self, times: NDArray[np.int64], samples: Array) -> None:
         count = len(times)

@@ -25,6 +25,7 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
+from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.readout import solution_of
@@ -65,6 +66,7 @@ class Navigator:
         self.imu = ImuBuffer(
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
         )
+        self._door = ImuDoor(imu, e.buffer_s, self._event)
         self.estimator = estimator_of(config, self.model)
         self.verdicts = Verdicts(
             config.consistency.window,
@@ -93,28 +95,35 @@ class Navigator:
     def add_imu(self, times: NDArray[np.int64], samples: Array) -> int:
         """IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; how many count.
 
-        A silence as long as the whole history ends the navigation: alignment begins anew.
+        What cannot be true is refused by name; what leaves too much unknown ends the navigation:
+        alignment begins anew (fusiond.navigator.imu_door).
         """
-        if self.imu.end and len(times):
-            silence = (int(times[0]) - self.imu.latest_ns) * 1e-9
-            if silence > self.config.estimator.buffer_s and self.started is not None:
-                self._event("imu_gap", f"IMU silent for {silence:.1f} s: aligning anew")
-                self.reset("IMU was silent")
-        taken = self.imu.append(times, samples)
-        stuck_s = self.imu.backward_in_a_row / self.config.imu.rate_hz
-        if stuck_s > self.config.imu.gap_s:
-            # One stamp far ahead, or a clock set back: nothing would be taken until it is made up.
-            self._event("imu_time", f"IMU stamps went back {stuck_s:.1f} s ago: aligning anew")
-            self.imu.restart()
-            self.reset("IMU stamps went back")
-        if taken:
-            felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
-            if self.started is None:
-                for window in felt.windows:
-                    self._aligner.known.window(window)
-            for aid in felt.aids:
-                self.timeline.insert(aid)
+        taken = 0
+        for run in self._door.admit(times, samples, self.imu, self.started is not None):
+            if run.ends:
+                self._begin_anew(run.ends)
+            appended = self.imu.append(run.times, run.samples)
+            if appended:
+                self._feel(appended)
+            taken += appended
+        if self._door.restarts(self.imu):
+            self._begin_anew("IMU stamps went back")
         return taken
+
+    def _begin_anew(self, why: str) -> None:
+        """Nothing that the samples so far have told counts any more."""
+        saved = self._saved if self.started is None else None
+        self.imu.restart()
+        self.reset(why, saved)
+
+    def _feel(self, taken: int) -> None:
+        """The newest samples have come: what they say by themselves."""
+        felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
+        if self.started is None:
+            for window in felt.windows:
+                self._aligner.known.window(window)
+        for aid in felt.aids:
+            self.timeline.insert(aid)
 
     def learn(self, message: Ephemeris | Klobuchar) -> None:
         """What a satellite broadcasts, for the raw epochs of the same source."""
@@ -138,11 +147,11 @@ class Navigator:
             self.timeline.insert(aid)
         return "accepted"
 
-    def reset(self, why: str) -> None:
-        """Forget the solution and align anew."""
+    def reset(self, why: str, saved: SavedState | None = None) -> None:
+        """Forget the solution and align anew, with a saved state if it still holds."""
         self.started = None
         self.timeline.clear()
-        self._saved = None
+        self._saved = saved
         self._aligner = self._new_aligner()
         self._aligner.reason = why
 
@@ -219,14 +228,14 @@ class Navigator:
         """What the solution is worth at `t_ns`, and why."""
         e = self.config.estimator
         if not self.imu.end:
-            return Mode.WAITING, "waiting for IMU data"
+            return Mode.WAITING, self._door.silence(None)
         silent = (t_ns - self.imu.latest_ns) * 1e-9
         if self.started is None:
             if silent > self.config.imu.gap_s:
-                return Mode.WAITING, f"IMU silent for {silent:.1f} s"
+                return Mode.WAITING, self._door.silence(silent)
             return Mode.ALIGNING, self._aligner.reason
         if silent > self.config.imu.gap_s:
-            return Mode.INVALID, f"IMU silent for {silent:.1f} s"
+            return Mode.INVALID, self._door.silence(silent)
         horizontal = float(np.hypot(*np.sqrt(np.diag(self.estimator.covariance)[6:8])))
         if not horizontal <= e.invalid_sd_m:
             return Mode.INVALID, f"horizontal sigma {horizontal:.0f} m"

@@ -33,6 +33,8 @@ VEHICLE = Config.model_validate(
         "imu": {
             "axes": ("+x", "-y", "-z"),
             "rate_hz": 100.0,
+            "gyro_range_deg_s": 2000.0,
+            "accel_range_g": 10.0,
             "gyro_noise_deg_sqrt_h": 0.3,
             "accel_noise_m_s_sqrt_h": 0.1,
             "gyro_bias_instability_deg_h": 10.0,

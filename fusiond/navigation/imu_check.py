@@ -1,0 +1,270 @@
+r"""Whether an inertial sample can be a measurement: judged in order, each by those before it.
+
+    |x_k - x_g| <= n L_j,    L_j = 30 max(a_j, floor_j)       a leap is a `spike`
+    r >= ln(1e-9) / ln(p)                                      a value that comes too often
+
+x_g is the last sample that was taken, n how many have come since (three at most), a_j the running
+mean of |dx| of axis j. p is the running probability that a sample repeats the one before it to the
+bit, r how often it has done so now: by chance that comes once in 1e9 samples, four months at
+100 Hz. p starts at 1, so that a sensor is condemned only for what it has shown not to do.
+
+Figures, of four recordings of cars and a walker (MEMS units of 100 to 167 Hz; one with steps of
+0.25 deg/s and 0.125 m/s^2; one that sends each third sample twice):
+
+    all six values the same           3 samples in a row at most (of 320,000)
+    one axis the same                 101 samples in a row (1.0 s, the coarse unit at rest)
+    leap between samples              16 a_j in cars, 28 a_j of a walker
+    smallest specific force           3.6 m/s^2 in one sample (a shock)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+OUTCOMES = (
+    "taken",
+    "saturated",
+    "repeated",
+    "no_gravity",
+    "spike",
+    "stamp_ahead",
+    "axis_dead",
+)
+"""What a sample's code means. `stamp_ahead`: stamped later than one that came after it."""
+TAKEN, SATURATED, REPEATED, NO_GRAVITY, SPIKE, STAMP_AHEAD, AXIS_DEAD = range(7)
+
+# Twice the largest leap of a car, and more than that of a walker.
+LEAP = 30.0
+# So many leaps may add up while samples are refused: then the new level must last for DEAD_S, in
+# which a sensor that is at its unknown full scale is seen to be dead.
+LEAPS_ALLOWED = 3.0
+# Mean leaps of a good sensor on a quiet ride; with LEAP they allow what a shock does from rest:
+# 0.9 rad/s and 15 m/s^2 from sample to sample. Cars showed 1.7 and 10, shaken long before.
+RATE_FLOOR_RAD_S, FORCE_FLOOR_M_S2 = 0.03, 0.5
+# Samples that the running mean of leaps and the running probability of repetition remember.
+LEAPS_KEPT, REPEATS_KEPT = 100.0, 500.0
+# A repetition as rare as this is none; and at least three times the longest seen.
+CHANCE = 1e-9
+FEWEST_REPEATS = 10
+# An axis that is dead: no change for a second, and rare by chance, while others change. A quarter
+# of that would have refused nothing of those recordings.
+DEAD_S = 1.0
+# A run that ended by a step as small as the sensor has was rest, not a fault: three times as long a
+# run is allowed from then on.
+SMALLEST_STEPS, RUN_FACTOR = 1.5, 3.0
+# Free fall: a wheeled vehicle that leaves the ground is back within 0.1 s (5 cm high). A fifth of
+# gravity is below the smallest force that was seen, and above one gravity in units of g.
+FREE_FALL_M_S2, FREE_FALL_S = 2.0, 0.1
+# Nearer to full scale than the scale factor's tolerance.
+FULL = 0.99
+
+# The checker's memory: figures by axis, then single ones.
+_GOOD, _RAW, _LEAP, _STEP, _REPEATS, _RUN, _OTHERS, _LONGEST = range(0, 48, 6)
+_P_ALL, _RUN_ALL, _LONGEST_ALL, _SEEN, _FREE_S, _REFUSED = range(48, 54)
+_MEMORY = 54
+_NEVER_NS = -(2**62)
+
+
+@compiled("f8(f8, f8)", forceinline=True)
+def _most(p: float, longest: float) -> float:
+    """Repetitions in a row that a sensor may show."""
+    by_chance = math.log(CHANCE) / math.log(min(p, 1.0 - 1e-12))
+    return max(float(FEWEST_REPEATS), by_chance, RUN_FACTOR * longest)
+
+
+@compiled("void(f8[::1], f8[:, ::1], i8)")
+def _begin(memory: Array, samples: Array, i: int) -> None:
+    """Sample i is the first."""
+    memory[:] = 0.0
+    for j in range(6):
+        memory[_GOOD + j] = memory[_RAW + j] = samples[i, j]
+        floor = RATE_FLOOR_RAD_S if j < 3 else FORCE_FLOOR_M_S2
+        memory[_LEAP + j] = 10.0 * floor
+        memory[_STEP + j] = math.inf
+        memory[_REPEATS + j] = 1.0
+    memory[_P_ALL] = memory[_SEEN] = 1.0
+
+
+@compiled("void(f8[::1], f8[:, ::1], i8, f8)")
+def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> None:
+    """Sample i against the one before it: which axes stand still, and for how long."""
+    moved = 0
+    small = True
+    for j in range(6):
+        step = abs(samples[i, j] - memory[_RAW + j])
+        if step > 0.0:
+            moved += 1
+            memory[_STEP + j] = min(memory[_STEP + j], step)
+            small = small and step <= SMALLEST_STEPS * memory[_STEP + j]
+    if moved:
+        if small:
+            memory[_LONGEST_ALL] = max(memory[_LONGEST_ALL], memory[_RUN_ALL])
+        memory[_RUN_ALL] = 0.0
+        memory[_P_ALL] -= memory[_P_ALL] / REPEATS_KEPT
+    else:
+        memory[_RUN_ALL] += 1.0
+        if memory[_RUN_ALL] < _most(memory[_P_ALL], memory[_LONGEST_ALL]):
+            memory[_P_ALL] += (1.0 - memory[_P_ALL]) / REPEATS_KEPT
+    for j in range(6):
+        step = abs(samples[i, j] - memory[_RAW + j])
+        if step > 0.0:
+            if step <= SMALLEST_STEPS * memory[_STEP + j]:
+                memory[_LONGEST + j] = max(memory[_LONGEST + j], memory[_RUN + j])
+            memory[_RUN + j] = memory[_OTHERS + j] = 0.0
+            memory[_REPEATS + j] -= memory[_REPEATS + j] / REPEATS_KEPT
+        elif moved:
+            memory[_RUN + j] += 1.0
+            memory[_OTHERS + j] += 1.0
+            if memory[_RUN + j] < DEAD_S * rate_hz:
+                memory[_REPEATS + j] += (1.0 - memory[_REPEATS + j]) / REPEATS_KEPT
+        else:
+            memory[_RUN + j] += 1.0
+        memory[_RAW + j] = samples[i, j]
+
+
+@compiled("i8(f8[::1], f8[:, ::1], i8, f8, f8[::1])")
+def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array) -> int:
+    """Code of sample i, `since_s` after the one before it, repetitions counted."""
+    rate_hz = limits[0]
+    force = math.sqrt(samples[i, 3] ** 2 + samples[i, 4] ** 2 + samples[i, 5] ** 2)
+    memory[_FREE_S] = memory[_FREE_S] + since_s if force < FREE_FALL_M_S2 else 0.0
+    for j in range(6):
+        if abs(samples[i, j]) >= FULL * (limits[1] if j < 3 else limits[2]):
+            return SATURATED
+    if force == 0.0 or memory[_FREE_S] > FREE_FALL_S:
+        return NO_GRAVITY
+    run = memory[_RUN_ALL]
+    if run >= FEWEST_REPEATS and run >= _most(memory[_P_ALL], memory[_LONGEST_ALL]):
+        return REPEATED
+    for j in range(6):
+        run = memory[_RUN + j]
+        if run < DEAD_S * rate_hz or memory[_OTHERS + j] < 0.5 * run:
+            continue
+        if run >= _most(memory[_REPEATS + j], memory[_LONGEST + j]):
+            return AXIS_DEAD
+    if memory[_REFUSED] > DEAD_S * rate_hz:
+        return TAKEN
+    since = min(memory[_REFUSED] + 1.0, LEAPS_ALLOWED)
+    for j in range(6):
+        floor = RATE_FLOOR_RAD_S if j < 3 else FORCE_FLOOR_M_S2
+        most = LEAP * max(floor, memory[_LEAP + j]) * since
+        if abs(samples[i, j] - memory[_GOOD + j]) > most:
+            return SPIKE
+    return TAKEN
+
+
+@compiled("void(f8[::1], f8[:, ::1], i8)")
+def _take(memory: Array, samples: Array, i: int) -> None:
+    """Sample i is the one that the next is compared with."""
+    for j in range(6):
+        floor = RATE_FLOOR_RAD_S if j < 3 else FORCE_FLOOR_M_S2
+        leap = abs(samples[i, j] - memory[_GOOD + j]) / (memory[_REFUSED] + 1.0)
+        usual = memory[_LEAP + j]
+        # A single leap weighs no more than eight usual ones.
+        memory[_LEAP + j] += (min(leap, 8.0 * max(floor, usual)) - usual) / LEAPS_KEPT
+        memory[_GOOD + j] = samples[i, j]
+    memory[_REFUSED] = 0.0
+
+
+@compiled("i8(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1], i8[::1])")
+def _check(
+    times: Stamps,
+    samples: Array,
+    last_ns: int,
+    hold_ns: int,
+    limits: Array,
+    memory: Array,
+    codes: Stamps,
+) -> int:
+    """Write `codes` (m,); return how many samples are judged: the rest waits for more.
+
+    `limits`: rate in Hz, full scale of rate and force. Samples whose stamps do not go forward are
+    left to whoever orders them.
+    """
+    i, m = 0, len(times)
+    while i < m:
+        codes[i] = TAKEN
+        if memory[_SEEN] == 0.0:
+            _begin(memory, samples, i)
+            last_ns = times[i]
+            i += 1
+            continue
+        if times[i] <= last_ns:
+            i += 1
+            continue
+        gap = times[i] - last_ns > hold_ns
+        if gap:
+            # Real if the next sample goes on from here; else this stamp was wrong.
+            k = i + 1
+            while k < m and times[k] <= last_ns:
+                k += 1
+            if k == m:
+                return i
+            if times[k] <= times[i]:
+                codes[i] = STAMP_AHEAD
+                i += 1
+                continue
+        _count_repeats(memory, samples, i, limits[0])
+        since_s = 1.0 / limits[0] if gap else (times[i] - last_ns) * 1e-9
+        codes[i] = _judged(memory, samples, i, since_s, limits)
+        # After a gap there is nothing to compare with.
+        if codes[i] == TAKEN or (codes[i] == SPIKE and gap):
+            codes[i] = TAKEN
+            _take(memory, samples, i)
+        else:
+            memory[_REFUSED] += 1.0
+        last_ns = times[i]
+        i += 1
+    return i
+
+
+class Checked(NamedTuple):
+    """Samples that are judged (m,) ns, (m, 6), and their codes (m,), into OUTCOMES."""
+
+    times: Stamps
+    samples: Array
+    codes: Stamps
+
+
+class ImuCheck:
+    """Judges samples in sensor axes, whatever the chunks they come in.
+
+    `rate_hz` as configured; `rate_range` (rad/s) and `force_range` (m/s^2) are the sensor's full
+    scale, infinite where nobody knows. A sample after a pause waits for the one after it: until
+    then nobody can say which stamp is wrong.
+    """
+
+    def __init__(self, rate_hz: float, rate_range: float, force_range: float) -> None:
+        self._limits = np.array([rate_hz, rate_range, force_range])
+        self._memory = np.zeros(_MEMORY)
+        self._last_ns = _NEVER_NS
+        self._waiting: tuple[Stamps, Array] = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+
+    def restart(self) -> None:
+        """Forget all: the next sample may have any stamp."""
+        self._memory[:] = 0.0
+        self._last_ns = _NEVER_NS
+        self._waiting = self._waiting[0][:0], self._waiting[1][:0]
+
+    def feed(self, times: Stamps, samples: Array, hold_ns: int) -> Checked:
+        """Samples (m,) ns and (m, 6), finite; a pause beyond `hold_ns` is a gap."""
+        if len(self._waiting[0]):
+            times = np.concatenate((self._waiting[0], times))
+            samples = np.concatenate((self._waiting[1], samples))
+        times, samples = np.ascontiguousarray(times), np.ascontiguousarray(samples)
+        codes = np.zeros(len(times), dtype=np.int64)
+        done = _check(times, samples, self._last_ns, hold_ns, self._limits, self._memory, codes)
+        self._waiting = times[done:].copy(), samples[done:].copy()
+        good = times[:done][codes[:done] != STAMP_AHEAD]
+        if len(good):
+            self._last_ns = max(int(good.max()), self._last_ns)
+        return Checked(times[:done], samples[:done], codes[:done])
