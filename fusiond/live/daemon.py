@@ -28,6 +28,7 @@ from fusiond.live.service_manager import ServiceManager
 from fusiond.live.sources import Sources
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
+from fusiond.live.warm_keeper import WarmKeeper
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.outputs.mqtt import MqttPublisher
@@ -51,10 +52,14 @@ class Daemon:
         self.config = config
         self.clock = clock or Clock(config.clock)
         self._events = Events(self.clock)
-        self._state = StateKeeper(config, self.clock)
-        self.navigator = Navigator(
-            config, self._state.load(), on_event=partial(self._events.report, "navigator")
-        )
+        navigator_event = partial(self._events.report, "navigator")
+        self._state = StateKeeper(config, self.clock, navigator_event)
+        self._warm = WarmKeeper(config, navigator_event)
+        saved = self._state.load()
+        self.navigator = Navigator(config, saved, on_event=navigator_event)
+        if saved is None or "saved" not in config.alignment.heading:
+            # A vehicle that stood knows more by what it kept then.
+            self._warm.offer(self.navigator)
         self.sources = Sources(config, self.clock, self.navigator, self._events.report)
         self.service = ServiceManager()
         self.scheduler = Scheduler(
@@ -73,7 +78,7 @@ class Daemon:
                 on_command=Operator(self.navigator, self.sources).carry_out,
                 utc_now=lambda: self.clock.utc_ns(self.clock.now_ns()),
             )
-            self._events.listeners.append(self.mqtt.publish_event)
+            self._events.listen(self.mqtt.publish_event)
             self._publishing = Publishing(
                 config, self.clock, self.navigator, self.sources, self.scheduler, self.mqtt
             )
@@ -108,6 +113,7 @@ class Daemon:
             self.service.stopping()
             await _cancel(*work, stopped)
             await self._state.close(self.solution)
+            await self._warm.close(self.solution, self.navigator)
             await _cancel(*outputs)
             self.service.close()
             log.info(
@@ -131,6 +137,7 @@ class Daemon:
         if self._second.due(t_ns) or changed:
             self._each_second(t_ns, solution)
         self._state.keep(t_ns, solution)
+        self._warm.keep(t_ns, solution, self.navigator)
 
     def _each_second(self, t_ns: int, solution: Solution) -> None:
         """Tell the service manager and the terminals how it stands."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable
 
 from fusiond.clock.clock import Clock
@@ -37,8 +38,13 @@ WARNINGS = (
     "not_finite",
     "out_of_range",
     "imu_time",
+    "damaged",
+    "taken",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
+
+# What the parts of a start say before the outputs are there: each of them says little.
+MOST_UNHEARD = 32
 
 
 def level_of(code: str) -> Level:
@@ -51,18 +57,26 @@ def level_of(code: str) -> Level:
 
 
 class Events:
-    """Takes the events of all parts; `listeners` hear each as the message that goes out."""
+    """Takes the events of all parts; each who listens hears them as the messages that go out, and
+    first those of the time before anybody listened."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self.listeners: list[Callable[[EventMessage], None]] = []
+        self._listeners: list[Callable[[EventMessage], None]] = []
+        self._unheard: deque[EventMessage] = deque(maxlen=MOST_UNHEARD)
+
+    def listen(self, listener: Callable[[EventMessage], None]) -> None:
+        """Tell `listener` every event from now on, and what nobody has heard yet."""
+        self._listeners.append(listener)
+        while self._unheard:
+            listener(self._unheard.popleft())
 
     def report(self, source: str, code: str, text: str) -> None:
         level = level_of(code)
         log.log(getattr(logging, level.upper()), "%s: %s: %s", source, code, text)
-        if not self.listeners:
-            return
         utc_ns = self._clock.utc_ns(self._clock.now_ns())
         message = event_message(utc_ns, source=source, code=code, text=text, level=level)
-        for listener in self.listeners:
+        if not self._listeners:
+            self._unheard.append(message)
+        for listener in self._listeners:
             listener(message)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from fusiond.configuration.settings import DEG
 from fusiond.live.sources import Sources
 from fusiond.navigator.navigator import Navigator
@@ -12,6 +14,8 @@ from fusiond.outputs.commands import (
     ResetFilter,
     SetPosition,
 )
+
+EARTH_RADIUS_M = 6.371e6  # mean; the distance is told to people
 
 
 class Operator:
@@ -25,12 +29,7 @@ class Operator:
         """What was done. Raises `CommandRefusedError` for what cannot be done now."""
         match command:
             case SetPosition():
-                if not self._navigator.imu.end:
-                    raise CommandRefusedError("no IMU data yet")
-                self._navigator.set_position(
-                    command.lat_deg * DEG, command.lon_deg * DEG, command.height_m, command.sd_m
-                )
-                return "position taken"
+                return self._set_position(command)
             case RequestFix():
                 said = self._sources.request_fix()
                 if not said:
@@ -41,3 +40,35 @@ class Operator:
                 return "aligning anew"
             case _:
                 raise CommandRefusedError(f"unknown command {type(command).__name__}")
+
+    def _set_position(self, command: SetPosition) -> str:
+        navigator = self._navigator
+        if not navigator.imu.end:
+            raise CommandRefusedError("no IMU data yet")
+        if command.force:
+            navigator.reset("an operator's position")
+        before = navigator.solution(navigator.imu.latest_ns)
+        lat, lon = command.lat_deg * DEG, command.lon_deg * DEG
+        outcome = navigator.set_position(lat, lon, command.height_m, command.sd_m)
+        if outcome == "aligning":
+            return "position taken: aligning from it"
+        if not math.isfinite(before.lat_rad):
+            return f"position {outcome}: aligned from it"
+        far = distance_m(before.lat_rad, before.lon_rad, lat, lon)
+        where = f"{far:.0f} m from the solution"
+        if outcome == "fused":
+            return f"position fused: it was {where}"
+        if outcome == "gated":
+            raise CommandRefusedError(
+                f"position gated: it is {where}, whose sigma is"
+                f" {math.hypot(*before.sd_ned_m[:2]):.1f} m; nothing moved. To align anew from it,"
+                " send it with force = true"
+            )
+        raise CommandRefusedError(f"position refused: {outcome}")
+
+
+def distance_m(lat_a: float, lon_a: float, lat_b: float, lon_b: float) -> float:
+    """Way between two places (rad) on a sphere, to half a percent: the haversine formula."""
+    across = math.cos(lat_a) * math.cos(lat_b) * math.sin(0.5 * (lon_b - lon_a)) ** 2
+    chord = math.sin(0.5 * (lat_b - lat_a)) ** 2 + across
+    return 2.0 * EARTH_RADIUS_M * math.asin(math.sqrt(min(1.0, chord)))

@@ -5,23 +5,28 @@ from __future__ import annotations
 import ctypes
 import os
 import time
+from pathlib import Path
+
+STATM, MAPS = Path("/proc/self/statm"), Path("/proc/self/maps")
 
 
 class ProcessUsage:
     """CPU and memory of this process: `sample()` gives percent of one core since the last call
-    and resident memory in MB (10^6 bytes)."""
+    and resident memory in MB (10^6 bytes), None where the kernel does not show it."""
 
     def __init__(self) -> None:
         self._page_bytes = os.sysconf("SC_PAGESIZE")
         self._wall_ns = time.monotonic_ns()
         self._cpu_ns = time.process_time_ns()
 
-    def sample(self) -> tuple[float, float]:
+    def sample(self) -> tuple[float, float | None]:
         wall_ns, cpu_ns = time.monotonic_ns(), time.process_time_ns()
         percent = 100.0 * (cpu_ns - self._cpu_ns) / max(1, wall_ns - self._wall_ns)
         self._wall_ns, self._cpu_ns = wall_ns, cpu_ns
-        with open("/proc/self/statm", encoding="ascii") as statm:
-            resident_pages = int(statm.read().split()[1])
+        try:
+            resident_pages = int(STATM.read_text(encoding="ascii").split()[1])
+        except (OSError, ValueError, IndexError):  # no /proc, none that may be read, none like it
+            return percent, None
         return percent, resident_pages * self._page_bytes / 1e6
 
 
@@ -35,8 +40,11 @@ def release_compiler_pages() -> None:
     file; should LLVM run again, they are read again.
     """
     libc = ctypes.CDLL(None)
-    with open("/proc/self/maps", encoding="utf-8") as maps:
-        mappings = [line.split(maxsplit=5) for line in maps]
+    try:
+        lines = MAPS.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:  # the pages stay
+        return
+    mappings = [line.split(maxsplit=5) for line in lines]
     for fields in mappings:
         if fields[1] == "r-xp" and "libllvmlite" in fields[-1]:
             start, end = (int(address, 16) for address in fields[0].split("-"))

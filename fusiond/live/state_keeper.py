@@ -9,14 +9,17 @@ import asyncio
 import logging
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+
+from pydantic import ValidationError
 
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.saved_state import SavedState, load_state, save_state
+from fusiond.navigator.state_file import DamagedStateError, RefusedStateError, set_aside
 
 log = logging.getLogger("fusiond")
 
@@ -33,15 +36,21 @@ class StateKeeper:
     """Keeps one vehicle's state in `state_file`, else in systemd's state directory, else not.
 
     Files are written and removed in a thread: a tick never waits for a disk. One that cannot be
-    is told in the log.
+    is told in the log. `on_event(code, text)` hears `saved_state_damaged` and
+    `saved_state_refused`.
     """
 
     def __init__(
-        self, config: Config, clock: Clock, environ: Mapping[str, str] = os.environ
+        self,
+        config: Config,
+        clock: Clock,
+        on_event: Callable[[str, str], None],
+        environ: Mapping[str, str] = os.environ,
     ) -> None:
         self._path = _state_file(config, environ)
         self._max_age_s = config.alignment.saved_max_age_s
         self._clock = clock
+        self._event = on_event
         self._kept = False
         self._working: asyncio.Task[None] | None = None
         self._save = Every(SAVE_EVERY_S * SECOND_NS)
@@ -51,8 +60,16 @@ class StateKeeper:
         if self._path is None:
             return None
         utc_ns = self._clock.utc_ns(self._clock.now_ns())
-        state, why = load_state(self._path, (utc_ns or 0) * 1e-9, self._max_age_s)
-        log.info("%s: %s", self._path, why)
+        now_utc_s = None if utc_ns is None else utc_ns * 1e-9
+        try:
+            state = load_state(self._path, now_utc_s, self._max_age_s)
+        except DamagedStateError as error:
+            self._event("saved_state_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
+            return None
+        except RefusedStateError as error:
+            self._event("saved_state_refused", f"{self._path}: {error}")
+            return None
+        log.info("%s: %s", self._path, "no saved state" if state is None else "saved state")
         self._kept = state is not None
         return state
 
@@ -82,13 +99,17 @@ class StateKeeper:
         if utc_ns is None or not _speed_m_s(solution) <= SAVE_MAX_SPEED_M_S:
             return None
         s = solution
-        return SavedState(
-            utc_ns * 1e-9,
-            (s.lat_rad, s.lon_rad, s.height_m),
-            math.hypot(s.sd_ned_m[0], s.sd_ned_m[1]),
-            s.rpy_rad[2],
-            s.sd_rpy_rad[2],
-        )
+        try:
+            return SavedState(
+                utc_ns * 1e-9,
+                (s.lat_rad, s.lon_rad, s.height_m),
+                math.hypot(s.sd_ned_m[0], s.sd_ned_m[1]),
+                s.rpy_rad[2],
+                s.sd_rpy_rad[2],
+            )
+        except ValidationError as error:  # a heading that no model estimates, a diverged filter
+            log.warning("state not saved: %s", error.errors(include_url=False)[0]["msg"])
+            return None
 
 
 def _speed_m_s(solution: Solution) -> float:

@@ -31,7 +31,9 @@ from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
+from fusiond.navigator.state_file import RefusedStateError
 from fusiond.navigator.timeline import Entry, Timeline
+from fusiond.navigator.warm_start import WarmStart
 
 Array = NDArray[np.float64]
 
@@ -85,6 +87,8 @@ class Navigator:
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
         self.started: Start | None = None
+        self.warm: WarmStart | None = None
+        """A start to be tried before any alignment, and its trial."""
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -151,12 +155,13 @@ class Navigator:
         """Forget the solution and align anew, with a saved state if it still holds."""
         self.started = None
         self.timeline.clear()
-        self._saved = saved
+        self._saved, self.warm = saved, None
         self._aligner = self._new_aligner()
         self._aligner.reason = why
 
-    def set_position(self, lat_rad: float, lon_rad: float, height_m: float, sd_m: float) -> None:
-        """An operator's position, now: the fix to align by, or a fix like any other."""
+    def set_position(self, lat_rad: float, lon_rad: float, height_m: float, sd_m: float) -> str:
+        """An operator's position, now: the fix to align by (`aligning`), or a fix like any other,
+        whose outcome is returned."""
         aid = PositionAid(
             "operator",
             self.imu.latest_ns,
@@ -169,14 +174,16 @@ class Navigator:
         )
         if self.started is None:
             self._aligner.known.aids([aid])
-        self.timeline.insert(aid)
+        entry = self.timeline.insert(aid)
+        self.advance()
+        return "aligning" if entry.outcome is None else entry.outcome.name
 
     # ------------------------------------------------------------------ running
 
     def advance(self, record: bool = False) -> None:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
-            start = self._aligner.attempt(self.imu)
+            start = self._warm_start() or self._aligner.attempt(self.imu)
             if start is None:
                 return
             first = self.imu.index_after(start.t_ns) + self.imu.start
@@ -196,6 +203,26 @@ class Navigator:
             self.reset(failure)
             return
         self._left_out.tell()
+        if self.warm is not None and self.warm.refused_by is not None:
+            why = f"{self.warm.refused_by} speaks against the state of before the restart"
+            self._event("warm_start_refused", f"{why}: aligning anew")
+            self.reset(why)
+
+    def _warm_start(self) -> Start | None:
+        """The start from the state of the last run, at the first sample; there is one attempt."""
+        if self.warm is None or not self.imu.end:
+            return None
+        try:
+            return self.warm.start(self.imu.oldest_ns)
+        except RefusedStateError as error:
+            self._event("warm_state_refused", str(error))
+            self.warm = None
+            return None
+
+    @property
+    def on_trial(self) -> bool:
+        """Started from the state of the last run, and no position aid has confirmed it yet."""
+        return self.warm is not None and self.warm.on_trial
 
     def isolated(self, source: str) -> str | None:
         """Why the fault detection leaves a source out; None if it does not."""
@@ -239,6 +266,8 @@ class Navigator:
         horizontal = float(np.hypot(*np.sqrt(np.diag(self.estimator.covariance)[6:8])))
         if not horizontal <= e.invalid_sd_m:
             return Mode.INVALID, f"horizontal sigma {horizontal:.0f} m"
+        if self.on_trial:
+            return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
         shaken = self._standing.shaken(self.estimator.t_ns, self.timeline.isolation)
@@ -257,6 +286,8 @@ class Navigator:
 
     def _outcome(self, entry: Entry) -> None:
         outcome = entry.outcome
+        if outcome is not None and self.warm is not None and entry.aid.locates:
+            self.warm.judge(entry.aid.source, outcome.name)
         if outcome is not None and outcome.name == "fused":
             if outcome.whitened and not entry.judged:
                 entry.judged = True

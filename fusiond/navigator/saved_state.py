@@ -2,57 +2,70 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from fusiond.navigator.state_file import RefusedStateError, read_state, write_state
 
 # A parked vehicle does not turn; ferries and tow trucks do. What the sigma of a saved heading grows
 # to at least (rad).
 SAVED_HEADING_SD_RAD = math.radians(2.0)
+# A host's clock that is set by network time may go back by this much (s) between two runs.
+CLOCK_SLACK_S = 60.0
+
+# Anywhere that a vehicle drives, sails or flies, in WGS 84, as for the commands of an operator.
+Latitude = Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)]
+Longitude = Annotated[float, Field(ge=-math.pi, le=math.pi)]
+Height = Annotated[float, Field(ge=-1000.0, le=100_000.0)]
+# Half the Earth's circumference: a sigma beyond it says nothing more.
+PositionSigma = Annotated[float, Field(gt=0.0, le=2.1e7)]
+
+STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class SavedState:
-    """Position (rad, rad, m), yaw (rad) and sigmas of a vehicle at rest, with POSIX time (s)."""
+    """Position (rad, rad, m), yaw (rad) and sigmas of a vehicle at rest, with POSIX time (s).
 
-    utc_s: float
-    position: tuple[float, float, float]
-    sd_position_m: float
-    yaw_rad: float
-    sd_yaw_rad: float
+    Raises pydantic's `ValidationError` for what no vehicle can have.
+    """
+
+    utc_s: Annotated[float, Field(ge=0.0, le=1e11)]
+    position: tuple[Latitude, Longitude, Height]
+    sd_position_m: PositionSigma
+    yaw_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)]
+    sd_yaw_rad: Annotated[float, Field(gt=0.0, le=2.0 * math.pi)]
+    version: Literal[1] = 1
+    """Of this layout; files of before it was written have none and are the same."""
+
+
+_SAVED = TypeAdapter(SavedState)
 
 
 def save_state(path: Path, state: SavedState) -> None:
     """Write atomically: a power cut leaves the old file or the new one. OSError passes."""
-    temporary = path.with_suffix(".new")
-    with temporary.open("w") as f:
-        json.dump(asdict(state), f)
-        f.flush()
-        os.fsync(f.fileno())
-    temporary.replace(path)
+    write_state(path, _SAVED.dump_json(state), durable=True)
 
 
-def load_state(path: Path, now_utc_s: float, max_age_s: float) -> tuple[SavedState | None, str]:
-    """The saved state, or None and why there is none that can be used."""
-    try:
-        raw = json.loads(path.read_text())
-        state = SavedState(
-            float(raw["utc_s"]),
-            (float(raw["position"][0]), float(raw["position"][1]), float(raw["position"][2])),
-            float(raw["sd_position_m"]),
-            float(raw["yaw_rad"]),
-            max(float(raw["sd_yaw_rad"]), SAVED_HEADING_SD_RAD),
-        )
-    except FileNotFoundError:
-        return None, "no saved state"
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        return None, f"saved state unusable: {error!r}"
-    numbers = (state.utc_s, *state.position, state.sd_position_m, state.yaw_rad, state.sd_yaw_rad)
-    if not all(math.isfinite(x) for x in numbers) or abs(state.position[0]) > math.pi / 2:
-        return None, "saved state unusable: a figure out of range"
+def load_state(path: Path, now_utc_s: float | None, max_age_s: float) -> SavedState | None:
+    """The saved state, None if there is none.
+
+    Raises `DamagedStateError` for what is none, `RefusedStateError` for one of the wrong time, or
+    while the time (`now_utc_s`, POSIX) is not known.
+    """
+    state = read_state(path, _SAVED)
+    if state is None:
+        return None
+    if now_utc_s is None:
+        raise RefusedStateError("the time is not known yet, so its age is not")
     age = now_utc_s - state.utc_s
-    if not -60.0 <= age <= max_age_s:
-        return None, f"saved state is {age:.0f} s old (limit {max_age_s:.0f} s)"
-    return state, "saved state"
+    if age < -CLOCK_SLACK_S:
+        raise RefusedStateError(f"it is from {-age:.0f} s ahead of this computer's clock")
+    if age > max_age_s:
+        raise RefusedStateError(f"it is {age:.0f} s old (limit {max_age_s:.0f} s)")
+    return replace(state, sd_yaw_rad=max(state.sd_yaw_rad, SAVED_HEADING_SD_RAD))

@@ -20,12 +20,17 @@ class Command(BaseModel):
 
 
 class SetPosition(Command):
-    """Where the vehicle is: WGS 84, height above the ellipsoid; one sigma per horizontal axis."""
+    """Where the vehicle is: WGS 84, height above the ellipsoid; one sigma per horizontal axis.
+
+    It is fused like any fix, and gated like one; with `force` the filter is reset and aligns anew
+    from it.
+    """
 
     lat_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     lon_deg: Annotated[float, Field(ge=-180.0, le=180.0)]
     height_m: Annotated[float, Field(ge=-1000.0, le=100_000.0)]
     sd_m: Annotated[float, Field(gt=0.0, le=100_000.0)]
+    force: bool = False
 
 
 class RequestFix(Command):

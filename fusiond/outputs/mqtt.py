@@ -11,29 +11,25 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 from collections import Counter, deque
 from collections.abc import Callable
 
 import aiomqtt
 
-from drivers.base import Backoff, DriverStatus
+from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
 from fusiond.outputs import broker_access
-from fusiond.outputs.commands import (
-    COMMANDS,
-    BadCommandError,
-    CommandRefusedError,
-    Handler,
-    parse,
-)
-from fusiond.outputs.messages.base import Message, stamp
+from fusiond.outputs.command_intake import CommandIntake
+from fusiond.outputs.commands import Handler
+from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.nav import NavMessage
-from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import StatusMessage
+from fusiond.outputs.reconnecting import Reconnecting
 from fusiond.outputs.topics import CONSISTENCY, EVENT, HEALTH, NAV, REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
@@ -42,19 +38,24 @@ _FAREWELL_S = 2.0
 """Longest a shutdown waits for the broker."""
 _INCOMING = 16
 """Commands that may wait; aiomqtt discards more."""
+_OVERDUE = "timed out"
+"""In the text of aiomqtt's error for a confirmation that did not come: it was we who hung up."""
+# aiomqtt warns of every message that it discards: in a flood of commands a line each.
+_LOG = logging.getLogger("fusiond.aiomqtt")
+_LOG.setLevel(logging.ERROR)
 
 
 class MqttPublisher:
     """Publishes a vehicle's topics and takes its commands.
 
     `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
-    `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out a configured
-    command; without it, or with none configured, nothing is subscribed. `utc_now` (ns,
+    `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out
+    a configured command; without it, or with none configured, nothing is subscribed. `utc_now` (ns,
     None if unknown) dates the replies.
 
     `counters`: `mqtt_published`; `mqtt_dropped` (replaced by a newer one, pushed out of the full
-    event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_commands`,
-    `mqtt_commands_refused`. `status` is for `health`.
+    event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_taken_over`, connections lost
+    to another client of our name; those of `CommandIntake`. `status` is for `health`.
 
     Raises `ConfigError` for a password file or TLS files that cannot be used.
     """
@@ -76,8 +77,6 @@ class MqttPublisher:
         self._password = broker_access.password(options)
         self._tls = broker_access.tls_context(options)
         self._on_event = on_event
-        self._on_command = on_command
-        self._utc_now = utc_now
         self._confirm_s = max(1.0, options.keepalive_s / 2)
         self._heartbeat_s = options.keepalive_s / 4
         self._latest: dict[Topic, Message] = {}
@@ -88,6 +87,12 @@ class MqttPublisher:
         self._confirmed_ready = asyncio.Event()
         self._flowing = asyncio.Event()
         self.counters: Counter[str] = Counter()
+        self._commands: CommandIntake | None = None
+        if on_command is not None and options.commands:
+            self._commands = CommandIntake(
+                options.commands, on_command, self.counters, on_event, utc_now
+            )
+        self._reconnecting = Reconnecting()
         self.status = DriverStatus()
 
     # ------------------------------------------------------------------ for the tick
@@ -127,30 +132,43 @@ class MqttPublisher:
         if broker_access.readable_by_all(self._options.password_file):
             path = self._options.password_file
             self._on_event("mqtt_password_exposed", f"{path} is readable by all: chmod 600 {path}")
-        backoff = Backoff()
         connected_before = False
+        loop = asyncio.get_running_loop()
         while True:
             client = self._client()
             try:
                 async with client:
                     _honour_cancellation()
-                    backoff.reset()
+                    since_s = loop.time()
                     self.counters["mqtt_reconnects"] += connected_before
                     connected_before = True
                     where = f"{self._options.host}:{self._options.port}"
                     self.status = DriverStatus("running", where)
                     self._on_event("mqtt_connected", where)
                     reason = await self._serve(client)
-                self.status = DriverStatus("absent", reason)
                 self._on_event("mqtt_lost", reason)
+                self.status = DriverStatus("absent", reason)
+                self._look_for_a_rival(loop.time() - since_s, _OVERDUE not in reason)
             except aiomqtt.MqttError as error:
+                self._reconnecting.failed()
                 if self.status.state != "absent":
                     self._on_event("mqtt_absent", str(error))
                 self.status = DriverStatus("absent", str(error))
             finally:
                 _hang_up(client)
             _honour_cancellation()
-            await asyncio.sleep(backoff.next())
+            await asyncio.sleep(self._reconnecting.wait_s())
+
+    def _look_for_a_rival(self, lasted_s: float, by_broker: bool) -> None:
+        newly = self._reconnecting.ended(lasted_s, by_broker)
+        if not self._reconnecting.taken:
+            return
+        text = f"another client has the name {self._client_id!r} at the broker"
+        self.status = DriverStatus("absent", text)
+        self.counters["mqtt_taken_over"] += by_broker
+        if newly:
+            what = "give each daemon a 'vehicle' or a mqtt.client_id of its own"
+            self._on_event("client_name_taken", f"{text}: {what}; trying again seldom")
 
     def _client(self) -> aiomqtt.Client:
         options = self._options
@@ -164,6 +182,7 @@ class MqttPublisher:
             keepalive=options.keepalive_s,
             timeout=self._confirm_s,
             max_queued_incoming_messages=_INCOMING,
+            logger=_LOG,
             tls_context=self._tls,
         )
 
@@ -268,36 +287,16 @@ class MqttPublisher:
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Answer commands; ends with `MqttError` when the connection does."""
         prefix = f"{self._base}/cmd/"
-        if self._on_command is not None and self._options.commands:
-            await client.subscribe([(prefix + name, 1) for name in self._options.commands])
+        if self._commands is not None:
+            await client.subscribe(f"{prefix}+", 1)
             _honour_cancellation()
         async for message in client.messages:
-            name = message.topic.value.removeprefix(prefix)
             payload = message.payload
-            if name in COMMANDS and isinstance(payload, bytes) and self._on_command is not None:
-                self._enqueue(REPLY, self._answer(name, payload, message.retain, self._on_command))
-
-    def _answer(self, name: str, payload: bytes, retained: bool, handler: Handler) -> ReplyMessage:
-        request_id: str | None = None
-        ok = False
-        try:
-            command = parse(name, payload)
-            request_id = command.id
-            if retained:
-                # It would be carried out again at every connection.
-                raise CommandRefusedError("commands must not be retained")
-            text = handler(command)
-            ok = True
-        except BadCommandError as error:
-            request_id, text = error.id, str(error)
-        except CommandRefusedError as error:
-            text = str(error)
-        except Exception as error:  # a fault of ours must not cost the connection
-            text = f"failed: {error!r}"
-            self._on_event("mqtt_command_failed", f"{name}: {error!r}")
-        self.counters["mqtt_commands" if ok else "mqtt_commands_refused"] += 1
-        t_utc, t_ms = stamp(self._utc_now())
-        return ReplyMessage(t_utc=t_utc, t_ms=t_ms, id=request_id, command=name, ok=ok, text=text)
+            if self._commands is not None and isinstance(payload, bytes):
+                name = message.topic.value.removeprefix(prefix)
+                reply = self._commands.answer(name, payload, message.retain)
+                if reply is not None:
+                    self._enqueue(REPLY, reply)
 
 
 def _encoded(message: Message) -> bytes:

@@ -349,7 +349,8 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 await bench.mode(Mode.ALIGNING)
                 # Told where it is, it can start without any receiver.
                 reply = await ask("set_position", here)
-                assert (reply["ok"], reply["text"]) == (True, "position taken")
+                assert reply["ok"], reply
+                assert reply["text"].startswith(("position taken: aligning", "position fused"))
                 await bench.mode(Mode.NAVIGATING)
                 await until(lambda: bench.health["rdss"].state == "running")
                 reply = await ask("request_fix", {})
@@ -363,9 +364,20 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 reply = await ask("set_position", {**here, "lat_deg": 91.0})
                 assert not reply["ok"]
                 assert "lat_deg" in reply["text"]
-                # While it navigates it is a fix like any other.
+                # While it navigates it is a fix like any other; the reply says how it ended.
                 reply = await ask("set_position", here)
-                await until(lambda: bench.health["operator"].fused >= 1)
+                assert reply["ok"], reply
+                assert reply["text"].startswith("position fused: it was ")
+                far = {**here, "lat_deg": here["lat_deg"] + 2.7}
+                reply = await ask("set_position", far)
+                assert not reply["ok"]
+                assert "position gated: it is 300" in reply["text"]
+                assert "force = true" in reply["text"]
+                assert abs(math.degrees(bench.seen[-1].lat_rad) - here["lat_deg"]) < 0.01
+                reply = await ask("set_position", {**far, "force": True})
+                assert reply["ok"], reply
+                assert reply["text"] == "position taken: aligning from it"
+                await bench.mode(Mode.ALIGNING)
     modes = [json.loads(p)["mode"] for p in listener.payloads("fusiond/test/status")]
     assert {"waiting", "aligning", "navigating"} <= set(modes)
 

@@ -33,6 +33,9 @@ from tests.clock.host_time import Host, S
         ("driver_fault", "error"),
         ("bus_open_failed", "error"),
         ("bus_off", "error"),
+        ("saved_state_damaged", "warning"),
+        ("warm_start_refused", "warning"),
+        ("client_name_taken", "warning"),
     ],
 )
 def test_the_code_gives_the_level(code: str, level: str) -> None:
@@ -45,11 +48,15 @@ def test_an_event_is_logged_and_every_listener_hears_it(caplog: pytest.LogCaptur
     events.report("gnss", "early", "before there is a listener")
     first: list[EventMessage] = []
     second: list[EventMessage] = []
-    events.listeners += [first.append, second.append]
+    events.listen(first.append)
+    events.listen(second.append)
     events.report("imu", "driver_fault", "a defect: restarting it")
-    assert first == second
     heard = [(e.source, e.code, e.level, e.text) for e in first]
-    assert heard == [("imu", "driver_fault", "error", "a defect: restarting it")]
+    assert heard == [
+        ("gnss", "early", "info", "before there is a listener"),
+        ("imu", "driver_fault", "error", "a defect: restarting it"),
+    ]
+    assert second == first[1:]
     assert [(r.levelno, r.getMessage()) for r in caplog.records] == [
         (logging.INFO, "gnss: early: before there is a listener"),
         (logging.ERROR, "imu: driver_fault: a defect: restarting it"),

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
+from pathlib import Path
 
-from fusiond.live.process_usage import ProcessUsage
+import pytest
+
+from fusiond.live import process_usage
+from fusiond.live.process_usage import ProcessUsage, release_compiler_pages
 
 
 def test_process_usage() -> None:
@@ -13,7 +18,23 @@ def test_process_usage() -> None:
     sum(i * i for i in range(200_000))
     percent, resident_mb = usage.sample()
     assert 0.0 < percent <= 400.0
+    assert resident_mb is not None
     assert 5.0 < resident_mb < 4000.0
+
+
+@pytest.mark.parametrize("content", [None, "", "12", "a b c", "\xff"])
+def test_a_figure_that_the_kernel_does_not_show_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str | None
+) -> None:
+    """As under `ProcSubset=pid` of systemd, or without /proc."""
+    if content is not None:
+        (tmp_path / "statm").write_text(content)
+    monkeypatch.setattr(process_usage, "STATM", tmp_path / "statm")
+    monkeypatch.setattr(process_usage, "MAPS", tmp_path / "maps")
+    percent, resident_mb = ProcessUsage().sample()
+    assert math.isfinite(percent)
+    assert resident_mb is None
+    release_compiler_pages()
 
 
 def test_the_compiler_gives_its_pages_back_and_still_works() -> None:

@@ -115,6 +115,6 @@ EXAMPLES: dict[str, Any] = {
         id="a1",
         command="set_position",
         ok=True,
-        text="position set, sigma 5 m",
+        text="position fused: it was 3 m from the solution",
     ),
 }

@@ -6,6 +6,7 @@ import asyncio
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,10 +16,17 @@ import pytest
 
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Mqtt
+from fusiond.outputs.command_intake import BURST, CommandIntake
 from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.reconnecting import (
+    LONGEST_CONTESTED_S,
+    PEACE_S,
+    TAKEN_COUNT,
+    Reconnecting,
+)
 from fusiond.outputs.topics import EVENT, HEALTH, NAV, STATUS
 from tests.broker import Broker, Listener, listening
 from tests.outputs.messages_examples import EXAMPLES
@@ -356,15 +364,128 @@ async def test_commands_that_are_not_configured_do_nothing(tmp_path: Path) -> No
             async with running(enabled, on_command=handler(taken)):
                 await listener.until(heard("online"))
                 await client.publish(f"{BASE}/cmd/request_fix", b'{"id":"1"}', qos=1)
+                await client.publish(f"{BASE}/cmd/reset_fliter", b'{"id":"1"}', qos=1)
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"2"}', qos=1)
-                reply = json.loads((await listener.until(heard("reply")))[0])
-                assert reply["id"] == "2"
+                raw = await listener.until(lambda li: len(r := heard("reply")(li)) == 3 and r)
+                replies = [json.loads(reply) for reply in raw]
+                assert [(r["id"], r["ok"]) for r in replies] == [
+                    ("1", False),
+                    (None, False),
+                    ("2", True),
+                ]
+                assert "not listed in mqtt.commands" in replies[0]["text"]
+                assert "no such command; there are set_position" in replies[1]["text"]
             async with running(options(broker), on_command=handler(taken)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"3"}', qos=1)
                 it.publisher.publish_event(event("after the command"))
                 await listener.until(heard("event"))
     assert [c.id for c in taken] == ["2"]
+
+
+async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(tmp_path: Path) -> None:
+    taken: list[Command] = []
+    flood = 3000
+    with Broker(tmp_path) as broker:
+        async with (
+            listening(broker, f"{BASE}/#") as (listener, _),
+            running(options(broker, commands=("reset_filter",)), on_command=handler(taken)) as it,
+        ):
+            await listener.until(heard("online"))
+            sender = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-c", FLOOD, str(broker.port), str(flood))
+            )
+            sent = 0
+            while sender.returncode is None:
+                it.publisher.publish_nav(nav(float(sent)))
+                sent += 1
+                await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
+            it.publisher.publish_event(event("after the flood"))
+            await listener.until(heard("event"))
+    replies = [json.loads(p) for p in heard("reply")(listener)]
+    refused = [r for r in replies if not r["ok"]]
+    assert it.publisher.counters["mqtt_commands_limited"] > 0
+    assert len(taken) >= BURST
+    assert len(replies) - len(refused) == len(taken)
+    assert len(refused) < 5
+    assert all("too many commands" in r["text"] for r in refused)
+
+
+FLOOD = """
+import sys
+import paho.mqtt.client as mqtt
+client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+client.connect("127.0.0.1", int(sys.argv[1]))
+client.loop_start()
+for _ in range(int(sys.argv[2])):
+    last = client.publish("fusiond/truck/cmd/reset_filter", b'{"id": "flood"}', qos=1)
+last.wait_for_publish()
+"""
+
+
+def test_the_bucket_fills_at_its_rate_and_the_first_of_a_row_is_answered() -> None:
+    now_s = 100.0
+    counters: Counter[str] = Counter()
+    intake = CommandIntake(
+        ("reset_filter",),
+        handler([]),
+        counters,
+        lambda *_: None,
+        lambda: UTC_NS,
+        lambda: now_s,
+    )
+
+    def ask() -> bool | None:
+        reply = intake.answer("reset_filter", b'{"id":"1"}', False)
+        return None if reply is None else reply.ok
+
+    assert [ask() for _ in range(23)] == [True] * 20 + [False, None, None]
+    now_s += 1.0
+    assert [ask() for _ in range(7)] == [True] * 5 + [None] * 2  # the same row
+    now_s += 10.0
+    assert [ask() for _ in range(22)] == [True] * 20 + [False, None]
+    assert counters == {"mqtt_commands": 45, "mqtt_commands_limited": 7}
+
+
+# ------------------------------------------------------------------ another client of our name
+
+
+async def test_two_of_one_name_say_so_and_stop_throwing_each_other_out(tmp_path: Path) -> None:
+    with Broker(tmp_path) as broker:
+        async with running(options(broker)) as a, running(options(broker)) as b:
+            await a.until(lambda r: "client_name_taken" in r.codes() + b.codes())
+            told = a if "client_name_taken" in a.codes() else b
+            assert told.publisher.counters["mqtt_taken_over"] >= 1
+            text = dict(told.events)["client_name_taken"]
+            assert "'fusiond-truck'" in text
+            assert "mqtt.client_id" in text
+            # Whoever is in now stays, until the one that waits comes back: seconds, not 250 ms.
+            assert told.publisher.status.state == "absent"
+            assert "another client" in told.publisher.status.detail
+            ended = a.codes().count("mqtt_lost") + b.codes().count("mqtt_lost")
+            assert ended <= 2 * TAKEN_COUNT
+
+
+def test_a_rival_is_told_from_a_broker_that_restarts() -> None:
+    rival = Reconnecting()
+    assert [rival.ended(0.3, by_broker=True) for _ in range(4)] == [False, False, True, False]
+    waits = [rival.wait_s() for _ in range(6)]
+    assert waits == [5.0, 10.0, 20.0, 40.0, LONGEST_CONTESTED_S, LONGEST_CONTESTED_S]
+    assert not rival.ended(50.0, by_broker=True)
+    assert rival.taken  # a rival waits as long
+    rival.ended(PEACE_S + 1.0, by_broker=True)
+    assert not rival.taken
+    assert rival.wait_s() < 1.0
+
+    restarting = Reconnecting()
+    for _ in range(5):
+        restarting.ended(0.3, by_broker=True)
+        restarting.failed()
+    frozen = Reconnecting()
+    for _ in range(5):
+        frozen.ended(2.0, by_broker=False)
+    assert not restarting.taken
+    assert not frozen.taken
 
 
 async def test_supervisor_is_a_plain_task(tmp_path: Path) -> None:

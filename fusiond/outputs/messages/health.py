@@ -80,7 +80,7 @@ class HealthMessage(Message):
     system_clock_error_s: Number
     clock_counters: dict[str, Count]
     cpu_percent: float = Field(description="of one core")
-    memory_mb: float = Field(description="resident, 10^6 bytes")
+    memory_mb: float | None = Field(description="resident, 10^6 bytes; null if not known")
 
 
 def health_message(
@@ -90,7 +90,7 @@ def health_message(
     scheduler: SchedulerStatus,
     clock: ClockStatus,
     cpu_percent: float,
-    memory_mb: float,
+    memory_mb: float | None,
 ) -> HealthMessage:
     """`health` from the parts' own snapshots."""
     t_utc, t_ms = stamp(utc_ns)
@@ -109,5 +109,5 @@ def health_message(
         system_clock_error_s=clock.system_error_s,
         clock_counters=clock.counters,
         cpu_percent=round(cpu_percent, 1),
-        memory_mb=round(memory_mb, 1),
+        memory_mb=None if memory_mb is None else round(memory_mb, 1),
     )

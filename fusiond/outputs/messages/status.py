@@ -26,6 +26,8 @@ class StatusMessage(Message):
     mqtt_published: Count
     mqtt_dropped: Count
     mqtt_reconnects: Count
+    mqtt_taken_over: Count
+    mqtt_commands_limited: Count
 
 
 def status_message(
@@ -61,4 +63,6 @@ def status_message(
         mqtt_published=mqtt.get("mqtt_published", 0),
         mqtt_dropped=mqtt.get("mqtt_dropped", 0),
         mqtt_reconnects=mqtt.get("mqtt_reconnects", 0),
+        mqtt_taken_over=mqtt.get("mqtt_taken_over", 0),
+        mqtt_commands_limited=mqtt.get("mqtt_commands_limited", 0),
     )

@@ -1,0 +1,68 @@
+"""A daemon that is killed (SIGKILL) at random instants of a drive and started again:
+
+    python benchmarks/kill_nine.py [TIMES] [--seed S]
+
+A line of JSON for each restart (`tests.live.kill_nine.Restart`), and last a summary: how many were
+warm, the longest wait for the first output and from the first data to the solution, and how many
+first errors, and errors of the two seconds after them, were beyond three sigma.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.live.kill_nine import Restart, as_row, driving, killed
+
+# A restart, what is watched after it, and a new alignment where the gap was too long.
+SECONDS_EACH = 60.0
+
+
+async def measure(folder: Path, times: int, seed: int) -> list[Restart]:
+    """The restarts of one drive, told as they come."""
+    found: list[Restart] = []
+    async with driving(folder, 60.0 + SECONDS_EACH * times, seed) as vehicle:
+        async for restart in killed(folder, vehicle, times, seed):
+            print(as_row(restart), flush=True)
+            found.append(restart)
+    return found
+
+
+def summary(found: list[Restart]) -> dict[str, float | int]:
+    """Counts and greatest figures."""
+    warm = [r for r in found if not math.isnan(r.gap_s)]
+    return {
+        "kills": len(found),
+        "warm": len(warm),
+        "first_beyond_3_sigma": sum(r.first_ratio > 3.0 for r in found),
+        "first_greatest_ratio": round(max(r.first_ratio for r in found), 2),
+        "later_beyond_3_sigma": sum(r.ratio > 3.0 for r in found),
+        "later_greatest_ratio": round(max(r.ratio for r in found), 2),
+        "first_output_s": round(max(r.first_output_s for r in found), 2),
+        "first_output_median_s": round(sorted(r.first_output_s for r in found)[len(found) // 2], 2),
+        "warm_solution_s": round(max((r.solution_s for r in warm), default=math.nan), 3),
+        "warm_first_error_m": round(max((r.first_error_m for r in warm), default=math.nan), 1),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("times", type=int, nargs="?", default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
+    with tempfile.TemporaryDirectory(prefix="fusiond-kill-") as folder:
+        found = asyncio.run(measure(Path(folder), args.times, args.seed))
+    print(json.dumps(summary(found), indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""The navigation state in memory that outlives the process: for a start moments after its end.
+
+It lies in systemd's runtime directory, a tmpfs: written twice a second it would wear out flash (at
+6 kB each 45 MB an hour), and after a power cut it is worth nothing anyway, because its clock has
+begun anew. Writing is left to a thread; a tick only copies the arrays.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from fusiond.configuration.load import config_digest
+from fusiond.configuration.schema import Config
+from fusiond.live.scheduler import SECOND_NS, Every
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.state_file import (
+    DamagedStateError,
+    RefusedStateError,
+    read_state,
+    set_aside,
+    write_state,
+)
+from fusiond.navigator.warm_start import (
+    RESTARTED,
+    WARM_STATE,
+    WarmStart,
+    WarmState,
+    same_run,
+    warm_state,
+)
+
+log = logging.getLogger("fusiond")
+
+# The age of the snapshot is part of the gap that a restart has to cross; half a second is small
+# against the start of the process.
+SNAPSHOT_NS = SECOND_NS // 2
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+class WarmKeeper:
+    """Keeps one vehicle's navigation state in systemd's runtime directory, else not.
+
+    `on_event(code, text)` hears `warm_state_damaged` and `warm_state_refused`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        on_event: Callable[[str, str], None],
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        directory = environ.get("RUNTIME_DIRECTORY")
+        self._boot_id = _boot_id()
+        self._path: Path | None = None
+        if directory and self._boot_id:
+            self._path = Path(directory.split(":")[0]) / f"{config.vehicle}.warm.json"
+        self._config = config_digest(config)
+        self._event = on_event
+        self._due = Every(SNAPSHOT_NS)
+        self._working: asyncio.Task[None] | None = None
+        self._failing = False
+
+    def offer(self, navigator: Navigator) -> None:
+        """Let the navigator start from the state of the last run, if it is one of this boot."""
+        if self._path is None:
+            return
+        try:
+            state = read_state(self._path, WARM_STATE)
+            if state is None:
+                return
+            same_run(state, self._config, self._boot_id, _asleep_ns())
+            navigator.warm = WarmStart(state, navigator.model)
+        except DamagedStateError as error:
+            self._event("warm_state_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
+        except RefusedStateError as error:
+            self._event("warm_state_refused", f"{self._path}: {error}")
+
+    def keep(self, t_ns: int, solution: Solution, navigator: Navigator) -> None:
+        """Renew the file, if it is due and the solution is worth it."""
+        busy = self._working is not None and not self._working.done()
+        if self._path is None or busy or not self._due.due(t_ns):
+            return
+        state = self._state(solution, navigator)
+        if state is not None:
+            self._working = asyncio.create_task(asyncio.to_thread(self._write, self._path, state))
+
+    async def close(self, solution: Solution | None, navigator: Navigator) -> None:
+        """Keep the last state, after what is under way has ended: `restart` is a gap, too."""
+        if self._working is not None:
+            await asyncio.wait([self._working])
+        state = None if solution is None else self._state(solution, navigator)
+        if self._path is not None and state is not None:
+            await asyncio.to_thread(self._write, self._path, state)
+
+    def _state(self, solution: Solution, navigator: Navigator) -> WarmState | None:
+        usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
+        if navigator.started is None or navigator.on_trial or not usable:
+            return None
+        try:
+            return warm_state(
+                navigator.estimator,
+                navigator.imu,
+                navigator.started.how.partition(RESTARTED)[0],
+                self._config,
+                self._boot_id,
+                _asleep_ns(),
+            )
+        except ValidationError as error:
+            self._told(f"warm state not kept: {error.errors(include_url=False)[0]}")
+            return None
+
+    def _write(self, path: Path, state: WarmState) -> None:
+        try:
+            write_state(path, WARM_STATE.dump_json(state), durable=False)
+            self._failing = False
+        except OSError as error:
+            self._told(f"warm state not kept: {error}")
+
+    def _told(self, text: str) -> None:
+        """Once a row of failures: it would be twice a second."""
+        if not self._failing:
+            self._failing = True
+            log.warning("%s", text)
+
+
+def _boot_id() -> str:
+    """Which boot of this computer it is; empty where the kernel does not say."""
+    try:
+        return BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
+
+
+def _asleep_ns() -> int:
+    """How long this boot has been suspended, ns: a monotonic clock that stood still."""
+    asleep = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(
+        time.CLOCK_MONOTONIC
+    )
+    return max(0, asleep)

@@ -1,0 +1,89 @@
+"""Small files of state that a start reads: written whole or not at all, believed once validated.
+
+A start must outlive whatever lies at the path: nothing, half a file, a directory, a pipe, numbers
+that no vehicle has. So the size is looked at before anything is read, a parser that bounds depth
+and numbers reads it, a model of the state judges ranges, and what fails any of that is put aside,
+where a person can look at it and the next start does not meet it again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+State = TypeVar("State")
+
+# The longest state, a covariance of the widest model (32 states, 528 numbers of 25 characters),
+# has 15 kB; what is larger is none of ours.
+MOST_BYTES = 65_536
+
+
+class DamagedStateError(Exception):
+    """What lies at the path is no state: the text says why."""
+
+
+class RefusedStateError(Exception):
+    """The state is sound but cannot be used now: the text says why."""
+
+
+def read_state(path: Path, kind: TypeAdapter[State]) -> State | None:
+    """The state at `path`, None where nothing is. Raises `DamagedStateError` for all else."""
+    try:
+        # A pipe without a writer would hold up the start.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            about = os.fstat(descriptor)
+            if not stat.S_ISREG(about.st_mode):
+                raise DamagedStateError("not a regular file")
+            if about.st_size > MOST_BYTES:
+                raise DamagedStateError(f"{about.st_size} bytes, at most {MOST_BYTES} are read")
+            text = os.read(descriptor, MOST_BYTES)
+        finally:
+            os.close(descriptor)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DamagedStateError(error.strerror or str(error)) from error
+    try:
+        return kind.validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "file"
+        raise DamagedStateError(f"{where}: {first['msg']}") from error
+
+
+def write_state(path: Path, text: bytes, durable: bool) -> None:
+    """Write whole: whenever the process dies, the old file or the new one is there. OSError passes.
+
+    `durable`: also after a power cut; it costs the disk two flushes.
+    """
+    temporary = path.with_name(path.name + ".new")
+    with contextlib.suppress(FileNotFoundError):
+        temporary.unlink()
+    with temporary.open("xb") as file:
+        file.write(text)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+    temporary.replace(path)
+    if durable:
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def set_aside(path: Path) -> str:
+    """Rename what lies at `path`, so that the next start does not meet it; what became of it."""
+    aside = path.with_name(path.name + ".bad")
+    try:
+        path.rename(aside)
+    except OSError as error:
+        return f"it stays: {error.strerror}"
+    return f"kept as {aside}"

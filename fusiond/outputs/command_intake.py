@@ -1,0 +1,102 @@
+"""Commands as they come off the broker: how many are taken, which, and what each is answered.
+
+The rate is bounded by a token bucket: it holds `BURST` tokens, gains `RATE_HZ` a second, and a
+command takes one. A command without a token is not read; the first of a row is answered, the row
+ends when the bucket is full again. Every command and every reply costs the tick's own loop time, so
+a client that has run wild costs an addition and a comparison each.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+
+from fusiond.outputs.commands import (
+    COMMANDS,
+    BadCommandError,
+    CommandRefusedError,
+    Handler,
+    parse,
+)
+from fusiond.outputs.messages.base import stamp
+from fusiond.outputs.messages.reply import ReplyMessage
+
+# What a person means: a few clicks a second, and a script that sends a screenful at once.
+RATE_HZ = 5.0
+BURST = 20.0
+# The longest command name is 13 characters; of what is none so much is repeated.
+_NAME_SHOWN = 40
+
+
+class CommandIntake:
+    """Answers commands; `allowed` are those that the configuration lists.
+
+    `counters`: `mqtt_commands`, `mqtt_commands_refused`, `mqtt_commands_limited`. `on_event` hears
+    `mqtt_command_failed`, `now` is monotonic, s.
+    """
+
+    def __init__(
+        self,
+        allowed: tuple[str, ...],
+        handler: Handler,
+        counters: Counter[str],
+        on_event: Callable[[str, str], None],
+        utc_now: Callable[[], int | None],
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._allowed = allowed
+        self._handler = handler
+        self._counters = counters
+        self._on_event = on_event
+        self._utc_now = utc_now
+        self._now = now
+        self._tokens, self._filled_s = BURST, now()
+        self._limiting = False
+
+    def answer(self, name: str, payload: bytes, retained: bool) -> ReplyMessage | None:
+        """Carry the command out; the reply, None for one of too many that is not answered."""
+        now_s = self._now()
+        self._tokens = min(BURST, self._tokens + RATE_HZ * (now_s - self._filled_s))
+        self._filled_s = now_s
+        if self._tokens >= 1.0:
+            self._limiting = self._limiting and self._tokens < BURST
+            self._tokens -= 1.0
+            return self._answer(name, payload, retained)
+        self._counters["mqtt_commands_limited"] += 1
+        if self._limiting:
+            return None
+        self._limiting = True
+        text = f"too many commands: {RATE_HZ:.0f} a second are taken, the rest is not answered"
+        return self._reply(name, None, False, text)
+
+    def _answer(self, name: str, payload: bytes, retained: bool) -> ReplyMessage:
+        request_id: str | None = None
+        ok = False
+        try:
+            if name not in COMMANDS:
+                raise BadCommandError(f"no such command; there are {', '.join(COMMANDS)}")
+            command = parse(name, payload)
+            request_id = command.id
+            if name not in self._allowed:
+                raise CommandRefusedError("not listed in mqtt.commands of the configuration")
+            if retained:
+                # It would be carried out again at every connection.
+                raise CommandRefusedError("commands must not be retained")
+            text = self._handler(command)
+            ok = True
+        except BadCommandError as error:
+            request_id, text = error.id, str(error)
+        except CommandRefusedError as error:
+            text = str(error)
+        except Exception as error:  # a fault of ours must not cost the connection
+            text = f"failed: {error!r}"
+            self._on_event("mqtt_command_failed", f"{name}: {error!r}")
+        self._counters["mqtt_commands" if ok else "mqtt_commands_refused"] += 1
+        return self._reply(name, request_id, ok, text)
+
+    def _reply(self, name: str, request_id: str | None, ok: bool, text: str) -> ReplyMessage:
+        t_utc, t_ms = stamp(self._utc_now())
+        return ReplyMessage(
+            t_utc=t_utc, t_ms=t_ms, id=request_id, command=name[:_NAME_SHOWN], ok=ok, text=text
+        )

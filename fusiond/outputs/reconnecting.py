@@ -1,0 +1,53 @@
+"""When to try the broker again, and how to know that another client has our name.
+
+A broker ends the older of two connections of one client identifier (MQTT 3.1.1, 3.1.4-2). In that
+version it does not say why; but a connection that it ends moments after it was made, again and
+again, is the mark of a rival who comes back as we do. Each then waits longer, or the two would
+throw each other out several times a second for ever.
+"""
+
+from __future__ import annotations
+
+from drivers.base import Backoff
+
+# A rival that reconnects as we do is back within the longest ordinary wait, 5 s; so a connection
+# was taken over if it was ended within twice that.
+TAKEN_WITHIN_S = 10.0
+# Once may be a broker that restarts, twice its configuration being tried out.
+TAKEN_COUNT = 3
+# With a rival each waits at most a minute; peace is a connection that outlives two such waits.
+LONGEST_CONTESTED_S = 60.0
+PEACE_S = 2.0 * LONGEST_CONTESTED_S
+
+
+class Reconnecting:
+    """Waits between connections; `taken` while another client seems to have our name."""
+
+    def __init__(self) -> None:
+        self.taken = False
+        self._ordinary = Backoff()
+        self._contested = Backoff(first_s=5.0, longest_s=LONGEST_CONTESTED_S)
+        self._in_a_row = 0
+
+    def failed(self) -> None:
+        """No connection came about: the broker is away, or was."""
+        self._in_a_row = 0
+
+    def ended(self, lasted_s: float, by_broker: bool) -> bool:
+        """A connection has ended; whether it tells, as the first to do so, of a rival."""
+        if lasted_s > PEACE_S:
+            self.taken = False
+            self._contested.reset()
+        if not by_broker or lasted_s > TAKEN_WITHIN_S:
+            self._in_a_row = 0
+            self._ordinary.reset()
+            return False
+        self._in_a_row += 1
+        if self._in_a_row < TAKEN_COUNT or self.taken:
+            return False
+        self.taken = True
+        return True
+
+    def wait_s(self) -> float:
+        """How long to wait before the next attempt, s."""
+        return (self._contested if self.taken else self._ordinary).next()

@@ -1,0 +1,240 @@
+"""A daemon in a process of its own that is killed while the vehicle drives, and what comes after.
+
+The vehicle is simulated here, on a multicast bus and a pseudo terminal; the daemon tells every
+solution on its standard output, stamped by the monotonic clock that both processes share. The next
+process is there, with Python and the kernels loaded, before the last is killed, and begins after a
+pause that is drawn: how long a gap is does not hang on how busy this computer is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import os
+import random
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.solution import Mode
+from fusiond.navigator.warm_start import LONGEST_GAP_S
+from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
+from fusiond.simulation.scenarios import SCENARIOS
+from fusiond.simulation.trajectories import drive
+from fusiond.simulation.vehicle import SimulatedVehicle
+from tests.hil.processes import SIM_IMU
+from tests.patience import PATIENCE_S
+
+CONFIG = """
+vehicle = "killed"
+[imu]
+axes = ["+x", "-y", "-z"]
+{imu}
+[sources.gnss]
+driver = "nmea"
+port = "{folder}/gnss"
+[aiding.gnss]
+lever_arm_m = [0.0, 0.0, -1.0]
+[alignment]
+heading = ["gnss_course"]
+[mqtt]
+enabled = false
+"""
+DAEMON = """
+import asyncio, json, logging, sys
+from pathlib import Path
+from fusiond.configuration.load import load_config
+from fusiond.live.daemon import Daemon
+
+def say(s):
+    figures = s.lat_rad, s.lon_rad, *s.sd_ned_m[:2], *s.v_ned_m_s[:2]
+    print(json.dumps([s.t_ns, s.mode, s.reason, *figures]), flush=True)
+
+logging.basicConfig(stream=sys.stderr, level=logging.INFO)
+print("loaded", flush=True)
+sys.stdin.readline()
+asyncio.run(Daemon(load_config(Path(sys.argv[1])), on_solution=say).run(asyncio.Event()))
+"""
+NAVIGATED = (Mode.NAVIGATING, Mode.COASTING)
+WATCHED_S = 2.0
+"""How long position and sigma are compared after each restart."""
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """A solution as it left the process; `position` rad, `sd` m north and east."""
+
+    t_ns: int
+    mode: Mode
+    reason: str
+    position: tuple[float, float]
+    sd: tuple[float, float]
+    speed_m_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """What came of one kill. `first_output_s` from when it may begin, `solution_s` from the
+    first data to the first solution, `first_ratio` its error north or east in sigmas, `ratio` the
+    greatest until `WATCHED_S` later. `gap_s` is NaN if the restart was not a warm one."""
+
+    speed_m_s: float
+    first_output_s: float
+    solution_s: float
+    gap_s: float
+    first_sd_m: float
+    first_error_m: float
+    first_ratio: float
+    ratio: float
+
+
+class Daemon:
+    """The process, its log, and what it says. `log` is shared by all of a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._log = folder / "daemon.log"
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def load(self) -> Daemon:
+        """Start it, and wait until it has loaded its code."""
+        with self._log.open("ab") as log:
+            self._process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-c", DAEMON, str(self._folder / "killed.toml")),
+                env={**os.environ, "RUNTIME_DIRECTORY": str(self._folder)},
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=log,
+            )
+        assert await self._line() == b"loaded\n"
+        return self
+
+    async def begin(self) -> None:
+        """Let it begin."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.write(b"\n")
+        await self._process.stdin.drain()
+
+    async def said(self) -> Said:
+        """The next solution."""
+        line = await self._line()
+        t_ns, mode, reason, lat, lon, north, east, v_n, v_e = json.loads(line)
+        return Said(t_ns, Mode(mode), reason, (lat, lon), (north, east), math.hypot(v_n, v_e))
+
+    async def _line(self) -> bytes:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        async with asyncio.timeout(PATIENCE_S):
+            line = await self._process.stdout.readline()
+        assert line, self._log.read_text()
+        return line
+
+    async def kill(self) -> None:
+        """SIGKILL: nothing is put in order."""
+        if self._process is not None and self._process.returncode is None:
+            self._process.kill()
+            await self._process.communicate()
+
+
+@asynccontextmanager
+async def driving(folder: Path, seconds: float, seed: int) -> AsyncIterator[SimulatedVehicle]:
+    """A vehicle under way, and the configuration of a daemon for it."""
+    dice = random.Random(os.getpid() * 1000 + seed)
+    bus = {"interface": "udp_multicast", "channel": f"239.{dice.randrange(64, 250)}.163.2"}
+    (folder / "killed.toml").write_text(CONFIG.format(imu=SIM_IMU.format(**bus), folder=folder))
+    scenario = replace(SCENARIOS["drive"], path=partial(drive, rest_s=5.0))
+    vehicle = SimulatedVehicle(
+        scenario,
+        seed=seed,
+        duration_s=seconds,
+        can_imu=SIM_IMU_OPTIONS.model_copy(update=bus),
+        gnss_link=folder / "gnss",
+    )
+    task = asyncio.create_task(vehicle.run())
+    try:
+        yield vehicle
+        assert not task.done(), task
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def killed(
+    folder: Path, vehicle: SimulatedVehicle, times: int, seed: int
+) -> AsyncIterator[Restart]:
+    """Kill it at `times` random instants of its navigation; what came of each."""
+    dice = random.Random(seed)
+    daemon, spare = await Daemon(folder).load(), Daemon(folder)
+    try:
+        await daemon.begin()
+        before = await daemon.said()
+        for _ in range(times):
+            loading = asyncio.create_task(spare.load())
+            while before.mode is not Mode.NAVIGATING or not loading.done():
+                before = await daemon.said()
+            until_ns = before.t_ns + round(dice.uniform(0.0, 3.0) * 1e9)
+            while before.t_ns < until_ns or before.mode not in NAVIGATED:
+                before = await daemon.said()
+            await daemon.kill()
+            await asyncio.sleep(dice.uniform(0.0, LONGEST_GAP_S - 1.5))
+            daemon, spare = spare, Daemon(folder)
+            begun_s, speed = time.monotonic(), before.speed_m_s
+            await daemon.begin()
+            restart, before = await _watched(daemon, vehicle, begun_s)
+            yield replace(restart, speed_m_s=speed)
+    finally:
+        await daemon.kill()
+        await spare.kill()
+
+
+async def _watched(
+    daemon: Daemon, vehicle: SimulatedVehicle, begun_s: float
+) -> tuple[Restart, Said]:
+    said = await daemon.said()
+    first_output_s = time.monotonic() - begun_s
+    while said.mode is Mode.WAITING:
+        said = await daemon.said()
+    data_ns = said.t_ns
+    while said.mode not in NAVIGATED:
+        said = await daemon.said()
+    first, gap = said, said.reason.partition(", restarted over ")[2].partition(" s")[0]
+    first_error_m, first_ratio = _error(said, vehicle)
+    ratio = first_ratio
+    while said.t_ns - first.t_ns < WATCHED_S * 1e9:
+        if said.mode in NAVIGATED:
+            ratio = max(ratio, _error(said, vehicle)[1])
+        said = await daemon.said()
+    result = Restart(
+        0.0,
+        first_output_s,
+        (first.t_ns - data_ns) * 1e-9,
+        float(gap) if gap else math.nan,
+        math.hypot(*first.sd),
+        first_error_m,
+        first_ratio,
+        ratio,
+    )
+    return result, said
+
+
+def _error(said: Said, vehicle: SimulatedVehicle) -> tuple[float, float]:
+    """How far off it is (m), and the greater of north and east in sigmas."""
+    lat, lon, height = (float(x) for x in vehicle.truth_at(said.t_ns).position[0])
+    north = (said.position[0] - lat) * (meridian_radius(lat) + height)
+    east = (said.position[1] - lon) * (transverse_radius(lat) + height) * math.cos(lat)
+    return math.hypot(north, east), max(abs(north) / said.sd[0], abs(east) / said.sd[1])
+
+
+def as_row(restart: Restart) -> str:
+    """One line of JSON; a figure that there is not is null."""
+    figures = {k: None if math.isnan(v) else round(v, 3) for k, v in asdict(restart).items()}
+    return json.dumps(figures)
