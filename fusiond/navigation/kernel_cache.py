@@ -19,7 +19,6 @@ import os
 import pickle
 import secrets
 import shutil
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -33,9 +32,6 @@ _rebuild: Any = CompileResult._rebuild
 _dumps: Any = dumps
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
-
-# A file is written in milliseconds. Who is robbed of one nevertheless compiles again next time.
-_STRAY_S = 60.0
 
 
 class KernelCache(NullCache):
@@ -76,7 +72,7 @@ class KernelCache(NullCache):
             return  # it holds addresses of this process
         payload: bytes = _dumps(data._reduce())
         path = self._path(signature, data.codegen)
-        written = path.with_suffix(f".{secrets.token_hex(8)}.writing")
+        written = path.with_suffix(f".{os.getpid()}-{secrets.token_hex(8)}.writing")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with written.open("xb") as file:
@@ -94,11 +90,17 @@ class KernelCache(NullCache):
 
 
 def remove_strays(folder: Path) -> None:
-    """Remove what processes left in `folder` that died while they wrote."""
-    oldest = time.time() - _STRAY_S
+    """Remove what processes left in `folder` that died while they wrote.
+
+    Where the folder is shared with other hosts, one may lose a file that it writes just now: it
+    compiles that kernel again at its next start.
+    """
     for written in folder.glob("*.writing"):
-        with contextlib.suppress(OSError):
-            if written.stat().st_mtime < oldest:
+        writer = written.suffixes[-2][1:].partition("-")[0]
+        with contextlib.suppress(OSError, ValueError):
+            try:
+                os.kill(int(writer), 0)  # asks whether it lives
+            except ProcessLookupError:
                 written.unlink()
 
 
