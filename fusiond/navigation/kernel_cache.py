@@ -72,7 +72,7 @@ class KernelCache(NullCache):
             return  # it holds addresses of this process
         payload: bytes = _dumps(data._reduce())
         path = self._path(signature, data.codegen)
-        written = path.with_suffix(f".{os.getpid()}.{secrets.token_hex(8)}.writing")
+        written = path.with_suffix(f".{os.getpid()}-{secrets.token_hex(8)}.writing")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with written.open("xb") as file:
@@ -90,12 +90,17 @@ class KernelCache(NullCache):
 
 
 def remove_strays(folder: Path) -> None:
-    """Remove what processes left in `folder` that died while they wrote: who writes stands in the
-    name. One of another machine that is robbed compiles again next time."""
+    """Remove what processes left in `folder` that died while they wrote.
+
+    Where the folder is shared with other hosts, one may lose a file that it writes just now: it
+    compiles that kernel again at its next start.
+    """
     for written in folder.glob("*.writing"):
-        writer = written.name.split(".")[-3]
-        with contextlib.suppress(OSError):
-            if not Path("/proc", writer).exists():
+        writer = written.suffixes[-2][1:].partition("-")[0]
+        with contextlib.suppress(OSError, ValueError):
+            try:
+                os.kill(int(writer), 0)  # asks whether it lives
+            except ProcessLookupError:
                 written.unlink()
 
 

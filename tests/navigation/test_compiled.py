@@ -184,12 +184,12 @@ def test_a_process_killed_while_it_writes_leaves_no_half_kernel(run: Run, tmp_pa
 def test_a_later_start_removes_what_a_killed_writer_left(run: Run, tmp_path: Path) -> None:
     run("import os; os.replace = lambda *_: os.kill(os.getpid(), 9)\nimport kernels")
     (left,) = (tmp_path / "cache").rglob("*.writing")
-    parts = left.name.split(".")
-    mine = left.with_name(".".join([*parts[:-3], str(os.getpid()), *parts[-2:]]))
-    mine.write_bytes(b"half of a kernel")
+    (writer,) = re.findall(r"\.(\d+)-[0-9a-f]+\.writing$", left.name)
+    alive = left.with_name(left.name.replace(f".{writer}-", f".{os.getpid()}-"))
+    alive.write_bytes(b"half")
     run("import kernels")
     assert not left.exists()
-    assert mine.exists()  # its writer lives
+    assert alive.exists()
     assert len(_kept(tmp_path / "cache")) == 1
 
 
