@@ -116,6 +116,10 @@ class Estimator(Protocol):
         """Estimates (12,): rate bias (rad/s), force bias (m/s^2), rate and force scale (1)."""
 
     @property
+    def isolates(self) -> bool:
+        """Whether it detects and leaves out faulty sources by itself."""
+
+    @property
     def isolated(self) -> dict[str, str]:
         """Sources that a fault detection keeps out of the solution, and why."""
 
@@ -178,6 +182,11 @@ class ErrorStateFilter:
     def covariance(self) -> Array:
         """P (n, n) of the published error state, a view."""
         return self._covs[0, : self.model.size, : self.model.size]
+
+    @property
+    def isolates(self) -> bool:
+        """Whether it detects and leaves out faulty sources by itself."""
+        return False
 
     @property
     def isolated(self) -> dict[str, str]:

@@ -196,7 +196,7 @@ class Timeline:
         aid = entry.aid.at(estimator.nav)
         fold = estimator.update if isolation.believes(aid.source) else estimator.look
         outcome = fold(aid)
-        if outcome.name in JUDGED:
+        if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)

@@ -68,7 +68,7 @@ def test_what_happens_to_the_clock_is_an_event() -> None:
     clock = Clock(ClockOptions(), host)
     events = Events(clock)
     heard: list[EventMessage] = []
-    events.listeners.append(heard.append)
+    events.listen(heard.append)
     Sources(Config(), clock, cast(Any, None), events.report)
     host.suspend(20 * S)
     host.system_error = 2 * S

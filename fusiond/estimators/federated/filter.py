@@ -101,6 +101,11 @@ class FederatedFilter(ErrorStateFilter):
         self._trace: Array = np.zeros(k)
 
     @property
+    def isolates(self) -> bool:
+        """Whether it detects and leaves out faulty sources by itself."""
+        return self.options.fault_detection
+
+    @property
     def isolated(self) -> dict[str, str]:
         """Sources that a fault detection keeps out of the solution, and why."""
         records = zip(self.names, self._faults.records, strict=True)
