@@ -20,7 +20,7 @@ from fusiond.simulation.trajectories import Path, drive, flight, static
 
 ANTENNA_M = (0.0, 0.0, -1.0)
 """Both antennas: on the roof, 1 m above the IMU."""
-CAR_IMU = Imu(axes=("+x", "-y", "-z"), rate_hz=100.0)
+CAR_IMU = Imu(axes=("+x", "-y", "-z"), rate_hz=100.0, gyro_range_deg_s=2000.0, accel_range_g=10.0)
 """As in `config/vehicle.toml`: MEMS, 10 deg/h and 0.1 mg, 0.3 deg/sqrt(h), 0.1 m/s/sqrt(h)."""
 REAR_AXLE_M = (-1.0, 0.0, 0.5)
 """From the IMU of the car to the middle of its rear axle, body axes."""
