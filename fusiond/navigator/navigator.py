@@ -52,7 +52,7 @@ class Navigator:
         self._event = on_event or (lambda code, text: None)
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
-        self._intake = Intake(config.aiding)
+        self._intake = Intake(config.aiding, config.plausibility, self._event)
         self.raw = self._intake.receivers
         self.model = model_of(config, *self._intake.extra_blocks())
         self.imu = ImuBuffer(
