@@ -25,6 +25,7 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
+from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.isolation import Isolation
 from fusiond.navigator.readout import solution_of
@@ -70,6 +71,7 @@ class Navigator:
         self._on_outcome = on_outcome
         self._constraints = ConstraintMaker(config.constraints)
         names = e.federated.sources or tuple(config.aiding)
+        self._failed = FailedAids(self._event)
         self._isolation = Isolation(self.estimator, names, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
@@ -119,7 +121,11 @@ class Navigator:
         """A measurement valid at `t_ns`; returns `accepted` or the name of its refusal."""
         if seen_ns and t_ns > seen_ns + AHEAD_NS:
             return self._refuse(m.source, "from_future")
-        aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
+        try:
+            aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
+        except RAISED_BY_NUMBERS as error:
+            self._failed.tell(m.source, repr(error))
+            return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
@@ -168,6 +174,11 @@ class Navigator:
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
+        what = broken(self.estimator)
+        if what is not None:
+            self._event("filter_not_finite", f"{what}: aligning anew")
+            self.reset(what)
+            return
         self._isolation.tell()
 
     def isolated(self, source: str) -> str | None:
@@ -235,5 +246,7 @@ class Navigator:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
         if outcome is not None:
             entry.aid.judged(outcome.rows, outcome.whitened)
+        if entry.error:
+            self._failed.tell(entry.aid.source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 
 Key = tuple[int, str, int]
 
@@ -34,12 +35,14 @@ MOST_WAITING = 4096
 @dataclass(slots=True)
 class Entry:
     """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been looked at: a rewind applies it again."""
+    `judged` that its innovation has been looked at: a rewind applies it again. `error` is what made
+    it `failed`."""
 
     key: Key
     aid: Aid
     outcome: Outcome | None = None
     judged: bool = False
+    error: str = ""
 
 
 @dataclass(slots=True)
@@ -193,7 +196,11 @@ class Timeline:
             self.estimator.release()
         elif feedback == "hold":
             self.estimator.hold()
-        outcome = self.estimator.update(entry.aid.at(self.estimator.nav), inflate=recover)
+        try:
+            outcome = self.estimator.update(entry.aid.at(self.estimator.nav), inflate=recover)
+        except RAISED_BY_NUMBERS as error:
+            entry.error = repr(error)
+            return Outcome("failed")
         if outcome.name == "gated":
             failing[source] = (since, count + 1)
         elif outcome.name == "fused":
