@@ -57,6 +57,9 @@ def process(
         result = run_process(loaded, imu, aids, outages, out, _systems_argument(systems))
     _print_summary(result, err="-" in (json_path, str(out)))
     write_json(result, json_path)
+    if not result["solution_rows"]:
+        typer.echo(f"fusiond: nothing was navigated: {result['why']}", err=True)
+        raise typer.Exit(EXIT_DATA)
 
 
 def simulate(
@@ -156,12 +159,21 @@ def _systems_argument(text: str | None) -> tuple[System, ...] | None:
 
 
 def _print_summary(result: dict[str, Any], err: bool) -> None:
-    """`files`: what was read; `sources`: each aid's measurements by outcome."""
+    """`files`: what was read; `sources`: each aid's measurements by outcome; the solution."""
     for name, report in result["files"].items():
         _print_file(name, report, err)
     for name, outcomes in result["sources"].items():
         counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
         typer.echo(f"{name}: {counts or 'nothing'}", err=err)
+    rows = result["solution_rows"]
+    if not rows:
+        return
+    how = result["aligned"] or "lost again"
+    typer.echo(f"aligned at {result['solution_from_s']:.3f} s: {how}", err=err)
+    samples = result["files"]["imu"]
+    used = samples["rows"] - sum(samples["rejected"].values())
+    modes = ", ".join(f"{n} {mode}" for mode, n in result["solution_modes"].items())
+    typer.echo(f"solution: {rows} of {used} samples: {modes}", err=err)
 
 
 def _print_file(name: str, report: dict[str, Any], err: bool) -> None:

@@ -49,8 +49,9 @@ class GnssAiding(Aiding):
     """Times DOP gives sigma where the receiver sends no GST; see `docs/gnss-nmea.md`."""
     velocity_sd_m_s: PositiveFloat = 0.1
     """Where the receiver states none."""
-    min_position_sd_m: PositiveFloat = 0.02
-    """No smaller sigma is believed."""
+    min_position_sd_m: PositiveFloat | None = None
+    """No smaller sigma is believed; without it by the fix's quality: 0.3 m by code, 0.05 m RTK
+    float, 0.02 m RTK fixed."""
     min_velocity_sd_m_s: PositiveFloat = 0.02
     """No smaller sigma is believed."""
     velocity_delay_s: NonNegativeFloat = 0.0

@@ -28,6 +28,7 @@ from fusiond.configuration.aiding import (
     Section,
     Vector,
 )
+from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
 
 
@@ -298,6 +299,8 @@ class Config(Section):
     """A vehicle. `sources` are devices, `aiding` says how the filter uses what they send."""
 
     vehicle: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")] = "vehicle"
+    vehicle_class: VehicleClass = "road"
+    """What it is: height and speed of no measurement may exceed what its class can do."""
     state_file: Path | None = None
     """Where the last solution is kept for the next start; the unit's state directory by default."""
     imu: Imu = Imu()
@@ -310,6 +313,11 @@ class Config(Section):
     scheduler: Scheduler = Scheduler()
     clock: ClockOptions = ClockOptions()
     mqtt: Mqtt = Mqtt()
+
+    @property
+    def plausibility(self) -> Plausibility:
+        """What a vehicle of this class can do."""
+        return PLAUSIBILITY[self.vehicle_class]
 
     @model_validator(mode="before")
     @classmethod

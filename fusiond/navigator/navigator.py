@@ -25,6 +25,7 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
+from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.left_out import LeftOut
@@ -42,9 +43,6 @@ AHEAD_NS = 200_000_000
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
 # measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
 UNKNOWN_TIME_S = 0.9
-# Faster than any road vehicle (the land speed record stands at 341 m/s), slower than an aircraft's
-# cruise: what is beyond is a filter that has run away.
-MAX_SPEED_M_S = 400.0
 
 
 class Navigator:
@@ -62,7 +60,7 @@ class Navigator:
         self._event = on_event or (lambda code, text: None)
         e, imu = config.estimator, config.imu
         self._noise = imu_noise(imu)
-        self._intake = Intake(config.aiding)
+        self._intake = Intake(config.aiding, config.plausibility, self._event)
         self.raw = self._intake.receivers
         self.model = model_of(config, *self._intake.extra_blocks())
         self.imu = ImuBuffer(
@@ -81,8 +79,9 @@ class Navigator:
         self._on_outcome = on_outcome
         self._constraints = ConstraintMaker(config.constraints)
         names = e.federated.sources or tuple(config.aiding)
+        self._failed = FailedAids(self._event)
         self._left_out = LeftOut(self.timeline, names, self._event)
-        self._standing = Standing(MAX_SPEED_M_S)
+        self._standing = Standing(config.plausibility.max_speed_m_s)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
@@ -142,7 +141,11 @@ class Navigator:
             return self._refuse(m.source, "from_future")
         if sd_time_s > UNKNOWN_TIME_S:
             return self._refuse(m.source, "time_unknown")
-        aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
+        try:
+            aids = self._intake.aids(m, t_ns, sd_time_s, seen_ns)
+        except RAISED_BY_NUMBERS as error:
+            self._failed.tell(m.source, repr(error))
+            return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
@@ -195,8 +198,13 @@ class Navigator:
             self._standing.started(start.t_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
+        what = broken(self.estimator)
+        if what is not None:
+            self._event("filter_not_finite", f"{what}: aligning anew")
+            self.reset(what)
+            return
         e = self.estimator
-        failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav, e.covariance)
+        failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav)
         if failure is not None:
             self._standing.given_up()
             self._event("diverged", f"{failure}: aligning anew")
@@ -298,5 +306,7 @@ class Navigator:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
         if outcome is not None:
             entry.aid.judged(outcome.rows, outcome.whitened)
+        if entry.error:
+            self._failed.tell(entry.aid.source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)

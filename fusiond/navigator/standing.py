@@ -56,13 +56,11 @@ class Standing:
         """It was wrong: the next one is on trial."""
         self._failed = True
 
-    def failure(self, t_ns: int, isolation: Isolation, nav: Array, cov: Array) -> str | None:
+    def failure(self, t_ns: int, isolation: Isolation, nav: Array) -> str | None:
         """Why navigation must begin anew; None while it need not.
 
-        `nav` (10,) and `cov` (n, n) at `t_ns`, the filter's instant.
+        `nav` (10,) at `t_ns`, the filter's instant.
         """
-        if not (np.isfinite(nav).all() and np.isfinite(np.diag(cov)).all()):
-            return "the filter's numbers are not finite"
         speed = math.hypot(nav[VN], nav[VE])
         if speed > self._max_speed:
             return f"{speed:.0f} m/s is faster than this vehicle can be"

@@ -19,6 +19,7 @@ from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 
 Key = tuple[int, str, int]
 
@@ -32,12 +33,14 @@ MOST_WAITING = 4096
 @dataclass(slots=True)
 class Entry:
     """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been looked at: a rewind applies it again."""
+    `judged` that its innovation has been looked at: a rewind applies it again. `error` is what made
+    it `failed`."""
 
     key: Key
     aid: Aid
     outcome: Outcome | None = None
     judged: bool = False
+    error: str = ""
 
 
 @dataclass(slots=True)
@@ -193,9 +196,13 @@ class Timeline:
                 estimator.release()
             case "hold":
                 estimator.hold()
-        aid = entry.aid.at(estimator.nav)
-        fold = estimator.update if isolation.believes(aid.source) else estimator.look
-        outcome = fold(aid)
+        believed = isolation.believes(entry.aid.source)
+        try:
+            aid = entry.aid.at(estimator.nav)
+            outcome = estimator.update(aid) if believed else estimator.look(aid)
+        except RAISED_BY_NUMBERS as error:
+            entry.error = repr(error)
+            return Outcome("failed")
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
             if action is not Action.NONE:

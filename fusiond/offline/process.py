@@ -7,6 +7,7 @@ solution at each sample is what the daemon would have said then, before anything
 from __future__ import annotations
 
 import gc
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -23,11 +24,12 @@ from drivers.measurements import (
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, counts
+from fusiond.files.csv_tables import counts
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.files.tables import ImuTable, read_imu
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import READERS, Arrival, source_of
+from fusiond.offline.reasons import FileRead, nothing_navigated, wrong_units
 
 Array = NDArray[np.float64]
 
@@ -47,6 +49,8 @@ def process(
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
+    Of the solution: its rows, by mode too; when it begins; the sentence `why` where there is none.
+    Samples whose units cannot be what the columns say are not navigated, and no `out` is written.
     `systems` are the satellite systems of raw data to use, instead of the configuration's. Raises
     `TableError` for a file that cannot be read as what it is said to be.
     """
@@ -76,18 +80,18 @@ def _process(
     if any(kind == "raw" for kind, _ in aids):
         config = _with_raw(config, systems)
     imu = read_imu(imu_path)
-    rows_read = len(imu.t_s) + len(imu.rejected)
-    files: dict[str, Any] = {"imu": _account(rows_read, imu.rejected)}
+    imu_span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
+    read = {"imu": FileRead(imu_span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)}
     arrivals: list[Arrival] = []
-    withheld: dict[str, int] = {}
+    withheld: Counter[str] = Counter()
     for kind, path in aids:
         rows, rejected = READERS[kind](path, imu, source_of(kind, config))
-        name = kind if kind not in files else f"{kind}:{path.name}"
-        files[name] = _account(len(rows) + len(rejected), rejected)
+        name = kind if kind not in read else f"{kind}:{path.name}"
+        read[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
         kept = rows
         if outages:
             kept = [row for row in rows if not _withheld(row.measurement, outages)]
-        withheld[kind] = withheld.get(kind, 0) + len(rows) - len(kept)
+        withheld[kind] += len(rows) - len(kept)
         arrivals += kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
 
@@ -95,7 +99,33 @@ def _process(
     navigator = Navigator(
         config, on_event=lambda code, text: events.append({"code": code, "text": text})
     )
-    written = _run(navigator, imu, arrivals, out)
+    why = wrong_units(imu, config.imu, arrivals)
+    recorder = _Recorder(navigator, SolutionWriter(out) if out and why is None else None)
+    if why is None:
+        _run(navigator, imu, arrivals, recorder)
+    mode, reason = navigator.mode(navigator.imu.latest_ns)
+    if why is None and not recorder.rows:
+        why = nothing_navigated(read, navigator.refused, reason)
+    return {
+        "files": {name: _account(file) for name, file in read.items()},
+        "sources": _outcomes(navigator, withheld),
+        "events": events,
+        "solution_rows": recorder.rows,
+        "solution_modes": dict(recorder.modes),
+        "solution_from_s": recorder.first_s,
+        "why": why,
+        "aligned": None if navigator.started is None else navigator.started.how,
+        "mode": str(mode),
+        "reason": reason,
+        "consistency": {
+            name: asdict(report) for name, report in navigator.verdicts.reports().items()
+        },
+        "rewinds": navigator.timeline.counters.rewinds,
+    }
+
+
+def _outcomes(navigator: Navigator, withheld: Counter[str]) -> dict[str, dict[str, int]]:
+    """Of each source's measurements, by name."""
     sources: dict[str, dict[str, int]] = {}
     for source, outcomes in navigator.timeline.counters.outcomes.items():
         sources[source] = {name: count for name, count in outcomes.items() if count}
@@ -106,19 +136,7 @@ def _process(
             sources.setdefault(source, {})["withheld"] = count
     if navigator.imu.counters:
         sources["imu"] = dict(navigator.imu.counters)
-    return {
-        "files": files,
-        "sources": sources,
-        "events": events,
-        "solution_rows": written,
-        "aligned": None if navigator.started is None else navigator.started.how,
-        "mode": str(navigator.mode(navigator.imu.latest_ns)[0]),
-        "reason": navigator.mode(navigator.imu.latest_ns)[1],
-        "consistency": {
-            name: asdict(report) for name, report in navigator.verdicts.reports().items()
-        },
-        "rewinds": navigator.timeline.counters.rewinds,
-    }
+    return sources
 
 
 def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
@@ -131,12 +149,18 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
     return config.model_copy(update={"aiding": {**config.aiding, name: raw}})
 
 
-def _account(rows: int, rejected: list[Rejection]) -> dict[str, Any]:
+def _account(file: FileRead) -> dict[str, Any]:
     return {
-        "rows": rows,
-        "rejected": counts(rejected),
-        "first_rejected": [str(r) for r in rejected[:_SHOWN]],
+        "rows": file.rows,
+        "rejected": counts(file.rejected),
+        "first_rejected": [str(r) for r in file.rejected[:_SHOWN]],
     }
+
+
+def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
+    """Of the measurements' instants; what a satellite broadcasts has none."""
+    valid_ns = [_valid_ns(m) for _, m in rows if not isinstance(m, Ephemeris | Klobuchar)]
+    return (min(valid_ns) * 1e-9, max(valid_ns) * 1e-9) if valid_ns else None
 
 
 def _withheld(m: Measurement | RawEvent, outages: Iterable[tuple[float, float]]) -> bool:
@@ -153,7 +177,7 @@ def _valid_ns(m: Measurement | RawGnssEpoch) -> int:
     return stamp.t_ns
 
 
-def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], out: Path | None) -> int:
+def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], recorder: _Recorder) -> None:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
     samples = np.hstack([imu.gyro, imu.accel])
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
@@ -161,8 +185,6 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], out: Path
     breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
     late = [_is_late(a, navigator.config) for a in arrivals]
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
-    writer = SolutionWriter(out) if out is not None else None
-    recorder = _Recorder(navigator, writer)
     done = given = 0
     while done < len(times) or given < len(arrivals):
         # Samples up to the next arrival that must find the filter where it then stood. One that is
@@ -187,9 +209,7 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], out: Path
             given += 1
             navigator.advance(record=True)
             recorder.take()
-    if writer is not None:
-        writer.close()
-    return recorder.rows
+    recorder.close()
 
 
 def _give(navigator: Navigator, arrival: Arrival) -> None:
@@ -217,13 +237,15 @@ def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
 
 
 class _Recorder:
-    """Takes each sample's solution as it was first known."""
+    """Takes each sample's solution as it was first known; how many, in which modes, from when."""
 
     def __init__(self, navigator: Navigator, writer: SolutionWriter | None) -> None:
         self._navigator = navigator
         self._writer = writer
         self._next = 0
         self.rows = 0
+        self.modes: Counter[str] = Counter()
+        self.first_s: float | None = None
 
     def take(self) -> None:
         navigator = self._navigator
@@ -236,10 +258,13 @@ class _Recorder:
         rows = slice(first - imu.start, passed - imu.start)
         nav, count = imu.nav[rows], passed - first
         self._next = passed
+        mode, _ = navigator.mode(int(imu.times[rows.stop - 1]))
         self.rows += count
+        self.modes[str(mode)] += count
+        if self.first_s is None:
+            self.first_s = float(imu.times[rows.start] * 1e-9)
         if self._writer is None:
             return
-        mode, _ = navigator.mode(int(imu.times[rows.stop - 1]))
         self._writer.rows(
             np.asarray(imu.times[rows] * 1e-9, dtype=np.float64),
             nav[:, 0],
@@ -250,6 +275,11 @@ class _Recorder:
             np.where(navigator.model.stated, imu.sigmas[rows], np.nan),
             np.full(count, STATUS.index(mode), dtype=np.int64),
         )
+
+    def close(self) -> None:
+        """Write out what is left."""
+        if self._writer is not None:
+            self._writer.close()
 
 
 def _rpy(q: Array) -> Array:

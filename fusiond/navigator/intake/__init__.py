@@ -1,21 +1,25 @@
 """The door of the navigator: a driver's measurement becomes aids, or is refused by name.
 
 Here the configuration meets the measurement: lever arm, sigma where the device states none, floors
-and gates. Behind it everything is in SI units with a settled instant. Each kind of measurement has
-a module of its own, which `KINDS` lists; nothing else knows them.
+and gates. Behind it everything is in SI units with a settled instant, and can be true (`plausible`,
+`pace`). Each kind of measurement has a module of its own, which `KINDS` lists; nothing else knows
+them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import AnyAiding
+from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility
 from fusiond.models.blocks import Block
 from fusiond.navigator.intake import attitude, bearing, gnss, heading, height, raw, rdss, wheel
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
+from fusiond.navigator.intake.pace import Pace
+from fusiond.navigator.intake.plausible import refusal
 
 KINDS: tuple[Kind, ...] = (
     gnss.KIND,
@@ -30,10 +34,21 @@ KINDS: tuple[Kind, ...] = (
 
 
 class Intake:
-    """Holds `aiding` by source name; a source without a section takes its kind's defaults."""
+    """Holds `aiding` by source name; a source without a section takes its kind's defaults.
 
-    def __init__(self, aiding: Mapping[str, AnyAiding]) -> None:
+    `limits` are those of the vehicle's class; `tell(code, text)` hears of a source that is too
+    fast.
+    """
+
+    def __init__(
+        self,
+        aiding: Mapping[str, AnyAiding],
+        limits: Plausibility = PLAUSIBILITY["aircraft"],
+        tell: Callable[[str, str], None] = lambda code, text: None,
+    ) -> None:
         self._sections = Sections(aiding)
+        self._limits = limits
+        self._pace = Pace(tell)
         self.receivers = self._sections.receivers
 
     def aids(
@@ -43,6 +58,9 @@ class Intake:
         when = Instants(t_ns, sd_time_s, seen_ns)
         for kind in KINDS:
             if isinstance(m, kind.measurement):
+                refused = refusal(m, self._limits) or self._pace.refusal(m, t_ns)
+                if refused is not None:
+                    return refused
                 return kind.aids(m, self._sections, when)
         return "not_an_aid"
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from drivers.measurements import Bearing
 from fusiond.aiding.base import Aid
 from fusiond.aiding.bearing import SAR_BLOCK, BearingAid
@@ -16,8 +14,6 @@ from fusiond.navigator.intake.misalignment import misalignment_block, misalignme
 def aids(m: Bearing, sections: Sections, when: Instants) -> list[Aid] | str:
     """The bearing; `unknown_target` where neither it nor the configuration says the place."""
     o = sections.of(m.source, SarAiding)
-    if not (math.isfinite(m.azimuth_rad) and math.isfinite(m.elevation_rad)):
-        return "not_finite"
     point = m.point
     if point is None:
         known = o.targets_deg_m.get(m.target)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 
-from drivers.measurements import PositionFix
+from drivers.measurements import PositionFix, Vector3
+from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.models.blocks import Block, position_bias
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
+from fusiond.navigator.intake.plausible import LEAST_SPEED_SD_M_S
 
 # Dilution of precision to assume where a receiver sends neither GST nor GSA: a poor open sky.
 ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
@@ -18,6 +20,13 @@ ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
 # when the receiver sends no GST (typical: 0.5 m differential, 0.3 m float, 0.02 m fixed for 3 m
 # code).
 RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
+# One sigma an axis that a fix may have where the section says no other, by quality: no receiver is
+# better, and one that claims it counts noise alone, not what successive fixes share. By code:
+# differentially 0.4 to 0.5 m horizontally (data sheets of Trimble 5700 and Septentrio mosaic-X5),
+# 0.3 m an axis. By phase with ambiguities in doubt: a fraction of the wavelength of 0.19 m. Fixed:
+# 1 cm + 1 ppm (both sheets and u-blox ZED-F9P's), 2 cm at a base 10 km away.
+CODE_FLOOR_M = 0.3
+FLOOR_M = {4: 0.02, 5: 0.05}
 RTK = (4, 5)
 """Quality of fixes by carrier phase against a base station."""
 FIX_BIAS = "gnss_bias"
@@ -33,18 +42,12 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     if isinstance(sections.aiding.get(m.source), RawAiding):
         return "raw_is_used"
     o = sections.of(m.source, GnssAiding)
-    if not (math.isfinite(m.lat_rad) and math.isfinite(m.lon_rad)):
-        return "not_finite"
-    if m.sd_ned_m is not None:
-        sd = m.sd_ned_m
-    else:
-        error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
-        horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
-        sd = (horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP))
-    if not (sd[0] > 0.0 and sd[1] > 0.0 and sd[2] > 0.0):
+    if m.sd_ned_m is not None and min(m.sd_ned_m) <= 0.0:
         return "no_sigma"
-    scale, least = o.sigma_scale, o.min_position_sd_m
-    n, e, d = (max(s * scale, least) for s in sd)
+    least = o.min_position_sd_m
+    if least is None:
+        least = FLOOR_M.get(m.quality, CODE_FLOOR_M)
+    n, e, d = (max(s * o.sigma_scale, least) for s in _position_sd(m, o))
     found: list[Aid] = [
         PositionAid(
             m.source,
@@ -63,25 +66,34 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     return found if velocity is None else [*found, velocity]
 
 
+def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:
+    """What the receiver states, or the range error times DOP where it states nothing credible."""
+    if m.sd_ned_m is not None and min(m.sd_ned_m) >= SIGMA_M[0]:
+        return m.sd_ned_m
+    error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
+    horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
+    return horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP)
+
+
 def _velocity(m: PositionFix, o: GnssAiding, when: Instants) -> VelocityAid | None:
     if m.v_ned_m_s is None:
         return None
     north, east, down = m.v_ned_m_s
     sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
-    scale, horizontal, least = o.sigma_scale, o.velocity_sd_m_s, o.min_velocity_sd_m_s
+    horizontal = o.velocity_sd_m_s
     v: tuple[float, ...] = (north, east)
-    sd_v: tuple[float, ...] = (
-        max((sd_n or horizontal) * scale, least),
-        max((sd_e or horizontal) * scale, least),
-    )
+    sd_v: tuple[float, ...] = _speed_sd(sd_n, horizontal, o), _speed_sd(sd_e, horizontal, o)
     if down is not None:
         v = (north, east, down)
-        vertical = horizontal * VERTICAL_VELOCITY_FACTOR
-        sd_v = (*sd_v, max((sd_d or vertical) * scale, least))
-    if not math.isfinite(sum(v)):
-        return None
+        sd_v = (*sd_v, _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o))
     t_ns = when.t_ns - round(o.velocity_delay_s * 1e9)
     return VelocityAid(f"{m.source}_velocity", t_ns, o.gate_probability, v, sd_v, o.lever_arm_m)
+
+
+def _speed_sd(stated: float | None, default: float, o: GnssAiding) -> float:
+    """One axis: what the receiver states, or `default` where it states nothing credible."""
+    sd = default if stated is None or stated < LEAST_SPEED_SD_M_S else stated
+    return max(sd * o.sigma_scale, o.min_velocity_sd_m_s)
 
 
 def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:

@@ -1,0 +1,82 @@
+r"""How fast a source may speak: what comes faster than its kind can is not believed.
+
+A bucket of tokens for a source and kind of measurement:
+
+    tokens <- min(BURST, tokens + |t - t_before| rate) - 1
+
+With less than none left the source is too fast: that measurement, and all from it until none was
+too fast for `CALM_NS`, are `too_often`. Who sends false data at a high rate sends honest ones
+between them: nobody can tell which, and the mean of repetitions has no smaller error than one.
+
+t is the instant of validity, so that a backlog in which each has its own stamp is as good as one
+that came in time; the sign of a difference is not looked at, since late ones come out of order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from drivers.measurements import (
+    Attitude,
+    Bearing,
+    DelayedFix,
+    Heading,
+    Height,
+    Measurement,
+    PositionFix,
+    WheelSpeed,
+)
+from drivers.raw.messages import RawGnssEpoch
+
+RATES: Mapping[type, tuple[float, str]] = {
+    # Receivers offer 10 to 25 Hz (u-blox ZED-F9P: 20 Hz), those for machines 50, and 100 only from
+    # extrapolated phase: more than 50 in a second say nothing that the inertial unit does not.
+    PositionFix: (50.0, "fixes"),
+    RawGnssEpoch: (50.0, "epochs"),
+    Heading: (50.0, "headings"),
+    # The fastest cards may be asked once a second (docs/rdss-terminal.md).
+    DelayedFix: (2.0, "fixes"),
+    # CAN carries wheel speeds every 10 or 20 ms; attitude units and altimeters reach 200 Hz.
+    WheelSpeed: (200.0, "speeds"),
+    Attitude: (200.0, "attitudes"),
+    Height: (200.0, "heights"),
+    Bearing: (50.0, "bearings"),
+}
+"""The most that a source may send in a second, and what it sends."""
+BURST = 5.0
+"""As many at once are chance: stamps of arrival jitter, and a line that stood still for a moment
+hands over what has gathered."""
+CALM_NS = 1_000_000_000
+
+
+class Pace:
+    """The buckets. `tell(code, text)` hears of a source that is too fast, once an episode."""
+
+    def __init__(self, tell: Callable[[str, str], None]) -> None:
+        self._tell = tell
+        self._buckets: dict[tuple[str, type], tuple[float, int]] = {}
+        self._fast_ns: dict[tuple[str, type], int] = {}
+
+    def refusal(self, m: Measurement | RawGnssEpoch, t_ns: int) -> str | None:
+        """`too_often`, or None where `m`, valid at `t_ns`, comes as its kind may."""
+        kind = type(m)
+        if kind not in RATES:
+            return None
+        rate_hz, what = RATES[kind]
+        key = m.source, kind
+        tokens, before_ns = self._buckets.get(key, (BURST, t_ns))
+        tokens = min(BURST, tokens + abs(t_ns - before_ns) * 1e-9 * rate_hz) - 1.0
+        self._buckets[key] = max(tokens, 0.0), t_ns
+        fast_ns = self._fast_ns.get(key)
+        if tokens >= 0.0 and (fast_ns is None or abs(t_ns - fast_ns) >= CALM_NS):
+            self._fast_ns.pop(key, None)
+            return None
+        if tokens < 0.0:
+            self._fast_ns[key] = t_ns
+            if fast_ns is None:
+                self._tell(
+                    "source_too_fast",
+                    f"{m.source} sends more than {rate_hz:g} {what} a second: it is left out until "
+                    "it does not",
+                )
+        return "too_often"
