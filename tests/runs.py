@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.standstill import Rest
+from fusiond.aiding.witnesses import Witnesses
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
@@ -15,6 +17,7 @@ from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import quaternion_from_rpy
+from fusiond.navigation.standstill import Window
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Leg, follow
@@ -34,6 +37,7 @@ __all__ = [
     "metres",
     "nav_error",
     "random_attitude",
+    "rest",
     "sample_times",
     "town_truth",
     "true_nav",
@@ -126,3 +130,17 @@ def random_attitude(rng: np.random.Generator) -> tuple[float, float, float]:
 def level_nav(rpy: tuple[float, float, float], v: tuple[float, float, float]) -> Array:
     """A navigation state (10,) at ORIGIN."""
     return np.array([*ORIGIN, *v, *quaternion_from_rpy(*rpy)])
+
+
+def rest(
+    max_speed_m_s: float = 0.5,
+    mean_rate: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    witnesses: Witnesses | None = None,
+    end_s: float = 10.0,
+    run: int = 1,
+) -> Rest:
+    """The hypothesis of rest in a window of one second, with the default sigmas and no noise."""
+    rate = np.array(mean_rate)
+    window = Window(round(end_s * 1e9), 100, rate, np.array([0.0, 0.0, -9.8]), True, run, rate)
+    sd_rate = math.radians(0.1)
+    return Rest(window, witnesses or Witnesses(), max_speed_m_s, 0.05, sd_rate, 0.0)

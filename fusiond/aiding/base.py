@@ -29,12 +29,14 @@ aid says so; or now, all that was held."""
 
 
 class State(NamedTuple):
-    """What an aid may look at: navigation state (10,), parameters (n,), last step (18,), model."""
+    """What an aid may look at: navigation state (10,), parameters (n,), last step (18,), model, and
+    the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth)."""
 
     nav: Array
     xi: Array
     step: Array
     model: Model
+    covariance: Array | None = None
 
     @property
     def dcm(self) -> Array:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.offers import SpeedOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements
@@ -104,3 +105,6 @@ class WheelSpeedAid(Aid):
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return _body_velocity(state, self.lever, FORWARD, 1, self.speed_m_s, self.sd_m_s)
+
+    def offers(self) -> tuple[SpeedOffer, ...]:
+        return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s),)

@@ -1,4 +1,4 @@
-"""What an aid can give a filter that has not started: position, velocity, heading, height.
+"""What an aid can give a filter that has not started: position, velocity, speed, heading, height.
 
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m.
@@ -29,6 +29,15 @@ class VelocityOffer(NamedTuple):
     t_ns: int
     v_ned: tuple[float, ...]
     sd: tuple[float, ...]
+    lever: Vector3 = (0.0, 0.0, 0.0)
+
+
+class SpeedOffer(NamedTuple):
+    """Speed (m/s) along the forward axis, as a wheel says it."""
+
+    t_ns: int
+    speed_m_s: float
+    sd_m_s: float
 
 
 class HeadingOffer(NamedTuple):
@@ -46,4 +55,4 @@ class HeightOffer(NamedTuple):
     sd_m: float
 
 
-Offer = PositionOffer | VelocityOffer | HeadingOffer | HeightOffer
+Offer = PositionOffer | VelocityOffer | SpeedOffer | HeadingOffer | HeightOffer

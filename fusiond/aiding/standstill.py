@@ -1,11 +1,23 @@
-r"""Standstill: zero velocity and zero rate.
+r"""Standstill: zero velocity and zero rate, where rest has stood its tests.
 
     z = v^ - 0 = dv + v
     z = mean of w^ over the window - C^T w_ie = e + v
 
-The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill). A
-quiet sensor alone cannot tell rest from smooth driving, so the aid holds only while the computed
-speed can be zero: below `max_speed_m_s`.
+The mean rate is that of a window in which the sensor was quiet (fusiond.navigation.standstill).
+Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a hypothesis, which
+all that is known may refute (`Rest.doubt`):
+
+    |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
+    the mean of measured speeds is not zero               `moving`    (fusiond.aiding.witnesses)
+    |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
+    the ride is smooth, and neither sqrt(P_vv) nor the
+    sigma of a mean of measured speeds is below s_v       `quiet_at_speed`
+
+v_max is the largest speed of a vehicle that creeps, s_v the sigma of the zero velocity, s_r of the
+rate of a vehicle at rest, all configured; s_n the gyro's noise in a window, k the number of windows
+in a row (one, and up to ten). The bias's P is at the start that of the data sheet: a turn within
+it cannot be told from a bias. The last test asks for evidence as good as what the aid
+will claim, once quiet windows at speed have shown that quiet is none.
 
 Source: Groves, 2nd ed., section 15.3.
 """
@@ -17,10 +29,86 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, rate_columns
+from fusiond.aiding.base import (
+    Aid,
+    Innovation,
+    NotApplicable,
+    State,
+    Vector3,
+    rate_columns,
+)
+from fusiond.aiding.witnesses import Witnesses
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
+from fusiond.navigation.standstill import Window
 from fusiond.navigation.strapdown import LAT, VN
+
+Array = NDArray[np.float64]
+
+# Against the filter's own velocity: rest is refused once in ten thousand windows.
+VELOCITY_PROBABILITY = 1e-4
+# Against the bias's sigma, each axis.
+RATE_SIGMAS = 3.0
+# How far back measured speeds are averaged: as many windows as a run has.
+WITNESSED_NS = 1_000_000_000
+
+
+def _rate_error(state: State, mean_rate: Array) -> Array:
+    """Mean rate (3,) less the bias's estimate and the Earth's."""
+    lat = state.nav[LAT]
+    bias = np.array([sum(state.xi[s] for s in state.model.parameters(9 + j)) for j in range(3)])
+    earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
+    error: Array = mean_rate - bias - state.dcm.T @ earth
+    return error
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The hypothesis that the vehicle stood in a quiet window; sigmas of the module's text."""
+
+    window: Window
+    witnesses: Witnesses
+    max_speed_m_s: float
+    velocity_sd_m_s: float
+    rate_sd_rad_s: float
+    noise_sd_rad_s: float
+
+    def doubt(self, state: State) -> str | None:
+        """The name of what refutes rest; None if nothing does."""
+        p, w = state.covariance, self.window
+        if p is None:
+            return "moving" if state.speed > self.max_speed_m_s else None
+        rows = 2 if state.model.hold_height else 3
+        v, p_v = state.nav[VN : VN + rows], p[3 : 3 + rows, 3 : 3 + rows]
+        sd = math.sqrt(max(p_v[0, 0], p_v[1, 1]))
+        self.witnesses.quiet_at_speed(w.end_ns, state.speed - 3.0 * sd > self.max_speed_m_s)
+        if state.speed > self.max_speed_m_s:
+            return "moving"
+        # A tenth of the sigma that the aid claims, beside P: a filter that is surer is not.
+        least = (0.1 * self.velocity_sd_m_s) ** 2
+        square = float(v @ np.linalg.solve(p_v + least * np.eye(rows), v))
+        begin_ns = w.end_ns - w.run * WITNESSED_NS
+        measured = self.witnesses.measured(begin_ns, w.end_ns)
+        if square > chdtri(rows, VELOCITY_PROBABILITY) or measured.contradicts:
+            return "moving"
+        if self._turns(state, p, w.mean_rate, 1) or self._turns(state, p, w.run_rate, w.run):
+            return "turning"
+        known = min(sd, measured.sd) <= self.velocity_sd_m_s
+        if not known and self.witnesses.smooth_ride(w.end_ns):
+            return "quiet_at_speed"
+        return None
+
+    def _turns(self, state: State, p: Array, mean_rate: Array, count: int) -> bool:
+        error = _rate_error(state, mean_rate)
+        free = (self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2) / count
+        for axis in range(3):
+            slots = state.model.parameters(9 + axis)
+            variance = float(p[np.ix_(slots, slots)].sum()) + free
+            if error[axis] ** 2 > RATE_SIGMAS**2 * variance:
+                return True
+        return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +118,12 @@ class ZeroVelocityAid(Aid):
     constraint: ClassVar[bool] = True
 
     sd_m_s: float
-    max_speed_m_s: float
+    rest: Rest
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        if state.speed > self.max_speed_m_s:
-            return NotApplicable("moving")
+        doubt = self.rest.doubt(state)
+        if doubt is not None:
+            return NotApplicable(doubt)
         rows = 2 if state.model.hold_height else 3
         h = np.zeros((rows, state.model.size))
         for i in range(rows):
@@ -51,15 +140,14 @@ class ZeroRateAid(Aid):
 
     mean_rate: Vector3
     sd_rad_s: float
-    max_speed_m_s: float
+    rest: Rest
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        if state.speed > self.max_speed_m_s:
-            return NotApplicable("moving")
-        model, lat = state.model, state.nav[LAT]
-        bias = np.array([sum(state.xi[s] for s in model.parameters(9 + j)) for j in range(3)])
-        earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
+        doubt = self.rest.doubt(state)
+        if doubt is not None:
+            return NotApplicable(doubt)
+        model = state.model
         h = np.zeros((3, model.size))
         rate_columns(h, slice(None), model, np.eye(3))
-        z = np.array(self.mean_rate) - bias - state.dcm.T @ earth
+        z = _rate_error(state, np.array(self.mean_rate))
         return Innovation(z, h, np.full(3, self.sd_rad_s**2))

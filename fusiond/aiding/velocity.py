@@ -90,4 +90,4 @@ class VelocityAid(Aid):
         return Innovation(z, h, np.square(self.sd[:rows]))
 
     def offers(self) -> tuple[VelocityOffer, ...]:
-        return (VelocityOffer(self.t_ns, self.v_ned, self.sd),)
+        return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever),)

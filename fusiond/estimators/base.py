@@ -247,7 +247,7 @@ class ErrorStateFilter:
     @property
     def state(self) -> State:
         """What an aid may look at."""
-        return State(self.nav, self.xi, self.step, self.model)
+        return State(self.nav, self.xi, self.step, self.model, self.covariance)
 
     @property
     def sensor_errors(self) -> Array:

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 
 # A window with fewer samples says nothing about a standard deviation.
 FEWEST_SAMPLES = 10
+# Quiet windows in a row that are averaged: ten seconds, in which the rocking of a vehicle at rest
+# averages out and a slow turn does not.
+LONGEST_RUN = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +43,18 @@ class QuietLimits:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A finished window: its end, means (3,) and whether the sensor was quiet in all of it."""
+    """A finished window: its end, means (3,) and whether the sensor was quiet in all of it.
+
+    `run_rate` (3,) is the mean rate of the last `run` quiet windows in a row, this one with them.
+    """
 
     end_ns: int
     samples: int
     mean_rate: Array
     mean_force: Array
     quiet: bool
+    run: int
+    run_rate: Array
 
 
 @compiled("void(f8[:, ::1], i8, i8, f8[::1], f8[::1])")
@@ -78,7 +86,8 @@ def judge(
         and max(force_sd) < limits.force_sd
         and max(abs(mx), abs(my), abs(mz)) < limits.mean_rate
     )
-    return Window(int(times[end - 1]), end - first, mean[:3], mean[3:], quiet)
+    rate = mean[:3]
+    return Window(int(times[end - 1]), end - first, rate, mean[3:], quiet, 1, rate)
 
 
 class StandstillDetector:
@@ -88,6 +97,7 @@ class StandstillDetector:
         self.limits = limits
         self._first: int | None = None
         self._reference: Array | None = None
+        self._run: list[Array] = []
 
     def feed(
         self, times: NDArray[np.int64], samples: Array, start: int, new: int, end: int
@@ -108,7 +118,8 @@ class StandstillDetector:
             stop = new + int(change)
             first = self._first - start
             if 0 <= first < stop:
-                windows.append(self._same_force(judge(times, samples, first, stop, self.limits)))
+                window = judge(times, samples, first, stop, self.limits)
+                windows.append(self._in_a_row(self._same_force(window)))
             self._first = start + stop
         return windows
 
@@ -122,3 +133,10 @@ class StandstillDetector:
             self._reference = None
             return replace(w, quiet=False)
         return w
+
+    def _in_a_row(self, w: Window) -> Window:
+        self._run = [*self._run, w.mean_rate][-LONGEST_RUN:] if w.quiet else []
+        if not w.quiet:
+            return w
+        rate: Array = np.mean(self._run, axis=0)
+        return replace(w, run=len(self._run), run_rate=rate)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import NonHolonomicAid
-from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
+from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
+from fusiond.aiding.witnesses import Witnesses
 from fusiond.configuration.schema import Constraints
 from fusiond.configuration.settings import DEG, quiet_limits
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -26,10 +28,14 @@ class Felt(NamedTuple):
 
 
 class ConstraintMaker:
-    """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in."""
+    """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in.
 
-    def __init__(self, options: Constraints) -> None:
-        self._options = options
+    `rate_noise` (rad/s/sqrt(Hz)) is the gyro's; `witnesses` hears of what is measured.
+    """
+
+    def __init__(self, options: Constraints, rate_noise: float) -> None:
+        self._options, self._rate_noise = options, rate_noise
+        self.witnesses = Witnesses()
         self._detector = StandstillDetector(quiet_limits(options.zero_velocity))
         self._last_cell = -1
 
@@ -47,11 +53,18 @@ class ConstraintMaker:
 
     def _standstill(self, w: Window) -> list[Aid]:
         z = self._options.zero_velocity
+        rest = Rest(
+            w,
+            self.witnesses,
+            z.max_speed_m_s,
+            z.velocity_sd_m_s,
+            z.rate_sd_deg_s * DEG,
+            self._rate_noise / math.sqrt(z.window_s),
+        )
         rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
-        sd_rate = z.rate_sd_deg_s * DEG
         return [
-            ZeroVelocityAid("zero_velocity", w.end_ns, GATE, z.velocity_sd_m_s, z.max_speed_m_s),
-            ZeroRateAid("zero_rate", w.end_ns, GATE, rate, sd_rate, z.max_speed_m_s),
+            ZeroVelocityAid("zero_velocity", w.end_ns, GATE, z.velocity_sd_m_s, rest),
+            ZeroRateAid("zero_rate", w.end_ns, GATE, rate, rest.rate_sd_rad_s, rest),
         ]
 
     def _no_sliding(self, imu: ImuBuffer, new: int) -> list[Aid]:

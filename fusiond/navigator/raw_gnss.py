@@ -234,5 +234,5 @@ class RawGnss:
         if found.velocity is not None:
             v_n, v_e, v_d = (axes.T @ found.velocity).tolist()
             sd = self._section.start_velocity_sd_m_s
-            offers.append(VelocityOffer(t_ns, (v_n, v_e, v_d), (sd, sd, sd)))
+            offers.append(VelocityOffer(t_ns, (v_n, v_e, v_d), (sd, sd, sd), lever))
         return offers

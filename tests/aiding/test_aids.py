@@ -130,8 +130,8 @@ AIDS: dict[str, Callable[[Array], Linearised]] = {
     "heading": lambda nav: HeadingAid(*SOURCE, 2.25, 0.01),
     "non-holonomic": lambda nav: NonHolonomicAid(*SOURCE, 0.1, 2.0, LEVER),
     "wheel speed": lambda nav: WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
-    "zero velocity": lambda nav: ZeroVelocityAid(*SOURCE, 0.05, 100.0),
-    "zero rate": lambda nav: ZeroRateAid(*SOURCE, (2e-3, 1e-3, 3e-3), 1e-3, 100.0),
+    "zero velocity": lambda nav: ZeroVelocityAid(*SOURCE, 0.05, runs.rest(100.0)),
+    "zero rate": lambda nav: ZeroRateAid(*SOURCE, (2e-3, 1e-3, 3e-3), 1e-3, runs.rest(100.0)),
 }
 
 
@@ -187,9 +187,8 @@ def test_innovation_is_zero_where_the_measurement_is_true() -> None:
     lat = runs.ORIGIN[0]
     sensed = dcm.T @ (EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)]))
     x, y, z = (float(v) for v in sensed)
-    assert _innovation(ZeroRateAid(*SOURCE, (x, y, z), 1e-3, 99.0), state).z == pytest.approx(
-        [0.0, 0.0, 0.0], abs=1e-12
-    )
+    still = ZeroRateAid(*SOURCE, (x, y, z), 1e-3, runs.rest(99.0))
+    assert _innovation(still, state).z == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
 
 
 def test_position_across_the_date_line() -> None:
@@ -293,8 +292,8 @@ def test_aids_that_do_not_hold_say_why() -> None:
     moving = _state(model, runs.level_nav(RPY, VELOCITY), np.zeros(model.size))
     slow = _state(model, runs.level_nav(RPY, (0.3, 0.1, 0.0)), np.zeros(model.size))
     steep = _state(model, runs.level_nav((0.0, 1.45, 0.0), VELOCITY), np.zeros(model.size))
-    assert ZeroVelocityAid(*SOURCE, 0.05, 0.5).innovation(moving) == NotApplicable("moving")
-    rest = ZeroRateAid(*SOURCE, (0.0, 0.0, 0.0), 1e-3, 0.5)
+    assert ZeroVelocityAid(*SOURCE, 0.05, runs.rest()).innovation(moving) == NotApplicable("moving")
+    rest = ZeroRateAid(*SOURCE, (0.0, 0.0, 0.0), 1e-3, runs.rest())
     assert rest.innovation(moving) == NotApplicable("moving")
     assert isinstance(rest.innovation(slow), Innovation)
     slide = NonHolonomicAid(*SOURCE, 0.1, 2.0, LEVER)

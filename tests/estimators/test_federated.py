@@ -64,7 +64,7 @@ class Drive:
                 FeedBackAid("rdss_feedback", t_ns + 700_000_000, gate),
             ]
         rate = (0.0, 0.0, 0.0)
-        self.aids.append(ZeroRateAid("zero_rate", 300_000_000, 0.9999, rate, 0.1, 0.5))
+        self.aids.append(ZeroRateAid("zero_rate", 300_000_000, 0.9999, rate, 0.1, runs.rest()))
         self.aids.sort(key=lambda a: (a.t_ns, a.source))
 
     def start(self, estimator: Estimator) -> Estimator:

@@ -1,0 +1,116 @@
+r"""What speaks for or against rest beside a quiet sensor: measured speeds, and quiet at speed.
+
+    m = sum(v_k) / n,   s = max(sd / sqrt(n), s_0),   contradicts rest if m^2 / s^2 > chi2(0.999)
+
+over the velocities v_k (north, east, or a wheel's speed) of one kind in a span of time. n fixes
+average: 0.2 m/s is seen by five fixes of 0.1 m/s. s_0 is what does not average.
+
+Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity aids.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right, insort
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import SpeedOffer, VelocityOffer
+
+# What remains of an averaged velocity (m/s): multipath moves a receiver's Doppler by a centimetre
+# or two a second, for seconds alike.
+LEAST_SD_M_S = 0.02
+# A test of rest refuses a vehicle at rest once in a thousand windows: it loses one aid of many.
+# Quantiles of chi-square of one and two degrees of freedom.
+CONTRADICTION = (10.83, 13.82)
+# Kept longer than any history: a rewind asks again.
+KEEP_NS = 700_000_000_000
+# A ride is smooth if this many windows of this time were quiet at a speed that is no rest: chance
+# makes one or two where driving shakes the vehicle.
+SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
+
+
+class Measured(NamedTuple):
+    """What the measured speeds of a span say: whether they contradict rest, and the sigma (m/s) of
+    the best of their means (infinite: none was measured)."""
+
+    contradicts: bool
+    sd: float
+
+
+class Witnesses:
+    """Speeds that were measured, and the quiet windows that were none of rest."""
+
+    def __init__(self) -> None:
+        self._speeds: defaultdict[str, list[tuple[int, tuple[float, ...], float]]]
+        self._speeds = defaultdict(list)
+        self._at_speed: list[int] = []
+
+    def hear(self, aids: Sequence[Aid]) -> None:
+        """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
+        alone is an effort, and it has the rates of all satellites."""
+        for aid in aids:
+            if aid.screened:
+                continue
+            for offer in aid.offers():
+                match offer:
+                    case VelocityOffer():
+                        self._keep(aid.source, offer.t_ns, offer.v_ned[:2], max(offer.sd[:2]))
+                    case SpeedOffer():
+                        self._keep(aid.source, offer.t_ns, (offer.speed_m_s,), offer.sd_m_s)
+
+    def _keep(self, source: str, t_ns: int, v: tuple[float, ...], sd: float) -> None:
+        speeds = self._speeds[source]
+        insort(speeds, (t_ns, v, sd))
+        if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
+            del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
+
+    def measured(self, begin_ns: int, end_ns: int) -> Measured:
+        """What was measured from `begin_ns` to `end_ns`, both included."""
+        contradicts, best = False, math.inf
+        for speeds in self._speeds.values():
+            first = bisect_left(speeds, (begin_ns,))
+            found = speeds[first : bisect_left(speeds, (end_ns + 1,))]
+            if not found:
+                continue
+            count = len(found)
+            sd = math.sqrt(sum(s * s for _, _, s in found)) / count
+            sd = max(sd, LEAST_SD_M_S)
+            size = len(found[0][1])
+            square = sum((sum(v[axis] for _, v, _ in found) / count) ** 2 for axis in range(size))
+            contradicts |= square > CONTRADICTION[size - 1] * sd * sd
+            best = min(best, sd)
+        return Measured(contradicts, best)
+
+    def velocity(self, begin_ns: int, end_ns: int) -> tuple[float, float, float] | None:
+        """Mean velocity north, east (m/s) of the source that had most to say from `begin_ns` to
+        `end_ns`, both included, and the sigma of one of its measurements."""
+        found: list[tuple[int, tuple[float, ...], float]] = []
+        for speeds in self._speeds.values():
+            rows = speeds[bisect_left(speeds, (begin_ns,)) : bisect_left(speeds, (end_ns + 1,))]
+            if len(rows) > len(found) and len(rows[0][1]) == 2:
+                found = rows
+        if not found:
+            return None
+        north, east = (sum(v[axis] for _, v, _ in found) / len(found) for axis in range(2))
+        return north, east, max(sd for _, _, sd in found)
+
+    def quiet_at_speed(self, t_ns: int, at_speed: bool) -> None:
+        """Whether the quiet window that ended at `t_ns` was at speed; a rewind may say otherwise
+        than before."""
+        row = bisect_left(self._at_speed, t_ns)
+        known = row < len(self._at_speed) and self._at_speed[row] == t_ns
+        if at_speed and not known:
+            self._at_speed.insert(row, t_ns)
+            if self._at_speed[0] < self._at_speed[-1] - 2 * KEEP_NS:
+                del self._at_speed[: bisect_left(self._at_speed, self._at_speed[-1] - KEEP_NS)]
+        elif known and not at_speed:
+            del self._at_speed[row]
+
+    def smooth_ride(self, t_ns: int) -> bool:
+        """Whether, before `t_ns`, the vehicle has been as quiet at speed as at rest: then quiet
+        says nothing."""
+        first = bisect_right(self._at_speed, t_ns - SMOOTH_NS)
+        return bisect_left(self._at_speed, t_ns) - first >= SMOOTH_WINDOWS

@@ -1,0 +1,112 @@
+"""Rest as a hypothesis: what refutes it, and what does not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fusiond.aiding.base import State
+from fusiond.aiding.body_velocity import WheelSpeedAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.witnesses import SMOOTH_WINDOWS, Witnesses
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.models.catalogue import make_model
+from fusiond.navigation.strapdown import STEP_SIZE
+from tests import runs
+
+MODEL = make_model("ins21", imu_noise(Imu()))
+DEG = math.pi / 180.0
+END_S = 10.0
+
+
+def _state(speed_m_s: float, sd_m_s: float, sd_bias_deg_s: float = 0.002) -> State:
+    sd = runs.initial_sd(MODEL, np.full(3, 0.01), sd_m_s, 1.0)
+    for axis in range(3):
+        sd[MODEL.parameters(9 + axis)] = sd_bias_deg_s * DEG
+    nav = runs.level_nav((0.0, 0.0, 0.0), (speed_m_s, 0.0, 0.0))
+    return State(nav, np.zeros(MODEL.size), np.zeros(STEP_SIZE), MODEL, np.diag(sd**2))
+
+
+def _fixes(speed_m_s: float, count: int, sd_m_s: float = 0.1) -> Witnesses:
+    """`count` fixes in the last second before END_S, whose errors have the stated sigma."""
+    witnesses, rng = Witnesses(), np.random.default_rng(3)
+    for k in range(count):
+        t_ns = round((END_S - 0.9 * k / count) * 1e9)
+        north, east = (float(e) for e in sd_m_s * rng.standard_normal(2))
+        v = (speed_m_s + north, east, 0.0)
+        aid = VelocityAid("gnss_velocity", t_ns, 0.999, v, (sd_m_s,) * 3, (0.0, 0.0, 0.0))
+        witnesses.hear([aid])
+    return witnesses
+
+
+def test_nothing_speaks_against_a_vehicle_that_stands() -> None:
+    assert runs.rest(witnesses=_fixes(0.0, 10)).doubt(_state(0.01, 0.02)) is None
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "sd_m_s", "doubt"),
+    [(0.6, 5.0, "moving"), (0.2, 0.03, "moving"), (0.2, 0.3, None), (20.0, 0.1, "moving")],
+)
+def test_the_filter_s_own_velocity_must_be_near_zero_within_its_sigma(
+    speed_m_s: float, sd_m_s: float, doubt: str | None
+) -> None:
+    assert runs.rest().doubt(_state(speed_m_s, sd_m_s)) == doubt
+
+
+@pytest.mark.parametrize(("speed_m_s", "doubt"), [(0.0, None), (0.2, "moving"), (0.45, "moving")])
+def test_fixes_average(speed_m_s: float, doubt: str | None) -> None:
+    """A filter that believes to stand cannot see the creeping that five fixes show."""
+    assert runs.rest(witnesses=_fixes(speed_m_s, 5)).doubt(_state(0.0, 0.01)) == doubt
+
+
+def test_a_fix_before_the_quiet_windows_says_nothing() -> None:
+    witnesses = Witnesses()
+    before_ns = round((END_S - 1.5) * 1e9)
+    sd = (0.1, 0.1, 0.1)
+    aid = VelocityAid("gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0))
+    witnesses.hear([aid])
+    assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) is None
+    assert runs.rest(witnesses=witnesses, run=2).doubt(_state(0.0, 0.02)) == "moving"
+
+
+def test_a_wheel_that_turns_is_no_rest() -> None:
+    witnesses = Witnesses()
+    t_ns = round((END_S - 0.5) * 1e9)
+    witnesses.hear([WheelSpeedAid("wheel", t_ns, 0.999, 0.4, 0.1, (0.0, 0.0, 0.0))])
+    assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) == "moving"
+
+
+def test_a_turn_is_no_bias() -> None:
+    """0.6 deg/s are seen in one window, 0.2 deg/s in ten; what the bias's prior allows is none."""
+    known, unknown = _state(0.0, 0.02), _state(0.0, 0.02, sd_bias_deg_s=0.3)
+    fast, slow = (0.0, 0.0, 0.6 * DEG), (0.0, 0.0, 0.2 * DEG)
+    assert runs.rest(mean_rate=fast).doubt(known) == "turning"
+    assert runs.rest(mean_rate=slow).doubt(known) is None
+    assert runs.rest(mean_rate=slow, run=10).doubt(known) == "turning"
+    assert runs.rest(mean_rate=fast, run=10).doubt(unknown) is None
+
+
+def test_quiet_proves_nothing_on_a_smooth_ride() -> None:
+    """Once quiet windows at speed have been seen, rest takes evidence as good as its claim."""
+    witnesses = Witnesses()
+    doubtful, sure = _state(0.1, 0.3), _state(0.01, 0.03)
+    assert runs.rest(witnesses=witnesses).doubt(doubtful) is None
+    for k in range(SMOOTH_WINDOWS):
+        assert runs.rest(witnesses=witnesses, end_s=5.0 + k).doubt(_state(20.0, 0.3)) == "moving"
+    assert runs.rest(witnesses=witnesses).doubt(doubtful) == "quiet_at_speed"
+    assert runs.rest(witnesses=witnesses).doubt(sure) is None
+    witnesses.hear([WheelSpeedAid("wheel", round(END_S * 1e9), 0.9, 0.0, 0.03, (0.0, 0.0, 0.0))])
+    assert runs.rest(witnesses=witnesses).doubt(doubtful) is None
+
+
+def test_a_rewind_may_take_a_window_at_speed_back() -> None:
+    witnesses = Witnesses()
+    for k in range(SMOOTH_WINDOWS):
+        runs.rest(witnesses=witnesses, end_s=5.0 + k).doubt(_state(20.0, 0.3))
+    assert witnesses.smooth_ride(round(END_S * 1e9))
+    assert not witnesses.smooth_ride(round(5.0 * 1e9))  # what came later is not known yet
+    runs.rest(witnesses=witnesses, end_s=5.0).doubt(_state(0.0, 0.02))
+    assert not witnesses.smooth_ride(round(END_S * 1e9))
