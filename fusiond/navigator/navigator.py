@@ -20,6 +20,7 @@ from fusiond.configuration.settings import imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
@@ -77,7 +78,7 @@ class Navigator:
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
         self._on_outcome = on_outcome
-        self._constraints = ConstraintMaker(config.constraints)
+        self._constraints = ConstraintMaker(config.constraints, self._noise.rate_noise)
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedAids(self._event)
         self._left_out = LeftOut(self.timeline, names, self._event)
@@ -86,12 +87,15 @@ class Navigator:
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
         self.started: Start | None = None
+        self._afterwards: Afterwards | None = None
         self.warm: WarmStart | None = None
         """A start to be tried before any alignment, and its trial."""
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
-        return Aligner(alignment_options(self.config), self._noise, self.model, self._saved)
+        return Aligner(
+            alignment_options(self.config), self._noise, self.model, self._saved, self._event
+        )
 
     # ------------------------------------------------------------------ arrivals
 
@@ -150,6 +154,7 @@ class Navigator:
             return self._refuse(m.source, aids)
         if self.started is None:
             self._aligner.known.aids(aids)
+        self._constraints.witnesses.hear(aids)
         for aid in aids:
             self.timeline.insert(aid)
         return "accepted"
@@ -194,6 +199,7 @@ class Navigator:
             self.timeline.start()
             self.verdicts.reset()
             self.started = start
+            self._afterwards = Afterwards(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._standing.started(start.t_ns)
             self._event("aligned", f"heading from {start.how}")
@@ -209,6 +215,14 @@ class Navigator:
             self._standing.given_up()
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
+            return
+        wrong = self._afterwards and self._afterwards.refuted(
+            e.t_ns, e.nav, e.covariance, self._constraints.witnesses
+        )
+        if wrong:
+            self._event(*wrong)
+            self.reset(wrong[1])
+            self._aligner.known.told.add(wrong[0])
             return
         self._left_out.tell()
         if self.warm is not None and self.warm.refused_by is not None:

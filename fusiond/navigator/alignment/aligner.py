@@ -39,16 +39,24 @@ class Aligner:
     """Tries a start whenever asked; `known` takes in what may lead to one."""
 
     def __init__(
-        self, options: AlignmentOptions, noise: ImuNoise, model: Model, saved: SavedState | None
+        self,
+        options: AlignmentOptions,
+        noise: ImuNoise,
+        model: Model,
+        saved: SavedState | None,
+        on_event: Callable[[str, str], None],
     ) -> None:
         self.reason = "waiting for IMU data"
-        self.known = Collected(options, saved)
+        self.known = Collected(options, noise, saved, on_event)
         self._basis = Basis(options, noise, model, saved, self.known)
 
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""
         if not imu.end:
             self.reason = "waiting for IMU data"
+            return None
+        if self.known.upside_down:
+            self.reason = self.known.why
             return None
         place = self.known.place()
         if place is None:
@@ -63,4 +71,6 @@ class Aligner:
             self.reason = "not at rest: no level yet"
         else:
             self.reason = f"no heading yet (allowed: {', '.join(allowed)})"
+        if self.known.why:
+            self.reason += f"; {self.known.why}"
         return None

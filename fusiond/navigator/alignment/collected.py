@@ -3,24 +3,45 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from bisect import insort
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import HeadingOffer, HeightOffer, PositionOffer, VelocityOffer
+from fusiond.aiding.witnesses import Witnesses
+from fusiond.models.blocks import ImuNoise
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import FEWEST_SAMPLES, Window
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Place, as_geodetic, velocity_of
 from fusiond.navigator.saved_state import SavedState
 
 Array = NDArray[np.float64]
+ANY_TIME_NS = 1 << 62
 
-# Fixes that a course may be taken from: the last eight seconds of a receiver of 5 Hz, twice the
-# longest interval that a change of velocity is taken over.
-MOST_FIXES = 40
+# Fixes that a course may be taken from: of the last twenty seconds, the longest that changes of
+# velocity are taken over, of a receiver of 20 Hz.
+MOST_FIXES, FIXES_NS = 400, 20_000_000_000
+# Sigmas at which a rate is no bias of the gyro's data sheet, and at which position and velocity of
+# a receiver contradict each other.
+BIAS_SIGMAS = 3.0
+CONTRADICTION_SIGMAS = 4.0
+# Of the way by velocity (scale): what the trapezoids between fixes leave out.
+WAY_SCALE = 0.05
+# After so long positions that are too coarse to confirm a velocity need not.
+CONFIRMED_NS = 15_000_000_000
+
+
+class Fix(NamedTuple):
+    """A measurement that offered both."""
+
+    velocity: VelocityOffer
+    position: PositionOffer
 
 
 @dataclass(slots=True)
@@ -45,14 +66,31 @@ class Standing:
 class Collected:
     """Windows and offers since the alignment began."""
 
-    def __init__(self, options: AlignmentOptions, saved: SavedState | None) -> None:
-        self._options, self._saved = options, saved
+    def __init__(
+        self,
+        options: AlignmentOptions,
+        noise: ImuNoise,
+        saved: SavedState | None,
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self._options, self._noise, self._saved = options, noise, saved
+        self._event = on_event
+        self.why = ""
+        """What the start waits for, beyond what the aligner sees itself."""
+        self.told: set[str] = set()
+        """Events that the operator has heard."""
+        self.upside_down = False
+        self.tried_ns = 0
+        """Instant of the last fix that a course was tried with."""
+        self.moving_since_ns = 0
+        """The first fix since which all were fast enough for a course."""
+        self.witnesses = Witnesses()
         self.standing: Standing | None = None
         """The last standstill, also when the vehicle has moved off since."""
         self.ever_moved = False
         self.heading: HeadingOffer | None = None
-        self.fixes: list[tuple[VelocityOffer, PositionOffer]] = []
-        """Of the last measurements that offered both, velocity and position."""
+        self.fixes: list[Fix] = []
+        """The last measurements that offered both, velocity and position."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
@@ -69,7 +107,9 @@ class Collected:
             self._at_rest = False
             self._pending = None
             return
-        if not latest.quiet or self._speed > self._options.rest_speed_m_s:
+        self._gravity_points_up(latest)
+        turning = latest.quiet and self._turns(latest)
+        if not latest.quiet or turning or self._speed > self._options.rest_speed_m_s:
             self._at_rest = False
             self.ever_moved = True
             self._pending = None
@@ -89,6 +129,7 @@ class Collected:
 
     def aids(self, aids: Sequence[Aid]) -> None:
         """A measurement has arrived, as the aids it stands for."""
+        self.witnesses.hear(aids)
         offers = [offer for aid in aids for offer in aid.offers()]
         height = next((o for o in offers if isinstance(o, HeightOffer)), None)
         position: PositionOffer | None = None
@@ -111,14 +152,99 @@ class Collected:
         if velocity is not None:
             self._speed = math.hypot(*velocity.v_ned[:2])
             if position is not None:
-                self.fixes = [*self.fixes, (velocity, position)][-MOST_FIXES:]
+                self._keep(Fix(velocity, position))
 
     def levelled(self) -> Standing | None:
         """The standstill that the vehicle is in, once it is long enough to level by."""
         s = self.standing
         if s is None or not self._at_rest or s.seconds < self._options.levelling_s:
             return None
-        return s
+        return s if self.rested(s, ANY_TIME_NS) else None
+
+    def rested(self, s: Standing, until_ns: int = 0) -> bool:
+        """Whether no measured speed contradicts a standstill, up to its end or later."""
+        return not self.witnesses.measured(s.start_ns, max(s.end_ns, until_ns)).contradicts
+
+    def seen_at_rest(self, s: Standing) -> bool:
+        """Whether speeds were measured in a standstill, and were zero."""
+        seen = self.witnesses.measured(s.start_ns, s.end_ns)
+        return math.isfinite(seen.sd) and not seen.contradicts
+
+    def doubted(self, why: str) -> str:
+        """Why there is no start yet; `why` back."""
+        self.why = why
+        return why
+
+    def tell(self, code: str, text: str) -> str:
+        """The same, and an event the first time."""
+        if code not in self.told:
+            self.told.add(code)
+            self._event(code, text)
+        return self.doubted(text)
+
+    def position_confirms(self, latest: Fix) -> bool:
+        """Whether the positions have moved as the velocities say, so far that the opposite would
+        be seen."""
+        way, before = np.zeros(2), None
+        first: Fix | None = None
+        for fix in self.fixes:
+            if fix.position.t_ns > latest.position.t_ns:
+                break
+            if first is None:
+                first = fix
+            elif before is not None:
+                seconds = (fix.position.t_ns - before.position.t_ns) * 1e-9
+                v = np.add(fix.velocity.v_ned[:2], before.velocity.v_ned[:2])
+                way += 0.5 * seconds * v
+            before = fix
+        if first is None or first is latest:
+            return False
+        a, b = first.position, latest.position
+        metres = 1.0 / as_geodetic(np.ones(3), a.lat_rad)[:2]
+        east = math.remainder(b.lon_rad - a.lon_rad, 2.0 * math.pi)
+        moved = np.array([b.lat_rad - a.lat_rad, east]) * metres
+        span_ns = b.t_ns - a.t_ns
+        size = math.hypot(*way)
+        sd = math.hypot(max(a.sd[:2]), max(b.sd[:2]), WAY_SCALE * size)
+        sd = math.hypot(sd, max(latest.velocity.sd[:2]) * span_ns * 1e-9)
+        if math.hypot(*(moved - way)) > CONTRADICTION_SIGMAS * sd:
+            return False
+        return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_ns >= CONFIRMED_NS
+
+    def _keep(self, fix: Fix) -> None:
+        """In order of validity."""
+        oldest = max(fix.velocity.t_ns, self.fixes[-1].velocity.t_ns if self.fixes else 0)
+        kept = [f for f in self.fixes if f.velocity.t_ns >= oldest - FIXES_NS]
+        insort(kept, fix, key=lambda f: f.velocity.t_ns)
+        self.fixes = kept[-MOST_FIXES:]
+        if self._speed < self._options.course_speed_m_s:
+            self.moving_since_ns = 0
+        elif not self.moving_since_ns:
+            self.moving_since_ns = fix.velocity.t_ns
+
+    def _gravity_points_up(self, w: Window) -> None:
+        self.upside_down = bool(w.mean_force[2] > 0.5 * STANDARD_GRAVITY_M_S2)
+        if self.upside_down:
+            self.tell(
+                "imu_upside_down",
+                "gravity is felt to point up: the IMU is mounted upside down. Correct [imu] axes",
+            )
+
+    def _turns(self, w: Window) -> bool:
+        """Whether the rate of quiet windows can be no bias that the data sheet allows."""
+        n = self._noise
+        prior = n.rate_bias_initial**2 + n.rate_bias_instability**2
+        free = n.rate_noise**2 / self._options.window_s + self._options.rate_sd_rad_s**2
+        for rate, count in ((w.mean_rate, 1), (w.run_rate, w.run)):
+            most = EARTH_RATE_RAD_S + BIAS_SIGMAS * math.sqrt(prior + free / count)
+            largest = float(np.abs(rate).max())
+            if largest > most:
+                self.doubted(
+                    f"turning at {math.degrees(largest):.2f} deg/s, so not at rest; or the gyro's "
+                    "bias is larger than gyro_bias_initial_deg_h says"
+                )
+                return True
+        return False
 
     def place(self) -> Place | None:
         """Position (rad, rad, m) to start at, the fix it came from, and its sigma."""

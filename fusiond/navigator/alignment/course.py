@@ -1,14 +1,29 @@
-"""Heading from the course over ground: moving off from a standstill, or on the move."""
+r"""Heading from the course over ground: moving off from a standstill, or on the move.
+
+The receiver measures the antenna, the heading is the body's. With the body's rate w, the antenna at
+l and the point that does not slide at s, a vehicle of forward speed V (negative: backward) has
+
+    C^T v_antenna = V x + w x (l - s),   yaw = course of the antenna - atan2 of that
+
+Moving off from rest the IMU has felt the velocity itself, and its direction in the body:
+
+    C^T v_antenna = int f dt + w x l
+
+which needs no assumption about slip, but that it was at rest: felt and measured speed must agree in
+size. Where they do not, quiet was not rest, and the start is one on the move, where the changes of
+velocity tell forward from backward (fusiond.navigator.alignment.motion).
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import VelocityOffer
-from fusiond.navigation.alignment import integrate_from_rest, level, level_in_motion
+from fusiond.navigation.alignment import integrate_from_rest, level
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import (
@@ -18,46 +33,83 @@ from fusiond.navigation.rotation import (
     rpy_from_dcm,
     wrap_angle,
 )
+from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.collected import Standing, place_of
-from fusiond.navigator.alignment.start import Place, Start, build_start, velocity_of
+from fusiond.navigator.alignment.collected import Fix, Standing, place_of
+from fusiond.navigator.alignment.start import (
+    LEVEL_SD_RAD,
+    Place,
+    Start,
+    build_start,
+    velocity_of,
+)
 
 Array = NDArray[np.float64]
 
-# Course and integrated motion must agree this well (rad), forward or backward, or the vehicle slid
+# Sigmas beyond which felt and measured speed do not agree: chance makes 1 in 16,000.
+AGREEMENT_SIGMAS = 4.0
+# Course and felt direction must agree this well (rad), forward or backward, or the vehicle slid
 # or the integration is poor: the next fix decides.
 COURSE_AGREEMENT_RAD = math.radians(45.0)
-# Turn rate (rad/s) above which levelling in motion is not tried.
-MOTION_MAX_RATE_RAD_S = math.radians(5.0)
-MOTION_INTERVAL_NS = (800_000_000, 3_500_000_000)
+# One sigma (m) of where the point that does not slide is: as measured with a tape; and not said at
+# all, when the IMU itself is taken for it (half a wheelbase).
+MEASURED_LEVER_SD_M, UNKNOWN_LEVER_SD_M = 0.3, 1.5
+# No start claims a better heading (rad): scale factors and misalignments of the IMU.
+LEAST_YAW_SD_RAD = math.radians(1.0)
+# A start on the move is taken over this long at most, and no shorter.
+MOTION_NS = (800_000_000, 20_000_000_000)
+# Log likelihood ratio at which forward and backward are told apart: one start in 10,000 is wrong.
+DECIDED = math.log(1e4)
+# A vehicle that is not seen to accelerate for so long (s) is taken to drive forward: above the
+# speed that one reverses at, where only forward remains, and below it, where nobody reverses for a
+# minute without braking.
+FORWARD_AFTER_S = (5.0, 60.0)
+# Reversing has settled once the speed (m/s) has not grown by more in two seconds.
+SETTLED_M_S, SETTLED_NS = 0.5, 2_000_000_000
+
+
+class Along(NamedTuple):
+    """Direction of the antenna's velocity in the body (rad) and its sigma."""
+
+    angle: float
+    sd: float
 
 
 def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """Heading from the course over ground, forward or backward as the IMU felt it move off."""
-    for velocity, position in reversed(by.known.fixes):
-        speed = math.hypot(*velocity.v_ned[:2])
-        if speed < by.options.course_speed_m_s or velocity.t_ns > imu.latest_ns:
-            continue
-        course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
-        sd_course = math.hypot(by.options.course_sd_rad, max(velocity.sd[:2]) / speed)
-        here = place_of(position, velocity)
-        s = by.known.standing
-        if s is not None and s.seconds >= 1.0 and imu.oldest_ns <= s.end_ns < velocity.t_ns:
-            return _moved_off(by, imu, s, velocity, course, sd_course, here)
-        return _on_the_move(by, imu, velocity, course, sd_course, here)
-    return None
+    """Heading from the course over ground, forward or backward as the IMU felt it."""
+    known = by.known
+    latest = next((f for f in reversed(known.fixes) if f.velocity.t_ns <= imu.latest_ns), None)
+    if latest is None or latest.velocity.t_ns == known.tried_ns:
+        return None  # the same data say the same
+    speed = math.hypot(*latest.velocity.v_ned[:2])
+    if speed < by.options.course_speed_m_s:
+        known.why = f"drive off: the course counts from {by.options.course_speed_m_s:g} m/s on"
+        return None
+    known.tried_ns = latest.velocity.t_ns
+    if not known.position_confirms(latest):
+        known.why = "waiting until the positions of the fixes confirm their velocity"
+        return None
+    s = known.standing
+    here = place_of(latest.position, latest.velocity)
+    if (
+        s is not None
+        and s.seconds >= 1.0
+        and imu.oldest_ns <= s.end_ns < latest.velocity.t_ns
+        and known.rested(s)
+    ):
+        found = _moved_off(by, imu, s, latest.velocity, here)
+        if found is not None:
+            return found if isinstance(found, Start) else None
+    return _on_the_move(by, imu, latest, here)
 
 
 def _moved_off(
-    by: Basis,
-    imu: ImuBuffer,
-    standing: Standing,
-    velocity: VelocityOffer,
-    course: float,
-    sd: float,
-    place: Place,
-) -> Start | None:
+    by: Basis, imu: ImuBuffer, standing: Standing, velocity: VelocityOffer, place: Place
+) -> Start | str | None:
+    """A start, why not yet, or None where what was felt since the quiet began to end is not the
+    velocity: it was no rest."""
     lat, _, height = (float(v) for v in place[1])
+    g = gravity(lat, height)
     q = quaternion_from_rpy(*level(standing.mean_force), 0.0)
     first, end = imu.index_after(standing.end_ns), imu.index_after(velocity.t_ns)
     gained = np.zeros(3)
@@ -66,59 +118,176 @@ def _moved_off(
         np.ascontiguousarray(imu.samples[first:end]),
         standing.mean_rate,
         q,
-        gravity(lat, height),
+        g,
         gained,
     )
-    roll, pitch, turned = rpy_from_dcm(dcm_from_quaternion(q))
-    # Course seen from the body, by integration: near 0 when it drove forward, near pi backward.
-    slip = wrap_angle(math.atan2(gained[1], gained[0]) - turned)
-    backward = abs(slip) > math.pi / 2.0
-    if abs(wrap_angle(slip - (math.pi if backward else 0.0))) > COURSE_AGREEMENT_RAD:
+    dcm = dcm_from_quaternion(q)
+    roll, pitch, turned = rpy_from_dcm(dcm)
+    rate = motion.rate_at(imu, velocity.t_ns) - standing.mean_rate
+    antenna = gained + dcm @ np.cross(rate, velocity.lever)
+    felt_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
+    sd_felt = _felt_sd(by, g, (velocity.t_ns - standing.end_ns) * 1e-9, turned, speed)
+    sd_speed = max(velocity.sd[:2])
+    if abs(felt_m_s - speed) > AGREEMENT_SIGMAS * math.hypot(sd_felt, sd_speed):
         return None
-    yaw = course + (math.pi if backward else 0.0)
+    felt = wrap_angle(math.atan2(antenna[1], antenna[0]) - turned)
+    backward = abs(felt) > math.pi / 2.0
+    by_course = _along(by, velocity, rate, backward)
+    apart = wrap_angle(felt - by_course.angle)
+    if abs(apart) > COURSE_AGREEMENT_RAD:
+        return by.known.doubted("the vehicle was felt to move off sideways: check [imu] axes")
+    if backward:
+        if not by.known.seen_at_rest(standing):
+            return None  # braking from twice the speed feels the same
+        if why := _reversing(by, velocity):
+            return why
+    sd_felt_angle = math.hypot(sd_felt, sd_speed) / speed
+    share = by_course.sd**2 / (by_course.sd**2 + sd_felt_angle**2)
+    angle = by_course.angle + share * apart
+    sd = by_course.sd * sd_felt_angle / math.hypot(by_course.sd, sd_felt_angle)
+    yaw = math.atan2(velocity.v_ned[1], velocity.v_ned[0]) - angle
     at_rest = dcm_from_rpy(*level(standing.mean_force), yaw - turned)
-    return build_start(
-        by.model,
-        velocity.t_ns,
+    return _build(
+        by,
+        velocity,
         place,
         dcm_from_rpy(roll, pitch, yaw),
-        sd,
-        *velocity_of(velocity),
+        max(sd, LEAST_YAW_SD_RAD),
+        rate,
         "GNSS course" + (", backward" if backward else ""),
-        bias=rest_bias(by.noise, standing, at_rest, lat),
-        levelled=True,
+        rest_bias(by.noise, standing, at_rest, lat),
     )
 
 
-def _on_the_move(
-    by: Basis,
-    imu: ImuBuffer,
-    velocity: VelocityOffer,
-    course: float,
-    sd: float,
-    place: Place,
-) -> Start | None:
-    shortest, longest = MOTION_INTERVAL_NS
-    for earlier, _ in reversed(by.known.fixes):
-        interval = velocity.t_ns - earlier.t_ns
-        if not shortest <= interval <= longest or imu.oldest_ns > earlier.t_ns:
-            continue
-        first, end = imu.index_after(earlier.t_ns), imu.index_after(velocity.t_ns)
-        mean = imu.samples[first:end].mean(axis=0)
-        if np.abs(mean[:3]).max() > MOTION_MAX_RATE_RAD_S:
+def _felt_sd(by: Basis, g: float, seconds: float, turned: float, speed: float) -> float:
+    """Sigma (m/s) of a velocity integrated from rest: white noise of both sensors, level, force
+    bias (which the level hides until the vehicle has turned), scale."""
+    n = by.noise
+    return math.sqrt(
+        n.force_noise**2 * seconds
+        + (g * n.rate_noise) ** 2 * seconds**3 / 3.0
+        + (g * LEVEL_SD_RAD * seconds) ** 2
+        + (2.0 * math.sin(0.5 * turned) * n.force_bias_initial * seconds) ** 2
+        + (n.force_scale * speed) ** 2
+    )
+
+
+def _along(by: Basis, velocity: VelocityOffer, rate: Array, backward: bool) -> Along:
+    """Where the antenna moves in a body that turns and does not slide."""
+    no_slip = by.options.no_slip_m
+    known = no_slip is not None
+    arm = np.array(velocity.lever) - np.array(no_slip if no_slip is not None else (0.0, 0.0, 0.0))
+    speed = math.hypot(*velocity.v_ned[:2])
+    across = float(np.cross(rate, arm)[1])
+    forward = math.sqrt(max(speed**2 - across**2, 0.0))
+    bend = abs(float(rate[2])) * (MEASURED_LEVER_SD_M if known else UNKNOWN_LEVER_SD_M)
+    sd = math.hypot(by.options.course_sd_rad, math.hypot(max(velocity.sd[:2]), bend) / speed)
+    return Along(math.atan2(across, -forward if backward else forward), sd)
+
+
+def _reversing(by: Basis, velocity: VelocityOffer) -> str:
+    """Why a start backward must wait; empty if it need not.
+
+    An IMU mounted backwards feels a vehicle that drives off forward just as one that reverses; the
+    speed tells, once it has settled or is one that nobody reverses at. From then on no start is
+    one backward.
+    """
+    speed = math.hypot(*velocity.v_ned[:2])
+    if speed > by.options.max_reverse_m_s or "imu_backwards" in by.known.told:
+        return by.known.tell(
+            "imu_backwards",
+            f"the vehicle is felt to drive backward at {speed:.0f} m/s: is the IMU mounted "
+            "backwards? Correct [imu] axes",
+        )
+    for fix in by.known.fixes:
+        age_ns = velocity.t_ns - fix.velocity.t_ns
+        if 0 < age_ns <= SETTLED_NS:
+            if speed - math.hypot(*fix.velocity.v_ned[:2]) > SETTLED_M_S:
+                return by.known.doubted("moving off backward: waiting until the speed has settled")
+            break
+    return ""
+
+
+def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start | None:
+    velocity = latest.velocity
+    shortest, longest = MOTION_NS
+    oldest = max(velocity.t_ns - longest, imu.oldest_ns)
+    usable = [f.velocity for f in by.known.fixes if oldest <= f.velocity.t_ns <= velocity.t_ns]
+    if velocity.t_ns - usable[0].t_ns < shortest:
+        by.known.doubted("moving: collecting fixes")
+        return None
+    every = math.ceil(len(usable) / motion.MOST_FIXES)
+    fixes = usable[::-1][::every][::-1]
+    f = motion.felt(imu, [x.t_ns for x in fixes])
+    lat, _, height = (float(v) for v in place[1])
+    g = gravity(lat, height)
+    course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
+    fits = []
+    for backward in (False, True):
+        along = _along(by, velocity, f.rates[-1], backward)
+        fits.append(motion.fit(f, fixes, by.noise, g, course - along.angle, along.sd))
+    forward_fit, backward_fit = fits
+    best = min(fits, key=lambda x: x.cost)
+    # Where even the better fit is poor, the sigmas are too small by as much.
+    doubt = max(1.0, best.cost / best.degrees)
+    ratio = 0.5 * (backward_fit.cost - forward_fit.cost) / doubt
+    speed = math.hypot(*velocity.v_ned[:2])
+    if ratio < -DECIDED:
+        if _reversing(by, velocity):
             return None
-        lat, _, height = (float(v) for v in place[1])
-        change = velocity_of(velocity)[0] - velocity_of(earlier)[0]
-        roll, pitch = level_in_motion(
-            mean[3:], change / (interval * 1e-9), course, gravity(lat, height)
-        )
-        return build_start(
-            by.model,
-            velocity.t_ns,
+        return _build(
+            by,
+            velocity,
             place,
-            dcm_from_rpy(roll, pitch, course),
-            sd,
-            *velocity_of(velocity),
-            "GNSS course, on the move",
+            backward_fit.dcm,
+            max(math.sqrt(doubt) * backward_fit.sd_yaw, LEAST_YAW_SD_RAD),
+            f.rates[-1],
+            "GNSS course, on the move, backward",
         )
-    return None
+    fast = speed > by.options.max_reverse_m_s
+    moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9
+    patience = FORWARD_AFTER_S[0 if fast else 1]
+    # The prior says forward, but not once an IMU was found to face the other way.
+    assumed = moving_s >= patience and ratio > -1.0 and "imu_backwards" not in by.known.told
+    if ratio < DECIDED and not assumed:
+        by.known.doubted(
+            "forward or backward is not told yet: brake, accelerate or take a bend "
+            f"(forward is assumed after {patience:.0f} s)"
+        )
+        return None
+    return _build(
+        by,
+        velocity,
+        place,
+        forward_fit.dcm,
+        max(math.sqrt(doubt) * forward_fit.sd_yaw, LEAST_YAW_SD_RAD),
+        f.rates[-1],
+        "GNSS course, on the move",
+    )
+
+
+def _build(
+    by: Basis,
+    offer: VelocityOffer,
+    place: Place,
+    dcm: Array,
+    sd_yaw: float,
+    rate: Array,
+    how: str,
+    bias: tuple[Array, float] | None = None,
+) -> Start:
+    """With the antenna's velocity taken to the body."""
+    velocity, sd = velocity_of(offer)
+    velocity = velocity - dcm @ np.cross(rate, offer.lever)
+    return build_start(
+        by.model,
+        offer.t_ns,
+        place,
+        dcm,
+        sd_yaw,
+        velocity,
+        sd,
+        how,
+        bias=bias,
+        levelled=bias is not None,
+    )

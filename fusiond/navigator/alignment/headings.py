@@ -15,6 +15,9 @@ from fusiond.navigator.alignment.start import Place, Start, build_start
 
 # A heading that came this long ago no longer describes a body at rest that may have been moved.
 HEADING_AGE_NS = 2_000_000_000
+SAVED, CONFIGURED = "saved state", "configured heading"
+CLAIMS = (SAVED, CONFIGURED)
+"""Headings that nothing measured at the start."""
 # One sigma of velocity (m/s) of a vehicle that stands.
 REST_VELOCITY_SD = np.full(3, 0.1)
 
@@ -43,16 +46,14 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """What the vehicle knew when it was parked, while it has not moved since."""
     if by.saved is None or by.known.ever_moved:
         return None
-    return _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, "saved state")
+    return _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, SAVED)
 
 
 def from_config(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """The configured heading, while the vehicle has not moved."""
     if by.options.heading_rad is None or by.known.ever_moved:
         return None
-    return _at_standstill(
-        by, place, by.options.heading_rad, by.options.heading_sd_rad, "configured heading"
-    )
+    return _at_standstill(by, place, by.options.heading_rad, by.options.heading_sd_rad, CONFIGURED)
 
 
 def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:

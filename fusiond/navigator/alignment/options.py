@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
 
+# Faster (m/s) than a road vehicle reverses: a reverse gear ends at 10 to 25 km/h in a car.
+# A train drives either way.
+MAX_REVERSE_M_S = 8.0
+
 
 @dataclass(frozen=True, slots=True)
 class AlignmentOptions:
     """SI units; `heading` the allowed sources in order of preference, `window_s` the length of the
-    standstill detector's windows."""
+    standstill detector's windows, `rate_sd_rad_s` what a vehicle at rest may turn, `no_slip_m` from
+    the IMU to the point that does not slide, where it is known."""
 
     heading: tuple[str, ...]
     heading_rad: float | None
@@ -25,11 +31,15 @@ class AlignmentOptions:
     gyrocompass_s: float
     gyrocompass_max_sd_rad: float
     window_s: float
+    rate_sd_rad_s: float
+    no_slip_m: tuple[float, float, float] | None
+    max_reverse_m_s: float
 
 
 def alignment_options(config: Config) -> AlignmentOptions:
     """From `[alignment]` and `[constraints.zero_velocity]`."""
     a, rest = config.alignment, config.constraints.zero_velocity
+    no_slip = config.constraints.non_holonomic
     position = a.position_deg_m
     return AlignmentOptions(
         heading=a.heading,
@@ -44,4 +54,7 @@ def alignment_options(config: Config) -> AlignmentOptions:
         gyrocompass_s=a.gyrocompass_s,
         gyrocompass_max_sd_rad=a.gyrocompass_max_sd_deg * DEG,
         window_s=rest.window_s,
+        rate_sd_rad_s=rest.rate_sd_deg_s * DEG,
+        no_slip_m=no_slip.lever_arm_m if no_slip.enabled else None,
+        max_reverse_m_s=math.inf if config.vehicle_class == "rail" else MAX_REVERSE_M_S,
     )

@@ -1,0 +1,75 @@
+"""What the first motion says of a start: headings that were claimed, and how the IMU is mounted."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.witnesses import Witnesses
+from fusiond.navigation.rotation import dcm_from_quaternion, wrap_angle
+from fusiond.navigation.strapdown import Q0, VN
+from fusiond.navigator.alignment.headings import CLAIMS
+from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.start import Start
+
+Array = NDArray[np.float64]
+
+# Sigmas of heading and course beyond which a claimed heading is contradicted, and for how long: an
+# obstacle that the vehicle slides at takes less.
+HEADING_SIGMAS = 4.0
+CONTRADICTED_NS = 1_000_000_000
+# Measured velocities of so long are averaged to a course.
+COURSE_NS = 1_000_000_000
+
+
+class Afterwards:
+    """Watches a start; `refuted` says why it was a wrong one."""
+
+    def __init__(self, options: AlignmentOptions, start: Start) -> None:
+        self._options = options
+        self._claim = start.how if start.how in CLAIMS else ""
+        self._since_ns: int | None = None
+
+    def refuted(
+        self, t_ns: int, nav: Array, covariance: Array, measured: Witnesses
+    ) -> tuple[str, str] | None:
+        """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
+        the start was wrong."""
+        axes = dcm_from_quaternion(nav[Q0:])
+        forward = float(axes[:, 0] @ nav[VN : VN + 3])
+        sd = math.sqrt(max(float(axes[:, 0] @ covariance[3:6, 3:6] @ axes[:, 0]), 0.0))
+        if -forward - 3.0 * sd > self._options.max_reverse_m_s:
+            return "imu_backwards", (
+                f"driving backward at {-forward:.0f} m/s, faster than the vehicle can: is the IMU "
+                "mounted backwards? Correct [imu] axes"
+            )
+        if not self._claim:
+            return None
+        velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
+        return velocity and self._heading(t_ns, velocity, axes, math.sqrt(covariance[2, 2]))
+
+    def _heading(
+        self, t_ns: int, velocity: tuple[float, float, float], axes: Array, sd_yaw: float
+    ) -> tuple[str, str] | None:
+        """A heading that was configured or saved, against the measured course, forward or backward:
+        a filter with a wrong heading gates the velocity that says so."""
+        north, east, sd_speed = velocity
+        speed = math.hypot(north, east)
+        if speed < self._options.course_speed_m_s + 3.0 * sd_speed:
+            self._since_ns = None
+            return None
+        yaw, course = math.atan2(axes[1, 0], axes[0, 0]), math.atan2(east, north)
+        apart = abs(wrap_angle(course - yaw))
+        sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
+        if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
+            self._claim = ""  # confirmed
+            return None
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        if t_ns - self._since_ns < CONTRADICTED_NS:
+            return None
+        return "heading_contradicted", (
+            f"the {self._claim} is {math.degrees(apart):.0f} deg from the course: aligning anew"
+        )

@@ -1,0 +1,233 @@
+"""Starts by the course, many times over: is the stated sigma that of the error?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from drivers.measurements import MonotonicStamp, PositionFix
+from fusiond.configuration.schema import Config
+from fusiond.configuration.settings import DEG
+from fusiond.navigation.solution import Mode
+from fusiond.navigator.navigator import Navigator
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.trajectories import Leg, dcm_from_rpy, follow
+from tests import runs
+
+Array = NDArray[np.float64]
+
+RATE_HZ, FIXES_HZ = 50.0, 5.0
+SD_M, SD_M_S = 1.5, 0.05
+RUNS = 24
+HIGH = float(chi2.ppf(0.999, 3 * RUNS)) / RUNS
+"""99.9 % of the mean of as many NEES of three states."""
+FORWARD, BACKWARD = "GNSS course", "GNSS course, backward"
+MOVING, MOVING_BACKWARD = "GNSS course, on the move", "GNSS course, on the move, backward"
+LEVER = (3.0, 0.4, -1.0)
+BRAKE = (Leg(6), Leg(4, speed_m_s=8.0), Leg(4, speed_m_s=14.0), Leg(8, turn_deg=80.0), Leg(60))
+
+
+class Case(NamedTuple):
+    """A drive, what is heard of it from `from_s` on, and the start that it must lead to."""
+
+    legs: Sequence[Leg]
+    how: str
+    from_s: float = 0.0
+    fixes_from_s: float = 0.0
+    lever: tuple[float, float, float] = (0.0, 0.0, -1.0)
+
+
+TURN_OFF = Leg(8, speed_m_s=9.0, turn_deg=90.0)
+CASES = {
+    "straight": Case((Leg(8), Leg(8, speed_m_s=12.0), Leg(30)), FORWARD),
+    "in a bend with a long lever": Case((Leg(8), TURN_OFF, Leg(30)), FORWARD, lever=LEVER),
+    "backward": Case((Leg(8), Leg(6, speed_m_s=-4.5), Leg(30)), BACKWARD),
+    "on a slope": Case(
+        (Leg(1, climb_deg=6.0), Leg(8), Leg(8, speed_m_s=10.0), Leg(30)), FORWARD, from_s=2.0
+    ),
+    "on the move": Case((Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER),
+    "on the move, backward": Case(
+        (Leg(1), Leg(6, speed_m_s=-6.0), Leg(4), Leg(4, speed_m_s=-4.0), Leg(6, turn_deg=-60.0),
+         Leg(6, turn_deg=40.0), Leg(40)), MOVING_BACKWARD, 8.0,
+    ),
+    "quiet all the time, first fixes on the move": Case(
+        (Leg(1), Leg(6, speed_m_s=14.0), Leg(20), *BRAKE), MOVING, 9.0, 24.0
+    ),
+}  # fmt: skip
+
+
+def _truth(case: Case, seconds: float = 60.0) -> Truth:
+    return Truth(follow(case.legs, seconds, course_deg=40.0), runs.ORIGIN, RATE_HZ, seconds)
+
+
+def _fix(truth: Truth, t_s: float, lever: Sequence[float], rng: np.random.Generator) -> PositionFix:
+    s = truth.at(np.array([t_s]))
+    dcm = dcm_from_rpy(s.rpy)[0]
+    near = truth.at(np.array([t_s - 0.005, t_s + 0.005]))
+    turn = dcm_from_rpy(near.rpy)
+    w = (turn[0].T @ turn[1] - np.eye(3)) / 0.01
+    rate = np.array([w[2, 1], w[0, 2], w[1, 0]])
+    away = dcm @ np.array(lever) * [1.0, 1.0, -1.0] + SD_M * rng.standard_normal(3)
+    p = s.position[0] + away / np.abs(runs.metres(s.position[0, 0], s.position[0, 2]))
+    v = s.v_ned[0] + dcm @ np.cross(rate, lever) + SD_M_S * rng.standard_normal(3)
+    t_ns = round(t_s * 1e9)
+    lat, lon, height = (float(x) for x in p)
+    fix = PositionFix("gnss", t_ns, MonotonicStamp(t_ns), lat, lon, height)
+    north, east, down = (float(x) for x in v)
+    sd: Any = {"sd_ned_m": (SD_M,) * 3, "sd_v_ned_m_s": (SD_M_S,) * 3}
+    return replace(fix, v_ned_m_s=(north, east, down), **sd)
+
+
+def _started(case: Case, seed: int, until_s: float = 60.0, **imu: Any) -> Navigator:
+    """Run until the start, or to `until_s`."""
+    config = Config.model_validate(
+        {
+            "imu": {"rate_hz": RATE_HZ, **imu},
+            "aiding": {"gnss": {"lever_arm_m": case.lever}},
+            "alignment": {"heading": ["gnss_course"]},
+        }
+    )
+    truth, rng = _truth(case), np.random.default_rng(seed)
+    samples = runs.imu_run(config.imu, truth, seed).samples
+    times = runs.sample_times(truth)
+    events: list[str] = []
+    navigator = Navigator(config, on_event=lambda code, text: events.append(code))
+    step = round(RATE_HZ / FIXES_HZ)
+    for row in range(round(case.from_s * RATE_HZ), round(until_s * RATE_HZ), step):
+        rows = slice(row, row + step)
+        navigator.add_imu(times[rows], samples[rows])
+        t_s = float(times[rows][-1]) * 1e-9
+        if t_s >= case.fixes_from_s:
+            fix = _fix(truth, t_s, case.lever, rng)
+            navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+        if navigator.started is not None:
+            break
+    return navigator
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_sigma_of_a_start_is_honest(name: str) -> None:
+    case = CASES[name]
+    truth = _truth(case)
+    attitude, velocity, yaw_sd = [], [], []
+    for seed in range(RUNS):
+        start = _started(case, seed).started
+        assert start is not None, f"seed {seed}"
+        assert start.how == case.how, f"seed {seed}"
+        true = runs.true_nav(truth, np.array([start.t_ns * 1e-9]))[0]
+        error, p = runs.nav_error(start.nav, true), start.covariance
+        assert abs(error[2]) < 5.0 * math.sqrt(p[2, 2]), f"seed {seed}: yaw"
+        attitude.append(error[:3] @ np.linalg.solve(p[:3, :3], error[:3]))
+        velocity.append(error[3:6] @ np.linalg.solve(p[3:6, 3:6], error[3:6]))
+        yaw_sd.append(math.sqrt(p[2, 2]) / DEG)
+    print(
+        f"{name}: mean NEES of attitude {np.mean(attitude):.2f}, of velocity "
+        f"{np.mean(velocity):.2f} of 3 (to {HIGH:.2f}); sigma of yaw {np.mean(yaw_sd):.1f} deg"
+    )
+    assert np.mean(attitude) < HIGH
+    assert np.mean(velocity) < HIGH
+    assert np.mean(yaw_sd) < 10.0
+
+
+def test_straight_on_at_constant_speed_nobody_knows_forward_from_backward() -> None:
+    """Below the speed that one reverses at it waits, and says what to do."""
+    case = Case((Leg(1), Leg(6, speed_m_s=5.0), Leg(60)), MOVING, 9.0)
+    navigator = _started(case, 1, until_s=40.0)
+    assert navigator.started is None
+    mode, reason = navigator.mode(navigator.imu.latest_ns)
+    assert mode is Mode.ALIGNING
+    assert "brake, accelerate or take a bend" in reason
+
+
+def test_an_imu_that_is_upside_down_is_refused() -> None:
+    """Its data are those of x forward, y left, z up; the configuration says right and down."""
+    case = CASES["straight"]
+    truth = _truth(case)
+    events: list[str] = []
+    config = Config.model_validate({"imu": {"rate_hz": RATE_HZ}})
+    navigator = Navigator(config, on_event=lambda code, text: events.append(code))
+    samples = runs.imu_run(config.imu, truth, 1).samples * np.tile([1.0, -1.0, -1.0], 2)
+    rng = np.random.default_rng(1)
+    times = runs.sample_times(truth)
+    for row in range(0, 1500, 10):
+        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
+        fix = _fix(truth, float(times[row + 9]) * 1e-9, case.lever, rng)
+        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+    assert navigator.started is None
+    assert events == ["imu_upside_down"]
+    assert "upside down" in navigator.mode(navigator.imu.latest_ns)[1]
+
+
+def test_an_imu_that_is_mounted_backwards_is_told_and_never_navigates() -> None:
+    case = CASES["straight"]
+    truth = _truth(case)
+    events: list[str] = []
+    config = Config.model_validate({"imu": {"rate_hz": RATE_HZ}})
+    navigator = Navigator(config, on_event=lambda code, text: events.append(code))
+    samples = runs.imu_run(config.imu, truth, 1).samples * np.tile([-1.0, -1.0, 1.0], 2)
+    rng = np.random.default_rng(1)
+    times = runs.sample_times(truth)
+    for row in range(0, 1800, 10):
+        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
+        fix = _fix(truth, float(times[row + 9]) * 1e-9, case.lever, rng)
+        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+        assert navigator.started is None
+    assert events == ["imu_backwards"]
+
+
+def test_a_turning_deck_is_no_rest() -> None:
+    """0.6 deg/s is six sigma of the bias at switch-on; the start says so, and waits."""
+    legs = (Leg(60, turn_deg=36.0 * 1.875),)  # the profile's largest rate, in its middle
+    case = Case(legs, "", from_s=20.0)
+    truth = _truth(case)
+    config = Config.model_validate(
+        {
+            "imu": {"rate_hz": RATE_HZ},
+            "alignment": {"heading": ["config"], "heading_deg": 60.0},
+        }
+    )
+    navigator = Navigator(config)
+    samples, times = runs.imu_run(config.imu, truth, 2).samples, runs.sample_times(truth)
+    rng = np.random.default_rng(2)
+    for row in range(1000, 2000, 10):
+        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
+        fix = _fix(truth, float(times[row + 9]) * 1e-9, (0.0, 0.0, 0.0), rng)
+        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+    assert navigator.started is None
+    assert "turning at" in navigator.mode(navigator.imu.latest_ns)[1]
+
+
+@pytest.mark.parametrize(("heading_deg", "events"), [(45.0, []), (130.0, ["heading_contradicted"])])
+def test_a_configured_heading_is_compared_with_the_course(
+    heading_deg: float, events: list[str]
+) -> None:
+    """At rest nothing measures it; driving off does, and the course takes its place."""
+    case = CASES["straight"]
+    truth = _truth(case)
+    told: list[str] = []
+    heading = {"heading": ["config", "gnss_course"], "heading_deg": heading_deg}
+    config = Config.model_validate({"imu": {"rate_hz": RATE_HZ}, "alignment": heading})
+    navigator = Navigator(config, on_event=lambda code, text: told.append(code))
+    samples, times = runs.imu_run(config.imu, truth, 4).samples, runs.sample_times(truth)
+    rng = np.random.default_rng(4)
+    for row in range(0, 1500, 10):
+        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
+        fix = _fix(truth, float(times[row + 9]) * 1e-9, case.lever, rng)
+        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+    assert [code for code in told if code == "heading_contradicted"] == events
+    start, yaw = navigator.started, navigator.solution(int(times[1499])).rpy_rad[2]
+    assert start is not None
+    assert start.how == (MOVING if events else "configured heading")
+    assert yaw == pytest.approx(40.0 * DEG, abs=5.0 * DEG)
