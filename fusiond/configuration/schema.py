@@ -23,11 +23,14 @@ from pydantic import (
 from fusiond.configuration.aiding import (
     AIDING_KINDS,
     AnyAiding,
+    GnssAiding,
     Probability,
     RawAiding,
+    RdssAiding,
     Section,
     Vector,
 )
+from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
 
@@ -310,6 +313,7 @@ class Config(Section):
     alignment: Alignment = Alignment()
     estimator: Estimator = Estimator()
     consistency: ConsistencyTest = ConsistencyTest()
+    integrity: Integrity = Integrity()
     scheduler: Scheduler = Scheduler()
     clock: ClockOptions = ClockOptions()
     mqtt: Mqtt = Mqtt()
@@ -338,6 +342,28 @@ class Config(Section):
         raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
         if len(raw) > 1:
             raise ValueError(f"{' and '.join(raw)}: one receiver's raw data at most, one clock")
+        return self
+
+    @property
+    def positioning(self) -> tuple[str, ...]:
+        """The sections of aiding that give positions."""
+        kinds = GnssAiding | RawAiding | RdssAiding
+        return tuple(name for name, section in self.aiding.items() if isinstance(section, kinds))
+
+    @model_validator(mode="after")
+    def _levels_can_be_computed(self) -> Config:
+        o = self.integrity
+        unknown = [name for name in o.fault_probability_per_hour if name not in self.positioning]
+        if unknown:
+            raise ValueError(
+                f"integrity.fault_probability_per_hour: no [aiding.{unknown[0]}] with positions"
+            )
+        if not o.watched:
+            return self
+        if self.estimator.filter != "kalman":
+            raise ValueError("[integrity] needs estimator.filter 'kalman'")
+        if not self.positioning:
+            raise ValueError("[integrity] needs a section [aiding.NAME] that gives positions")
         return self
 
     @model_validator(mode="after")

@@ -40,6 +40,7 @@ WARNINGS = (
     "imu_time",
     "damaged",
     "taken",
+    "protection_level",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 

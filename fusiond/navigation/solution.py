@@ -25,6 +25,26 @@ class Mode(StrEnum):
     INVALID = "invalid"
 
 
+class BoundState(StrEnum):
+    """What the protection levels are worth. OFF: no alert limit is configured. UNKNOWN: no solution
+    to bound. WITHIN, BEYOND: against the alert limits."""
+
+    OFF = "off"
+    UNKNOWN = "unknown"
+    WITHIN = "within"
+    BEYOND = "beyond"
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Protection levels of a solution: horizontal and vertical, NaN where none is computed,
+    infinite where nothing bounds the error (fusiond.integrity.protection)."""
+
+    state: BoundState = BoundState.OFF
+    hpl_m: float = nan
+    vpl_m: float = nan
+
+
 @dataclass(frozen=True, slots=True)
 class Solution:
     """Navigation state of the body origin at one instant, with one sigma each.
@@ -48,3 +68,4 @@ class Solution:
     sd_rpy_rad: Vector3 = _UNKNOWN
     gyro_bias_rad_s: Vector3 = field(default=_UNKNOWN)
     accel_bias_m_s2: Vector3 = field(default=_UNKNOWN)
+    bound: Bound = Bound()

@@ -16,6 +16,7 @@ from fusiond.estimators.federated.reset import ResetFilter
 from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
+from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
@@ -41,6 +42,8 @@ def estimator_of(config: Config, model: Model) -> Estimator:
     """The estimator that `[estimator] filter` names."""
     match config.estimator.filter:
         case "kalman":
+            if config.integrity.watched:
+                return SeparatedEstimator(model, config.imu.gap_s, config.positioning)
             return KalmanEstimator(model, config.imu.gap_s)
         case "multiscale":
             m = config.estimator.multiscale

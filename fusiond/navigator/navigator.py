@@ -30,6 +30,7 @@ from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.left_out import LeftOut
+from fusiond.navigator.protection import ProtectionWatch
 from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
@@ -83,6 +84,7 @@ class Navigator:
         self._failed = FailedAids(self._event)
         self._left_out = LeftOut(self.timeline, names, self._event)
         self._standing = Standing(config.plausibility.max_speed_m_s)
+        self._protection = ProtectionWatch(config, self.estimator, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
         self._last_position_ns = 0
@@ -229,6 +231,8 @@ class Navigator:
             why = f"{self.warm.refused_by} speaks against the state of before the restart"
             self._event("warm_start_refused", f"{why}: aligning anew")
             self.reset(why)
+            return
+        self._protection.tell()
 
     def _warm_start(self) -> Start | None:
         """The start from the state of the last run, at the first sample; there is one attempt."""
@@ -269,9 +273,10 @@ class Navigator:
     def _present(self, t_ns: int) -> Solution:
         mode, reason = self.mode(t_ns)
         if self.started is None:
-            return Solution(t_ns, mode, reason)
+            return Solution(t_ns, mode, reason, bound=self._protection.unknown())
         gap_ns = round(self.config.imu.gap_s * 1e9)
-        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason)
+        bound = self._protection.bound()
+        return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound)
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """What the solution is worth at `t_ns`, and why."""

@@ -11,14 +11,20 @@ from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import compensate
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
-from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigation.solution import Bound, Mode, Solution
 from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
 
 Array = NDArray[np.float64]
 
 
 def solution_of(
-    estimator: Estimator, imu: ImuBuffer, t_ns: int, most_ns: int, mode: Mode, reason: str
+    estimator: Estimator,
+    imu: ImuBuffer,
+    t_ns: int,
+    most_ns: int,
+    mode: Mode,
+    reason: str,
+    bound: Bound,
 ) -> Solution:
     """The solution at `t_ns`; where that is later than the estimator's instant, carried ahead by
     holding the rates of the newest sample, for `most_ns` at most."""
@@ -43,6 +49,7 @@ def solution_of(
         (sd[6], sd[7], sd[8]),
         (bias[0], bias[1], bias[2]),
         (bias[3], bias[4], bias[5]),
+        bound,
     )
 
 

@@ -17,5 +17,6 @@ STUDIES = {
     "bds-tight": "fusiond.studies.bds_tight.study",
     "consistency": "fusiond.studies.consistency",
     "reduced-order": "fusiond.studies.reduced_order.study",
+    "protection": "fusiond.studies.protection",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
 }

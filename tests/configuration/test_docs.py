@@ -8,6 +8,7 @@ import pytest
 
 from fusiond.configuration import aiding as config_aiding
 from fusiond.configuration import schema as config
+from fusiond.configuration.integrity import Integrity
 from tests.places import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "configuration.md").read_text(encoding="utf-8")
@@ -30,6 +31,7 @@ SECTIONS = {
     "[estimator.federated]": config.Federated,
     "[estimator.unscented]": config.Unscented,
     "[consistency]": config.ConsistencyTest,
+    "[integrity]": Integrity,
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,
     "[mqtt]": config.Mqtt,

@@ -7,7 +7,7 @@ from typing import Any
 
 from fusiond.clock.clock import ClockStatus
 from fusiond.integrity.consistency import judge
-from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
@@ -30,6 +30,7 @@ SOLUTION = Solution(
     sd_ned_m=(0.9, 0.85, 1.7),
     sd_v_ned_m_s=(0.06, 0.06, 0.08),
     sd_rpy_rad=(radians(0.08), radians(0.08), radians(0.6)),
+    bound=Bound(BoundState.WITHIN, 38.412, 21.07),
 )
 
 SCHEDULER = SchedulerStatus(

@@ -32,6 +32,10 @@ class NavMessage(Message):
     sd_roll_deg: Number
     sd_pitch_deg: Number
     sd_yaw_deg: Number
+    protection_horizontal_m: Number = Field(
+        description="bound of the horizontal error at the configured integrity risk"
+    )
+    protection_vertical_m: Number = Field(description="bound of the vertical error")
 
 
 def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
@@ -60,4 +64,6 @@ def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
         sd_roll_deg=round(degrees(s.sd_rpy_rad[0]), 5),
         sd_pitch_deg=round(degrees(s.sd_rpy_rad[1]), 5),
         sd_yaw_deg=round(degrees(s.sd_rpy_rad[2]), 5),
+        protection_horizontal_m=round(s.bound.hpl_m, 3),
+        protection_vertical_m=round(s.bound.vpl_m, 3),
     )

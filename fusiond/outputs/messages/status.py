@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigation.solution import BoundState, Mode, Solution
 from fusiond.outputs.messages.base import Count, Message, stamp
 from fusiond.outputs.messages.health import SchedulerStatus
 
@@ -14,6 +14,7 @@ class StatusMessage(Message):
 
     mode: Mode
     why: str
+    protection: BoundState
     since_utc: str | None
     since_ms: int | None
     version: str
@@ -51,6 +52,7 @@ def status_message(
         t_ms=t_ms,
         mode=solution.mode,
         why=solution.reason,
+        protection=solution.bound.state,
         since_utc=since_utc,
         since_ms=since_ms,
         version=version,

@@ -128,7 +128,7 @@ class Drive:
         imu = car.imu_output(truth, imu_rng)
         stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
         receiver = replace(car.gnss, rate_hz=self.gnss_rate_hz)
-        received = _gnss(GnssReceiver(truth, receiver, gnss_rng))
+        received = gnss_fixes(GnssReceiver(truth, receiver, gnss_rng))
         received += _rdss(RdssCentre(truth, car.rdss, rdss_rng))
         if self.wheels:
             received += _wheels(truth, wheel_rng)
@@ -136,7 +136,7 @@ class Drive:
         return truth, Recording(stamps, stamps, samples, ()).with_received(received)
 
 
-def _gnss(receiver: GnssReceiver) -> list[Received]:
+def gnss_fixes(receiver: GnssReceiver) -> list[Received]:
     found = []
     for k in range(len(receiver)):
         t_ns, seen_ns = (round(float(t[k]) * 1e9) for t in (receiver.t_s, receiver.t_arrival_s))

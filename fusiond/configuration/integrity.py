@@ -1,0 +1,38 @@
+"""Section `[integrity]`: alert limits, the risk allowed, and how likely faults are."""
+
+from __future__ import annotations
+
+from pydantic import Field, PositiveFloat
+
+from fusiond.configuration.aiding import Probability, Section
+
+DEVICE_FAULT = 1e-3
+"""Of a position device in an hour. From space come 1e-4 (ten GPS satellites of 1e-5 each: GPS SPS
+Performance Standard, 5th ed., 2020, section 3.5.1; a constellation: 1e-4, Working Group C ARAIM,
+Milestone 3, 2016); ten times that for the receiver and where it stands, which nobody has measured.
+A factor of ten moves a level by about a tenth."""
+
+
+class Integrity(Section):
+    """Protection levels, computed where an alert limit is set; see `docs/integrity.md`."""
+
+    horizontal_alert_limit_m: PositiveFloat | None = None
+    """A horizontal protection level beyond it is an alarm."""
+    vertical_alert_limit_m: PositiveFloat | None = None
+    """The same for the vertical one."""
+    integrity_risk_per_hour: Probability = 1e-5
+    """Of an error beyond a protection level at some time of an hour."""
+    false_alarm_per_hour: Probability = 1e-4
+    """Of a level that grows by chance, because two solutions are further apart than they should."""
+    fault_probability_per_hour: dict[str, Probability] = Field(default_factory=dict)
+    """By `[aiding.NAME]`: that the device is at fault at some time of an hour; 1e-3 where it is
+    not named."""
+
+    def priors(self, devices: tuple[str, ...]) -> tuple[float, ...]:
+        """Probability of a fault in an hour of each device."""
+        return tuple(self.fault_probability_per_hour.get(d, DEVICE_FAULT) for d in devices)
+
+    @property
+    def watched(self) -> bool:
+        """Whether there is a limit, and so a use for levels."""
+        return self.horizontal_alert_limit_m is not None or self.vertical_alert_limit_m is not None

@@ -1,0 +1,129 @@
+r"""Solution separation in the filter: beside the estimate of all aids one without each device.
+
+    x_0   of all aids                                P_0
+    x_k   of all aids but those of device k          P_k
+
+All are error estimates of the one navigation state: an aid is linearised once, and each subset
+folds it in with its own gain after its own gate; what is fed back is x_0, and x_k <- x_k - x_0.
+Then, where the noise is as modelled and both have taken the same aids,
+
+    cov(x_k - x_0) = P_k - P_0
+
+as the error of an optimal estimate is orthogonal to what the same data could still change. A subset
+gates for itself: the aids that agree with a device that is wrong are not those that agree without
+it. With one device its subset is the IMU with what else there is (wheels, standstill): it drifts.
+
+The initial estimate is common to all: a start from a fix that was wrong shows in no separation.
+
+Source: Brenner, Integrated GPS/inertial fault detection availability, NAVIGATION 43 (1996), 111;
+Young, McGraw, Fault detection and exclusion using normalized solution separation and residual
+monitoring methods, NAVIGATION 50 (2003), 151.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable
+from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.federated.options import local_of
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.screening import KEPT
+from fusiond.estimators.update import fuse
+from fusiond.models.model import Model
+
+Array = NDArray[np.float64]
+
+POSITION = slice(6, 9)
+
+
+class SeparatedEstimator(KalmanEstimator):
+    """The centralised filter with a subset for each of `devices`: sources of position, by the name
+    that their aids begin with. What is published is, to rounding, the filter's without subsets."""
+
+    def __init__(self, model: Model, gap_s: float, devices: tuple[str, ...]) -> None:
+        if not devices:
+            raise ValueError("solution separation needs at least one device")
+        ErrorStateFilter.__init__(self, model, gap_s, (1.0,) * (1 + len(devices)))
+        self.devices = devices
+        self._carrying = True
+        self._device_of: dict[str, int | None] = {}
+
+    def covariances(self) -> Array:
+        """P (1 + devices, 3, 3), m^2, of the position north, east, down: of all aids, then of the
+        subsets."""
+        return self._covs[:, POSITION, POSITION]
+
+    def separations(self) -> Array:
+        """(devices, 3), m: position of the solution without each device minus the published one."""
+        return self._dxs[0, POSITION] - self._dxs[1:, POSITION]
+
+    def update(self, aid: Linearised) -> Outcome:
+        """Fold one aid in, or name why not."""
+        innovation = self._linearise(aid)
+        if isinstance(innovation, NotApplicable):
+            return Outcome(innovation.outcome)
+        held, self._holding = self._holding, True
+        try:
+            outcome = super().update(aid)
+        finally:
+            self._holding = held
+        self._fold_into_subsets(aid, innovation)
+        if not held:
+            self._take_out()
+        return outcome
+
+    def look(self, aid: Linearised) -> Outcome:
+        """What the innovation of an aid would be; the aid is `isolated`, nothing that is published
+        changes. The subsets judge for themselves: there the aid may be the sound one."""
+        outcome = super().look(aid)
+        innovation = self._linearise(aid)
+        if not isinstance(innovation, NotApplicable):
+            self._fold_into_subsets(aid, innovation)
+        return outcome
+
+    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors, which
+        all share. What a device measures is no concern of the subset without it."""
+        super().doubt(aid, measured, motion)
+        rows = self._linearise(aid)
+        if isinstance(rows, NotApplicable):
+            return
+        own = self._device(aid)
+        for k in range(len(self.devices)):
+            used = len(rows.z) if measured and k != own else 0
+            z, h = rows.z[:used], rows.h[:used]
+            self._widen(self._covs[k + 1], z - h @ self._dxs[k + 1], h, motion)
+
+    def release(self) -> None:
+        """Feed back what was carried."""
+        self._holding = False
+        self._take_out()
+
+    def _take_out(self) -> None:
+        """Feed the published estimate back: the others are of what is left."""
+        if self._dxs[0].any():
+            self._feed_back(self._dxs[0])
+            self._dxs -= self._dxs[0].copy()
+
+    def _device(self, aid: Linearised) -> int | None:
+        """Which device an aid comes from; None where from none of them."""
+        if aid.source not in self._device_of:
+            self._device_of[aid.source] = local_of(aid.source, self.devices)
+        return self._device_of[aid.source]
+
+    def _fold_into_subsets(self, aid: Linearised, i: Innovation) -> None:
+        """An aid into each subset but its own device's, if the subset's gate lets it pass."""
+        own = self._device(aid)
+        for k in range(1, 1 + len(self.devices)):
+            if k - 1 == own:
+                continue
+            cov, dx = self._covs[k], self._dxs[k]
+            if aid.screened:
+                s = self._screen(aid, i, cov, dx)
+                if (s.codes == KEPT).any():
+                    cov[:], dx[:] = s.cov, s.dx
+            else:
+                threshold, y = gate_threshold(aid.gate, i.z.shape[0]), np.zeros(i.z.shape[0])
+                fuse(self.nav, self.xi, cov, dx, i.z, i.h, i.r, threshold, True, y)

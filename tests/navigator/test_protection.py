@@ -1,0 +1,130 @@
+"""Protection levels of the navigator: what nav says, and what an operator hears."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from drivers.measurements import Measurement, PositionFix
+from fusiond.configuration.load import ConfigError
+from fusiond.configuration.schema import Config
+from fusiond.navigation.solution import BoundState
+from fusiond.navigator.navigator import Navigator
+from tests.navigator import vehicle
+
+GNSS: dict[str, Any] = {"kind": "gnss"}
+# The drive starts from a configured position: levels are wide until the receivers have spoken.
+ALARMED_AT_FIRST = ["protection_level", "protection_restored"]
+
+
+def settings(limit_m: float | None, **aiding: dict[str, Any]) -> dict[str, Any]:
+    limits = {} if limit_m is None else {"horizontal_alert_limit_m": limit_m}
+    return {**vehicle.CONFIG, "aiding": {"gnss": GNSS, **aiding}, "integrity": limits}
+
+
+def driven(
+    limit_m: float | None, two: bool = False, off_m: float = 0.0
+) -> tuple[Navigator, list[str]]:
+    """The drive of 44 s with one receiver or two alike; the first is off north by `off_m` from
+    half way on. The navigator at the end, and its events about levels."""
+    heard: list[str] = []
+
+    def hear(code: str, text: str) -> None:
+        if code.startswith("protection"):
+            heard.append(code)
+
+    d = vehicle.drive()
+    extra = {"other": GNSS} if two else {}
+    navigator = Navigator(Config.model_validate(settings(limit_m, **extra)), on_event=hear)
+    waiting: list[Measurement] = list(d.measurements)
+    for row in range(0, len(d.times), 10):
+        navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
+        now = int(d.times[min(row + 10, len(d.times)) - 1])
+        while waiting and waiting[0].t_seen_ns <= now:
+            m = waiting.pop(0)
+            if isinstance(m, PositionFix):
+                if two:
+                    navigator.add(replace(m, source="other"), m.t_seen_ns)
+                if m.t_seen_ns - vehicle.START_NS > 25e9:
+                    m = replace(m, lat_rad=m.lat_rad + off_m / 6.37e6)
+            navigator.add(m, m.t_seen_ns)
+        navigator.advance()
+    return navigator, heard
+
+
+def test_without_an_alert_limit_there_are_no_levels() -> None:
+    navigator, heard = driven(None)
+    bound = navigator.solution(navigator.imu.latest_ns).bound
+    assert bound.state is BoundState.OFF
+    assert math.isnan(bound.hpl_m)
+    assert math.isnan(bound.vpl_m)
+    assert heard == []
+
+
+def test_with_one_receiver_nobody_can_check_it() -> None:
+    """The only other solution is the IMU with its wheels: the level grows as that drifts."""
+    navigator, heard = driven(20.0)
+    now = navigator.imu.latest_ns
+    late = navigator.solution(now).bound
+    assert late.state is BoundState.BEYOND
+    assert late.hpl_m > 2.0 * 20.0
+    assert heard == ["protection_level"]
+    assert math.hypot(*navigator.solution(now).sd_ned_m[:2]) < 1.5
+
+
+def test_with_two_receivers_the_level_stays() -> None:
+    navigator, heard = driven(20.0, two=True)
+    bound = navigator.solution(navigator.imu.latest_ns).bound
+    sd = math.hypot(*navigator.solution(navigator.imu.latest_ns).sd_ned_m[:2])
+    assert 5.0 * sd < bound.hpl_m < 15.0
+    assert bound.state is BoundState.WITHIN
+    assert heard in (
+        [],
+        ["protection_level", "protection_restored"],
+    )  # alarmed before the second fix
+
+
+def test_a_receiver_that_is_off_raises_the_level_beyond_its_error() -> None:
+    sound, _ = driven(20.0, two=True)
+    wrong, heard = driven(20.0, two=True, off_m=3.0)
+    now = sound.imu.latest_ns
+    a, b = sound.solution(now), wrong.solution(now)
+    apart = abs(b.lat_rad - a.lat_rad) * 6.37e6
+    assert apart > 0.5
+    assert b.bound.hpl_m >= a.bound.hpl_m
+    assert b.bound.hpl_m > 3.0
+    assert heard in ([], ALARMED_AT_FIRST)
+
+
+def test_before_the_start_the_levels_are_unknown() -> None:
+    navigator = Navigator(Config.model_validate(settings(20.0)))
+    bound = navigator.solution(0).bound
+    assert bound.state is BoundState.UNKNOWN
+    assert math.isnan(bound.hpl_m)
+
+
+def test_a_risk_below_that_of_two_faults_together_is_refused() -> None:
+    asked = settings(20.0, rdss={"kind": "rdss"})
+    asked["integrity"] = {**asked["integrity"], "integrity_risk_per_hour": 1e-7}
+    with pytest.raises(ConfigError, match="two devices at fault"):
+        Navigator(Config.model_validate(asked))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"estimator": {"filter": "unscented"}}, "needs estimator.filter 'kalman'"),
+        ({"aiding": {"wheel": {"kind": "wheel"}}}, "gives positions"),
+        (
+            {"integrity": {"fault_probability_per_hour": {"wheel": 1e-3}}},
+            r"no \[aiding.wheel\] with positions",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        Config.model_validate({**settings(20.0), **change})
