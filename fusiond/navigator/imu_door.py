@@ -18,17 +18,19 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_range
-from fusiond.estimators.propagation import GAP_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-# A yaw error whose sine is wrong by 3 %, so that an error state still means what it says. Its sigma
-# after a gap of T is GAP_RATE_RAD_S * T: that makes 4.4 s.
+# A yaw error whose sine is wrong by 3 %, so that an error state still means what it says; and how
+# fast a vehicle ordinarily turns at a street corner, a quarter turn in six to eight seconds. The
+# mean of a drive, by which sigma grows, is half of that: a gap of 3 s in a bend left errors of 7.7
+# sigma. That makes 2.2 s.
 BEARABLE_YAW_RAD = math.radians(25.0)
-BEARABLE_GAP_S = BEARABLE_YAW_RAD / GAP_RATE_RAD_S
+CORNER_RATE_RAD_S = 0.2
+BEARABLE_GAP_S = BEARABLE_YAW_RAD / CORNER_RATE_RAD_S
 # Good samples that end a trouble: twice what it takes to see that an axis is dead.
 SOUND_NS = 2_000_000_000
 

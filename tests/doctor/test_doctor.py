@@ -82,6 +82,9 @@ async def test_all_is_well(tmp_path: Path) -> None:
     assert all("samples a second" in f or "old on arrival" in f for f in findings), text
     assert code == (1 if findings else 0), text
     assert findings or text.endswith("all is well\n")
+    (rate,) = (line.split(", ")[1] for line in text.splitlines() if "ImuSample" in line)
+    in_time = 80.0 < float(rate.removesuffix(" Hz")) < 120.0
+    assert in_time or any("samples a second" in f for f in findings), text
     assert f"imu: can_imu on virtual {tmp_path}: running" in text
     assert "ImuSample: " in text
     assert "at rest: specific force 9.8" in text

@@ -155,7 +155,8 @@ def test_bad_samples_leave_no_trace() -> None:
     assert (np.abs(runs.nav_error(navigator.estimator.nav, true)) < 4.0 * sd).all()
 
 
-def test_a_gap_is_invalid_while_it_lasts_and_honest_after() -> None:
+@pytest.mark.parametrize("gap_s", [1.0, 2.0])
+def test_a_gap_is_invalid_while_it_lasts_and_honest_after(gap_s: float) -> None:
     d = drive()
     navigator, row = started()
     stop = round(18.0 * RATE_HZ)
@@ -165,13 +166,27 @@ def test_a_gap_is_invalid_while_it_lasts_and_honest_after() -> None:
     solution = navigator.solution(silent)
     assert solution.mode is Mode.INVALID
     assert solution.reason == "IMU silent for 2.0 s"
-    _feed_until(navigator, stop + round(1.0 * RATE_HZ), len(d.times))
+    _feed_until(navigator, stop + round(gap_s * RATE_HZ), len(d.times))
     assert navigator.imu.counters["gap"] == 1
     assert navigator.started is not None
     true = runs.true_nav(d.truth, np.array([SECONDS]))[0]
     sd = np.sqrt(np.diag(navigator.estimator.covariance)[:9])
     assert (np.abs(runs.nav_error(navigator.estimator.nav, true)) < 4.0 * sd).all()
     assert before[0] < 1.5
+
+
+@pytest.mark.parametrize("gap_s", [2.5, 3.0, 4.0])
+def test_a_gap_that_a_bend_makes_unbearable_ends_navigation(gap_s: float) -> None:
+    """The vehicle turns by 15 deg/s meanwhile: no sigma of a linear filter is honest after it."""
+    d = drive()
+    events: list[str] = []
+    navigator, row = started(on_event=lambda code, text: events.append(code))
+    stop = round(18.0 * RATE_HZ)
+    _feed_until(navigator, row, stop)
+    _feed_until(navigator, stop + round(gap_s * RATE_HZ), len(d.times))
+    assert "imu_gap" in events
+    assert navigator.started is None
+    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.ALIGNING
 
 
 def _feed_until(navigator: Navigator, row: int, stop: int) -> None:

@@ -28,12 +28,12 @@ def test_every_fault_has_its_figures() -> None:
     assert found["runs"] == 2
     assert "paper 004" in found["paper"]["source"]
     assert set(found["faults"]) == {"step", "drift", "frozen"}
-    for fault in found["faults"].values():
+    for name, fault in found["faults"].items():
         assert 0.0 < fault["detected_after_s"] < 60.0
-        # A gate that never gives in keeps a step out as well: nobody believes it by patience.
+        if name != "frozen":  # which the local filters' gates keep out by themselves
+            assert fault["rms_isolated_m"] < 0.5 * fault["rms_unisolated_m"]
         assert fault["rms_isolated_m"] < 2.5
         assert fault["rms_centralised_m"] < 2.5
-        assert fault["rms_unisolated_m"] > 0.9 * fault["rms_isolated_m"]
         assert fault["rms_isolated_m"] == fault["modes"]["no_reset"]["rms_m"]
     assert ". " not in found["finding"]
     for name in ("step", "drift", "frozen"):

@@ -31,8 +31,7 @@ from typing import NamedTuple
 from fusiond.estimators.base import gate_threshold
 
 # A local filter is isolated only while another is believed that was heard in the last ten seconds
-# (as long as the timeline waits before it believes a gated source again): there must be somebody to
-# disagree with.
+# (as long as a position holds the mode `navigating`): there must be somebody to disagree with.
 RECENT_NS = 10_000_000_000
 NEVER_NS = -(2**62)
 # The sum of the innovations that bring a sensor back lies below this quantile: a healthy sensor
