@@ -227,9 +227,9 @@ class Isolation:
             return Action.NONE
         reason = "jumped" if record.jumped else "disagrees"
         self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
-        # A jump is the source's. Else the motion may be what is wrong, and positions shall decide. What
-        # is neither position nor velocity (a heading, a height) has nobody to decide: a doubt would
-        # open the filter until it passes, which is patience by another name.
+        # A jump is the source's. Else the motion may be what is wrong, and positions shall decide.
+        # What is neither position nor velocity (a heading, a height) has nobody to decide: a doubt
+        # would open the filter until it passes, which is patience by another name.
         if record.jumped or not (record.locates or record.moves):
             return Action.NONE
         return Action.DOUBT_MOTION
