@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.offers import Offer
 from fusiond.models.model import Model
+from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
-from fusiond.navigation.strapdown import Q0, VE, VN
+from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
 
 Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
@@ -29,7 +30,7 @@ aid says so; or now, all that was held."""
 
 
 class State(NamedTuple):
-    """What an aid may look at: navigation state (10,), parameters (n,), last step (18,), model, and
+    """What an aid may look at: navigation state (10,), parameters (n,), last step (21,), model, and
     the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth)."""
 
     nav: Array
@@ -47,6 +48,13 @@ class State(NamedTuple):
     def rate_b(self) -> Array:
         """Compensated angular rate (3,), rad/s, body axes, of the last step."""
         return self.step[3:6]
+
+    @property
+    def acceleration(self) -> Array:
+        """North, east, down (3,), m/s^2: the mean over the last quarter of a second."""
+        a = self.step[STEP_SMOOTH_N : STEP_SMOOTH_N + 3].copy()
+        a[2] += gravity(self.nav[LAT], self.nav[HEIGHT])
+        return a
 
     @property
     def speed(self) -> float:

@@ -1,13 +1,25 @@
-r"""Velocity in body axes: non-holonomic constraint and wheel speed.
+r"""Velocity in the vehicle's axes: no side slip and wheel speed, and what is not known about them.
 
-At a point l of the vehicle (rear axle, wheel), with the body's rate w:
+At a point l of the vehicle (rear axle, wheel), with the body's rate w, body axes turned into the
+vehicle's by the mounting m:
 
-    z = C^T v^ + w x l - v_b = C^T dv - C^T [v x] phi - [l x] e + v
+    u = exp[m x] (C^T v + w x l),     l = l_0 + (l_x, 0, 0)
 
-Non-holonomic: v_b right and down are 0. Wheel speed: v_b forward is what the wheel says.
+    no slip:      0 = u_right - s,   0 = u_down
+    wheel speed:  y = (1 + k) (u_forward - a_forward tau)
+
+m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, wind: it lasts for
+seconds), the wheel's scale k and latency tau are estimated where the model has their blocks
+(fusiond.models.vehicle). With z = h(x^) - y, navigation errors computed minus true, parameters true
+minus estimated, and e_i the axis's unit vector:
+
+    z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + ds + v
+    z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) a_forward dtau + v    (wheel)
+
+a_forward is smoothed: one sample of a shaken sensor would make the latency look smaller than it is.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
-T-RA 17 (2001), eq. 8; Groves, 2nd ed., section 15.4.1.
+T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and mounting of odometers).
 """
 
 from __future__ import annotations
@@ -20,71 +32,136 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.offers import SpeedOffer
+from fusiond.models.model import Model
+from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import gravity
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
-from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import Q0, STEP_RATE_B, VN
+from fusiond.navigation.rotation import dcm_elements, rotation_vector_to_quaternion
+from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_RATE_B, STEP_SMOOTH_N, VN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 FORWARD, RIGHT = 0, 1
+# Where the kernel finds the slot of each parameter; -1 for one that the model has not.
+PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
 
 
-@compiled("void(f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8, f8[::1], f8[:, ::1])")
+def _slots(model: Model, scale: str = "", latency: str = "") -> Indices:
+    """Slots (6,) of the parameters, by the names of the wheel's own blocks."""
+    found = [*(model.slots_of(MOUNTING) or (-1, -1))]
+    for block in (AXLE_LEVER, SIDE_DRIFT, scale, latency):
+        found += model.slots_of(block) or (-1,)
+    return np.array(found, dtype=np.int64)
+
+
+@compiled("f8(f8[::1], i8)", forceinline=True)
+def _estimate(xi: Array, slot: int) -> float:
+    return xi[slot] if slot >= 0 else 0.0
+
+
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], i8, f8[::1], f8[:, ::1])"
+)
 def _rows(
     nav: Array,
     step: Array,
+    xi: Array,
     column_of: Indices,
     hold_height: bool,
     l0: float,
     l1: float,
     l2: float,
+    slot: Indices,
     first: int,
     z: Array,
     h: Array,
 ) -> None:
-    """Write the point's velocity along body axes first, first + 1 ... to z (m,), and H (m, n)."""
+    """Write h(x^) of vehicle axes first, first + 1 ... to z (m,), and H (m, n), zero before."""
     c = dcm_elements(nav[Q0:])
+    turn = np.array(
+        rotation_vector_to_quaternion(0.0, _estimate(xi, slot[PITCH]), _estimate(xi, slot[YAW]))
+    )
+    t = dcm_elements(turn)
     w0, w1, w2 = step[STEP_RATE_B], step[STEP_RATE_B + 1], step[STEP_RATE_B + 2]
     v0, v1, v2 = nav[VN], nav[VN + 1], nav[VN + 2]
-    turning = (w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0)
+    l0 += _estimate(xi, slot[LEVER])
+    b0 = c[0] * v0 + c[3] * v1 + c[6] * v2 + w1 * l2 - w2 * l1
+    b1 = c[1] * v0 + c[4] * v1 + c[7] * v2 + w2 * l0 - w0 * l2
+    b2 = c[2] * v0 + c[5] * v1 + c[8] * v2 + w0 * l1 - w1 * l0
+    u = (
+        t[0] * b0 + t[1] * b1 + t[2] * b2,
+        t[3] * b0 + t[4] * b1 + t[5] * b2,
+        t[6] * b0 + t[7] * b1 + t[8] * b2,
+    )
     # Rows of -[l x].
     arm = (0.0, l2, -l1, -l2, 0.0, l0, l1, -l0, 0.0)
     for i in range(z.shape[0]):
         axis = first + i
-        a, b, e = c[axis], c[3 + axis], c[6 + axis]
-        z[i] = a * v0 + b * v1 + e * v2 + turning[axis]
+        t0, t1, t2 = t[3 * axis], t[3 * axis + 1], t[3 * axis + 2]
+        # Row of exp[m x] C^T.
+        a = t0 * c[0] + t1 * c[1] + t2 * c[2]
+        b = t0 * c[3] + t1 * c[4] + t2 * c[5]
+        e = t0 * c[6] + t1 * c[7] + t2 * c[8]
+        z[i] = u[axis]
         h[i, 0] = e * v1 - b * v2
         h[i, 1] = a * v2 - e * v0
         h[i, 2] = b * v0 - a * v1
         h[i, 3], h[i, 4] = a, b
         if not hold_height:
             h[i, 5] = e
-        for slot in range(CORE_SIZE, column_of.shape[0]):
-            kind = column_of[slot] - RATE_ERROR
+        for j in range(CORE_SIZE, column_of.shape[0]):
+            kind = column_of[j] - RATE_ERROR
             if 0 <= kind < 3:
-                h[i, slot] = arm[3 * axis + kind]
+                h[i, j] = t0 * arm[kind] + t1 * arm[3 + kind] + t2 * arm[6 + kind]
+        if slot[PITCH] >= 0:
+            # Row of [u x], and columns of the left Jacobian of exp[m x] to second order.
+            x = 0.0 if axis == 0 else (u[2] if axis == 1 else -u[1])
+            y = -u[2] if axis == 0 else (0.0 if axis == 1 else u[0])
+            w = u[1] if axis == 0 else (-u[0] if axis == 1 else 0.0)
+            p, q = xi[slot[PITCH]], xi[slot[YAW]]
+            h[i, slot[PITCH]] = -0.5 * q * x + (1.0 - q * q / 6.0) * y + p * q / 6.0 * w
+            h[i, slot[YAW]] = 0.5 * p * x + p * q / 6.0 * y + (1.0 - p * p / 6.0) * w
+        if slot[LEVER] >= 0:
+            h[i, slot[LEVER]] = t2 * w1 - t1 * w2
+        if axis == RIGHT and slot[DRIFT] >= 0:
+            z[i] -= xi[slot[DRIFT]]
+            h[i, slot[DRIFT]] = 1.0
+        if axis == FORWARD:
+            ahead = a * step[STEP_SMOOTH_N] + b * step[STEP_SMOOTH_N + 1]
+            ahead += e * (step[STEP_SMOOTH_N + 2] + gravity(nav[LAT], nav[HEIGHT]))
+            z[i] -= ahead * _estimate(xi, slot[LATENCY])
+            if slot[LATENCY] >= 0:
+                h[i, slot[LATENCY]] = ahead
+            gain = 1.0 + _estimate(xi, slot[SCALE])
+            for j in range(h.shape[1]):
+                h[i, j] *= gain
+            if slot[SCALE] >= 0:
+                h[i, slot[SCALE]] = -z[i]
+            z[i] *= gain
 
 
 def _body_velocity(
-    state: State, lever: Vector3, first: int, count: int, measured: float, sd: float
-) -> Innovation:
-    """Innovation along `count` body axes from `first` on."""
+    state: State, lever: Vector3, first: int, count: int, slots: Indices
+) -> tuple[Array, Array]:
+    """h(x^) (m,) and H (m, n) along `count` of the vehicle's axes from `first` on."""
     model = state.model
     z, h = np.empty(count), np.zeros((count, model.size))
-    _rows(state.nav, state.step, model.column_of, model.hold_height, *lever, first, z, h)
-    z -= measured
-    return Innovation(z, h, np.full(count, sd**2))
+    hold = model.hold_height
+    _rows(state.nav, state.step, state.xi, model.column_of, hold, *lever, slots, first, z, h)
+    return z, h
 
 
 @dataclass(frozen=True, slots=True)
 class NonHolonomicAid(Aid):
-    """No sideways or vertical velocity (sigma `sd_m_s`) at `lever`, above `min_speed_m_s`."""
+    """No sideways (sigma `sd_m_s`) or vertical velocity (`sd_down_m_s`) at `lever`, above
+    `min_speed_m_s`."""
 
     constraint: ClassVar[bool] = True
 
     sd_m_s: float
+    sd_down_m_s: float
     min_speed_m_s: float
     lever: Vector3
 
@@ -92,19 +169,25 @@ class NonHolonomicAid(Aid):
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
         count = 1 if state.model.hold_height else 2  # right, down
-        return _body_velocity(state, self.lever, RIGHT, count, 0.0, self.sd_m_s)
+        z, h = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model))
+        return Innovation(z, h, np.square((self.sd_m_s, self.sd_down_m_s)[:count]))
 
 
 @dataclass(frozen=True, slots=True)
 class WheelSpeedAid(Aid):
-    """Forward speed (m/s) with `sd_m_s` at `lever`."""
+    """Forward speed (m/s) with `sd_m_s` at `lever`; `scale` and `latency` name the blocks of the
+    wheel's own errors."""
 
     speed_m_s: float
     sd_m_s: float
     lever: Vector3
+    scale: str = ""
+    latency: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        return _body_velocity(state, self.lever, FORWARD, 1, self.speed_m_s, self.sd_m_s)
+        slots = _slots(state.model, self.scale, self.latency)
+        z, h = _body_velocity(state, self.lever, FORWARD, 1, slots)
+        return Innovation(z - self.speed_m_s, h, np.array([self.sd_m_s**2]))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
         return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s),)

@@ -1,11 +1,14 @@
 r"""Position of an antenna: a GNSS fix, with or without height.
 
-    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l + b^
-      = dr + (C l) x phi - db + v
+    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + b^
+        + v^ (tau^ - tau_0)
+      = dr + (C l) x phi + (tau^ - tau_0) dv - C dl - db - v dtau + noise
 
-l is the lever arm from the IMU to the antenna. b is an error that successive fixes share (orbits,
-ionosphere), where the model has states for it; b^ its estimate, db true minus estimated. A timing
-error of sigma s_t moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis.
+l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
+ionosphere), tau how much later than its stamp the fix is valid; where the model has states for
+them they are estimated, true minus estimated in dl, db, dtau. The aid's instant has tau_0 in it
+already. A timing error of sigma s_t that is not shared moves the antenna by v s_t, which adds
+(v_i s_t)^2 to the variance of each axis.
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3.
 """
@@ -59,11 +62,21 @@ def _position(
         h[2, 8] = 1.0
 
 
+def antenna(state: State, lever: Vector3, block: str) -> tuple[Vector3, list[int]]:
+    """The lever arm (m) with the estimate of its rest, and the slots of that, none without it."""
+    slots = state.model.slots_of(block)
+    if not slots:
+        return lever, slots
+    x, y, z = (a + float(state.xi[slot]) for a, slot in zip(lever, slots, strict=True))
+    return (x, y, z), slots
+
+
 @dataclass(frozen=True, slots=True)
 class PositionAid(Aid):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 
-    `bias`: the blocks whose states north, east, down are the error that the fixes share.
+    `bias`: the blocks whose states north, east, down are the error that the fixes share; `time` and
+    `rest` those of the offset in time, of which `ahead_s` is in `t_ns`, and of the lever arm's rest.
     """
 
     locates: ClassVar[bool] = True
@@ -75,17 +88,29 @@ class PositionAid(Aid):
     lever: Vector3
     sd_time_s: float = 0.0
     bias: tuple[str, ...] = ()
+    time: str = ""
+    ahead_s: float = 0.0
+    rest: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav = state.nav
         rows = 2 if self.height_m is None or state.model.hold_height else 3
         height = 0.0 if self.height_m is None else self.height_m
         z, h = np.empty(rows), np.zeros((rows, state.model.size))
-        _position(nav, self.lat_rad, self.lon_rad, height, *self.lever, z, h)
+        lever, levers = antenna(state, self.lever, self.rest)
+        _position(nav, self.lat_rad, self.lon_rad, height, *lever, z, h)
+        if levers:
+            h[:, levers] = -state.dcm[:rows]
         shared = [slot for block in self.bias for slot in state.model.slots_of(block)]
         for row, slot in zip(range(rows), shared, strict=False):
             h[row, slot] = -1.0
             z[row] += state.xi[slot]
+        for slot in state.model.slots_of(self.time):
+            late_s = float(state.xi[slot]) - self.ahead_s
+            v = nav[VN : VN + rows]
+            z += v * late_s
+            h[:, slot] = -v
+            h[:, 3 : 3 + rows] += late_s * np.eye(rows)
         r = np.square(self.sd[:rows])
         if self.sd_time_s:
             r += np.square(nav[VN : VN + rows] * self.sd_time_s)

@@ -1,9 +1,12 @@
 r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 
-    z = v^ + C^ (w x l) - v_fix = dv + (C (w x l)) x phi - C [l x] e + v
+    z = v^ + C^ (w x l^) + a^ (tau^ - tau_0) - v_fix
+      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + noise
 
 w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s
-per 10 m.
+per 10 m. tau is how much later than its stamp the velocity is valid, tau_0 what the aid's instant
+has of it already, a the acceleration, smoothed: with the noise of single samples in its Jacobian an
+offset would come out too small, and too sure.
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.offers import VelocityOffer
+from fusiond.aiding.position import antenna
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements
@@ -70,13 +74,17 @@ def _velocity(
 
 @dataclass(frozen=True, slots=True)
 class VelocityAid(Aid):
-    """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three."""
+    """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three. `time`, `ahead_s`
+    and `rest` as of `PositionAid`."""
 
     moves: ClassVar[bool] = True
 
     v_ned: tuple[float, ...]
     sd: tuple[float, ...]
     lever: Vector3
+    time: str = ""
+    ahead_s: float = 0.0
+    rest: str = ""
 
     @property
     def device(self) -> str:
@@ -85,8 +93,17 @@ class VelocityAid(Aid):
     def innovation(self, state: State) -> Innovation | NotApplicable:
         rows = 2 if state.model.hold_height else len(self.v_ned)
         z, h = np.empty(rows), np.zeros((rows, state.model.size))
-        _velocity(state.nav, state.step, state.model.column_of, *self.lever, z, h)
+        lever, levers = antenna(state, self.lever, self.rest)
+        _velocity(state.nav, state.step, state.model.column_of, *lever, z, h)
+        if levers:
+            x, y, w = state.rate_b
+            turn = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
+            h[:, levers] = -(state.dcm @ turn)[:rows]
         z -= self.v_ned[:rows]
+        for slot in state.model.slots_of(self.time):
+            a = state.acceleration[:rows]
+            z += a * (state.xi[slot] - self.ahead_s)
+            h[:, slot] = -a
         return Innovation(z, h, np.square(self.sd[:rows]))
 
     def offers(self) -> tuple[VelocityOffer, ...]:

@@ -57,8 +57,14 @@ class GnssAiding(Aiding):
     velocity_delay_s: NonNegativeFloat = 0.0
     """Age of the velocity at the fix's instant: half an epoch where the receiver averages over
     one."""
+    time_offset_sd_s: NonNegativeFloat = 0.1
+    """How much later or earlier than their stamps fixes are valid, and velocities: one sigma of
+    offsets that the filter estimates. A serial line's latency is known to 0.1 s. 0: none is."""
     time_sd_s: NonNegativeFloat = 0.0
-    """Timing error of the fix against the IMU; times the speed it adds to sigma."""
+    """Timing error of a single fix against the IMU; times the speed it adds to sigma."""
+    lever_arm_sd_m: NonNegativeFloat = 0.0
+    """One sigma of what `lever_arm_m` is wrong by, each axis, which the filter then estimates; RTK
+    fixes show it in bends, others do not. 0: it is as measured."""
     bias_sd_m: NonNegativeFloat = 0.0
     """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east; 1.5 for a
     receiver without corrections. RTK fixes have none. 0: none is estimated, and sigma shrinks as
@@ -171,8 +177,18 @@ class HeightAiding(Aiding):
 
 
 class WheelAiding(Aiding):
+    """Speed of the vehicle from its wheels; see `docs/vehicle.md`."""
+
     kind: Literal["wheel"] = "wheel"
     sd_m_s: PositiveFloat = 0.1
+    """Where the device states none."""
+    correlation_s: NonNegativeFloat = 1.0
+    """How long its errors last (slip, quantised steps): what comes more often counts less."""
+    scale_sd: NonNegativeFloat = 0.02
+    """One sigma of the scale, which the filter estimates: tyres wear by 2 % of their radius. 0: the
+    speed is as it is said to be."""
+    latency_sd_s: NonNegativeFloat = 0.2
+    """One sigma of how old a speed is when it comes, which the filter estimates. 0: new."""
 
 
 AnyAiding = Annotated[

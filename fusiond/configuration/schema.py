@@ -114,14 +114,27 @@ class ZeroVelocity(Section):
 
 
 class NonHolonomic(Section):
-    """A wheeled vehicle does not slide sideways nor jump: v_right = v_down = 0 at a point."""
+    """A wheeled vehicle does not slide sideways nor jump: v_right = v_down = 0 at a point; see
+    `docs/vehicle.md`."""
 
     enabled: bool = False
     sd_m_s: PositiveFloat = 0.2
+    """Sideways, of what is new in each interval."""
+    sd_down_m_s: PositiveFloat = 0.5
+    """Downwards: heave and pitch of the suspension, which last for seconds."""
+    drift_sd_m_s: NonNegativeFloat = 0.1
+    """Sideways, of what lasts (slip angle, a road's crown): one sigma of a state; 0: none."""
+    drift_s: PositiveFloat = 5.0
+    """Correlation time of that drift."""
+    mounting_sd_deg: NonNegativeFloat = 5.0
+    """One sigma of pitch and yaw of the IMU against the vehicle beyond `imu.mounting_deg`, which
+    the filter estimates. 0: the mounting is as measured."""
     min_speed_m_s: NonNegativeFloat = 2.0
     interval_s: PositiveFloat = 0.1
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """From the IMU to the point that does not slide (the rear axle)."""
+    lever_arm_sd_m: NonNegativeFloat = 1.0
+    """One sigma of what its forward part is wrong by, which the filter estimates. 0: nothing."""
 
 
 class Constraints(Section):

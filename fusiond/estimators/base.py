@@ -29,13 +29,13 @@ from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
-from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE
+from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, STEP_SMOOTH_N
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Span = tuple[
     *tuple[bool, NDArray[np.bool_], Indices, Indices, Array],  # of the model
-    *tuple[Indices, Array, int, int],  # of the samples
+    *tuple[Indices, Array, Array, int, int],  # of the samples
     *tuple[int, int, int],  # from, to, gap
     *tuple[bool, Array, Array],  # whether to record, and where
 ]
@@ -205,7 +205,7 @@ class ErrorStateFilter:
         self._covs[:, :n, :n] = p / self._shares[:, None, None]
         self._dxs[:], self._holding = 0.0, False
         self.step[:] = 0.0
-        self.step[STEP_DCM:] = dcm_from_quaternion(self.nav[Q0:]).ravel()
+        self.step[STEP_DCM:STEP_SMOOTH_N] = dcm_from_quaternion(self.nav[Q0:]).ravel()
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
@@ -234,6 +234,7 @@ class ErrorStateFilter:
             model.noise,
             imu.times,
             imu.samples,
+            imu.densities,
             self.sample - imu.start,
             imu.end,
             self.t_ns,

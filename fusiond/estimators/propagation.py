@@ -93,7 +93,7 @@ def slopes(
 def sigmas(cov: Array, step: Array, out: Array) -> None:
     """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
 
-    Roll, pitch and yaw follow from phi by Euler kinematics, with C_nb as `step` (18,) holds it.
+    Roll, pitch and yaw follow from phi by Euler kinematics, with C_nb as `step` (21,) holds it.
     """
     for i in range(3):
         out[i] = math.sqrt(cov[6 + i, 6 + i])
@@ -128,6 +128,27 @@ def widen_for_gap(cov: Array, active: NDArray[np.bool_], whole: float, h: float)
             cov[r, r] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
 
 
+@compiled("void(f8[:, ::1], b1[::1], f8[::1], f8[::1], f8)", forceinline=True)
+def shake(
+    cov: Array, active: NDArray[np.bool_], step: Array, density: Array, h: float
+) -> None:
+    """Add to `cov` what h seconds of noise of `density` (6,) in body axes leave: C diag(N^2) C^T h."""
+    for first in (0, 3):
+        if density[first] + density[first + 1] + density[first + 2] == 0.0:
+            continue
+        for i in range(3):
+            for j in range(3):
+                if active[first + i] and active[first + j]:
+                    total = 0.0
+                    for k in range(3):
+                        total += (
+                            step[STEP_DCM + 3 * i + k]
+                            * step[STEP_DCM + 3 * j + k]
+                            * density[first + k]
+                        )
+                    cov[first + i, first + j] += h * total
+
+
 @cache
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
@@ -136,7 +157,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1],"
         "f8[::1], b1, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "i8[::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], b1)",
+        "i8[::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], b1)",
         variant=width,
     )
     def propagate(
@@ -155,6 +176,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         noise: Array,
         times: Indices,
         samples: Array,
+        densities: Array,
         first: int,
         end: int,
         now: int,
@@ -171,7 +193,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         (times[i-1], times[i]]. Samples first ... end-1 may be used; the last one only as far as
         `target`, so a target inside an interval splits it. With `record`, the solution and the
         sigmas of covariance 0 at the end of each whole sample go to nav_out[i] (10,) and
-        sigma_out[i] (9,). `step` (18,) is left as of the last step. `covs` (k, width, width) are
+        sigma_out[i] (9,). `step` (21,) is left as of the last step. `covs` (k, width, width) are
         covariances, their noise divided by `shares` (k,). With `carry`, the error estimates `dxs`
         (k, n) are propagated too; `phi` (width, width) is too, unless it is (0, 0). `scratch` has
         scratch_size(width) doubles, zero at first.
@@ -216,6 +238,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if decaying:
                     propagate_parameters(xi, h, rate_terms, decay_rate)
                     sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
+                for k in range(covs.shape[0]):
+                    shake(covs[k], active, step, densities[i], h / shares[k])
                 if silent:
                     # The held sample is a guess: its error acts over the whole of the gap.
                     whole = (times[i] - times[i - 1]) * 1e-9

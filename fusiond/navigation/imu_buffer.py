@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.strapdown import NAV_SIZE
+from fusiond.navigation.vibration import Vibration
 
 Array = NDArray[np.float64]
 
@@ -51,10 +52,13 @@ class ImuBuffer:
         sensor_to_body: Array,
         time_offset_s: float,
         gap_s: float,
+        vibration: Vibration | None = None,
     ) -> None:
         capacity = int(rate_hz * keep_s * 2.5) + 1000
         self.times: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)
         self.samples: Array = np.zeros((capacity, 6))
+        self.densities: Array = np.zeros((capacity, 6))
+        self._vibration = vibration
         self.nav: Array = np.full((capacity, NAV_SIZE), np.nan)
         self.sigmas: Array = np.full((capacity, 9), np.nan)
         self.start = 0
@@ -169,7 +173,7 @@ class ImuBuffer:
             if self.needed is not None:
                 drop = min(drop, self.needed - self.start)
             drop = max(0, drop - MARGIN)
-            for array in (self.times, self.samples, self.nav, self.sigmas):
+            for array in (self.times, self.samples, self.densities, self.nav, self.sigmas):
                 array[: self.end - drop] = array[drop : self.end].copy()
             self.start += drop
             self.end -= drop
@@ -178,6 +182,8 @@ class ImuBuffer:
         rows = slice(self.end, self.end + count)
         self.times[rows] = times
         np.matmul(samples, self._turn, out=self.samples[rows])
+        if self._vibration is not None:
+            self.densities[rows] = self._vibration.follow(self.samples[rows])
         self.nav[rows] = np.nan
         self.end += count
 
@@ -186,5 +192,6 @@ class ImuBuffer:
         more = capacity - len(self.times)
         self.times = np.concatenate([self.times, np.zeros(more, dtype=np.int64)])
         self.samples = np.concatenate([self.samples, np.zeros((more, 6))])
+        self.densities = np.concatenate([self.densities, np.zeros((more, 6))])
         self.nav = np.concatenate([self.nav, np.full((more, NAV_SIZE), np.nan)])
         self.sigmas = np.concatenate([self.sigmas, np.full((more, 9), np.nan)])

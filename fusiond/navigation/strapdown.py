@@ -34,9 +34,12 @@ Array = NDArray[np.float64]
 LAT, LON, HEIGHT, VN, VE, VD, Q0 = 0, 1, 2, 3, 4, 5, 6
 NAV_SIZE = 10
 # What a step leaves for the error model (STEP_SIZE,): mean specific force in NED (m/s^2), mean
-# compensated rate and specific force in body axes, and C_nb in the middle of the interval by rows.
-STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM = 0, 3, 6, 9
-STEP_SIZE = 18
+# compensated rate and specific force in body axes, C_nb in the middle of the interval by rows, and
+# the specific force in NED smoothed over the steps.
+STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM, STEP_SMOOTH_N = 0, 3, 6, 9, 18
+STEP_SIZE = 21
+# Time constant (s) of that: a car's acceleration changes in a second, an engine shakes in 50 ms.
+SMOOTH_S = 0.25
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, b1, f8[::1])", forceinline=True)
@@ -50,7 +53,7 @@ def strapdown_step(
     hold_height: bool,
     step: Array,
 ) -> None:
-    """Advance `nav` (10,) in place by `h` seconds; write `step` (18,) for the error model.
+    """Advance `nav` (10,) in place by `h` seconds; write `step` (21,) for the error model.
 
     `rate` (rad/s) and `force` (m/s^2) are the interval's means in body axes after compensation,
     the slopes their time derivatives. `hold_height` keeps height and v_D = 0 (planar models).
@@ -132,6 +135,10 @@ def strapdown_step(
 
     inverse = 1.0 / h
     step[0], step[1], step[2] = d0 * inverse, d1 * inverse, d2 * inverse
+    # Nothing before: what is smoothed begins with this interval.
+    gain = h / (h + SMOOTH_S) if step[STEP_SMOOTH_N + 2] != 0.0 else 1.0
+    for j in range(3):
+        step[STEP_SMOOTH_N + j] += gain * (step[j] - step[STEP_SMOOTH_N + j])
     for j in range(3):
         step[STEP_RATE_B + j] = rate[j]
         step[STEP_FORCE_B + j] = force[j]

@@ -11,8 +11,10 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.witnesses import Witnesses
-from fusiond.configuration.schema import Constraints
+from fusiond.configuration.schema import Constraints, NonHolonomic
 from fusiond.configuration.settings import DEG, quiet_limits
+from fusiond.models.blocks import Block
+from fusiond.models.vehicle import axle_lever, mounting, side_drift
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window
 
@@ -25,6 +27,20 @@ class Felt(NamedTuple):
 
     windows: list[Window]
     aids: list[Aid]
+
+
+def vehicle_blocks(options: NonHolonomic) -> list[Block]:
+    """What a vehicle that does not slide shows of itself: mounting of the IMU, axle, side drift."""
+    if not options.enabled:
+        return []
+    found = []
+    if options.mounting_sd_deg:
+        found.append(mounting(options.mounting_sd_deg * DEG))
+    if options.lever_arm_sd_m:
+        found.append(axle_lever(options.lever_arm_sd_m))
+    if options.drift_sd_m_s:
+        found.append(side_drift(options.drift_sd_m_s, options.drift_s))
+    return found
 
 
 class ConstraintMaker:
@@ -79,6 +95,7 @@ class ConstraintMaker:
                 int(imu.times[new + row]),
                 GATE,
                 o.sd_m_s,
+                o.sd_down_m_s,
                 o.min_speed_m_s,
                 o.lever_arm_m,
             )

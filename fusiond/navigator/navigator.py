@@ -8,23 +8,27 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.vibration import Vibration
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
-from fusiond.navigator.constraints import ConstraintMaker
+from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_door import ImuDoor
@@ -42,6 +46,9 @@ Array = NDArray[np.float64]
 
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
+# Offsets in time are taken out of an aid's instant in such steps (s), the rest by its Jacobian: what
+# an acceleration changes in half of one is below a millimetre a second.
+TIME_STEP_S = 0.01
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
 # measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
 UNKNOWN_TIME_S = 0.9
@@ -64,9 +71,10 @@ class Navigator:
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding, config.plausibility, self._event)
         self.raw = self._intake.receivers
-        self.model = model_of(config, *self._intake.extra_blocks())
+        self.model = model_of(config, *vehicle_blocks(config.constraints.non_holonomic), *self._intake.extra_blocks())
         self.imu = ImuBuffer(
-            imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
+            imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s,
+            Vibration(1.0 / imu.rate_hz, np.repeat([self._noise.rate_noise**2, self._noise.force_noise**2], 3)),
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self.estimator = estimator_of(config, self.model)
@@ -158,8 +166,18 @@ class Navigator:
             self._aligner.known.aids(aids)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
-            self.timeline.insert(aid)
+            self.timeline.insert(self._in_time(aid))
         return "accepted"
+
+    def _in_time(self, aid: Aid) -> Aid:
+        """The aid at its instant by the filter's own clock, where it has an offset in time."""
+        if self.started is None or not isinstance(aid, PositionAid | VelocityAid):
+            return aid
+        slots = self.model.slots_of(aid.time)
+        if not slots:
+            return aid
+        ahead_s = round(float(self.estimator.xi[slots[0]]) / TIME_STEP_S) * TIME_STEP_S
+        return replace(aid, t_ns=aid.t_ns + round(ahead_s * 1e9), ahead_s=ahead_s)
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
@@ -329,3 +347,4 @@ class Navigator:
             self._failed.tell(entry.aid.source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)
+

@@ -8,9 +8,16 @@ from drivers.measurements import PositionFix, Vector3
 from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.velocity import SUFFIX, VelocityAid
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.models.blocks import Block, position_bias
+from fusiond.models.vehicle import (
+    ANTENNA_LEVER,
+    FIX_TIME,
+    VELOCITY_TIME,
+    antenna_lever,
+    time_offset,
+)
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.plausible import LEAST_SPEED_SD_M_S
 
@@ -60,9 +67,11 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
             o.lever_arm_m,
             math.hypot(when.sd_time_s, o.time_sd_s),
             () if m.quality in RTK else _fix_bias(m.source, o, sections),
+            sections.own(FIX_TIME, m.source, o),
+            rest=sections.own(ANTENNA_LEVER, m.source, o),
         )
     ]
-    velocity = _velocity(m, o, when) if o.use_velocity else None
+    velocity = _velocity(m, o, when, sections) if o.use_velocity else None
     return found if velocity is None else [*found, velocity]
 
 
@@ -75,7 +84,9 @@ def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:
     return horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP)
 
 
-def _velocity(m: PositionFix, o: GnssAiding, when: Instants) -> VelocityAid | None:
+def _velocity(
+    m: PositionFix, o: GnssAiding, when: Instants, sections: Sections
+) -> VelocityAid | None:
     if m.v_ned_m_s is None:
         return None
     north, east, down = m.v_ned_m_s
@@ -87,7 +98,16 @@ def _velocity(m: PositionFix, o: GnssAiding, when: Instants) -> VelocityAid | No
         v = (north, east, down)
         sd_v = (*sd_v, _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o))
     t_ns = when.t_ns - round(o.velocity_delay_s * 1e9)
-    return VelocityAid(f"{m.source}_velocity", t_ns, o.gate_probability, v, sd_v, o.lever_arm_m)
+    return VelocityAid(
+        f"{m.source}{SUFFIX}",
+        t_ns,
+        o.gate_probability,
+        v,
+        sd_v,
+        o.lever_arm_m,
+        sections.own(VELOCITY_TIME, m.source, o),
+        rest=sections.own(ANTENNA_LEVER, m.source, o),
+    )
 
 
 def _speed_sd(stated: float | None, default: float, o: GnssAiding) -> float:
@@ -105,16 +125,24 @@ def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str
 
 
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
-    """North and east, and down, of the error that a receiver's fixes share."""
+    """What a receiver's fixes share: their offset in time, that of its velocities, what is left of
+    the lever arm, an error north and east, and one down."""
+    found = []
+    if section.time_offset_sd_s:
+        found.append(time_offset(sections.own(FIX_TIME, source, section), section.time_offset_sd_s))
+        if section.use_velocity:
+            name = sections.own(VELOCITY_TIME, source, section)
+            found.append(time_offset(name, section.time_offset_sd_s))
+    if section.lever_arm_sd_m:
+        name = sections.own(ANTENNA_LEVER, source, section)
+        found.append(antenna_lever(name, section.lever_arm_sd_m))
     names = _fix_bias(source, section, sections)
-    if not names:
-        return []
-    level, down = names
-    lasts_s = section.bias_correlation_s
-    return [
-        position_bias(level, section.bias_sd_m, lasts_s),
-        position_bias(down, section.bias_down_sd_m, lasts_s, "d"),
-    ]
+    if names:
+        level, down = names
+        lasts_s = section.bias_correlation_s
+        found.append(position_bias(level, section.bias_sd_m, lasts_s))
+        found.append(position_bias(down, section.bias_down_sd_m, lasts_s, "d"))
+    return found
 
 
 KIND = Kind(PositionFix, aids, {GnssAiding: blocks})

@@ -1,0 +1,59 @@
+"""Blocks of what an owner cannot measure: how sensors sit on the vehicle, and when they speak.
+
+Each is a constant, or nearly one, that driving shows; what a drive does not show stays at its
+prior. The aids that hold them say how they act (fusiond.aiding.body_velocity, position, velocity).
+"""
+
+from __future__ import annotations
+
+from fusiond.models.blocks import Block
+
+MOUNTING = "mounting"
+AXLE_LEVER = "axle_lever"
+SIDE_DRIFT = "side_drift"
+WHEEL_SCALE = "wheel_scale"
+WHEEL_LATENCY = "wheel_latency"
+FIX_TIME = "gnss_time"
+VELOCITY_TIME = "gnss_velocity_time"
+ANTENNA_LEVER = "antenna_lever"
+
+# Random walk (s per root second) of a time offset: a serial line's load and two clocks that differ
+# by some 10 ppm move it by milliseconds in minutes.
+TIME_WALK_S_SQRT_S = 1e-3
+
+
+def mounting(sd_rad: float) -> Block:
+    """Pitch and yaw (rad) of the IMU's nominal axes against the vehicle's. Its roll changes nothing
+    that wheels or axle feel."""
+    return _constant(MOUNTING, "rad", ("pitch", "yaw"), sd_rad)
+
+
+def axle_lever(sd_m: float) -> Block:
+    """How much further forward (m) than configured the point lies that does not slide sideways."""
+    return _constant(AXLE_LEVER, "m", ("x",), sd_m)
+
+
+def side_drift(sd_m_s: float, lasts_s: float) -> Block:
+    """Velocity (m/s) to the right that tyres, a road's crown and wind leave for a while."""
+    return Block(
+        SIDE_DRIFT, "m/s", ("right",), (-1,), initial=sd_m_s, steady=sd_m_s, tau_s=lasts_s
+    )
+
+
+def wheel_scale(name: str, sd: float) -> Block:
+    """By what share a wheel's speed is too high: a tyre's radius, worn or under pressure."""
+    return _constant(name, "1", ("scale",), sd)
+
+
+def time_offset(name: str, sd_s: float) -> Block:
+    """How much later (s) than its stamp a measurement is valid."""
+    return Block(name, "s", ("t",), (-1,), initial=sd_s, white=TIME_WALK_S_SQRT_S**2)
+
+
+def antenna_lever(name: str, sd_m: float) -> Block:
+    """What is left of the lever arm (m) from the IMU to an antenna, body axes."""
+    return _constant(name, "m", ("x", "y", "z"), sd_m)
+
+
+def _constant(name: str, unit: str, states: tuple[str, ...], sd: float) -> Block:
+    return Block(name, unit, states, (-1,) * len(states), initial=sd)
