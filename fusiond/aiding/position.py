@@ -75,8 +75,9 @@ def antenna(state: State, lever: Vector3, block: str) -> tuple[Vector3, list[int
 class PositionAid(Aid):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 
-    `bias`: the blocks whose states north, east, down are the error that the fixes share; `time` and
-    `rest` those of the offset in time, of which `ahead_s` is in `t_ns`, and of the lever arm's rest.
+    `bias`: the blocks whose states north, east, down are the error that the fixes share; `time`
+    that of their offset in time, of which `ahead_s` is in `t_ns`; `rest` that of what is left of
+    the lever arm.
     """
 
     locates: ClassVar[bool] = True

@@ -65,11 +65,11 @@ class GnssAiding(Aiding):
     lever_arm_sd_m: NonNegativeFloat = 0.0
     """One sigma of what `lever_arm_m` is wrong by, each axis, which the filter then estimates; RTK
     fixes show it in bends, others do not. 0: it is as measured."""
-    bias_sd_m: NonNegativeFloat = 0.0
-    """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east; 1.5 for a
-    receiver without corrections. RTK fixes have none. 0: none is estimated, and sigma shrinks as
-    if errors were white."""
-    bias_down_sd_m: PositiveFloat = 5.0
+    bias_sd_m: NonNegativeFloat = 1.0
+    """Error that fixes without carrier phase share for minutes (orbits, ionosphere), one sigma
+    north and east: data sheets state 1.5 to 2 m for half of all fixes, noise included. 0: none is
+    estimated, and sigma shrinks as if errors were white."""
+    bias_down_sd_m: PositiveFloat = 3.0
     """The same downwards, where most of the ionosphere goes."""
     bias_correlation_s: PositiveFloat = 1800.0
     """Correlation time of that error."""

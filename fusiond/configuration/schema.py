@@ -32,6 +32,7 @@ from fusiond.configuration.aiding import (
 )
 from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
+from fusiond.configuration.sensor_class import CLASSES, SensorClass
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
 
 
@@ -57,6 +58,9 @@ class Imu(Section):
     `mounting_deg` is the small rest, roll, pitch, yaw from body to those nominal axes.
     """
 
+    sensor_class: SensorClass | None = None
+    """`consumer`, `mems` or `tactical`: noise, biases and scale factors that no other key gives are
+    those of the class; see `docs/vehicle.md`."""
     axes: Axes = ("+x", "+y", "+z")
     """Sensor axes along body forward, right and down."""
     mounting_deg: Vector = (0.0, 0.0, 0.0)
@@ -89,6 +93,13 @@ class Imu(Section):
     gap_s: PositiveFloat = 0.5
     """A pause longer than this is a gap: the solution says so. The covariance grows for any that is
     longer than 3.5 samples."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_its_class(cls, data: Any) -> Any:
+        """What the class says stands where no key of its own does."""
+        known = CLASSES.get(data.get("sensor_class")) if isinstance(data, dict) else None
+        return {**known, **data} if known else data
 
 
 class ZeroVelocity(Section):

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates, sigmas
+from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates
+from fusiond.estimators.reading import sigmas
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
@@ -34,7 +35,7 @@ from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, STEP
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Span = tuple[
-    *tuple[bool, NDArray[np.bool_], Indices, Indices, Array],  # of the model
+    *tuple[bool, NDArray[np.bool_], Indices, Indices, Array, int],  # of the model
     *tuple[Indices, Array, Array, int, int],  # of the samples
     *tuple[int, int, int],  # from, to, gap
     *tuple[bool, Array, Array],  # whether to record, and where
@@ -106,6 +107,7 @@ class Estimator(Protocol):
     sample: int
     nav: Array
     xi: Array
+    step: Array
 
     @property
     def covariance(self) -> Array:
@@ -232,6 +234,7 @@ class ErrorStateFilter:
             model.sensor_terms,
             model.rate_terms,
             model.noise,
+            model.time_slot,
             imu.times,
             imu.samples,
             imu.densities,
@@ -261,7 +264,7 @@ class ErrorStateFilter:
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self._covs[0], self.step, out)
+        sigmas(self._covs[0], self.nav, self.step, self.model.time_slot, out)
         return out
 
     def _feed_back(self, dx: Array) -> None:

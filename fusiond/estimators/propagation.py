@@ -7,7 +7,6 @@ navigation state, for filters that keep several, and a transition matrix where a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
 
@@ -21,11 +20,11 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
+from fusiond.estimators.reading import in_fix_time, sigmas
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
 from fusiond.navigation.strapdown import (
-    NAV_SIZE,
     STEP_DCM,
     strapdown_step,
 )
@@ -89,31 +88,6 @@ def slopes(
     return silent
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[::1])")
-def sigmas(cov: Array, step: Array, out: Array) -> None:
-    """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
-
-    Roll, pitch and yaw follow from phi by Euler kinematics, with C_nb as `step` (21,) holds it.
-    """
-    for i in range(3):
-        out[i] = math.sqrt(cov[6 + i, 6 + i])
-        out[3 + i] = math.sqrt(cov[3 + i, 3 + i])
-    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
-    # 0],
-    # and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
-    sp = -step[STEP_DCM + 6]
-    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
-    cy, sy = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
-    a, b, c = cov[0, 0], cov[1, 1], cov[2, 2]
-    d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
-    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
-    cross = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
-    t = sp / cp
-    out[6] = math.sqrt(max(0.0, along)) / cp
-    out[7] = math.sqrt(max(0.0, cross))
-    out[8] = math.sqrt(max(0.0, t * t * along + c + 2.0 * t * (cy * e + sy * f)))
-
-
 @compiled("void(f8[:, ::1], b1[::1], f8, f8)", forceinline=True)
 def widen_for_gap(cov: Array, active: NDArray[np.bool_], whole: float, h: float) -> None:
     """Add to `cov` what h seconds of an IMU silence of `whole` seconds leave unknown."""
@@ -129,10 +103,8 @@ def widen_for_gap(cov: Array, active: NDArray[np.bool_], whole: float, h: float)
 
 
 @compiled("void(f8[:, ::1], b1[::1], f8[::1], f8[::1], f8)", forceinline=True)
-def shake(
-    cov: Array, active: NDArray[np.bool_], step: Array, density: Array, h: float
-) -> None:
-    """Add to `cov` what h seconds of noise of `density` (6,) in body axes leave: C diag(N^2) C^T h."""
+def shake(cov: Array, active: NDArray[np.bool_], step: Array, density: Array, h: float) -> None:
+    """Add to `cov` what h seconds of noise of `density` (6,), body axes, leave: C diag(n) C^T h."""
     for first in (0, 3):
         if density[first] + density[first + 1] + density[first + 2] == 0.0:
             continue
@@ -141,11 +113,8 @@ def shake(
                 if active[first + i] and active[first + j]:
                     total = 0.0
                     for k in range(3):
-                        total += (
-                            step[STEP_DCM + 3 * i + k]
-                            * step[STEP_DCM + 3 * j + k]
-                            * density[first + k]
-                        )
+                        a, b = step[STEP_DCM + 3 * i + k], step[STEP_DCM + 3 * j + k]
+                        total += a * b * density[first + k]
                     cov[first + i, first + j] += h * total
 
 
@@ -156,7 +125,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
 
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1],"
-        "f8[::1], b1, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
+        "f8[::1], b1, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], i8,"
         "i8[::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1], b1)",
         variant=width,
     )
@@ -174,6 +143,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         sensor_terms: Indices,
         rate_terms: Indices,
         noise: Array,
+        time_slot: int,
         times: Indices,
         samples: Array,
         densities: Array,
@@ -190,13 +160,13 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         """Propagate from `now` to `target` (ns); return the next sample's index and the new time.
 
         `times` (m,) and `samples` (m, 6: rate, force) are the IMU's; sample i holds over
-        (times[i-1], times[i]]. Samples first ... end-1 may be used; the last one only as far as
-        `target`, so a target inside an interval splits it. With `record`, the solution and the
-        sigmas of covariance 0 at the end of each whole sample go to nav_out[i] (10,) and
-        sigma_out[i] (9,). `step` (21,) is left as of the last step. `covs` (k, width, width) are
-        covariances, their noise divided by `shares` (k,). With `carry`, the error estimates `dxs`
-        (k, n) are propagated too; `phi` (width, width) is too, unless it is (0, 0). `scratch` has
-        scratch_size(width) doubles, zero at first.
+        (times[i-1], times[i]], with noise of `densities` (m, 6) beyond `noise`. Samples first ...
+        end-1 may be used; the last one only as far as `target`, so a target inside an interval
+        splits it. With `record`, the solution and the sigmas of covariance 0 at the end of each
+        whole sample go to nav_out[i] (10,) and sigma_out[i] (9,). `step` (21,) is left as of the
+        last step. `covs` (k, width, width) are covariances, their noise divided by `shares` (k,).
+        With `carry`, the error estimates `dxs` (k, n) are propagated too; `phi` (width, width) is
+        too, unless it is (0, 0). `scratch` has scratch_size(width) doubles, zero at first.
         """
         decay_rate = noise[0]
         sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
@@ -248,9 +218,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             now = stop
             if now == times[i]:
                 if record:
-                    for j in range(NAV_SIZE):
-                        nav_out[i, j] = nav[j]
-                    sigmas(covs[0], step, sigma_out[i])
+                    in_fix_time(nav, xi, step, time_slot, nav_out[i])
+                    sigmas(covs[0], nav, step, time_slot, sigma_out[i])
                 i += 1
         return i, now
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.models.blocks import Block
+from fusiond.models.vehicle import FIX_TIME
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR, RATE_SCALE, WIDTHS
 
 Array = NDArray[np.float64]
@@ -114,6 +115,15 @@ class Model:
     @cached_property
     def _slots_by_name(self) -> dict[str, list[int]]:
         return {block.name: slots for block, slots in self._slots()}
+
+    @cached_property
+    def time_slot(self) -> int:
+        """The slot of the first receiver's offset in time, which a solution is published with; -1
+        where none is estimated."""
+        for block in self.blocks:
+            if block.name.startswith(FIX_TIME):
+                return self.slots_of(block.name)[0]
+        return -1
 
     def parameters(self, column: int) -> list[int]:
         """Slots of the parameters of one column (constant and Markov gyro drift share one)."""

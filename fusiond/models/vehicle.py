@@ -35,9 +35,7 @@ def axle_lever(sd_m: float) -> Block:
 
 def side_drift(sd_m_s: float, lasts_s: float) -> Block:
     """Velocity (m/s) to the right that tyres, a road's crown and wind leave for a while."""
-    return Block(
-        SIDE_DRIFT, "m/s", ("right",), (-1,), initial=sd_m_s, steady=sd_m_s, tau_s=lasts_s
-    )
+    return Block(SIDE_DRIFT, "m/s", ("right",), (-1,), initial=sd_m_s, steady=sd_m_s, tau_s=lasts_s)
 
 
 def wheel_scale(name: str, sd: float) -> Block:

@@ -1,16 +1,15 @@
 r"""The noise of an inertial sensor on this vehicle, now: what engine and road shake into it.
 
-With means y_k of n samples over tau = n T each, the Hadamard variance
+With means y_k of n samples, each over tau = n T, the Hadamard variance
 
-    H(tau) = < (y_{k+2} - 2 y_{k+1} + y_k)^2 > / 6
+    H(tau) = < (y_k - 2 y_{k-1} + y_{k-2})^2 > / 6
 
-is N^2 / tau for white noise of density N^2, whatever the bias and its drift. Motion and vibration
-that averages out only add to H(tau) tau at some tau, so the smallest over several tau bounds the
-density that is integrated into attitude and velocity. The mean is over the last seconds, past
-samples only: an engine that starts is in it at once, and replay gives the same numbers.
+is N^2 / tau for white noise of density N^2, whatever the bias and its drift. Motion, and vibration
+that averages out, only add to tau H(tau) at one tau or another, so the smallest over several tau
+bounds the density that attitude and velocity integrate. The mean is over the last seconds and past
+samples alone: an engine that starts is in it at once, and a replay gives the same numbers.
 
-Source: IEEE Std 1139-2022, Hadamard variance; Riley, Handbook of Frequency Stability Analysis, NIST
-SP 1065 (2008), section 5.2.9.
+Source: Riley, Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), section 5.2.9.
 """
 
 from __future__ import annotations
@@ -22,60 +21,63 @@ from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
 
-# Samples averaged in each level: 10 to 160 ms at 100 Hz, above what suspension and steering do.
-AVERAGED = (1, 4, 16)
-# Seconds that the mean looks back: what an engine's speed and a road's surface take to change.
+# Means of 1, 4 and 16 samples: 10 to 160 ms at 100 Hz, faster than suspension and steering.
+LEVELS, RATIO = 3, 4
+# Seconds that the mean looks back: what an engine's speed or a road's surface takes to change.
 MEMORY_S = 10.0
-# Chance lets the smallest of three estimates of a few hundred differences reach this above the
-# truth: below it the sheet's noise stands.
+# Differences that a level needs before it counts: its estimate is then good to a factor of two.
+FEWEST = 10
+# The sheet's noise stands while what is seen is below so many times its density: the smallest of
+# three estimates over some hundred differences exceeds it once in 10^4.
 EXCESS = 1.5
+
+# Of each level and axis: sum and count of the present mean, the two means before, how many there
+# were, and tau H.
+_SUM, _COUNT, _LAST, _BEFORE, _MEANS, _DENSITY = range(6)
 
 
 @compiled("void(f8[:, ::1], f8, f8, f8[:, :, ::1], f8[:, ::1])")
 def _follow(samples: Array, period_s: float, memory_s: float, memory: Array, out: Array) -> None:
-    """Write `out` (m, 6), the density after each of `samples` (m, 6).
+    """Write `out` (m, 6), the smallest density so far after each of `samples` (m, 6).
 
-    `memory` (levels, 6, 6): of each level and axis the sum, its count, the two means before, how
-    many means there were, and H tau.
+    `memory` (LEVELS, 6, 6) goes on from call to call.
     """
     for i in range(samples.shape[0]):
         for axis in range(6):
-            out[i, axis] = np.inf
-        for level in range(memory.shape[0]):
+            smallest = np.inf
             wanted = 1.0
-            for _ in range(level):
-                wanted *= 4.0
-            tau = wanted * period_s
-            for axis in range(6):
+            for level in range(memory.shape[0]):
                 m = memory[level, axis]
-                m[0] += samples[i, axis]
-                m[1] += 1.0
-                if m[1] >= wanted:
-                    mean = m[0] / wanted
-                    if m[4] >= 2.0:
-                        found = (mean - 2.0 * m[3] + m[2]) ** 2 / 6.0 * tau
-                        gain = max(1.0 / (m[4] - 1.0), min(1.0, tau / memory_s))
-                        m[5] += gain * (found - m[5])
-                    m[2], m[3] = m[3], mean
-                    m[4] += 1.0
-                    m[0], m[1] = 0.0, 0.0
-                if m[4] < 10.0:
-                    out[i, axis] = min(out[i, axis], 0.0) if level == 0 else out[i, axis]
-                else:
-                    out[i, axis] = min(out[i, axis], m[5])
+                m[_SUM] += samples[i, axis]
+                m[_COUNT] += 1.0
+                if m[_COUNT] >= wanted:
+                    mean = m[_SUM] / wanted
+                    if m[_MEANS] >= 2.0:
+                        tau = wanted * period_s
+                        found = (mean - 2.0 * m[_LAST] + m[_BEFORE]) ** 2 / 6.0 * tau
+                        gain = max(1.0 / (m[_MEANS] - 1.0), min(1.0, tau / memory_s))
+                        m[_DENSITY] += gain * (found - m[_DENSITY])
+                    m[_BEFORE], m[_LAST] = m[_LAST], mean
+                    m[_MEANS] += 1.0
+                    m[_SUM], m[_COUNT] = 0.0, 0.0
+                if m[_MEANS] >= FEWEST:
+                    smallest = min(smallest, m[_DENSITY])
+                wanted *= RATIO
+            out[i, axis] = smallest if smallest < np.inf else 0.0
 
 
 class Vibration:
-    """Follows the density of each axis's noise; `sheet` (6,) what the data sheet says, (rad/s)^2/Hz
-    and (m/s^2)^2/Hz."""
+    """Follows each axis. `rate_noise` (rad/s/sqrt(Hz)) and `force_noise` (m/s^2/sqrt(Hz)) are the
+    data sheet's, `period_s` that of the samples."""
 
-    def __init__(self, period_s: float, sheet: Array) -> None:
-        self._period_s, self._sheet = period_s, sheet
-        self._memory = np.zeros((len(AVERAGED), 6, 6))
+    def __init__(self, period_s: float, rate_noise: float, force_noise: float) -> None:
+        self._period_s = period_s
+        self._sheet = np.repeat([rate_noise**2, force_noise**2], 3)
+        self._memory = np.zeros((LEVELS, 6, 6))
 
     def follow(self, samples: Array) -> Array:
-        """Density (m, 6) beyond the sheet's after each of samples (m, 6)."""
-        found = np.empty((len(samples), 6))
-        _follow(np.ascontiguousarray(samples), self._period_s, MEMORY_S, self._memory, found)
-        excess: Array = np.maximum(found - EXCESS * self._sheet, 0.0)
-        return excess
+        """Density (m, 6) beyond the sheet's, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples
+        (m, 6), rate and force of the same axes."""
+        seen = np.empty((len(samples), 6))
+        _follow(np.ascontiguousarray(samples), self._period_s, MEMORY_S, self._memory, seen)
+        return np.where(seen > EXCESS * self._sheet, seen - self._sheet, 0.0)

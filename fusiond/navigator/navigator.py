@@ -22,8 +22,8 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.vibration import Vibration
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigation.vibration import Vibration
 from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.options import alignment_options
@@ -46,8 +46,8 @@ Array = NDArray[np.float64]
 
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
-# Offsets in time are taken out of an aid's instant in such steps (s), the rest by its Jacobian: what
-# an acceleration changes in half of one is below a millimetre a second.
+# Offsets in time are taken out of an aid's instant in such steps (s), the rest by its Jacobian: a
+# car's acceleration changes by less than 0.05 m/s^2 in half of one.
 TIME_STEP_S = 0.01
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
 # measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
@@ -71,10 +71,11 @@ class Navigator:
         self._noise = imu_noise(imu)
         self._intake = Intake(config.aiding, config.plausibility, self._event)
         self.raw = self._intake.receivers
-        self.model = model_of(config, *vehicle_blocks(config.constraints.non_holonomic), *self._intake.extra_blocks())
+        of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
+        self.model = model_of(config, *of_vehicle, *self._intake.extra_blocks())
+        vibration = Vibration(1.0 / imu.rate_hz, self._noise.rate_noise, self._noise.force_noise)
         self.imu = ImuBuffer(
-            imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s,
-            Vibration(1.0 / imu.rate_hz, np.repeat([self._noise.rate_noise**2, self._noise.force_noise**2], 3)),
+            imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s, vibration
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self.estimator = estimator_of(config, self.model)
@@ -347,4 +348,3 @@ class Navigator:
             self._failed.tell(entry.aid.source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)
-

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import compensate
+from fusiond.estimators.reading import in_fix_time
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.solution import Bound, Mode, Solution
-from fusiond.navigation.strapdown import STEP_SIZE, strapdown_step
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, strapdown_step
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,9 @@ def solution_of(
     ahead_ns = min(t_ns - estimator.t_ns, most_ns)
     if ahead_ns > 0 and imu.end:
         nav = _carried(estimator, imu, ahead_ns * 1e-9)
+    published = np.empty(NAV_SIZE)
+    in_fix_time(nav, estimator.xi, estimator.step, estimator.model.time_slot, published)
+    nav = published
     sd = np.where(estimator.model.stated, estimator.sigmas(), np.nan).tolist()
     values = [float(v) for v in nav]
     bias = estimator.sensor_errors.tolist()

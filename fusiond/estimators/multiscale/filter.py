@@ -38,7 +38,7 @@ from fusiond.estimators.multiscale.block import (
     rows_on,
 )
 from fusiond.estimators.multiscale.wavelet import wavelet_matrix
-from fusiond.estimators.propagation import sigmas
+from fusiond.estimators.reading import sigmas
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, update
 from fusiond.models.model import Model
@@ -104,7 +104,7 @@ class MultiscaleEstimator(ErrorStateFilter):
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self.covariance, self.step, out)
+        sigmas(self.covariance, self.nav, self.step, self.model.time_slot, out)
         return out
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:

@@ -34,10 +34,11 @@ from fusiond.estimators.covariance import covariance_for, propagate_parameters
 from fusiond.estimators.propagation import (
     compensate,
     sensor_estimates,
-    sigmas,
+    shake,
     slopes,
     widen_for_gap,
 )
+from fusiond.estimators.reading import in_fix_time, sigmas
 from fusiond.estimators.unscented.sigma_points import NO_PIVOT
 from fusiond.estimators.update import feed_back
 from fusiond.navigation.compiled import compiled
@@ -150,8 +151,8 @@ def turn_attitude(cov: Array, before: Array, after: Array) -> None:
 
 @compiled(
     "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8, b1, b1[::1], i8[:, ::1],"
-    "i8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], i8, i8, i8, i8, i8, b1, f8[:, ::1], f8[:, ::1],"
-    "b1, f8[::1])"
+    "i8[:, ::1], f8[:, ::1], i8, i8[::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, b1,"
+    "f8[:, ::1], f8[:, ::1], b1, f8[::1])"
 )
 def propagate_points(
     nav: Array,
@@ -165,8 +166,10 @@ def propagate_points(
     sensor_terms: Indices,
     rate_terms: Indices,
     noise: Array,
+    time_slot: int,
     times: Indices,
     samples: Array,
+    densities: Array,
     first: int,
     end: int,
     now: int,
@@ -275,14 +278,14 @@ def propagate_points(
                 propagate_parameters(dx, h, rate_terms, decay_rate)
             else:
                 feed_back(nav, xi, mean)
+            shake(cov, active, step, densities[i], h)
             if silent:
                 # The held sample is a guess: its error acts over the whole of the gap.
                 widen_for_gap(cov, active, (times[i] - times[i - 1]) * 1e-9, h)
         now = stop
         if now == times[i]:
             if record:
-                for j in range(NAV_SIZE):
-                    nav_out[i, j] = nav[j]
-                sigmas(cov, step, sigma_out[i])
+                in_fix_time(nav, xi, step, time_slot, nav_out[i])
+                sigmas(cov, nav, step, time_slot, sigma_out[i])
             i += 1
     return i, now

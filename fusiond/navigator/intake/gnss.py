@@ -36,6 +36,8 @@ CODE_FLOOR_M = 0.3
 FLOOR_M = {4: 0.02, 5: 0.05}
 RTK = (4, 5)
 """Quality of fixes by carrier phase against a base station."""
+PHASE_SD_M = 0.1
+"""Nor has code, whatever its corrections, a sigma this small: a tenth of the best chip's noise."""
 FIX_BIAS = "gnss_bias"
 # Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
@@ -66,13 +68,20 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
             (n, e, d),
             o.lever_arm_m,
             math.hypot(when.sd_time_s, o.time_sd_s),
-            () if m.quality in RTK else _fix_bias(m.source, o, sections),
+            () if by_phase(m) else _fix_bias(m.source, o, sections),
             sections.own(FIX_TIME, m.source, o),
             rest=sections.own(ANTENNA_LEVER, m.source, o),
         )
     ]
     velocity = _velocity(m, o, when, sections) if o.use_velocity else None
     return found if velocity is None else [*found, velocity]
+
+
+def by_phase(m: PositionFix) -> bool:
+    """Whether the fix is one by carrier phase: it says so, or states a sigma that code cannot
+    have."""
+    stated = m.sd_ned_m
+    return m.quality in RTK or (stated is not None and max(stated[:2]) < PHASE_SD_M)
 
 
 def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:

@@ -1,0 +1,96 @@
+r"""Compiled kernels: what a filter publishes of its state, by the receiver's clock.
+
+A receiver defines the time that others label a solution with. Where a filter estimates by how much
+tau its fixes are later valid than their stamps say, its own instant t is t - tau there, and what it
+publishes for t is
+
+    p + v tau,   v + a tau,   q (x) exp(w tau)
+    var(p_i) = P_rr - 2 v_i P_rt + v_i^2 P_tt,   var(v_i) = P_vv - 2 a_i P_vt + a_i^2 P_tt
+
+which is what fixes measure: their offset's own sigma cancels in it. a is smoothed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
+from fusiond.navigation.rotation import rotate_quaternion
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    LON,
+    NAV_SIZE,
+    Q0,
+    STEP_DCM,
+    STEP_RATE_B,
+    STEP_SMOOTH_N,
+    VN,
+)
+
+Array = NDArray[np.float64]
+
+
+@compiled("f8(f8[::1], f8[::1], i8)", forceinline=True)
+def _acceleration(nav: Array, step: Array, axis: int) -> float:
+    """Smoothed, m/s^2, along north, east or down."""
+    force = step[STEP_SMOOTH_N + axis]
+    return force + gravity(nav[LAT], nav[HEIGHT]) if axis == 2 else force
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1], i8, f8[::1])")
+def in_fix_time(nav: Array, xi: Array, step: Array, time_slot: int, out: Array) -> None:
+    """Write `out` (10,): `nav` by the receiver's clock, whose offset is parameter `time_slot` (-1:
+    none)."""
+    for j in range(NAV_SIZE):
+        out[j] = nav[j]
+    if time_slot < 0:
+        return
+    tau = xi[time_slot]
+    lat, height = nav[LAT], nav[HEIGHT]
+    out[LAT] += nav[VN] * tau / (meridian_radius(lat) + height)
+    out[LON] += nav[VN + 1] * tau / ((transverse_radius(lat) + height) * math.cos(lat))
+    out[HEIGHT] -= nav[VN + 2] * tau
+    for j in range(3):
+        out[VN + j] += _acceleration(nav, step, j) * tau
+    rotate_quaternion(
+        out[Q0:],
+        step[STEP_RATE_B] * tau,
+        step[STEP_RATE_B + 1] * tau,
+        step[STEP_RATE_B + 2] * tau,
+        False,
+    )
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8[::1])")
+def sigmas(cov: Array, nav: Array, step: Array, time_slot: int, out: Array) -> None:
+    """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
+
+    Roll, pitch and yaw follow from phi by Euler kinematics, with C_nb as `step` (21,) holds it.
+    """
+    t = time_slot
+    for i in range(3):
+        position, velocity = cov[6 + i, 6 + i], cov[3 + i, 3 + i]
+        if t >= 0:
+            v, a = nav[VN + i], _acceleration(nav, step, i)
+            position = max(0.0, position + v * (v * cov[t, t] - 2.0 * cov[6 + i, t]))
+            velocity = max(0.0, velocity + a * (a * cov[t, t] - 2.0 * cov[3 + i, t]))
+        out[i] = math.sqrt(position)
+        out[3 + i] = math.sqrt(velocity)
+    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
+    # 0], and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
+    sp = -step[STEP_DCM + 6]
+    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
+    cy, sy = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
+    a, b, c = cov[0, 0], cov[1, 1], cov[2, 2]
+    d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
+    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
+    cross = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
+    tangent = sp / cp
+    out[6] = math.sqrt(max(0.0, along)) / cp
+    out[7] = math.sqrt(max(0.0, cross))
+    out[8] = math.sqrt(max(0.0, tangent * tangent * along + c + 2.0 * tangent * (cy * e + sy * f)))
