@@ -14,9 +14,11 @@ seconds), the wheel's scale k and latency tau are estimated where the model has 
 minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + ds + v
-    z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) a_forward dtau + v    (wheel)
+    z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
+        + tau e_i exp[m x] C^T [g x] phi) + v                                             (wheel)
 
-a_forward is smoothed: one sample of a shaken sensor would make the latency look smaller than it is.
+a_forward = f + C^T g is smoothed: one sample of a shaken sensor would make the latency look smaller
+than it is.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
 T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and mounting of odometers).
@@ -95,6 +97,15 @@ def _rows(
         t[3] * b0 + t[4] * b1 + t[5] * b2,
         t[6] * b0 + t[7] * b1 + t[8] * b2,
     )
+    # Acceleration, smoothed, along the vehicle's axes.
+    g = gravity(nav[LAT], nav[HEIGHT])
+    f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2] + g
+    b0 = c[0] * f0 + c[3] * f1 + c[6] * f2
+    b1 = c[1] * f0 + c[4] * f1 + c[7] * f2
+    b2 = c[2] * f0 + c[5] * f1 + c[8] * f2
+    a0 = t[0] * b0 + t[1] * b1 + t[2] * b2
+    a1 = t[3] * b0 + t[4] * b1 + t[5] * b2
+    a2 = t[6] * b0 + t[7] * b1 + t[8] * b2
     # Rows of -[l x].
     arm = (0.0, l2, -l1, -l2, 0.0, l0, l1, -l0, 0.0)
     for i in range(z.shape[0]):
@@ -115,11 +126,14 @@ def _rows(
             kind = column_of[j] - RATE_ERROR
             if 0 <= kind < 3:
                 h[i, j] = t0 * arm[kind] + t1 * arm[3 + kind] + t2 * arm[6 + kind]
+        late = _estimate(xi, slot[LATENCY]) if axis == FORWARD else 0.0
         if slot[PITCH] >= 0:
-            # Row of [u x], and columns of the left Jacobian of exp[m x] to second order.
-            x = 0.0 if axis == 0 else (u[2] if axis == 1 else -u[1])
-            y = -u[2] if axis == 0 else (0.0 if axis == 1 else u[0])
-            w = u[1] if axis == 0 else (-u[0] if axis == 1 else 0.0)
+            # Row of [u x], of the velocity that long before, and columns of the left Jacobian of
+            # exp[m x] to second order.
+            u0, u1, u2 = u[0] - late * a0, u[1] - late * a1, u[2] - late * a2
+            x = 0.0 if axis == 0 else (u2 if axis == 1 else -u1)
+            y = -u2 if axis == 0 else (0.0 if axis == 1 else u0)
+            w = u1 if axis == 0 else (-u0 if axis == 1 else 0.0)
             p, q = xi[slot[PITCH]], xi[slot[YAW]]
             h[i, slot[PITCH]] = -0.5 * q * x + (1.0 - q * q / 6.0) * y + p * q / 6.0 * w
             h[i, slot[YAW]] = 0.5 * p * x + p * q / 6.0 * y + (1.0 - p * p / 6.0) * w
@@ -129,11 +143,11 @@ def _rows(
             z[i] -= xi[slot[DRIFT]]
             h[i, slot[DRIFT]] = 1.0
         if axis == FORWARD:
-            ahead = a * step[STEP_SMOOTH_N] + b * step[STEP_SMOOTH_N + 1]
-            ahead += e * (step[STEP_SMOOTH_N + 2] + gravity(nav[LAT], nav[HEIGHT]))
-            z[i] -= ahead * _estimate(xi, slot[LATENCY])
+            z[i] -= late * a0
+            h[i, 0] += late * b * g
+            h[i, 1] -= late * a * g
             if slot[LATENCY] >= 0:
-                h[i, slot[LATENCY]] = ahead
+                h[i, slot[LATENCY]] = a0
             gain = 1.0 + _estimate(xi, slot[SCALE])
             for j in range(h.shape[1]):
                 h[i, j] *= gain

@@ -1,7 +1,7 @@
 r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 
     z = v^ + C^ (w x l^) + a^ (tau^ - tau_0) - v_fix
-      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + noise
+      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + (tau^ - tau_0) f x phi + noise
 
 w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s
 per 10 m. tau is how much later than its stamp the velocity is valid, tau_0 what the aid's instant
@@ -25,7 +25,7 @@ from fusiond.aiding.position import antenna
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import Q0, STEP_RATE_B, VN
+from fusiond.navigation.strapdown import Q0, STEP_RATE_B, STEP_SMOOTH_N, VN
 
 Array = NDArray[np.float64]
 
@@ -101,9 +101,12 @@ class VelocityAid(Aid):
             h[:, levers] = -(state.dcm @ turn)[:rows]
         z -= self.v_ned[:rows]
         for slot in state.model.slots_of(self.time):
-            a = state.acceleration[:rows]
-            z += a * (state.xi[slot] - self.ahead_s)
-            h[:, slot] = -a
+            late_s = float(state.xi[slot]) - self.ahead_s
+            z += state.acceleration[:rows] * late_s
+            h[:, slot] = -state.acceleration[:rows]
+            x, y, w = state.step[STEP_SMOOTH_N : STEP_SMOOTH_N + 3]
+            force = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
+            h[:, :3] += late_s * force[:rows]
         return Innovation(z, h, np.square(self.sd[:rows]))
 
     def offers(self) -> tuple[VelocityOffer, ...]:

@@ -26,7 +26,20 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
-from fusiond.navigation.earth import EARTH_RATE_RAD_S
+from fusiond.models.vehicle import (
+    ANTENNA_LEVER,
+    FIX_TIME,
+    VELOCITY_TIME,
+    WHEEL_LATENCY,
+    WHEEL_SCALE,
+    antenna_lever,
+    axle_lever,
+    mounting,
+    side_drift,
+    time_offset,
+    wheel_scale,
+)
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, dcm_from_rpy, rpy_from_dcm
 from fusiond.navigation.strapdown import STEP_SIZE
 from tests import runs
@@ -51,6 +64,26 @@ def _model(name: str) -> Model:
     return make_model(name, imu_noise(Imu()), *biases)
 
 
+VEHICLE = (
+    mounting(0.1),
+    axle_lever(1.0),
+    side_drift(0.1, 5.0),
+    wheel_scale(WHEEL_SCALE, 0.02),
+    time_offset(WHEEL_LATENCY, 0.2),
+    time_offset(FIX_TIME, 0.1),
+    time_offset(VELOCITY_TIME, 0.1),
+    antenna_lever(ANTENNA_LEVER, 0.3),
+)
+# What the filter holds of them: mounting pitch and yaw, lever, drift, scale, latency, two offsets
+# in time, lever of the antenna.
+ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05)
+ACCELERATION = (1.4, -0.8, 0.3)
+
+
+def _vehicle_model() -> Model:
+    return make_model("ins15", imu_noise(Imu()), *VEHICLE)
+
+
 def _state(model: Model, nav: Array, xi: Array) -> State:
     """As the filter leaves it: `step` holds the rate with the estimates taken out."""
     step = np.zeros(STEP_SIZE)
@@ -58,7 +91,9 @@ def _state(model: Model, nav: Array, xi: Array) -> State:
         bias = sum(xi[s] for s in model.parameters(9 + axis))
         scale = sum(xi[s] for s in model.parameters(15 + axis))
         step[3 + axis] = (RATE_SENSED[axis] - bias) / (1.0 + scale)
-    step[9:] = dcm_from_quaternion(nav[6:]).ravel()
+    step[9:18] = dcm_from_quaternion(nav[6:]).ravel()
+    felt = np.array(ACCELERATION) - [0.0, 0.0, gravity(float(nav[0]), float(nav[2]))]
+    step[18:] = dcm_from_quaternion(nav[6:]) @ (dcm_from_rpy(*RPY).T @ felt)
     return State(nav, xi, step, model)
 
 
@@ -73,18 +108,22 @@ def _check_jacobian(
     name: str,
     rpy: tuple[float, float, float] = RPY,
     tolerance: float = 1e-6,
+    model: Model | None = None,
+    estimated: tuple[float, ...] = (),
 ) -> None:
     """H against the change of z when the *computed* state is off by one state at a time.
 
     Parameters in error by +d are estimates short by d. `tolerance` covers the curvature over the
     step of the central difference and latitude's rounding.
     """
-    model = _model(name)
+    model = model or _model(name)
     v = (*VELOCITY[:2], 0.0) if model.hold_height else VELOCITY
     nav = runs.level_nav(rpy, v)
     xi = np.zeros(model.size)
     for axis in range(3):
         xi[model.parameters(9 + axis)[0]] = 1e-3 * (axis + 1)
+    if estimated:
+        xi[-len(estimated) :] = estimated
     aid = make(nav)
     z, h, r = _innovation(aid, _state(model, nav, xi))
     assert h.shape == (len(z), model.size)
@@ -128,7 +167,7 @@ AIDS: dict[str, Callable[[Array], Linearised]] = {
     "velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
     "horizontal velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2), (0.1, 0.1), LEVER),
     "heading": lambda nav: HeadingAid(*SOURCE, 2.25, 0.01),
-    "non-holonomic": lambda nav: NonHolonomicAid(*SOURCE, 0.1, 2.0, LEVER),
+    "non-holonomic": lambda nav: NonHolonomicAid(*SOURCE, 0.1, 0.2, 2.0, LEVER),
     "wheel speed": lambda nav: WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
     "zero velocity": lambda nav: ZeroVelocityAid(*SOURCE, 0.05, runs.rest(100.0)),
     "zero rate": lambda nav: ZeroRateAid(*SOURCE, (2e-3, 1e-3, 3e-3), 1e-3, runs.rest(100.0)),
@@ -141,6 +180,53 @@ def test_jacobian(kind: str, model: str) -> None:
     # Position: a metre north turns east's scale by cos' / R; zero rate: the Earth's own rate in H.
     tolerance = {"zero rate": 1e-4, "heading": 2e-6}.get(kind, 2e-6)
     _check_jacobian(AIDS[kind], model, tolerance=tolerance)
+
+
+IN_TIME: dict[str, Callable[[Array], Linearised]] = {
+    "no slip": AIDS["non-holonomic"],
+    "wheel": lambda nav: replace(
+        WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER), scale=WHEEL_SCALE, latency=WHEEL_LATENCY
+    ),
+    "position": lambda nav: replace(_position(nav), time=FIX_TIME, ahead_s=0.1, rest=ANTENNA_LEVER),
+    "horizontal position": lambda nav: replace(_position(nav, False), time=FIX_TIME),
+    "velocity": lambda nav: replace(
+        VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
+        time=VELOCITY_TIME,
+        ahead_s=-0.05,
+        rest=ANTENNA_LEVER,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(IN_TIME))
+def test_jacobian_of_what_an_owner_cannot_measure(kind: str) -> None:
+    """With estimates of 5 to 7 deg, decimetres and tenths of seconds."""
+    model = _vehicle_model()
+    # Third order of the mounting.
+    _check_jacobian(IN_TIME[kind], "", tolerance=1e-3, model=model, estimated=ESTIMATED)
+
+
+def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
+    """z = 0 where the parameters are those that the measurement was made with, by other means."""
+    model = _vehicle_model()
+    nav = runs.level_nav(RPY, VELOCITY)
+    xi = np.zeros(model.size)
+    xi[-len(ESTIMATED) :] = ESTIMATED
+    state = _state(model, nav, xi)
+    pitch, yaw, lever, _, scale, latency, late, _, *rest = ESTIMATED
+    to_vehicle = Rotation.from_rotvec([0.0, pitch, yaw]).as_matrix()
+    dcm = Rotation.from_euler("ZYX", RPY[::-1]).as_matrix()
+    at_wheel = dcm.T @ VELOCITY + np.cross(RATE_SENSED, np.add(LEVER, (lever, 0.0, 0.0)))
+    before = to_vehicle @ (at_wheel - dcm.T @ ACCELERATION * latency)
+    wheel = WheelSpeedAid(*SOURCE, float((1.0 + scale) * before[0]), 0.1, LEVER)
+    wheel = replace(wheel, scale=WHEEL_SCALE, latency=WHEEL_LATENCY)
+    assert _innovation(wheel, state).z == pytest.approx([0.0], abs=1e-9)
+    arm = dcm @ np.add(LEVER, rest)
+    antenna = nav[:3] + (arm + np.array(VELOCITY) * late) / runs.metres(*nav[[0, 2]])
+    lat, lon, height = (float(x) for x in antenna)
+    fix = PositionAid(*SOURCE, lat, lon, height, (1.0, 1.0, 1.0), LEVER)
+    fix = replace(fix, time=FIX_TIME, rest=ANTENNA_LEVER)
+    assert _innovation(fix, state).z == pytest.approx([0.0, 0.0, 0.0], abs=1e-4)
 
 
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.5, 1.1, -3.0), (-2.0, -0.9, 1.0)])
@@ -296,7 +382,7 @@ def test_aids_that_do_not_hold_say_why() -> None:
     rest = ZeroRateAid(*SOURCE, (0.0, 0.0, 0.0), 1e-3, runs.rest())
     assert rest.innovation(moving) == NotApplicable("moving")
     assert isinstance(rest.innovation(slow), Innovation)
-    slide = NonHolonomicAid(*SOURCE, 0.1, 2.0, LEVER)
+    slide = NonHolonomicAid(*SOURCE, 0.1, 0.2, 2.0, LEVER)
     assert slide.innovation(slow) == NotApplicable("too_slow")
     assert HeadingAid(*SOURCE, 0.0, 0.01).innovation(steep) == NotApplicable("too_steep")
 
@@ -308,5 +394,5 @@ def test_non_holonomic_point_follows_the_forward_axis() -> None:
     v = dcm @ (np.array([9.0, 0.0, 0.0]) - np.cross(RATE_SENSED, LEVER))
     n, e, d = (float(x) for x in v)
     state = _state(model, runs.level_nav(RPY, (n, e, d)), np.zeros(model.size))
-    z = _innovation(NonHolonomicAid(*SOURCE, 0.1, 2.0, LEVER), state).z
+    z = _innovation(NonHolonomicAid(*SOURCE, 0.1, 0.2, 2.0, LEVER), state).z
     assert z == pytest.approx([0.0, 0.0], abs=1e-12)

@@ -44,7 +44,7 @@ def _model(name: str, block: str) -> Model:
 def _state(model: Model, nav: Array, xi: Array) -> State:
     step = np.zeros(STEP_SIZE)
     step[3:6] = RATE
-    step[9:] = dcm_from_quaternion(nav[6:]).ravel()
+    step[9:18] = dcm_from_quaternion(nav[6:]).ravel()
     return State(nav, xi, step, model)
 
 

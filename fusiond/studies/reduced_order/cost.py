@@ -120,7 +120,7 @@ def level_step(nav: Array) -> Array:
     state = State(nav, np.zeros(0), np.zeros(0), flight.model("ins17"))
     step = np.zeros(STEP_SIZE)
     step[2] = step[8] = -9.8
-    step[9:] = state.dcm.ravel()
+    step[9:18] = state.dcm.ravel()
     return step
 
 
