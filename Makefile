@@ -50,8 +50,11 @@ kernels: $(STAMP)
 	@echo "compiling the kernels once, before the tests share them"
 	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle'
 
+# A file's tests stay on one core: they share what the first of them computed. Each core has its
+# process, so that threads of the linear algebra would only fight for it.
 unit: kernels test-packages ## unit and property tests, on every core
-	$(BIN)/pytest -n auto --dist worksteal --ignore tests/hil/test_hil.py $(ARGS)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder \
+		--ignore tests/hil/test_hil.py $(ARGS)
 
 fuzz: $(STAMP) ## every parser with atheris; RUNS=1000000 ARGS=nmea for one of them
 	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install --quiet 'atheris>=3'

@@ -1,8 +1,36 @@
-"""Property tests judge what comes out, not how long it took: a busy host is no counterexample."""
+"""What holds for all tests: how properties are judged, and which files come first."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 from hypothesis import HealthCheck, settings
+
+# A busy host is no counterexample: properties judge what comes out, not how long it took.
 
 settings.register_profile("fusiond", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("fusiond")
+
+LONG = (
+    "studies/test_studies",
+    "commands/test_kernel_cache",
+    "studies/",
+    "estimators/test_federated_faults",
+    "live/",
+    "offline/",
+    "commands/",
+)
+"""Files that take minutes come first, so that all cores end at about the same time."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those of `LONG` first; the tests of a file keep their order."""
+
+    here = Path(__file__).parent
+
+    def place(item: pytest.Item) -> int:
+        name = item.path.relative_to(here).as_posix()
+        return next((k for k, long in enumerate(LONG) if name.startswith(long)), len(LONG))
+
+    items.sort(key=place)

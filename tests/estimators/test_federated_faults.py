@@ -42,7 +42,9 @@ RUNS = 24
 
 @lru_cache(maxsize=8)
 def traces(fault: study.FaultKind, sd_m: tuple[float, ...], count: int) -> list[dict[str, Trace]]:
-    filters = (OWN, OFF, CENTRALISED) if fault else (OWN, RESET, RESCALE)
+    filters = (OWN, OFF, CENTRALISED) if fault else (OWN, RESET)
+    if not fault and sd_m == EQUAL_M:
+        filters += (RESCALE,)
     return study.monte_carlo(filters, fault, sd_m, count, seed=5)
 
 

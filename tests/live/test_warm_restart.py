@@ -7,11 +7,11 @@ from pathlib import Path
 
 from tests.live.kill_nine import driving, killed
 
-KILLS = 5
+KILLS = 3
 
 
 async def test_killed_while_driving_it_is_back_at_once_and_honest(tmp_path: Path) -> None:
-    """At five random instants, for gaps of up to five seconds; `benchmarks/kill_nine.py` has more.
+    """At three random instants, for gaps of up to five seconds; `benchmarks/kill_nine.py` has more.
 
     On a computer that is so busy that the gap grows too long, the start is an ordinary one.
     """

@@ -93,8 +93,14 @@ def _rms(errors: Any) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
-def test_all_systems(tmp_path: Path) -> None:
-    result, solution = _process(tmp_path)
+@pytest.fixture(scope="module")
+def all_in_view(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], TrajectoryTable]:
+    """Result and solution of the whole stream."""
+    return _process(tmp_path_factory.mktemp("all_in_view"))
+
+
+def test_all_systems(all_in_view: tuple[dict[str, Any], TrajectoryTable]) -> None:
+    result, solution = all_in_view
     assert result["mode"] == "navigating"
     t = _instants(solution)
     assert len(t) > 350
@@ -154,6 +160,27 @@ def _only(stream: bytes, keep: set[tuple[int, int]], start_s: float, length_s: f
     return bytes(out)
 
 
+START_S, LENGTH_S = 408690.0, 30.0
+FEW = np.arange(START_S, START_S + LENGTH_S, 0.25)
+
+
+def _growth(solution: TrajectoryTable, all_in_view: TrajectoryTable) -> float:
+    """How far a solution gets away from the one with all satellites (m)."""
+    apart = _errors(solution, FEW) - _errors(all_in_view, FEW)
+    return float(np.hypot(*apart.T).max())
+
+
+@pytest.fixture(scope="module")
+def coasting_growth(
+    all_in_view: tuple[dict[str, Any], TrajectoryTable], tmp_path_factory: pytest.TempPathFactory
+) -> float:
+    """Of a solution without any satellite."""
+    folder = tmp_path_factory.mktemp("coasting")
+    result, coasting = _process(folder, outages=[(START_S, LENGTH_S)])
+    assert result["sources"]["raw"]["withheld"] == 120
+    return _growth(coasting, all_in_view[1])
+
+
 @pytest.mark.parametrize(
     "keep",
     [
@@ -165,19 +192,13 @@ def _only(stream: bytes, keep: set[tuple[int, int]], start_s: float, length_s: f
     ids=["BeiDou", "BeiDou, others", "GPS", "one of each"],
 )
 def test_three_satellites_hold_what_coasting_loses(
-    keep: set[tuple[int, int]], tmp_path: Path
+    keep: set[tuple[int, int]],
+    all_in_view: tuple[dict[str, Any], TrajectoryTable],
+    coasting_growth: float,
+    tmp_path: Path,
 ) -> None:
-    start_s, length_s = 408690.0, 30.0
-    t = np.arange(start_s, start_s + length_s, 0.25)
-    all_in_view = _errors(_process(tmp_path)[1], t)
-    result, coasting = _process(tmp_path, outages=[(start_s, length_s)])
-    assert result["sources"]["raw"]["withheld"] == 120
     thinned = tmp_path / "thinned.ubx"
-    thinned.write_bytes(_only((WALK / "gnss.ubx").read_bytes(), keep, start_s, length_s))
+    thinned.write_bytes(_only((WALK / "gnss.ubx").read_bytes(), keep, START_S, LENGTH_S))
     result, three = _process(tmp_path, thinned)
     assert result["sources"]["raw"]["fused"] > 450
-
-    def growth(solution: TrajectoryTable) -> float:
-        return float(np.hypot(*(_errors(solution, t) - all_in_view).T).max())
-
-    assert growth(three) < growth(coasting) / 3.0
+    assert _growth(three, all_in_view[1]) < coasting_growth / 3.0
