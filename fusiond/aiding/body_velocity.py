@@ -12,6 +12,7 @@ T-RA 17 (2001), eq. 8; Groves, 2nd ed., section 15.4.1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 FORWARD, RIGHT = 0, 1
+SIGN_SIGMAS = 3.0
+"""A velocity beyond as many of its sigmas has the other sign once in 740."""
 
 
 @compiled("void(f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8, f8[::1], f8[:, ::1])")
@@ -97,14 +100,28 @@ class NonHolonomicAid(Aid):
 
 @dataclass(frozen=True, slots=True)
 class WheelSpeedAid(Aid):
-    """Forward speed (m/s) with `sd_m_s` at `lever`."""
+    """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that.
+
+    Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
+    is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
+    """
 
     speed_m_s: float
     sd_m_s: float
     lever: Vector3
+    signed: bool = True
+    rounding_sd_m_s: float = 0.0
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        return _body_velocity(state, self.lever, FORWARD, 1, self.speed_m_s, self.sd_m_s)
+        z, h, r = _body_velocity(state, self.lever, FORWARD, 1, 0.0, self.sd_m_s)
+        speed = self.speed_m_s
+        if not self.signed:
+            forward, p = float(z[0]), state.covariance
+            sd = 0.0 if p is None else math.sqrt(max(float(h[0] @ p @ h[0]), 0.0))
+            if abs(forward) <= SIGN_SIGMAS * sd:
+                return NotApplicable("direction_unknown")
+            speed = math.copysign(speed, forward)
+        return Innovation(z - speed, h, r)
 
     def offers(self) -> tuple[SpeedOffer, ...]:
-        return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s),)
+        return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)
