@@ -7,6 +7,9 @@ byte or frame came in. Whoever consumes the measurement turns the stamp into a v
 Frames: *sensor* axes are the device's own; *body* is forward-right-down; *NED* is
 north-east-down at the point that the measurement speaks of. Angles are radians unless a name says
 otherwise. Latitude, longitude and height are geodetic on WGS 84 (CGCS2000 agrees to centimetres).
+
+`rounding_sd` is one sigma of what a device's resolution takes off (`drivers.rounding`), beside the
+sigma that it states or that is known of it. It is 0 where the resolution is fine or not known.
 """
 
 from __future__ import annotations
@@ -110,6 +113,8 @@ class PositionFix:
     sd_ned_m: Vector3 | None = None
     v_ned_m_s: tuple[float, float, float | None] | None = None
     sd_v_ned_m_s: tuple[float, float, float | None] | None = None
+    rounding_sd_ned_m: Vector3 = (0.0, 0.0, 0.0)
+    rounding_sd_v_m_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,29 +181,40 @@ class Heading:
     stamp: Stamp
     yaw_rad: float
     sd_rad: float | None = None
+    rounding_sd_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Height:
-    """Ellipsoidal height of the body origin (m), one sigma if given."""
+    """Ellipsoidal height of the body origin (m), one sigma if given.
+
+    `barometric`: a pressure's height in the standard atmosphere. It changes as the height does, and
+    is off by the weather: 8 m a hPa, for hours alike.
+    """
 
     source: str
     t_seen_ns: int
     stamp: Stamp
     height_m: float
     sd_m: float | None = None
+    rounding_sd_m: float = 0.0
+    barometric: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class WheelSpeed:
-    """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if
-    given."""
+    """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given.
+
+    Not `signed`: the device does not know forward from backward, and the speed is its amount.
+    """
 
     source: str
     t_seen_ns: int
     stamp: Stamp
     speed_m_s: float
     sd_m_s: float | None = None
+    rounding_sd_m_s: float = 0.0
+    signed: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,13 +8,15 @@ mrad, arcsec ...).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from pydantic import PositiveFloat
 
 from drivers.base import DriverOptions, PermanentDriverError
 from drivers.can.dbc import plan_angle, plan_number
-from drivers.can.driver import CanDecoder, CanDriver, CanOptions, Find
+from drivers.can.decoder import CanDecoder, CanOptions, Find, Signals, plan_flags
+from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import Attitude, Bearing, Measurement, Stamp
 
 TURN = 2.0 * math.pi
@@ -24,8 +26,8 @@ NAN = math.nan
 class CanAidOptions(CanOptions):
     """What the two have in common."""
 
-    valid: str | None = None
-    """Flag: a measurement with 0 in it is counted as `not_valid` and goes no further."""
+    valid: str | Signals = ()
+    """Flags: a measurement with 0 in one is counted as `not_valid` and goes no further."""
     timeout_s: PositiveFloat = 5.0
     """Without a measurement for so long the device is `silent`."""
 
@@ -54,12 +56,6 @@ class CanBearingOptions(CanAidOptions):
     sd_elevation: str | None = None
 
 
-def _plan_flag(find: Find, slot: int, name: str | None) -> None:
-    if name is not None:
-        plan, signal = find(name, "valid")
-        plan.axes.append(plan_number(slot, signal, "valid"))
-
-
 class CanAttitudeDecoder(CanDecoder[CanAttitudeOptions]):
     """CAN frames in, attitudes out; no I/O. Slots: roll, pitch, yaw, sigma of each, flag."""
 
@@ -72,16 +68,17 @@ class CanAttitudeDecoder(CanDecoder[CanAttitudeOptions]):
                 what, low = ("rpy", -TURN) if slot < 3 else ("sd_rpy", 0.0)
                 plan, signal = find(name, what)
                 plan.axes.append(plan_angle(slot, signal, what, low, TURN))
-        _plan_flag(find, 6, options.valid)
-        return [NAN] * 6 + [1.0]
+        return [NAN] * 6 + plan_flags(find, 6, "valid", options.valid)
 
-    def _measurement(self, values: list[float], t_seen_ns: int, stamp: Stamp) -> Measurement | None:
-        roll, pitch, yaw, sd_roll, sd_pitch, sd_yaw, valid = values
-        if not valid:
+    def _measurements(
+        self, values: list[float], t_seen_ns: int, stamp: Stamp
+    ) -> Sequence[Measurement]:
+        roll, pitch, yaw, sd_roll, sd_pitch, sd_yaw, *valid = values
+        if not all(valid):
             self.counters["not_valid"] += 1
-            return None
+            return ()
         sd = (sd_roll, sd_pitch, sd_yaw)
-        return Attitude(self.name, t_seen_ns, stamp, (roll, pitch, yaw), sd)
+        return (Attitude(self.name, t_seen_ns, stamp, (roll, pitch, yaw), sd),)
 
 
 class CanBearingDecoder(CanDecoder[CanBearingOptions]):
@@ -104,27 +101,28 @@ class CanBearingDecoder(CanDecoder[CanBearingOptions]):
                 plan.axes.append(plan_angle(slot, signal, what, low, high))
         plan, signal = find(options.target, "target")
         plan.axes.append(plan_number(4, signal, "target"))
-        _plan_flag(find, 5, options.valid)
-        return [NAN] * 5 + [1.0]
+        return [NAN] * 5 + plan_flags(find, 5, "valid", options.valid)
 
-    def _measurement(self, values: list[float], t_seen_ns: int, stamp: Stamp) -> Measurement | None:
-        azimuth, elevation, sd_azimuth, sd_elevation, target, valid = values
-        if not valid:
+    def _measurements(
+        self, values: list[float], t_seen_ns: int, stamp: Stamp
+    ) -> Sequence[Measurement]:
+        azimuth, elevation, sd_azimuth, sd_elevation, target, *valid = values
+        if not all(valid):
             self.counters["not_valid"] += 1
-            return None
+            return ()
         sd = None if math.isnan(sd_azimuth) else (sd_azimuth, sd_elevation)
-        return Bearing(self.name, t_seen_ns, stamp, azimuth, elevation, sd, str(round(target)))
+        return (Bearing(self.name, t_seen_ns, stamp, azimuth, elevation, sd, str(round(target))),)
 
 
 class CanAttitudeDriver(CanDriver[CanAttitudeOptions]):
     """A star tracker or attitude reference on a CAN bus. `counters`: also `not_valid`."""
 
     Options: ClassVar[type[DriverOptions]] = CanAttitudeOptions
-    Decoder: ClassVar[type[CanDecoder[CanAttitudeOptions]]] = CanAttitudeDecoder
+    Decoder: ClassVar[Callable[..., Codec]] = CanAttitudeDecoder
 
 
 class CanBearingDriver(CanDriver[CanBearingOptions]):
     """A radar on a CAN bus that measures known points. `counters`: also `not_valid`."""
 
     Options: ClassVar[type[DriverOptions]] = CanBearingOptions
-    Decoder: ClassVar[type[CanDecoder[CanBearingOptions]]] = CanBearingDecoder
+    Decoder: ClassVar[Callable[..., Codec]] = CanBearingDecoder

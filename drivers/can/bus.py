@@ -78,7 +78,7 @@ Read = Callable[[], CanFrame | None]
 
 
 class CanBus:
-    """One CAN bus, reopened for ever. It only listens.
+    """One CAN bus, reopened for ever. It listens; it sends what it is told to, and nothing else.
 
     `counters`: `bus_opened`, `bus_closed`, `bus_open_failed`, `frames`, `remote_frames`,
     `error_frames`, `error_<class>`, `error_overflow` (controller lost frames), `socket_overflow`
@@ -104,6 +104,7 @@ class CanBus:
         self._on_frame: Callable[[CanFrame], None] = lambda frame: None
         self._on_controller: Callable[[ControllerState], None] = lambda state: None
         self._drops_seen = 0
+        self._bus: can.BusABC | None = None
 
     async def run(
         self,
@@ -134,15 +135,30 @@ class CanBus:
             self.counters["bus_opened"] += 1
             self.controller = "active"
             self._drops_seen = 0
+            self._bus = bus
             try:
                 on_link(True, "")
                 told = await self._serve(bus)
             finally:
+                self._bus = None
                 with contextlib.suppress(OSError, can.CanError):
                     bus.shutdown()
                 self.counters["bus_closed"] += 1
             on_link(False, told)
             await asyncio.sleep(self._backoff.next())
+
+    def send(self, frame: CanFrame) -> bool:
+        """Put a frame on the bus; False where it is down or its queue full. Never waits."""
+        if self._bus is None:
+            return False
+        message = can.Message(
+            arbitration_id=frame.can_id, is_extended_id=frame.extended, data=frame.data
+        )
+        try:
+            self._bus.send(message, timeout=0.0)
+        except (OSError, can.CanError):
+            return False
+        return True
 
     # ----------------------------------------------------------------- opening
 

@@ -55,8 +55,36 @@ ANGLE_UNITS = {
     "arcmin": math.pi / 10_800.0,
     "arcsec": math.pi / 648e3,
 }
+SPEED_UNITS = {
+    "m/s": 1.0,
+    "mm/s": 1e-3,
+    "km/h": 1.0 / 3.6,
+    "kph": 1.0 / 3.6,
+    "kmh": 1.0 / 3.6,
+    "km/hr": 1.0 / 3.6,
+    "mph": 0.44704,
+    "kn": 1852.0 / 3600.0,
+    "knots": 1852.0 / 3600.0,
+}
+"""1 mile (international, 1959) 1609.344 m, 1 nautical mile 1852 m."""
+ROTATION_UNITS = {
+    "rad/s": 1.0,
+    "deg/s": math.pi / 180.0,
+    "°/s": math.pi / 180.0,
+    "rpm": math.pi / 30.0,
+    "1/min": math.pi / 30.0,
+    "Hz": 2.0 * math.pi,
+}
+"""A wheel's own turning; the radius makes a speed of it."""
+LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048}
+PRESSURE_UNITS = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1e3, "bar": 1e5}
 NO_UNITS = {"": 1.0, "1": 1.0}
-TIME_UNITS = {"s": Fraction(1), "ms": Fraction(1, 1000), "us": Fraction(1, 10**6)} | {
+TIME_UNITS = {
+    "s": Fraction(1),
+    "sec": Fraction(1),
+    "ms": Fraction(1, 1000),
+    "us": Fraction(1, 10**6),
+} | {
     "µs": Fraction(1, 10**6),
     "ns": Fraction(1, 10**9),
 }
@@ -71,7 +99,10 @@ class RefusedFrameError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One value out of one signal: SI value = raw * scale + offset, believed within low..high."""
+    """One value out of one signal: SI value = raw * scale + offset, believed within low..high.
+
+    `step` is the distance of neighbouring values, 0 of a floating-point signal.
+    """
 
     slot: int
     signal: str
@@ -79,6 +110,7 @@ class Axis:
     offset: float
     low: float
     high: float
+    step: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +133,10 @@ class Part:
 
 @dataclass(slots=True)
 class MessagePlan:
-    """What is taken out of one message."""
+    """What is taken out of one message; `paired`: its frames wait for those of other messages."""
 
     message: Message
+    paired: bool = False
     axes: list[Axis] = field(default_factory=list)
     counter: Stamp | None = None
     time: Stamp | None = None
@@ -208,12 +241,29 @@ def plan_value(slot: int, signal: Signal, factor: float, low: float, high: float
         slack = 0.5 * abs(signal.scale)
         ends = sorted(((least - slack) * factor, (most + slack) * factor))
         low, high = max(low, ends[0]), min(high, ends[1])
-    return Axis(slot, signal.name, signal.scale * factor, signal.offset * factor, low, high)
+    scale, offset = signal.scale * factor, signal.offset * factor
+    step = 0.0 if signal.is_float else abs(scale)
+    return Axis(slot, signal.name, scale, offset, low, high, step)
 
 
 def plan_angle(slot: int, signal: Signal, what: str, low: float, high: float) -> Axis:
     """An angle within low..high (rad), in the unit that the DBC states."""
-    return plan_value(slot, signal, _unit(ANGLE_UNITS, signal, None, what), low, high)
+    return plan_quantity(slot, signal, what, ANGLE_UNITS, low, high)
+
+
+def plan_quantity(
+    slot: int,
+    signal: Signal,
+    what: str,
+    units: Mapping[str, float],
+    low: float,
+    high: float,
+    override: str | None = None,
+    times: float = 1.0,
+) -> Axis:
+    """A quantity within low..high (SI) in one of `units`, as the DBC or `override` states; its
+    value in SI is taken `times` this."""
+    return plan_value(slot, signal, _unit(units, signal, override, what) * times, low, high)
 
 
 def plan_number(slot: int, signal: Signal, what: str) -> Axis:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from drivers.base import DriverOptions, PermanentDriverError
 from drivers.can.dbc import FORCE_UNITS, RATE_UNITS, plan_axis
-from drivers.can.driver import CanDecoder, CanDriver, CanOptions, Find
+from drivers.can.decoder import CanDecoder, CanOptions, Find
+from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import ImuSample, Stamp
 
 AxisSource = str | float
@@ -52,9 +54,11 @@ class CanImuDecoder(CanDecoder[CanImuOptions]):
                 raise PermanentDriverError(f"{what}: at least one axis must be a signal")
         return constants
 
-    def _measurement(self, values: list[float], t_seen_ns: int, stamp: Stamp) -> ImuSample:
+    def _measurements(
+        self, values: list[float], t_seen_ns: int, stamp: Stamp
+    ) -> Sequence[ImuSample]:
         gx, gy, gz, ax, ay, az = values
-        return ImuSample(self.name, t_seen_ns, stamp, (gx, gy, gz), (ax, ay, az))
+        return (ImuSample(self.name, t_seen_ns, stamp, (gx, gy, gz), (ax, ay, az)),)
 
 
 def _number(source: AxisSource) -> float | None:
@@ -68,4 +72,4 @@ class CanImuDriver(CanDriver[CanImuOptions]):
     """An IMU on a CAN bus; see `CanDriver` for its counters and events."""
 
     Options: ClassVar[type[DriverOptions]] = CanImuOptions
-    Decoder: ClassVar[type[CanDecoder[CanImuOptions]]] = CanImuDecoder
+    Decoder: ClassVar[Callable[..., Codec]] = CanImuDecoder

@@ -26,6 +26,7 @@ T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and moun
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -48,6 +49,8 @@ Indices = NDArray[np.int64]
 FORWARD, RIGHT = 0, 1
 # Where the kernel finds the slot of each parameter; -1 for one that the model has not.
 PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
+SIGN_SIGMAS = 3.0
+"""A velocity beyond as many of its sigmas has the other sign once in 740."""
 
 
 def _slots(model: Model, scale: str = "", latency: str = "") -> Indices:
@@ -189,19 +192,32 @@ class NonHolonomicAid(Aid):
 
 @dataclass(frozen=True, slots=True)
 class WheelSpeedAid(Aid):
-    """Forward speed (m/s) with `sd_m_s` at `lever`; `scale` and `latency` name the blocks of the
-    wheel's own errors."""
+    """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `scale`
+    and `latency` name the blocks of the wheel's own errors.
+
+    Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
+    is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
+    """
 
     speed_m_s: float
     sd_m_s: float
     lever: Vector3
+    signed: bool = True
+    rounding_sd_m_s: float = 0.0
     scale: str = ""
     latency: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         slots = _slots(state.model, self.scale, self.latency)
         z, h = _body_velocity(state, self.lever, FORWARD, 1, slots)
-        return Innovation(z - self.speed_m_s, h, np.array([self.sd_m_s**2]))
+        speed = self.speed_m_s
+        if not self.signed:
+            forward, p = float(z[0]), state.covariance
+            sd = 0.0 if p is None else math.sqrt(max(float(h[0] @ p @ h[0]), 0.0))
+            if abs(forward) <= SIGN_SIGMAS * sd:
+                return NotApplicable("direction_unknown")
+            speed = math.copysign(speed, forward)
+        return Innovation(z - speed, h, np.array([self.sd_m_s**2]))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
-        return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s),)
+        return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)

@@ -33,11 +33,13 @@ class VelocityOffer(NamedTuple):
 
 
 class SpeedOffer(NamedTuple):
-    """Speed (m/s) along the forward axis, as a wheel says it."""
+    """Speed (m/s) along the forward axis, or its amount, as a wheel says it. `rounding_sd_m_s` is
+    the part of `sd_m_s` that is the same as long as the speed is: no mean takes it away."""
 
     t_ns: int
     speed_m_s: float
     sd_m_s: float
+    rounding_sd_m_s: float = 0.0
 
 
 class HeadingOffer(NamedTuple):

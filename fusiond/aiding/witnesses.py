@@ -3,7 +3,8 @@ r"""What speaks for or against rest beside a quiet sensor: measured speeds, and 
     m = sum(v_k) / n,   s = max(sd / sqrt(n), s_0),   contradicts rest if m^2 / s^2 > chi2(0.999)
 
 over the velocities v_k (north, east, or a wheel's speed) of one kind in a span of time. n fixes
-average: 0.2 m/s is seen by five fixes of 0.1 m/s. s_0 is what does not average.
+average: 0.2 m/s is seen by five fixes of 0.1 m/s. s_0 is what does not average: multipath, and the
+rounding of a speed that stays the same.
 
 Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity aids.
 """
@@ -40,12 +41,20 @@ class Measured(NamedTuple):
     sd: float
 
 
+class _Speed(NamedTuple):
+    """A velocity or speed (m/s) with its sigma, and the part of that which no mean takes away."""
+
+    t_ns: int
+    v: tuple[float, ...]
+    sd: float
+    rounding: float
+
+
 class Witnesses:
     """Speeds that were measured, and the quiet windows that were none of rest."""
 
     def __init__(self) -> None:
-        self._speeds: defaultdict[str, list[tuple[int, tuple[float, ...], float]]]
-        self._speeds = defaultdict(list)
+        self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
 
     def hear(self, aids: Sequence[Aid]) -> None:
@@ -59,11 +68,14 @@ class Witnesses:
                     case VelocityOffer():
                         self._keep(aid.source, offer.t_ns, offer.v_ned[:2], max(offer.sd[:2]))
                     case SpeedOffer():
-                        self._keep(aid.source, offer.t_ns, (offer.speed_m_s,), offer.sd_m_s)
+                        v, rounding = (offer.speed_m_s,), offer.rounding_sd_m_s
+                        self._keep(aid.source, offer.t_ns, v, offer.sd_m_s, rounding)
 
-    def _keep(self, source: str, t_ns: int, v: tuple[float, ...], sd: float) -> None:
+    def _keep(
+        self, source: str, t_ns: int, v: tuple[float, ...], sd: float, rounding: float = 0.0
+    ) -> None:
         speeds = self._speeds[source]
-        insort(speeds, (t_ns, v, sd))
+        insort(speeds, _Speed(t_ns, v, sd, rounding))
         if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
             del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
@@ -76,10 +88,10 @@ class Witnesses:
             if not found:
                 continue
             count = len(found)
-            sd = math.sqrt(sum(s * s for _, _, s in found)) / count
-            sd = max(sd, LEAST_SD_M_S)
-            size = len(found[0][1])
-            square = sum((sum(v[axis] for _, v, _ in found) / count) ** 2 for axis in range(size))
+            sd = math.sqrt(sum(row.sd * row.sd for row in found)) / count
+            sd = max(sd, LEAST_SD_M_S, *(row.rounding for row in found))
+            size = len(found[0].v)
+            square = sum((sum(row.v[axis] for row in found) / count) ** 2 for axis in range(size))
             contradicts |= square > CONTRADICTION[size - 1] * sd * sd
             best = min(best, sd)
         return Measured(contradicts, best)
@@ -87,15 +99,15 @@ class Witnesses:
     def velocity(self, begin_ns: int, end_ns: int) -> tuple[float, float, float] | None:
         """Mean velocity north, east (m/s) of the source that had most to say from `begin_ns` to
         `end_ns`, both included, and the sigma of one of its measurements."""
-        found: list[tuple[int, tuple[float, ...], float]] = []
+        found: list[_Speed] = []
         for speeds in self._speeds.values():
             rows = speeds[bisect_left(speeds, (begin_ns,)) : bisect_left(speeds, (end_ns + 1,))]
-            if len(rows) > len(found) and len(rows[0][1]) == 2:
+            if len(rows) > len(found) and len(rows[0].v) == 2:
                 found = rows
         if not found:
             return None
-        north, east = (sum(v[axis] for _, v, _ in found) / len(found) for axis in range(2))
-        return north, east, max(sd for _, _, sd in found)
+        north, east = (sum(row.v[axis] for row in found) / len(found) for axis in range(2))
+        return north, east, max(row.sd for row in found)
 
     def quiet_at_speed(self, t_ns: int, at_speed: bool) -> None:
         """Whether the quiet window that ended at `t_ns` was at speed; a rewind may say otherwise

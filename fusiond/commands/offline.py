@@ -10,6 +10,7 @@ import typer
 
 from fusiond.commands.shared import (
     EXIT_DATA,
+    EXIT_UNAVAILABLE,
     ConfigPath,
     JsonPath,
     config_errors,
@@ -21,20 +22,30 @@ from fusiond.commands.shared import (
 
 if TYPE_CHECKING:
     from drivers.raw.messages import System
+    from fusiond.offline.outages import Outage
 
 AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
 
 
 def process(
     config: ConfigPath,
-    imu: Annotated[Path, typer.Option(metavar="F.csv", help="IMU samples.")],
+    imu: Annotated[Path | None, typer.Option(metavar="F.csv", help="IMU samples.")] = None,
+    can: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="Recorded CAN bus of the sources: .log, .asc, .blf, .mf4."
+        ),
+    ] = None,
     aid: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
     ] = None,
     outage: Annotated[
         list[str] | None,
-        typer.Option(metavar="START:LENGTH", help="Withhold aids, in s of the files; repeatable."),
+        typer.Option(
+            metavar="START:LENGTH[:SOURCE,...]",
+            help="Withhold aids, all or of these sources, in s of the files; repeatable.",
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="F.csv", help="Write the solution; - is standard output.")
@@ -50,11 +61,19 @@ def process(
     outages = [_outage_argument(text) for text in outage or []]
     if out is not None and str(out) == "-" == json_path:
         raise typer.BadParameter("--out and --json cannot both be standard output")
+    if (imu is None) == (can is None):
+        raise typer.BadParameter("--imu or --can: the samples come of one of the two")
     loaded = load(config)
+    from fusiond.offline.can_log import MissingPackageError  # noqa: PLC0415
     from fusiond.offline.process import process as run_process  # noqa: PLC0415
 
-    with config_errors(), data_errors(), spinner("processing"):
-        result = run_process(loaded, imu, aids, outages, out, _systems_argument(systems))
+    wanted = _systems_argument(systems)
+    try:
+        with config_errors(), data_errors(), spinner("processing"):
+            result = run_process(loaded, imu, aids, outages, out, wanted, can)
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
     _print_summary(result, err="-" in (json_path, str(out)))
     write_json(result, json_path)
     if not result["solution_rows"]:
@@ -134,16 +153,20 @@ def _aid_argument(text: str) -> tuple[str, Path]:
     return kind, Path(path)
 
 
-def _outage_argument(text: str) -> tuple[float, float]:
-    """START:LENGTH."""
-    start, _, length = text.partition(":")
+def _outage_argument(text: str) -> Outage:
+    """START:LENGTH[:SOURCE,...]."""
+    start, _, rest = text.partition(":")
+    length, colon, sources = rest.partition(":")
     try:
         window = float(start), float(length)
     except ValueError:
         window = (0.0, 0.0)
-    if not (isfinite(window[0]) and isfinite(window[1]) and window[1] > 0.0):
-        raise typer.BadParameter(f"--outage {text}: START:LENGTH in seconds, LENGTH above 0")
-    return window
+    names = tuple(name.strip() for name in sources.split(",")) if colon else ()
+    if not (isfinite(window[0]) and isfinite(window[1]) and window[1] > 0.0 and all(names)):
+        raise typer.BadParameter(
+            f"--outage {text}: START:LENGTH in seconds, LENGTH above 0, then :SOURCE,... if any"
+        )
+    return (*window, names) if names else window
 
 
 def _systems_argument(text: str | None) -> tuple[System, ...] | None:

@@ -19,10 +19,12 @@ from drivers.base import PermanentDriverError, monotonic_ns
 from fusiond.configuration.aiding import (
     AnyAiding,
     GnssAiding,
+    HeightAiding,
     RawAiding,
     RdssAiding,
     SarAiding,
     StarTrackerAiding,
+    WheelAiding,
 )
 from fusiond.configuration.mistakes import Location, did_you_mean, mistake, validate
 from fusiond.configuration.schema import Config
@@ -36,6 +38,10 @@ _DEFAULT_AIDING: dict[str, AnyAiding] = {
     "rdss": RdssAiding(),
     "can_attitude": StarTrackerAiding(),
     "can_bearing": SarAiding(),
+    "can_gnss": GnssAiding(),
+    "can_height": HeightAiding(),
+    "can_wheel": WheelAiding(),
+    "obd_speed": WheelAiding(),
 }
 
 

@@ -265,26 +265,43 @@ def read_bearing(path: Path | str) -> BearingTable:
 
 @dataclass(frozen=True, slots=True)
 class WheelTable:
-    """Speed along the vehicle's forward axis and one sigma (m/s), (n,)."""
+    """Speed along the vehicle's forward axis and one sigma (m/s), (n,).
+
+    `step_m_s`: what it was rounded to. `unsigned` 1: it does not tell forward from backward.
+    """
 
     t_s: Floats
     t_arrival_s: Floats
     speed_m_s: Floats
     sd_m_s: Floats
+    step_m_s: Floats
+    unsigned: Floats
     rejected: list[Rejection]
 
 
 def read_wheel(path: Path | str) -> WheelTable:
-    """Read `wheel.csv`: t_s, speed_m_s and, where known, sd_m_s. Raises `TableError`."""
+    """Read `wheel.csv`: t_s, speed_m_s and, where known, sd_m_s, step_m_s, unsigned (0 or 1).
+
+    Raises `TableError`.
+    """
     columns = [
         TIME,
         _ARRIVAL,
         Column("speed_m_s", low=-_MAX_SPEED_M_S, high=_MAX_SPEED_M_S),
-        *_sigma(("sd_m_s",)),
+        *_sigma(("sd_m_s", "step_m_s")),
+        Column("unsigned", required=False, low=0.0, high=1.0),
     ]
     raw = read_table(path, columns, [_EARLY])
     c = raw.columns
-    return WheelTable(c["t_s"], c["t_arrival_s"], c["speed_m_s"], c["sd_m_s"], raw.rejected)
+    return WheelTable(
+        c["t_s"],
+        c["t_arrival_s"],
+        c["speed_m_s"],
+        c["sd_m_s"],
+        c["step_m_s"],
+        c["unsigned"],
+        raw.rejected,
+    )
 
 
 # --------------------------------------------------------------------------- trajectories

@@ -25,6 +25,7 @@ from drivers.measurements import (
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import RawEvent, RawGnssEpoch
+from drivers.rounding import rounded_speed
 from fusiond.configuration.aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError
@@ -49,10 +50,11 @@ _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset"
 
 
 class Arrival(NamedTuple):
-    """A measurement, or what a satellite broadcast, and when it came."""
+    """A measurement, or what a satellite broadcast, when it came, and one sigma of its instant."""
 
     t_arrival_ns: int
     measurement: Measurement | RawEvent
+    sd_time_s: float = 0.0
 
 
 def source_of(kind: str, config: Config) -> str:
@@ -178,13 +180,11 @@ def _read_wheel(path: Path, _: ImuTable, source: str) -> _Read:
     table = read_wheel(path)
 
     def speed(i: int, t_ns: int, seen: int) -> Measurement:
-        return WheelSpeed(
-            source,
-            seen,
-            MonotonicStamp(t_ns),
-            float(table.speed_m_s[i]),
-            _or_none(float(table.sd_m_s[i])),
-        )
+        value, step = float(table.speed_m_s[i]), _or_none(float(table.step_m_s[i])) or 0.0
+        mean, rounding_sd = rounded_speed(value, step)
+        stated = _or_none(float(table.sd_m_s[i]))
+        signed = mean == 0.0 or table.unsigned[i] != 1.0
+        return WheelSpeed(source, seen, MonotonicStamp(t_ns), mean, stated, rounding_sd, signed)
 
     return _arrivals(table.t_s, table.t_arrival_s, speed), table.rejected
 

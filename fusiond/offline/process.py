@@ -1,16 +1,17 @@
 """`fusiond process`: the daemon's navigator over recorded files, causal, a solution a sample.
 
-Rows are handed over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the
-solution at each sample is what the daemon would have said then, before anything that arrived later.
+Samples come of a table or of a recorded CAN bus, aids of that bus and of files. They are handed
+over in order of arrival (`t_arrival_s`, or `t_s` where there is none); the solution at each sample
+is what the daemon would have said then, before anything that arrived later.
 """
 
 from __future__ import annotations
 
 import gc
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,13 @@ from drivers.measurements import (
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, RawAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import counts
+from fusiond.files.csv_tables import TableError, counts
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.files.tables import ImuTable, read_imu
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import READERS, Arrival, source_of
+from fusiond.offline.can_log import read_can_log
+from fusiond.offline.outages import Outage, named, withheld
 from fusiond.offline.reasons import FileRead, nothing_navigated, wrong_units
 
 Array = NDArray[np.float64]
@@ -41,21 +44,25 @@ _SHOWN = 20
 
 def process(
     config: Config,
-    imu_path: Path,
+    imu_path: Path | None,
     aids: list[tuple[str, Path]],
-    outages: list[tuple[float, float]] | None = None,
+    outages: Sequence[Outage] | None = None,
     out: Path | None = None,
     systems: tuple[System, ...] | None = None,
+    can_log: Path | None = None,
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
     Of the solution: its rows, by mode too; when it begins; the sentence `why` where there is none.
     Samples whose units cannot be what the columns say are not navigated, and no `out` is written.
-    `systems` are the satellite systems of raw data to use, instead of the configuration's. Raises
-    `TableError` for a file that cannot be read as what it is said to be.
+    `systems` are the satellite systems of raw data to use, instead of the configuration's.
+    `can_log` is the bus of the sources on CAN, in place of `imu_path`. Raises `TableError` for a
+    file that cannot be read as what it is said to be, and for an outage of a source that there is
+    not; `MissingPackageError` for a format whose package is not installed.
     """
     with _imports_left_alone():
-        return _process(config, imu_path, aids, outages, out, systems)
+        read = _read(config, imu_path, aids, outages or (), systems, can_log)
+        return _process(read, out)
 
 
 @contextmanager
@@ -69,33 +76,71 @@ def _imports_left_alone() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _process(
+@dataclass(slots=True)
+class _Read:
+    """What has been read, and of which files; `withheld` measurements by source."""
+
+    config: Config
+    imu: ImuTable
+    arrivals: list[Arrival]
+    files: dict[str, FileRead]
+    events: list[dict[str, str]]
+    withheld: Counter[str]
+
+
+def _read(
     config: Config,
-    imu_path: Path,
+    imu_path: Path | None,
     aids: list[tuple[str, Path]],
-    outages: list[tuple[float, float]] | None,
-    out: Path | None,
+    outages: Sequence[Outage],
     systems: tuple[System, ...] | None,
-) -> dict[str, Any]:
+    can_log: Path | None,
+) -> _Read:
     if any(kind == "raw" for kind, _ in aids):
         config = _with_raw(config, systems)
-    imu = read_imu(imu_path)
-    imu_span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
-    read = {"imu": FileRead(imu_span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)}
+    events: list[dict[str, str]] = []
     arrivals: list[Arrival] = []
-    withheld: Counter[str] = Counter()
+    files: dict[str, FileRead] = {}
+    if can_log is not None:
+        log = read_can_log(can_log, config)
+        imu, arrivals = log.imu, log.arrivals
+        events += [{"code": code, "text": text} for code, text in log.events]
+        files["imu"] = _imu_read(imu)
+        for name, rejected in log.rejected.items():
+            rows = [row for row in arrivals if row.measurement.source == name]
+            if rows or rejected:
+                files[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
+    else:
+        assert imu_path is not None
+        imu = read_imu(imu_path)
+        files["imu"] = _imu_read(imu)
     for kind, path in aids:
         rows, rejected = READERS[kind](path, imu, source_of(kind, config))
-        name = kind if kind not in read else f"{kind}:{path.name}"
-        read[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
-        kept = rows
-        if outages:
-            kept = [row for row in rows if not _withheld(row.measurement, outages)]
-        withheld[kind] += len(rows) - len(kept)
-        arrivals += kept
+        name = kind if kind not in files else f"{kind}:{path.name}"
+        files[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
+        arrivals += rows
+    held = Counter[str]()
+    if outages:
+        there = {row.measurement.source for row in arrivals}
+        unknown = sorted(named(outages) - there - set(config.sources))
+        if unknown:
+            known = ", ".join(sorted(there))
+            raise TableError(f"outage of {unknown[0]}: no aid comes from it; there are {known}")
+        kept = [row for row in arrivals if not _withheld(row.measurement, outages)]
+        held += Counter(row.measurement.source for row in arrivals)
+        held -= Counter(row.measurement.source for row in kept)
+        arrivals = kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
+    return _Read(config, imu, arrivals, files, events, held)
 
-    events: list[dict[str, str]] = []
+
+def _imu_read(imu: ImuTable) -> FileRead:
+    span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
+    return FileRead(span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)
+
+
+def _process(read: _Read, out: Path | None) -> dict[str, Any]:
+    config, imu, arrivals, events = read.config, read.imu, read.arrivals, read.events
     navigator = Navigator(
         config, on_event=lambda code, text: events.append({"code": code, "text": text})
     )
@@ -105,10 +150,10 @@ def _process(
         _run(navigator, imu, arrivals, recorder)
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     if why is None and not recorder.rows:
-        why = nothing_navigated(read, navigator.refused, reason)
+        why = nothing_navigated(read.files, navigator.refused, reason)
     return {
-        "files": {name: _account(file) for name, file in read.items()},
-        "sources": _outcomes(navigator, withheld),
+        "files": {name: _account(file) for name, file in read.files.items()},
+        "sources": _outcomes(navigator, read.withheld),
         "events": events,
         "solution_rows": recorder.rows,
         "solution_modes": dict(recorder.modes),
@@ -159,15 +204,18 @@ def _account(file: FileRead) -> dict[str, Any]:
 
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
     """Of the measurements' instants; what a satellite broadcasts has none."""
-    valid_ns = [_valid_ns(m) for _, m in rows if not isinstance(m, Ephemeris | Klobuchar)]
+    valid_ns = [
+        _valid_ns(row.measurement)
+        for row in rows
+        if not isinstance(row.measurement, Ephemeris | Klobuchar)
+    ]
     return (min(valid_ns) * 1e-9, max(valid_ns) * 1e-9) if valid_ns else None
 
 
-def _withheld(m: Measurement | RawEvent, outages: Iterable[tuple[float, float]]) -> bool:
+def _withheld(m: Measurement | RawEvent, outages: Sequence[Outage]) -> bool:
     if isinstance(m, Ephemeris | Klobuchar):
         return False
-    t = _valid_ns(m) * 1e-9
-    return any(start <= t < start + length for start, length in outages)
+    return withheld(m.source, _valid_ns(m) * 1e-9, outages)
 
 
 def _valid_ns(m: Measurement | RawGnssEpoch) -> int:
@@ -217,7 +265,7 @@ def _give(navigator: Navigator, arrival: Arrival) -> None:
     if isinstance(m, Ephemeris | Klobuchar):
         navigator.learn(m)
         return
-    navigator.add(m, _valid_ns(m))
+    navigator.add(m, _valid_ns(m), arrival.sd_time_s)
 
 
 def _is_late(arrival: Arrival, config: Config) -> bool:

@@ -86,7 +86,7 @@ def _rate_factor(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> fl
     """k, None where the fixes tell of no turn."""
     courses = sorted(
         (m.stamp.t_ns * 1e-9, math.atan2(m.v_ned_m_s[1], m.v_ned_m_s[0]))
-        for _, m in arrivals
+        for m in (arrival.measurement for arrival in arrivals)
         if isinstance(m, PositionFix)
         and isinstance(m.stamp, MonotonicStamp)
         and m.v_ned_m_s is not None

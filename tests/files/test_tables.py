@@ -234,6 +234,11 @@ def test_wheel(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table.speed_m_s, [-2.5, 3.0])
     np.testing.assert_array_equal(table.sd_m_s, [0.1, np.nan])
     assert [(r.line, r.reason) for r in table.rejected] == [(4, "sd_not_positive")]
+    coarse = "t_s,speed_m_s,step_m_s,unsigned"
+    table = read_wheel(write(tmp_path, coarse, "1,2,0.5,1", "2,3,0,1", "3,4,,2", "4,5,,"))
+    np.testing.assert_array_equal(table.step_m_s, [0.5, np.nan])
+    np.testing.assert_array_equal(table.unsigned, [1.0, np.nan])
+    assert [r.reason for r in table.rejected] == ["sd_not_positive", "out_of_range"]
 
 
 def test_truth_needs_its_position_and_a_solution_does_not(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDecoder, CanImuOptions
 from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
@@ -260,11 +261,10 @@ def can(data: bytes) -> None:
         head, step = data[at], data[at + 1]
         t_ns += (0, 300_000, 5_000_000, 1 << 32)[step & 3] + step
         can_id = ids[head % len(ids)] if head < 240 else head
-        sample = decoder.feed(
-            can_id, False, data[at + 2 : at + 10], t_ns, t_ns if choice & 2 else None
-        )
+        frame = CanFrame(can_id, False, data[at + 2 : at + 10], t_ns, t_ns if choice & 2 else None)
         frames += 1
-        if isinstance(sample, ImuSample):
+        for sample in decoder.feed(frame):
+            assert isinstance(sample, ImuSample)
             samples += 1
             assert all(map(math.isfinite, sample.gyro_rad_s + sample.accel_m_s2))
             if isinstance(sample.stamp, DeviceStamp):

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import serial
 
+from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDecoder
 from drivers.measurements import DeviceStamp, ImuSample, UtcStamp
 from drivers.raw.decoder import RawDecoder
@@ -103,11 +104,9 @@ async def test_all_devices_speak_in_real_time(vehicle: SimulatedVehicle, tmp_pat
 
     def take(bus: can.BusABC, gnss: serial.Serial, terminal: serial.Serial) -> bool:
         while (frame := bus.recv(timeout=0.0)) is not None:
-            sample = decoder.feed(
-                frame.arbitration_id, False, bytes(frame.data), time.monotonic_ns()
-            )
-            if sample is not None:
-                samples.append(sample)
+            data = bytes(frame.data)
+            found = decoder.feed(CanFrame(frame.arbitration_id, False, data, time.monotonic_ns()))
+            samples.extend(s for s in found if isinstance(s, ImuSample))
         said.extend(gnss.read(4096))
         replies.extend(rdss.feed(terminal.read(4096)))
         fixes = any(isinstance(r, Fix) for r in replies)

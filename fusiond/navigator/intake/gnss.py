@@ -56,7 +56,10 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     least = o.min_position_sd_m
     if least is None:
         least = FLOOR_M.get(m.quality, CODE_FLOOR_M)
-    n, e, d = (max(s * o.sigma_scale, least) for s in _position_sd(m, o))
+    n, e, d = (
+        math.hypot(max(s * o.sigma_scale, least), rounding)
+        for s, rounding in zip(_position_sd(m, o), m.rounding_sd_ned_m, strict=True)
+    )
     found: list[Aid] = [
         PositionAid(
             m.source,
@@ -102,17 +105,18 @@ def _velocity(
     sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
     horizontal = o.velocity_sd_m_s
     v: tuple[float, ...] = (north, east)
-    sd_v: tuple[float, ...] = _speed_sd(sd_n, horizontal, o), _speed_sd(sd_e, horizontal, o)
+    sd_v = [_speed_sd(sd_n, horizontal, o), _speed_sd(sd_e, horizontal, o)]
     if down is not None:
         v = (north, east, down)
-        sd_v = (*sd_v, _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o))
+        sd_v.append(_speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o))
+    sds = tuple(math.hypot(s, m.rounding_sd_v_m_s) for s in sd_v)
     t_ns = when.t_ns - round(o.velocity_delay_s * 1e9)
     return VelocityAid(
         f"{m.source}{SUFFIX}",
         t_ns,
         o.gate_probability,
         v,
-        sd_v,
+        sds,
         o.lever_arm_m,
         sections.own(VELOCITY_TIME, m.source, o),
         rest=sections.own(ANTENNA_LEVER, m.source, o),

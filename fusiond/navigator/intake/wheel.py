@@ -14,13 +14,13 @@ from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
 def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
-    """The speed, with the section's sigma where the device states none.
+    """The speed, with the section's sigma where the device states none, and what rounding adds.
 
     Errors that last for T count as one in 2 T: n of them in that time get sqrt(n) times the sigma,
     so that their mean is as good as one of them.
     """
     o = sections.of(m.source, WheelAiding)
-    sd_m_s = (m.sd_m_s or o.sd_m_s) * o.sigma_scale
+    sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
     spacing_s = sections.spacing_s(m.source, when.t_ns)
     if 0.0 < spacing_s < 2.0 * o.correlation_s:
         sd_m_s *= math.sqrt(2.0 * o.correlation_s / spacing_s)
@@ -32,6 +32,8 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
             m.speed_m_s,
             sd_m_s,
             o.lever_arm_m,
+            m.signed,
+            m.rounding_sd_m_s,
             sections.own(WHEEL_SCALE, m.source, o),
             sections.own(WHEEL_LATENCY, m.source, o),
         )

@@ -13,7 +13,7 @@ from drivers.can.aids import (
     CanBearingDecoder,
     CanBearingOptions,
 )
-from drivers.can.driver import CanDecoder
+from drivers.can.decoder import CanDecoder
 from fusiond.simulation.aid_sensors import (
     SarOptions,
     SarRadar,

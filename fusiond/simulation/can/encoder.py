@@ -14,7 +14,7 @@ import can
 from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 
-from drivers.can.driver import CanDecoder
+from drivers.can.decoder import CanDecoder
 
 
 class CanEncoder:

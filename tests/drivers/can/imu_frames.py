@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 
+from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDecoder, CanImuOptions
 from drivers.measurements import ImuSample
 
@@ -47,8 +48,8 @@ class Line:
 
     def frame(self, at_ns: int, can_id: int, data: bytes, extended: bool = False) -> None:
         stamp = at_ns + self.offset_ns if self.kernel else None
-        sample = self.decoder.feed(can_id, extended, data, at_ns, stamp)
-        if sample is not None:
+        for sample in self.decoder.feed(CanFrame(can_id, extended, data, at_ns, stamp)):
+            assert isinstance(sample, ImuSample)
             self.samples.append(sample)
 
     def burst(self, at_ns: int, *frames: tuple[int, bytes]) -> None:

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import math
 import struct
-import tomllib
 from collections import Counter
 
 import can
@@ -21,6 +20,7 @@ from drivers.can.aids import (
     CanBearingDriver,
     CanBearingOptions,
 )
+from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDriver, CanImuOptions
 from drivers.measurements import (
     ArrivalStamp,
@@ -33,7 +33,6 @@ from drivers.measurements import (
 from fusiond.simulation.can.aids import SIM_SAR, SIM_STAR
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.patience import until
-from tests.places import REPOSITORY
 
 SECOND = 1_000_000_000
 
@@ -65,8 +64,8 @@ def sar_frames(number: int, target: int = 4711, valid: int = 1) -> list[tuple[in
 def fed(
     decoder: CanAttitudeDecoder | CanBearingDecoder, frames: list[tuple[int, bytes]], t_ns: int = 0
 ) -> list[Measurement]:
-    found = [decoder.feed(can_id, False, data, t_ns) for can_id, data in frames]
-    return [m for m in found if m is not None]
+    fed = (decoder.feed(CanFrame(can_id, False, data, t_ns)) for can_id, data in frames)
+    return [m for found in fed for m in found]
 
 
 def test_an_attitude_out_of_two_frames() -> None:
@@ -180,10 +179,3 @@ async def test_three_drivers_on_one_channel() -> None:
     assert kinds == {"ImuSample": 8, "Attitude": 8, "Bearing": 8}
     stamps = [m.stamp for m in emitted if isinstance(m, Attitude)]
     assert all(isinstance(s, KernelStamp) for s in stamps)
-
-
-def test_the_drivers_are_entry_points() -> None:
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
-    points = project["project"]["entry-points"]["fusiond.drivers"]
-    assert points["can_attitude"] == f"drivers.can.aids:{CanAttitudeDriver.__name__}"
-    assert points["can_bearing"] == f"drivers.can.aids:{CanBearingDriver.__name__}"

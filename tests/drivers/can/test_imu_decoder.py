@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base import PermanentDriverError
+from drivers.can.bus import CanFrame
 from drivers.can.dbc import STANDARD_GRAVITY_M_S2, parameter_group
 from drivers.can.imu import CanImuDecoder, CanImuOptions
-from drivers.measurements import ArrivalStamp, DeviceStamp
+from drivers.measurements import ArrivalStamp, DeviceStamp, ImuSample
 from tests.drivers.can.imu_frames import (
     ACEINNA,
     IMU04,
@@ -186,6 +187,7 @@ def test_garbage_never_raises_and_samples_are_finite(
     for options in (SBG, SBG_UNTIMED, MM7, IMU04, ACEINNA):
         decoder = CanImuDecoder("imu", options)
         for can_id, extended, data, t_seen_ns, realtime_ns in frames:
-            sample = decoder.feed(can_id, extended, data, t_seen_ns, realtime_ns)
-            if sample is not None:
+            frame = CanFrame(can_id, extended, data, t_seen_ns, realtime_ns)
+            for sample in decoder.feed(frame):
+                assert isinstance(sample, ImuSample)
                 assert all(map(math.isfinite, sample.gyro_rad_s + sample.accel_m_s2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDecoder, CanImuOptions
 from drivers.measurements import DeviceStamp, ImuSample
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
@@ -40,11 +41,11 @@ def test_samples_come_back_through_the_can_driver(
     samples: list[ImuSample] = []
     for k in range(300):
         t_ns = 5_000_000 * k + 2**32 * 1000 - 500_000_000  # the device's time wraps on the way
-        for frame in encoder.frames(k, t_ns, gyro[k].tolist(), accel[k].tolist()):
-            sample = decoder.feed(
-                frame.arbitration_id, frame.is_extended_id, bytes(frame.data), t_ns, t_ns
-            )
-            if sample is not None:
+        for sent in encoder.frames(k, t_ns, gyro[k].tolist(), accel[k].tolist()):
+            data = bytes(sent.data)
+            frame = CanFrame(sent.arbitration_id, sent.is_extended_id, data, t_ns, t_ns)
+            for sample in decoder.feed(frame):
+                assert isinstance(sample, ImuSample)
                 samples.append(sample)
     assert decoder.counters["lost_samples"] == 0
     assert len(samples) >= 295  # pairing without a counter needs a few samples to begin

@@ -1,0 +1,108 @@
+"""Driver `can_height`: a height, or the pressure that stands for one, out of a CAN bus by any DBC.
+
+    H = (T0 / L) (1 - (p / p0)^(R L / g0))
+
+T0 = 288.15 K, L = 6.5 K/km, p0 = 1013.25 hPa, g0 = 9.80665 m/s^2, R = 287.05287 J/(kg K).
+
+Source: Manual of the ICAO Standard Atmosphere, Doc 7488, 3rd ed. (1993), up to 11 km.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+from pydantic import PositiveFloat, model_validator
+
+from drivers.base import DriverOptions
+from drivers.can.dbc import LENGTH_UNITS, PRESSURE_UNITS, plan_quantity
+from drivers.can.decoder import CanDecoder, CanOptions, Find, Signals, plan_flags
+from drivers.can.driver import CanDriver, Codec
+from drivers.measurements import Height, Stamp
+from drivers.plausible import HEIGHT_M, SIGMA_M
+from drivers.rounding import NEAREST_SD
+
+T0_K, LAPSE_K_M, P0_PA, G0_M_S2, R_J_KG_K = 288.15, 6.5e-3, 101_325.0, 9.80665, 287.05287
+SCALE_M = T0_K / LAPSE_K_M
+EXPONENT = R_J_KG_K * LAPSE_K_M / G0_M_S2
+PRESSURE_PA = (22_632.0, 120_000.0)
+"""From the tropopause at 11 km, where the formula ends, to beyond the highest at any shore."""
+_ACCURACY, _FLAGS = 1, 2
+
+
+class CanHeightOptions(CanOptions):
+    """Which signal is a height, or the pressure of the air around. A signal is "Message.Signal"."""
+
+    height: str | None = None
+    """Metres or feet. Of a barometer's own, say `barometric`."""
+    pressure: str | None = None
+    """Of the air, in place of a height; an engine's intake is below it while the engine runs."""
+    barometric: bool = False
+    """`height` comes of a pressure: it is off by the weather. A `pressure` always is."""
+    accuracy: str | None = None
+    """One sigma of the height, where the device says it."""
+    valid: str | Signals = ()
+    """Flags: a height with 0 in one is counted as `not_valid` and goes no further."""
+    timeout_s: PositiveFloat = 5.0
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> CanHeightOptions:
+        if (self.height is None) == (self.pressure is None):
+            raise ValueError("height or pressure: one of the two")
+        return self
+
+
+def pressure_height_m(pressure_pa: float) -> float:
+    """Height (m) in the standard atmosphere at which this is the pressure."""
+    height: float = SCALE_M * (1.0 - (pressure_pa / P0_PA) ** EXPONENT)
+    return height
+
+
+def metres_a_pascal(pressure_pa: float) -> float:
+    """How much of height a step of pressure is: -dH/dp."""
+    ratio: float = (pressure_pa / P0_PA) ** EXPONENT
+    return SCALE_M * EXPONENT * ratio / pressure_pa
+
+
+class CanHeightDecoder(CanDecoder[CanHeightOptions]):
+    """CAN frames in, heights out; no I/O. Slots: height or pressure, accuracy, flags."""
+
+    def _plan_values(self, find: Find) -> list[float]:
+        o = self._options
+        what, name, units, limits = (
+            ("height", o.height, LENGTH_UNITS, HEIGHT_M)
+            if o.height is not None
+            else ("pressure", o.pressure or "", PRESSURE_UNITS, PRESSURE_PA)
+        )
+        plan, signal = find(name, what)
+        axis = plan_quantity(0, signal, what, units, *limits)
+        plan.axes.append(axis)
+        self._step = axis.step
+        if o.accuracy is not None:
+            plan, signal = find(o.accuracy, "accuracy", held=True)
+            plan.axes.append(
+                plan_quantity(_ACCURACY, signal, "accuracy", LENGTH_UNITS, 0.0, SIGMA_M[1])
+            )
+        return [math.nan] * _FLAGS + plan_flags(find, _FLAGS, "valid", o.valid, held=True)
+
+    def _measurements(self, values: list[float], t_seen_ns: int, stamp: Stamp) -> Sequence[Height]:
+        value, sd, *valid = values
+        if not all(valid):
+            self.counters["not_valid"] += 1
+            return ()
+        by_pressure = self._options.height is None
+        height, step = value, self._step
+        if by_pressure:
+            height, step = pressure_height_m(value), step * metres_a_pascal(value)
+        stated = None if math.isnan(sd) or sd == 0.0 else sd
+        barometric = by_pressure or self._options.barometric
+        rounding = step * NEAREST_SD
+        return (Height(self.name, t_seen_ns, stamp, height, stated, rounding, barometric),)
+
+
+class CanHeightDriver(CanDriver[CanHeightOptions]):
+    """A barometer or another altimeter on a CAN bus; see `CanDriver`."""
+
+    Options: ClassVar[type[DriverOptions]] = CanHeightOptions
+    Decoder: ClassVar[Callable[..., Codec]] = CanHeightDecoder
