@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurements import Measurement
+from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
@@ -28,6 +28,7 @@ from fusiond.navigator.constraints import ConstraintMaker
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_door import ImuDoor
+from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
@@ -69,6 +70,7 @@ class Navigator:
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
+        self._units = RateUnits(self._event)
         self.estimator = estimator_of(config, self.model)
         self.verdicts = Verdicts(
             config.consistency.window,
@@ -127,7 +129,9 @@ class Navigator:
 
     def _feel(self, taken: int) -> None:
         """The newest samples have come: what they say by themselves."""
-        felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
+        new = max(0, self.imu.end - taken)
+        felt = self._constraints.feed(self.imu, new)
+        self._units.samples(self.imu, new)
         if self.started is None:
             for window in felt.windows:
                 self._aligner.known.window(window)
@@ -156,6 +160,8 @@ class Navigator:
             return self._refuse(m.source, aids)
         if self.started is None:
             self._aligner.known.aids(aids)
+        if isinstance(m, PositionFix):
+            self._units.fix(m, t_ns, self.imu)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
             self.timeline.insert(aid)
@@ -283,6 +289,8 @@ class Navigator:
         e = self.config.estimator
         if not self.imu.end:
             return Mode.WAITING, self._door.silence(None)
+        if self._units.wrong is not None:
+            return Mode.INVALID, self._units.wrong
         silent = (t_ns - self.imu.latest_ns) * 1e-9
         if self.started is None:
             if silent > self.config.imu.gap_s:
