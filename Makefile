@@ -2,6 +2,7 @@
 PYTHON ?= python3
 ARGS ?=
 RUNS ?= 100000
+HOURS ?= 1
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -11,7 +12,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults load lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires soak load lock clean \
 	kernels test-packages
 
 help: ## this list
@@ -48,7 +49,9 @@ lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 
 kernels: $(STAMP)
 	@echo "compiling the kernels once, before the tests share them"
-	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle'
+	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle, \
+	fusiond.estimators.federated.standing, fusiond.estimators.multiscale.filter, \
+	fusiond.estimators.unscented.filter'
 
 # A file's tests stay on one core: they share what the first of them computed. Each core has its
 # process, so that threads of the linear algebra would only fight for it.
@@ -78,6 +81,12 @@ bench: $(STAMP) ## what the kernels cost; ARGS="--json F.json" keeps the figures
 
 faults: $(STAMP) ## fault matrix as a table; ARGS="--only step_500m --phase coasting"
 	$(BIN)/python -m fusiond.studies.faults $(ARGS)
+
+wires: $(STAMP) test-packages ## faults of wires, clocks and the host; ARGS="--only gnss_late_3s"
+	$(BIN)/python benchmarks/wire_faults.py $(ARGS)
+
+soak: $(STAMP) test-packages ## the daemon for HOURS of real time, with faults now and then
+	$(BIN)/python benchmarks/soak.py $(HOURS) $(ARGS)
 
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)

@@ -21,6 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.live.kill_nine import Restart, as_row, driving, killed
+from tests.live.rig import network_of_its_own
 
 # A restart, what is watched after it, and a new alignment where the gap was too long.
 SECONDS_EACH = 60.0
@@ -59,6 +60,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
+    network_of_its_own()
     with tempfile.TemporaryDirectory(prefix="fusiond-kill-") as folder:
         found = asyncio.run(measure(Path(folder), args.times, args.seed))
     print(json.dumps(summary(found), indent=2))

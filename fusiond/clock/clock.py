@@ -40,7 +40,7 @@ from drivers.measurements import (
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS, HostTime, SystemClock, SystemTime
 from fusiond.clock.time_of_day import RdssTimeOfDay, nearest
-from fusiond.clock.utc_envelope import UtcEnvelope
+from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown
 from fusiond.configuration.schema import ClockOptions
 
 _KERNEL_MAX_AGE_NS = SECOND_NS
@@ -56,6 +56,8 @@ _SYSTEM_LATENCY_NS = SECOND_NS
 _SOURCE_SILENT_NS = 60 * SECOND_NS
 _SAME_UTC_NS = 3 * SECOND_NS
 """Sources this close state the same UTC: whole seconds, and delays up to 2 s."""
+_RESUMED_NS = 60 * SECOND_NS
+"""Older knowledge is learnt anew: drift of 100 ppm has made 6 ms of it, twice what it is worth."""
 _BETTER_NS = 5 * MILLISECOND_NS
 _TOLD_NS = 500 * MILLISECOND_NS
 """A change of UTC this large is an event when another source becomes the reference."""
@@ -294,6 +296,30 @@ class Clock:
             self._jumped(jumped_ns, f"{report.source} has said so for minutes")
         if plausible:
             self._choose_reference(report.source, envelope)
+
+    def known(self) -> tuple[UtcKnown, ...]:
+        """UTC as its sources have told it, for `resume`; none of which there is a doubt."""
+        found = (envelope.known(source) for source, envelope in self._utc.items())
+        return tuple(known for known in found if known is not None)
+
+    def resume(self, known: tuple[UtcKnown, ...]) -> None:
+        """Go on with what a process before this one has learnt of UTC: monotonic time must have
+        gone on without a pause since. Before the first report; what is old is left.
+
+        Its first reports tell a new process UTC to 50 ms and more, alike for all fixes of the next
+        seconds: on a road a metre or two along the way, which no filter takes for what it is.
+        """
+        now_ns = self.now_ns()
+        for each in known:
+            if not 0 <= now_ns - each.t_seen_ns <= _RESUMED_NS:
+                continue
+            if not EARLIEST_UTC_NS <= each.utc_ns < LATEST_UTC_NS:
+                continue
+            envelope = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
+            envelope.resume(each)
+            self._utc[each.source] = envelope
+            self.counters["utc_resumed"] += 1
+            self._choose_reference(each.source, envelope)
 
     def _jumped(self, jumped_ns: int, why: str) -> None:
         self.counters["utc_jumped"] += 1

@@ -29,7 +29,10 @@ from __future__ import annotations
 from collections import Counter
 from datetime import UTC, datetime
 from math import hypot
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 
@@ -59,6 +62,21 @@ _DAY_NS = 86400 * SECOND_NS
 SD_S = 3e-3
 _UNKNOWN_S = 0.15
 """Sentences come 50 to 200 ms after their epoch."""
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, extra="forbid"))
+class UtcKnown:
+    """What is known of a source's UTC, for a process that runs later on the same monotonic clock.
+
+    `offset_ns` and `t_seen_ns` as of `UtcEnvelope`, `utc_ns` the UTC of its last report, `reports`
+    how many have told it. Raises pydantic's `ValidationError` for what no source can have told.
+    """
+
+    source: Annotated[str, Field(min_length=1, max_length=64)]
+    offset_ns: Annotated[int, Field(gt=-(2**63), lt=2**63)]
+    utc_ns: Annotated[int, Field(ge=0, lt=2**63)]
+    t_seen_ns: Annotated[int, Field(ge=0, lt=2**63)]
+    reports: Annotated[int, Field(ge=1, lt=2**63)]
 
 
 class Stamped(NamedTuple):
@@ -107,6 +125,19 @@ class UtcEnvelope:
         self._woke = False
         self.t_seen_ns = 0
         self.plausible = True
+
+    def known(self, source: str) -> UtcKnown | None:
+        """What another process may go on with; None while there is a doubt."""
+        if self._offset_ns is None or not (self.settled and self.plausible):
+            return None
+        return UtcKnown(source, self._offset_ns, self._utc_ns, self.t_seen_ns, self._reports)
+
+    def resume(self, known: UtcKnown) -> None:
+        """Go on with what another process has learnt."""
+        self._offset_ns = known.offset_ns
+        self._supported_ns = known.t_seen_ns
+        self._accept(known.utc_ns, known.t_seen_ns - known.utc_ns, known.t_seen_ns)
+        self._reports = known.reports
 
     @property
     def offset_ns(self) -> int:

@@ -48,10 +48,10 @@ def check(
     loaded = load(config)
     if compile_kernels:
         import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
-        from fusiond.commands.model_report import model_report  # noqa: PLC0415
+        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
         with config_errors():
-            model_report(loaded.estimator.model, loaded)
+            Navigator(loaded)  # and so does its filter
     typer.echo(f"{config}: ok, vehicle {loaded.vehicle}")
     for name, source in loaded.sources.items():
         aid = loaded.aiding.get(name)

@@ -54,7 +54,7 @@ class Daemon:
         self._events = Events(self.clock)
         navigator_event = partial(self._events.report, "navigator")
         self._state = StateKeeper(config, self.clock, navigator_event)
-        self._warm = WarmKeeper(config, navigator_event)
+        self._warm = WarmKeeper(config, self.clock, navigator_event)
         saved = self._state.load()
         self.navigator = Navigator(config, saved, on_event=navigator_event)
         if saved is None or "saved" not in config.alignment.heading:

@@ -38,6 +38,7 @@ WARNINGS = (
     "not_finite",
     "out_of_range",
     "imu_time",
+    "imu_units",
     "damaged",
     "taken",
     "protection_level",

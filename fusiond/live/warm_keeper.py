@@ -14,8 +14,11 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pydantic import ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
+from fusiond.clock.clock import Clock
+from fusiond.clock.utc_envelope import UtcKnown
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
@@ -30,7 +33,6 @@ from fusiond.navigator.state_file import (
 )
 from fusiond.navigator.warm_start import (
     RESTARTED,
-    WARM_STATE,
     WarmStart,
     WarmState,
     same_run,
@@ -45,6 +47,17 @@ SNAPSHOT_NS = SECOND_NS // 2
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
+@dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, extra="forbid"))
+class KeptState:
+    """What outlives the process: the filter's state, and UTC on the monotonic clock."""
+
+    navigation: WarmState
+    utc: tuple[UtcKnown, ...] = ()
+
+
+KEPT_STATE = TypeAdapter(KeptState)
+
+
 class WarmKeeper:
     """Keeps one vehicle's navigation state in systemd's runtime directory, else not.
 
@@ -54,6 +67,7 @@ class WarmKeeper:
     def __init__(
         self,
         config: Config,
+        clock: Clock,
         on_event: Callable[[str, str], None],
         environ: Mapping[str, str] = os.environ,
     ) -> None:
@@ -62,6 +76,7 @@ class WarmKeeper:
         self._path: Path | None = None
         if directory and self._boot_id:
             self._path = Path(directory.split(":")[0]) / f"{config.vehicle}.warm.json"
+        self._clock = clock
         self._config = config_digest(config)
         self._event = on_event
         self._due = Every(SNAPSHOT_NS)
@@ -69,15 +84,17 @@ class WarmKeeper:
         self._failing = False
 
     def offer(self, navigator: Navigator) -> None:
-        """Let the navigator start from the state of the last run, if it is one of this boot."""
+        """Let clock and navigator go on from the state of the last run, if it is one of this
+        boot."""
         if self._path is None:
             return
         try:
-            state = read_state(self._path, WARM_STATE)
+            state = read_state(self._path, KEPT_STATE)
             if state is None:
                 return
-            same_run(state, self._config, self._boot_id, _asleep_ns())
-            navigator.warm = WarmStart(state, navigator.model)
+            same_run(state.navigation, self._config, self._boot_id, _asleep_ns())
+            navigator.warm = WarmStart(state.navigation, navigator.model)
+            self._clock.resume(state.utc)
         except DamagedStateError as error:
             self._event("warm_state_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
         except RefusedStateError as error:
@@ -100,12 +117,12 @@ class WarmKeeper:
         if self._path is not None and state is not None:
             await asyncio.to_thread(self._write, self._path, state)
 
-    def _state(self, solution: Solution, navigator: Navigator) -> WarmState | None:
+    def _state(self, solution: Solution, navigator: Navigator) -> KeptState | None:
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.on_trial or not usable:
             return None
         try:
-            return warm_state(
+            state = warm_state(
                 navigator.estimator,
                 navigator.imu,
                 navigator.started.how.partition(RESTARTED)[0],
@@ -113,13 +130,14 @@ class WarmKeeper:
                 self._boot_id,
                 _asleep_ns(),
             )
+            return KeptState(state, self._clock.known())
         except ValidationError as error:
             self._told(f"warm state not kept: {error.errors(include_url=False)[0]}")
             return None
 
-    def _write(self, path: Path, state: WarmState) -> None:
+    def _write(self, path: Path, state: KeptState) -> None:
         try:
-            write_state(path, WARM_STATE.dump_json(state), durable=False)
+            write_state(path, KEPT_STATE.dump_json(state), durable=False)
             self._failing = False
         except OSError as error:
             self._told(f"warm state not kept: {error}")

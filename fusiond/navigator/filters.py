@@ -1,26 +1,26 @@
 """From a vehicle's configuration to its error-state model and its estimator.
 
 A new estimator is one module in `fusiond.estimators` and one case here; nothing else knows which
-one runs.
+one runs. Each is imported where it is asked for: loading its kernels takes a start's time.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator
-from fusiond.estimators.federated.filter import FederatedFilter
 from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.estimators.federated.reset import ResetFilter
-from fusiond.estimators.federated.standing import StandingFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.estimators.separation import SeparatedEstimator
-from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
+
+if TYPE_CHECKING:
+    from fusiond.estimators.federated.filter import FederatedFilter
 
 
 def model_of(config: Config, *extra: Block) -> Model:
@@ -46,9 +46,13 @@ def estimator_of(config: Config, model: Model) -> Estimator:
                 return SeparatedEstimator(model, config.imu.gap_s, config.positioning)
             return KalmanEstimator(model, config.imu.gap_s)
         case "multiscale":
+            from fusiond.estimators.multiscale.filter import MultiscaleEstimator  # noqa: PLC0415
+
             m = config.estimator.multiscale
             return MultiscaleEstimator(model, config.imu.gap_s, m.scales, m.wavelet)
         case "unscented":
+            from fusiond.estimators.unscented.filter import UnscentedEstimator  # noqa: PLC0415
+
             u = config.estimator.unscented
             return UnscentedEstimator(model, config.imu.gap_s, u.spread, u.propagation)
         case "federated":
@@ -59,6 +63,9 @@ def federated(
     model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
 ) -> FederatedFilter:
     """The federated filter of a mode."""
+    from fusiond.estimators.federated.reset import ResetFilter  # noqa: PLC0415
+    from fusiond.estimators.federated.standing import StandingFilter  # noqa: PLC0415
+
     resets = options.mode in ("fusion_reset", "zero_reset")
     return (ResetFilter if resets else StandingFilter)(model, gap_s, names, options)
 

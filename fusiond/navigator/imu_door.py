@@ -20,6 +20,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_range
 from fusiond.navigation.imu_buffer import ImuBuffer, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
+from fusiond.navigator.imu_units import other_unit
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -39,7 +40,7 @@ TEXTS = {
     "out_of_range": "samples beyond any sensor's range",
     "saturated": "samples at full scale",
     "repeated": "the same sample again and again",
-    "no_gravity": "no specific force: free fall, or accelerations in g",
+    "no_gravity": "no specific force: free fall, or accelerations in another unit",
     "spike": "samples that no vehicle can follow",
     "stamp_ahead": "stamps ahead of those that follow",
     "time": "stamps that go back",
@@ -107,8 +108,9 @@ class ImuDoor:
             self._newest = times[-1:]
         good = sound(samples)
         if not good.all():
+            unit = _unit(samples[~good])
             for name, count in imu.refuse(samples[~good]).items():
-                self._trouble(name, times[~good], count)
+                self._trouble(name, times[~good], count, TEXTS[name] + unit)
             times, samples = times[good], samples[good]
         checked = self._check.feed(times, samples, imu.hold_ns)
         ends = ""
@@ -144,7 +146,8 @@ class ImuDoor:
             rows = checked.codes == code
             name, count = OUTCOMES[code], int(rows.sum())
             imu.counters[name] += count
-            if self._trouble(name, checked.times[rows], count) and code == AXIS_DEAD:
+            text = TEXTS[name] + _unit(checked.samples[rows])
+            if self._trouble(name, checked.times[rows], count, text) and code == AXIS_DEAD:
                 ends = f"IMU: {TEXTS[name]}"
         return ends
 
@@ -166,3 +169,15 @@ class ImuDoor:
                 counted = f"{trouble.count} refused within {lasted_s:.1f} s"
                 self._event("imu_sound", f"no more {TEXTS[name]} ({counted})")
                 del self._troubles[name]
+
+
+def _unit(samples: Array) -> str:
+    """What else the forces of refused samples (m, 6) say by their magnitude."""
+    magnitude = float(np.median(np.linalg.norm(samples[:, 3:], axis=1)))
+    unit = other_unit(magnitude)
+    if unit is None:
+        return ""
+    name, factor = unit
+    return (
+        f"; {magnitude:.4g} looks like {name}: multiply the accelerometer's figures by {factor:g}"
+    )

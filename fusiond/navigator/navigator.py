@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurements import Measurement
+from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
@@ -32,6 +32,7 @@ from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_door import ImuDoor
+from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
@@ -78,6 +79,7 @@ class Navigator:
             imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s, vibration
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
+        self._units = RateUnits(self._event)
         self.estimator = estimator_of(config, self.model)
         self.verdicts = Verdicts(
             config.consistency.window,
@@ -136,7 +138,9 @@ class Navigator:
 
     def _feel(self, taken: int) -> None:
         """The newest samples have come: what they say by themselves."""
-        felt = self._constraints.feed(self.imu, max(0, self.imu.end - taken))
+        new = max(0, self.imu.end - taken)
+        felt = self._constraints.feed(self.imu, new)
+        self._units.samples(self.imu, new)
         if self.started is None:
             for window in felt.windows:
                 self._aligner.known.window(window)
@@ -165,6 +169,8 @@ class Navigator:
             return self._refuse(m.source, aids)
         if self.started is None:
             self._aligner.known.aids(aids)
+        if isinstance(m, PositionFix):
+            self._units.fix(m, t_ns, self.imu)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
             self.timeline.insert(self._in_time(aid))
@@ -302,6 +308,8 @@ class Navigator:
         e = self.config.estimator
         if not self.imu.end:
             return Mode.WAITING, self._door.silence(None)
+        if self._units.wrong is not None:
+            return Mode.INVALID, self._units.wrong
         silent = (t_ns - self.imu.latest_ns) * 1e-9
         if self.started is None:
             if silent > self.config.imu.gap_s:

@@ -55,7 +55,8 @@ class SimulatedVehicle:
 
     `gnss` and `terminal` are the simulated devices; `counters` holds frames, epochs and bytes sent
     and lost. A link that is None leaves that device out. `can_imu` are the options of the driver
-    that will read the IMU: bus, DBC and signals.
+    that will read the IMU: bus, DBC and signals. `lines` and `encoder` are what bytes and samples
+    pass through; whoever wants a fault on the wire puts one of his own there.
     """
 
     def __init__(
@@ -81,17 +82,17 @@ class SimulatedVehicle:
             self.raw = GnssRawStream(receiver, gnss_raw)
         self._start_clock()
         self.counters: Counter[str] = Counter()
-        self._encoder = CanImu(can_imu)
+        self.encoder = CanImu(can_imu)
         self._can = (can_imu.interface, can_imu.channel)
         self._bus: can.BusABC | None = None
         self.aids: dict[str, CanAid] = can_aids(
             self.truth, scenario.star_tracker, scenario.sar, seed, self._can
         )
-        self._lines: dict[Device, PtyLine] = {}
+        self.lines: dict[Device, PtyLine] = {}
         if gnss_link is not None:
-            self._lines["gnss"] = PtyLine(gnss_link)
+            self.lines["gnss"] = PtyLine(gnss_link)
         if rdss_link is not None:
-            self._lines["rdss"] = PtyLine(rdss_link)
+            self.lines["rdss"] = PtyLine(rdss_link)
         self._next_imu = 0
         self._next_gnss = 0
         self._next_raw = 0
@@ -121,8 +122,8 @@ class SimulatedVehicle:
                 self._bus = can.Bus(interface=interface, channel=channel)
         elif device in self.aids:
             self.aids[device].plug()
-        elif device in self._lines:
-            self._lines[device].plug()
+        elif device in self.lines:
+            self.lines[device].plug()
 
     def unplug(self, device: Device) -> None:
         """Take a device off its line: the IMU falls silent, a serial port vanishes."""
@@ -132,8 +133,8 @@ class SimulatedVehicle:
                 self._bus = None
         elif device in self.aids:
             self.aids[device].unplug()
-        elif device in self._lines:
-            self._lines[device].unplug()
+        elif device in self.lines:
+            self.lines[device].unplug()
 
     def lift(self) -> None:
         """The terminal's suppression or silence ends, and it says so."""
@@ -183,12 +184,12 @@ class SimulatedVehicle:
             if self.gnss.t_arrival_s[k] > t_s:
                 break
             self._next_gnss += 1
-            if "gnss" in self._lines:
+            if "gnss" in self.lines:
                 self._write("gnss", self.gnss.nmea(k, self.utc_start_ns))
         if self.raw is not None:
             self._serve_raw(self.raw, t_s)
-        if "rdss" in self._lines:
-            if data := self._lines["rdss"].read():
+        if "rdss" in self.lines:
+            if data := self.lines["rdss"].read():
                 self.terminal.receive(data, t_s)
             if data := self.terminal.take(t_s):
                 self._write("rdss", data)
@@ -199,8 +200,8 @@ class SimulatedVehicle:
                 break
             data = raw.bytes_of(self._next_raw)
             self._next_raw += 1
-            if "gnss" in self._lines:
-                sent = self._lines["gnss"].write(data)
+            if "gnss" in self.lines:
+                sent = self.lines["gnss"].write(data)
                 self.counters[f"gnss_raw_{'sent' if sent else 'lost'}"] += 1
                 if not sent:
                     raw.repeat()
@@ -211,7 +212,7 @@ class SimulatedVehicle:
             return
         t_ns = round(float(self.truth.t_s[k + 1]) * 1e9)
         gyro, accel = self.imu.gyro[k].tolist(), self.imu.accel[k].tolist()
-        for frame in self._encoder.frames(k + 1, t_ns, gyro, accel):
+        for frame in self.encoder.frames(k + 1, t_ns, gyro, accel):
             try:
                 self._bus.send(frame)
                 self.counters["imu_frames"] += 1
@@ -219,7 +220,7 @@ class SimulatedVehicle:
                 self.counters["imu_lost"] += 1
 
     def _write(self, device: Device, data: bytes) -> None:
-        sent = self._lines[device].write(data)
+        sent = self.lines[device].write(data)
         self.counters[f"{device}_{'sent' if sent else 'lost'}"] += 1
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from drivers.measurements import TimeReport, UtcStamp
 from fusiond.clock.clock import Clock, Instant
-from fusiond.clock.utc_envelope import UtcEnvelope, whole_seconds_ns
+from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown, whole_seconds_ns
 from fusiond.configuration.schema import ClockOptions
 from tests.clock.host_time import MS, Host, S, utc
 
@@ -319,3 +319,63 @@ def test_whole_seconds() -> None:
     assert whole_seconds_ns(-3_020 * MS) == -3 * S
     assert whole_seconds_ns(-2_850 * MS) == -3 * S
     assert whole_seconds_ns(-2_500 * MS) == 0
+
+
+# ------------------------------------------------------------------ a process that follows another
+
+
+def _restarted(pause: int) -> tuple[Receiver, Clock]:
+    """A receiver whose UTC one process has learnt for a minute; the clock of the next, later."""
+    first = Receiver(Clock(ClockOptions(), Host()), Host())
+    first.clock = Clock(ClockOptions(), first.host)
+    first.run(60)
+    first.host.mono += pause
+    clock = Clock(ClockOptions(), first.host)
+    clock.resume(first.clock.known())
+    return first, clock
+
+
+@pytest.mark.parametrize("pause", [S, 3 * S, 59 * S])
+def test_a_restarted_process_knows_utc_from_its_first_report(pause: int) -> None:
+    """Its first sentences come 100 ms later than usual: learnt anew, all fixes would be by that."""
+    receiver, clock = _restarted(pause)
+    receiver.clock = clock
+    assert clock.status().utc_source == "gnss"
+    for _ in range(20):
+        instant, error = receiver.epoch(late=100 * MS)
+        assert abs(error - (DELAY - 50 * MS)) < 10 * MS
+        assert instant.sd_s < 10e-3
+    assert clock.counters["utc_resumed"] == 1
+
+    receiver.clock = Clock(ClockOptions(), receiver.host)
+    assert receiver.epoch(late=100 * MS)[1] > 90 * MS
+
+
+def test_what_is_old_or_of_the_future_is_learnt_anew() -> None:
+    _, clock = _restarted(61 * S)
+    assert clock.status().utc_source == "system"
+    _, clock = _restarted(-10 * S)
+    assert clock.status().utc_source == "system"
+    assert clock.counters["utc_resumed"] == 0
+
+
+def test_a_jump_after_the_restart_is_found_all_the_same() -> None:
+    receiver, clock = _restarted(3 * S)
+    receiver.clock, receiver.lead = clock, 5 * S
+    receiver.run(130)
+    assert clock.counters["utc_jump"] == 1
+
+
+def test_nothing_is_handed_on_while_there_is_a_doubt() -> None:
+    receiver, clock = _restarted(3 * S)
+    receiver.clock, receiver.lead = clock, 5 * S
+    receiver.run(10)
+    assert clock.known() == ()
+
+
+@pytest.mark.parametrize("utc_ns", [0, utc("2018-01-01T00:00:00"), utc("2100-01-01T00:00:00")])
+def test_a_date_that_cannot_be_is_not_gone_on_with(utc_ns: int) -> None:
+    host = Host()
+    clock = Clock(ClockOptions(), host)
+    clock.resume((UtcKnown("gnss", host.mono - utc_ns, utc_ns, host.mono, 100),))
+    assert clock.status().utc_source == "system"

@@ -85,7 +85,7 @@ def test_accelerations_in_g_are_refused(drive: Path, tmp_path: Path) -> None:
     why = refused(
         changed(drive, "imu.csv", in_g, tmp_path), f"gnss={drive / 'gnss.csv'}", out=tmp_path
     )
-    assert "it looks like g; multiply the accel columns by 9.80665" in why
+    assert "it looks like g; multiply the accelerometer's figures by 9.80665" in why
     assert not (tmp_path / "solution.csv").exists()
 
 
@@ -98,7 +98,7 @@ def test_rates_in_deg_s_are_refused(drive: Path, tmp_path: Path) -> None:
     why = refused(imu, f"gnss={drive / 'gnss.csv'}", out=tmp_path)
     factor = int(why.split("the rates are ")[1].split(" times")[0])
     assert 40 <= factor <= 65  # 57, less what the course's noise takes off
-    assert "they look like deg/s; multiply the gyro columns by pi/180" in why
+    assert "they look like deg/s; multiply the gyro's figures by pi/180" in why
 
 
 def test_rates_that_nothing_turns_with_need_no_fixes(drive: Path, tmp_path: Path) -> None:

@@ -1,9 +1,8 @@
 """A daemon in a process of its own that is killed while the vehicle drives, and what comes after.
 
-The vehicle is simulated here, on a multicast bus and a pseudo terminal; the daemon tells every
-solution on its standard output, stamped by the monotonic clock that both processes share. The next
-process is there, with Python and the kernels loaded, before the last is killed, and begins after a
-pause that is drawn: how long a gap is does not hang on how busy this computer is.
+The vehicle is simulated here, on a multicast bus and a pseudo terminal. The next process is there,
+with Python and the kernels loaded, before the last is killed, and begins after a pause that is
+drawn: how long a gap is does not hang on how busy this computer is.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import json
 import math
 import os
 import random
-import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -23,14 +21,14 @@ from functools import partial
 from pathlib import Path
 
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.solution import Mode
+from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.warm_start import LONGEST_GAP_S
 from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.hil.processes import SIM_IMU
-from tests.patience import PATIENCE_S
+from tests.live.told import ToldDaemon
 
 CONFIG = """
 vehicle = "killed"
@@ -47,36 +45,9 @@ heading = ["gnss_course"]
 [mqtt]
 enabled = false
 """
-DAEMON = """
-import asyncio, json, logging, sys
-from pathlib import Path
-from fusiond.configuration.load import load_config
-from fusiond.live.daemon import Daemon
-
-def say(s):
-    figures = s.lat_rad, s.lon_rad, *s.sd_ned_m[:2], *s.v_ned_m_s[:2]
-    print(json.dumps([s.t_ns, s.mode, s.reason, *figures]), flush=True)
-
-logging.basicConfig(stream=sys.stderr, level=logging.INFO)
-print("loaded", flush=True)
-sys.stdin.readline()
-asyncio.run(Daemon(load_config(Path(sys.argv[1])), on_solution=say).run(asyncio.Event()))
-"""
 NAVIGATED = (Mode.NAVIGATING, Mode.COASTING)
 WATCHED_S = 2.0
 """How long position and sigma are compared after each restart."""
-
-
-@dataclass(frozen=True, slots=True)
-class Said:
-    """A solution as it left the process; `position` rad, `sd` m north and east."""
-
-    t_ns: int
-    mode: Mode
-    reason: str
-    position: tuple[float, float]
-    sd: tuple[float, float]
-    speed_m_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,55 +64,6 @@ class Restart:
     first_error_m: float
     first_ratio: float
     ratio: float
-
-
-class Daemon:
-    """The process, its log, and what it says. `log` is shared by all of a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._log = folder / "daemon.log"
-        self._process: asyncio.subprocess.Process | None = None
-
-    async def load(self) -> Daemon:
-        """Start it, and wait until it has loaded its code."""
-        with self._log.open("ab") as log:
-            self._process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-c", DAEMON, str(self._folder / "killed.toml")),
-                env={**os.environ, "RUNTIME_DIRECTORY": str(self._folder)},
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=log,
-            )
-        assert await self._line() == b"loaded\n"
-        return self
-
-    async def begin(self) -> None:
-        """Let it begin."""
-        assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.write(b"\n")
-        await self._process.stdin.drain()
-
-    async def said(self) -> Said:
-        """The next solution."""
-        line = await self._line()
-        t_ns, mode, reason, lat, lon, north, east, v_n, v_e = json.loads(line)
-        return Said(t_ns, Mode(mode), reason, (lat, lon), (north, east), math.hypot(v_n, v_e))
-
-    async def _line(self) -> bytes:
-        assert self._process is not None
-        assert self._process.stdout is not None
-        async with asyncio.timeout(PATIENCE_S):
-            line = await self._process.stdout.readline()
-        assert line, self._log.read_text()
-        return line
-
-    async def kill(self) -> None:
-        """SIGKILL: nothing is put in order."""
-        if self._process is not None and self._process.returncode is None:
-            self._process.kill()
-            await self._process.communicate()
 
 
 @asynccontextmanager
@@ -168,12 +90,16 @@ async def driving(folder: Path, seconds: float, seed: int) -> AsyncIterator[Simu
             await task
 
 
+def _daemon(folder: Path) -> ToldDaemon:
+    return ToldDaemon(folder / "killed.toml", environment={"RUNTIME_DIRECTORY": str(folder)})
+
+
 async def killed(
     folder: Path, vehicle: SimulatedVehicle, times: int, seed: int
 ) -> AsyncIterator[Restart]:
     """Kill it at `times` random instants of its navigation; what came of each."""
     dice = random.Random(seed)
-    daemon, spare = await Daemon(folder).load(), Daemon(folder)
+    daemon, spare = await _daemon(folder).load(), _daemon(folder)
     try:
         await daemon.begin()
         before = await daemon.said()
@@ -186,8 +112,8 @@ async def killed(
                 before = await daemon.said()
             await daemon.kill()
             await asyncio.sleep(dice.uniform(0.0, LONGEST_GAP_S - 1.5))
-            daemon, spare = spare, Daemon(folder)
-            begun_s, speed = time.monotonic(), before.speed_m_s
+            daemon, spare = spare, _daemon(folder)
+            begun_s, speed = time.monotonic(), math.hypot(*before.v_ned_m_s[:2])
             await daemon.begin()
             restart, before = await _watched(daemon, vehicle, begun_s)
             yield replace(restart, speed_m_s=speed)
@@ -197,8 +123,8 @@ async def killed(
 
 
 async def _watched(
-    daemon: Daemon, vehicle: SimulatedVehicle, begun_s: float
-) -> tuple[Restart, Said]:
+    daemon: ToldDaemon, vehicle: SimulatedVehicle, begun_s: float
+) -> tuple[Restart, Solution]:
     said = await daemon.said()
     first_output_s = time.monotonic() - begun_s
     while said.mode is Mode.WAITING:
@@ -218,7 +144,7 @@ async def _watched(
         first_output_s,
         (first.t_ns - data_ns) * 1e-9,
         float(gap) if gap else math.nan,
-        math.hypot(*first.sd),
+        math.hypot(*first.sd_ned_m[:2]),
         first_error_m,
         first_ratio,
         ratio,
@@ -226,12 +152,13 @@ async def _watched(
     return result, said
 
 
-def _error(said: Said, vehicle: SimulatedVehicle) -> tuple[float, float]:
+def _error(said: Solution, vehicle: SimulatedVehicle) -> tuple[float, float]:
     """How far off it is (m), and the greater of north and east in sigmas."""
     lat, lon, height = (float(x) for x in vehicle.truth_at(said.t_ns).position[0])
-    north = (said.position[0] - lat) * (meridian_radius(lat) + height)
-    east = (said.position[1] - lon) * (transverse_radius(lat) + height) * math.cos(lat)
-    return math.hypot(north, east), max(abs(north) / said.sd[0], abs(east) / said.sd[1])
+    north = (said.lat_rad - lat) * (meridian_radius(lat) + height)
+    east = (said.lon_rad - lon) * (transverse_radius(lat) + height) * math.cos(lat)
+    sd_n, sd_e, _ = said.sd_ned_m
+    return math.hypot(north, east), max(abs(north) / sd_n, abs(east) / sd_e)
 
 
 def as_row(restart: Restart) -> str:

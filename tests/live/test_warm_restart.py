@@ -23,7 +23,7 @@ async def test_killed_while_driving_it_is_back_at_once_and_honest(tmp_path: Path
         if not math.isnan(restart.gap_s):
             # The first data are enough: within a few ticks, counted by the daemon's own clock.
             assert restart.solution_s < 1.0, restart
-    log = (tmp_path / "daemon.log").read_text()
+    log = (tmp_path / "killed.log").read_text()
     cold = sum(math.isnan(restart.gap_s) for restart in restarts)
     assert log.count("warm_state_refused") == cold
     assert "Traceback" not in log

@@ -20,6 +20,7 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import Leg, dcm_from_rpy, follow
 from tests import runs
+from tests.navigator.vehicle import CONFIG, START_NS, drive
 
 Array = NDArray[np.float64]
 
@@ -231,3 +232,20 @@ def test_a_configured_heading_is_compared_with_the_course(
     assert start is not None
     assert start.how == (MOVING if events else "configured heading")
     assert yaw == pytest.approx(40.0 * DEG, abs=5.0 * DEG)
+
+
+def test_fixes_of_before_the_first_sample_start_nothing_and_raise_nothing() -> None:
+    """A daemon that was stopped for 20 s in motion: its lines still hold the fixes of the gap."""
+    d = drive()
+    navigator = Navigator(
+        Config.model_validate({**CONFIG, "alignment": {"heading": ["gnss_course"]}})
+    )
+    since = START_NS + 20 * runs.SECOND
+    navigator.add_imu(d.times[:10], d.samples[:10])
+    row = int(np.searchsorted(d.times, since))
+    navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
+    for m in d.measurements:
+        if since - 5 * runs.SECOND < m.t_seen_ns < since:
+            navigator.add(m, m.t_seen_ns)
+    navigator.advance()
+    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.ALIGNING

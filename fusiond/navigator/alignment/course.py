@@ -78,7 +78,9 @@ class Along(NamedTuple):
 def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """Heading from the course over ground, forward or backward as the IMU felt it."""
     known = by.known
-    latest = next((f for f in reversed(known.fixes) if f.velocity.t_ns <= imu.latest_ns), None)
+    # A fix of before the first sample is one of a gap: nothing was felt since.
+    felt = (f for f in reversed(known.fixes) if imu.oldest_ns <= f.velocity.t_ns <= imu.latest_ns)
+    latest = next(felt, None)
     if latest is None or latest.velocity.t_ns == known.tried_ns:
         return None  # the same data say the same
     speed = math.hypot(*latest.velocity.v_ned[:2])

@@ -1,0 +1,170 @@
+r"""Whether an IMU speaks in the units that it is configured for, of a file as of a running vehicle.
+
+Specific force. Its magnitude is that of gravity in the median, whatever the vehicle does; another
+unit shows as its factor. Rates are held against the course of the fixes: between two fixes of a
+vehicle that moves, the yaw rate's integral is the change of course,
+
+    k = sum(dpsi_gyro dpsi_course) / sum(dpsi_course^2),
+
+1 for rad/s and 180 / pi for deg/s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.measurements import PositionFix
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.imu_buffer import ImuBuffer
+
+Array = NDArray[np.float64]
+
+# In a loop of 2 g for half of the time nobody flies, and half of gravity for as long nobody falls.
+FORCE_RANGE = (0.5, 2.0)
+FORCE_UNITS = {"g": STANDARD_GRAVITY_M_S2, "milli-g": 1e-3 * STANDARD_GRAVITY_M_S2, "cm/s^2": 1e-2}
+# RMS over a file, or over ten seconds, that no vehicle turns with: a turn a second, all the time.
+MOST_RATE_RAD_S = 2.0 * math.pi
+RMS_S = 10.0
+# A course is one from the speed at which alignment takes it for the heading by default. Over a
+# second a bend changes it by more than its noise; changes of 30 deg in all show the factor of 57.
+COURSE_SPEED_M_S = 3.0
+COURSE_STEP_NS = (900_000_000, 2_100_000_000)
+LEAST_TURN_RAD = math.radians(30.0)
+DEGREES_RANGE = (10.0, 300.0)
+ADVICE = "they look like deg/s; multiply the gyro's figures by pi/180"
+
+
+def force_unit(magnitude: float) -> str | None:
+    """What to say of forces of this magnitude in the median; None where they can be m/s^2."""
+    if FORCE_RANGE[0] <= magnitude / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
+        return None
+    found = (
+        f"the specific force is {magnitude:.4g} in the median, where gravity alone is 9.81 m/s^2"
+    )
+    unit = other_unit(magnitude)
+    if unit is None:
+        return f"{found}: another unit, or gravity taken out"
+    name, factor = unit
+    return f"{found}: it looks like {name}; multiply the accelerometer's figures by {factor:g}"
+
+
+def other_unit(magnitude: float) -> tuple[str, float] | None:
+    """The unit in which forces of this magnitude are gravity's, and its size in m/s^2."""
+    for name, factor in FORCE_UNITS.items():
+        if FORCE_RANGE[0] <= magnitude * factor / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
+            return name, factor
+    return None
+
+
+def rms_unit(rms_rad_s: float) -> str | None:
+    """What to say of rates of this RMS; None where a vehicle can turn with them."""
+    if rms_rad_s <= MOST_RATE_RAD_S:
+        return None
+    return f"the rates are {rms_rad_s:.3g} rad/s RMS, more than a vehicle turns: {ADVICE}"
+
+
+class CourseTurns:
+    """Turns by the gyro against those by a receiver's course: k of the module's docstring."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float] | None = None
+        self._product = self._square = self._turn = 0.0
+
+    def fix(self, t_ns: int, v_ned: tuple[float, ...], turned: Callable[[int, int], float]) -> None:
+        """A velocity (m/s) at an instant, in order; `turned(a, b)` (rad) is the gyro's between two
+        instants, NaN where it is not known."""
+        if math.hypot(*v_ned[:2]) < COURSE_SPEED_M_S:
+            return
+        course = math.atan2(v_ned[1], v_ned[0])
+        if self._last is None:
+            self._last = t_ns, course
+            return
+        last_ns, before = self._last
+        if t_ns - last_ns < COURSE_STEP_NS[0]:
+            return
+        self._last = t_ns, course
+        gyro = turned(last_ns, t_ns)
+        if t_ns - last_ns > COURSE_STEP_NS[1] or not math.isfinite(gyro):
+            return
+        change = math.remainder(course - before, 2.0 * math.pi)
+        self._product += gyro * change
+        self._square += change**2
+        self._turn += abs(change)
+
+    @property
+    def decided(self) -> bool:
+        """Whether the course has turned enough to tell."""
+        return self._turn >= LEAST_TURN_RAD
+
+    def said(self) -> str | None:
+        """What to say of the rates; None where they fit, or nobody can tell."""
+        if not self.decided:
+            return None
+        factor = abs(self._product / self._square)
+        if not DEGREES_RANGE[0] <= factor <= DEGREES_RANGE[1]:
+            return None
+        return f"the rates are {factor:.0f} times the turns of the fixes' course: {ADVICE}"
+
+    def begin_anew(self) -> None:
+        """Forget the turns so far."""
+        self._product = self._square = self._turn = 0.0
+
+
+class RateUnits:
+    """Watches the rates of a running vehicle. `wrong` is the sentence while they are in another
+    unit, by the last turns of 30 deg or the last ten seconds that could tell.
+
+    `on_event(code, text)` hears of `imu_units` and `imu_units_well`.
+    """
+
+    def __init__(self, on_event: Callable[[str, str], None]) -> None:
+        self._event = on_event
+        self.wrong: str | None = None
+        self._turns: dict[str, CourseTurns] = {}
+        self._squares, self._count, self._since_ns = 0.0, 0, 0
+
+    def samples(self, imu: ImuBuffer, new: int) -> None:
+        """The samples from row `new` on have come."""
+        rates = imu.samples[new : imu.end, :3]
+        if not len(rates):
+            return
+        newest_ns = imu.latest_ns
+        if not self._count:
+            self._since_ns = int(imu.times[new])
+        self._squares += float(np.sum(rates**2))
+        self._count += len(rates)
+        if newest_ns - self._since_ns >= RMS_S * 1e9:
+            self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
+            self._squares, self._count = 0.0, 0
+
+    def fix(self, m: PositionFix, t_ns: int, imu: ImuBuffer) -> None:
+        """A receiver's fix, valid at `t_ns`."""
+        if m.v_ned_m_s is None or not all(math.isfinite(v) for v in m.v_ned_m_s if v is not None):
+            return
+        turns = self._turns.setdefault(m.source, CourseTurns())
+        turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
+        if turns.decided:
+            self._tell(turns.said())
+            turns.begin_anew()
+
+    def _tell(self, wrong: str | None) -> None:
+        if wrong is not None and self.wrong is None:
+            self._event("imu_units", wrong)
+        elif wrong is None and self.wrong is not None:
+            self._event("imu_units_well", "the rates fit the turns of the fixes' course again")
+        self.wrong = wrong
+
+
+def _turned(imu: ImuBuffer, begin_ns: int, end_ns: int) -> float:
+    """Yaw (rad) by the gyro between two instants; NaN where samples are not there any more, or not
+    yet."""
+    if not imu.end or begin_ns < imu.oldest_ns or end_ns > imu.latest_ns:
+        return math.nan
+    rows = slice(imu.index_after(begin_ns), imu.index_after(end_ns))
+    if rows.start == rows.stop:
+        return math.nan
+    return float(imu.samples[rows, 2].mean()) * (end_ns - begin_ns) * 1e-9

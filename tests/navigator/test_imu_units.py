@@ -1,0 +1,139 @@
+"""Units of the IMU: told of a running vehicle by what `fusiond process` refuses files for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fusiond.configuration.schema import Config
+from fusiond.navigation.solution import Mode
+from fusiond.navigator.imu_units import CourseTurns, force_unit, other_unit, rms_unit
+from fusiond.navigator.navigator import Navigator
+from tests.navigator.vehicle import CONFIG, RATE_HZ, Array, drive, started
+
+GRAVITY_M_S2 = 9.80665
+
+
+def _driven(change: Callable[[Array], Array]) -> tuple[Navigator, list[tuple[str, str]]]:
+    """The drive, its samples (n, 6) changed once the filter runs, and what was told."""
+    told: list[tuple[str, str]] = []
+    navigator, row = started(on_event=lambda code, text: told.append((code, text)))
+    d = drive()
+    samples = change(d.samples.copy())
+    waiting = list(d.measurements)
+    while row < len(d.times):
+        navigator.add_imu(d.times[row : row + 10], samples[row : row + 10])
+        row += 10
+        while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
+            navigator.add(waiting[0], waiting.pop(0).t_seen_ns)
+        navigator.advance()
+    return navigator, told
+
+
+def test_rates_in_deg_s_are_told_in_the_first_bend_and_nothing_is_vouched_for() -> None:
+    def in_degrees(samples: Array) -> Array:
+        samples[:, :3] *= 180.0 / math.pi
+        return samples
+
+    navigator, told = _driven(in_degrees)
+    texts = [text for code, text in told if code == "imu_units"]
+    assert len(texts) == 1
+    factor = int(texts[0].split("the rates are ")[1].split(" times")[0])
+    assert 40 <= factor <= 65  # 57, less what the course's noise takes off
+    mode, why = navigator.mode(navigator.imu.latest_ns)
+    assert mode is Mode.INVALID
+    assert "they look like deg/s" in why
+
+
+def test_good_rates_are_not_spoken_of() -> None:
+    navigator, told = _driven(lambda samples: samples)
+    assert [code for code, _ in told if code.startswith("imu")] == []
+    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
+
+
+def test_a_unit_that_is_corrected_is_believed_after_the_next_bend() -> None:
+    half = round(22.0 * RATE_HZ)  # between the two bends
+
+    def in_degrees_first(samples: Array) -> Array:
+        samples[:half, :3] *= 180.0 / math.pi
+        return samples
+
+    codes = [code for code, _ in _driven(in_degrees_first)[1]]
+    assert [code for code in codes if "units" in code] == ["imu_units", "imu_units_well"]
+
+
+def test_a_carousel_of_12_rad_s_needs_no_fix() -> None:
+    def carousel(samples: Array) -> Array:
+        samples[:, 2] += 12.0
+        return samples
+
+    navigator = Navigator(Config.model_validate(CONFIG), on_event=lambda *e: told.append(e))
+    told: list[tuple[str, str]] = []
+    d = drive()
+    navigator.add_imu(d.times, carousel(d.samples.copy()))
+    texts = [text for code, text in told if code == "imu_units"]
+    assert texts[0].startswith("the rates are 12 rad/s RMS, more than a vehicle turns: they look")
+
+
+@pytest.mark.parametrize(
+    ("factor", "name", "code"),
+    [
+        (1.0 / GRAVITY_M_S2, "g", "imu_no_gravity"),
+        (1e3 / GRAVITY_M_S2, "milli-g", "imu_out_of_range"),
+    ],
+)
+def test_forces_in_another_unit_are_named_where_they_are_refused(
+    factor: float, name: str, code: str
+) -> None:
+    def scaled(samples: Array) -> Array:
+        samples[:, 3:] *= factor
+        return samples
+
+    texts = dict(_driven(scaled)[1])
+    assert f"looks like {name}: multiply the accelerometer's figures by" in texts[code]
+
+
+def test_free_fall_is_no_unit() -> None:
+    def fall(samples: Array) -> Array:
+        samples[:, 3:] *= 1e-3
+        return samples
+
+    assert "looks like" not in dict(_driven(fall)[1])["imu_no_gravity"]
+
+
+@pytest.mark.parametrize("magnitude", [4.95, 9.81, 19.5])
+def test_forces_of_a_vehicle_are_no_other_unit(magnitude: float) -> None:
+    assert force_unit(magnitude) is None
+    assert other_unit(magnitude) is None
+
+
+def test_the_sentence_says_what_to_do() -> None:
+    assert "it looks like g; multiply the accelerometer's figures by 9.80665" in str(
+        force_unit(1.0)
+    )
+    assert "cm/s^2" in str(force_unit(981.0)) or "milli-g" in str(force_unit(981.0))
+    assert str(force_unit(0.02)).endswith("another unit, or gravity taken out")
+    assert rms_unit(1.0) is None
+
+
+@pytest.mark.parametrize("k", [0.5, 1.0, 5.0, -1.0])
+def test_a_poor_gyro_is_not_taken_for_another_unit(k: float) -> None:
+    """Half, five times, the wrong sign: something else is wrong with it."""
+    turns = CourseTurns()
+    for second in range(40):
+        course = 0.1 * second
+        velocity = (10.0 * math.cos(course), 10.0 * math.sin(course))
+        turns.fix(second * 1_000_000_000, velocity, lambda a, b: k * 0.1 * (b - a) * 1e-9)
+    assert turns.decided
+    assert turns.said() is None
+
+
+def test_straight_on_with_a_noisy_course_nothing_is_decided() -> None:
+    turns, rng = CourseTurns(), np.random.default_rng(3)
+    for second in range(30):
+        turns.fix(second * 1_000_000_000, (20.0, 0.1 * rng.standard_normal()), lambda a, b: 1.0)
+    assert not turns.decided
+    assert turns.said() is None
