@@ -83,6 +83,7 @@ class NonHolonomicAid(Aid):
     """No sideways or vertical velocity (sigma `sd_m_s`) at `lever`, above `min_speed_m_s`."""
 
     constraint: ClassVar[bool] = True
+    no_slip: ClassVar[bool] = True
 
     sd_m_s: float
     min_speed_m_s: float
