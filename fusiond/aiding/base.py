@@ -95,6 +95,9 @@ class Aid:
     constraint: ClassVar[bool] = False
     """Not measured but known of the vehicle: its innovations are neither independent nor white, and
     no verdict on a sigma follows from them."""
+    no_slip: ClassVar[bool] = False
+    """It holds while the vehicle moves the way it faces: refused for long, it slides, or the
+    attitude or the IMU's mounting is wrong."""
     late: ClassVar[bool] = False
     """It comes seldom and long after its instant, as what must be asked for does."""
 

@@ -176,6 +176,7 @@ class NonHolonomicAid(Aid):
     `min_speed_m_s`."""
 
     constraint: ClassVar[bool] = True
+    no_slip: ClassVar[bool] = True
 
     sd_m_s: float
     sd_down_m_s: float

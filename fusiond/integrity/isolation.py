@@ -10,7 +10,7 @@ Mean          m <- (1 - a) m + a y at two paces a. |m|^2 / (a / (2 - a) + c) is 
               innovations that share the part c of their variance, as the errors of a receiver
               without corrections do; beyond the quantile 1 - p the series has a bias that the gate
               cannot see: a ramp, a step inside the gate, a velocity of another instant.
-Repetition    a position that is the same to the bit while the filter moves.
+Repetition    what is the same to the bit while the filter moves, more often than by chance.
 
 A series that fails the mean test is measured against the rest: where another position, or the
 velocity of the same device, is believed, the series is excluded; where nothing is left to compare
@@ -35,6 +35,7 @@ Srinath, IEEE Trans. AC 32 (1987), 1133.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -42,9 +43,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.integrity.series import NO_TREND, PACES, WHITE, Offset, Series
+from fusiond.integrity import support
+from fusiond.integrity.series import NO_TREND, PACES, Offset, Proof, Series
+from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VE, VN
 
@@ -56,18 +59,12 @@ REFUSED_IN_A_ROW = 3
 # Five in a row that pass a gate of 0.9999 while a fault of four sigma lasts: one case in 1000; and
 # over three seconds, so that no burst of a wrong stream is let in by its number.
 READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
-# What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
-FORGET_NS = 5_000_000_000
-# The variance that a series' means show by themselves is averaged over so many innovations: errors
-# that last (orbits, slip of a tyre) are ordinary, and a fault is what stands out of them.
-LEARN = 1.0 / 300.0
 # Probability of a false alarm of one mean test.
 FALSE_ALARM = 1e-6
 # A mean over fewer innovations than this is left to the gate.
 FEWEST = 4
-# Position repeated to the bit this often, at this speed and beyond (m/s): receivers print metres
-# to the centimetre or finer, so that two alike in motion are chance, three are not.
-REPEATED, MOVING_M_S = 2, 1.0
+# Faster than this (m/s) the vehicle moves: what is measured of it changes.
+MOVING_M_S = 1.0
 # Beyond what gravity on the wrong axis can do to a position in the time (m/s^2).
 IMU_FAULT_M_S2 = 10.0
 # Without a velocity of the same device, the velocity error that an unnoticed IMU fault may have
@@ -75,14 +72,11 @@ IMU_FAULT_M_S2 = 10.0
 IMU_FAULT_M_S = 10.0
 # A jump is beyond so many sigmas of its innovation, on top of the above.
 JUMP_SIGMAS = 6.0
-# Another position supports the filter for as long as `coasting` is not said.
-OTHERS_NS = 10_000_000_000
-# A position of this sigma (m) sees within seconds what a wrong velocity does to the filter.
-FINE_M = 3.0
-# While the velocity of the same device was fused this lately, the filter's motion is supported.
-SUPPORT_NS = 2_000_000_000
+# A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
+# its constraint is refused. A corner taken too fast is over by then.
+SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
 # So many doubts of the filter are remembered.
-DOUBTS = 4
+DOUBTS = 8
 
 
 class Action(Enum):
@@ -99,16 +93,6 @@ class Action(Enum):
 
 MOTION = frozenset({Action.DOUBT_MOTION, Action.DOUBT_FILTER})
 MEASURED = frozenset({Action.DOUBT_MEASURED, Action.DOUBT_FILTER})
-
-
-class Lost(NamedTuple):
-    """No position is believed: since when, whether `source` or `filter` is to blame, and how the
-    first of them ended (`jumped`, `drifts`, ...)."""
-
-    since_ns: int
-    cause: str
-    device: str
-    reason: str
 
 
 class Memory(NamedTuple):
@@ -140,17 +124,16 @@ class Isolation:
 
     def lost(self, t_ns: int) -> Lost | None:
         """Set while positions come and none is believed: since when, and who is to blame."""
-        heard = [r for r in self._records.values() if r.locates and t_ns - r.heard_ns <= FORGET_NS]
-        if not heard or any(r.believed for r in heard):
-            return None
-        first = min(heard, key=lambda r: r.refused_ns)
-        source = all(r.jumped or self._supported(r.device, t_ns) for r in heard)
-        reason = first.excluded or "refused"
-        return Lost(first.refused_ns, "source" if source else "filter", first.device, reason)
+        return support.lost(self._records, t_ns)
 
-    def doubts(self, t_ns: int, within_ns: int) -> int:
-        """How often, of the last `DOUBTS` times, the filter was in doubt within that time."""
-        return sum(t_ns - doubted_ns <= within_ns for doubted_ns in self._doubts)
+    def contested(self, t_ns: int) -> str | None:
+        """Why nobody can tell whether filter or sources are right; None where that is known."""
+        return support.contested(self._records, t_ns)
+
+    @property
+    def doubts(self) -> tuple[int, ...]:
+        """Instants (ns) at which the filter was in doubt, the last `DOUBTS` of them."""
+        return self._doubts
 
     def snapshot(self) -> Memory:
         """A copy of everything."""
@@ -174,55 +157,89 @@ class Isolation:
         `nav` (10,): the navigation state that it was compared with.
         """
         t_ns = aid.t_ns
-        record = self._records.get(aid.source)
-        if record is None:
-            record = Series(aid.device, aid.locates, aid.moves, t_ns)
-            self._records[aid.source] = record
-        elif t_ns - record.heard_ns > FORGET_NS:
-            record.count = record.repeats = record.passes = 0
-            if not record.excluded:
-                record.refused, record.jumped = 0, False
-        record.heard_ns = t_ns
+        record = self._record(aid)
         passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-        offer = next((o for o in aid.offers() if isinstance(o, PositionOffer)), None)
-        repeats = offer is not None and self._repeats(record, offer, nav)
+        offers = aid.offers()
+        offer = next((o for o in offers if isinstance(o, PositionOffer)), None)
+        offset = offer and _apart(offer, float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT]))
+        if offer is not None and offset is not None:
+            record.sd_m, record.away_m = max(offer.sd[:2]), math.hypot(offset.north, offset.east)
+        moving = math.hypot(nav[VN], nav[VE]) > MOVING_M_S
+        value = _value(offers)
+        repeats = value is not None and record.repeats_itself(value, moving)
         if record.excluded:
-            offset = None if offer is None else _offset(offer, nav)
             self._look(record, t_ns, passed and not repeats, outcome.whitened, offset)
             return Action.NONE
         if repeats:
             self._exclude(record, t_ns, "repeats itself", jumped=True)
             return self._doubted(Action.DOUBT_MEASURED if passed else Action.NONE, t_ns)
         if outcome.name != "fused":
-            if aid.constraint or passed:
+            if aid.constraint:
+                self._slides(record, t_ns)
                 return Action.NONE
-            return self._doubted(self._refuse(record, t_ns, outcome.nis, offer, nav), t_ns)
+            if passed:
+                return Action.NONE
+            away = record.away_m if aid.locates else _velocity_away(offers, nav)
+            return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
+        if offer is not None:
+            self._prove(record, t_ns, offer, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
-        record.sd_m = 0.0 if offer is None else max(offer.sd[:2])
         self._average(record, outcome.whitened)
         if not self._biased(record):
             return Action.NONE
-        return self._doubted(self._blame(record, aid, offer, nav), t_ns)
+        return self._doubted(self._blame(record, aid), t_ns)
+
+    def _record(self, aid: Aid) -> Series:
+        """The series of an aid, which is heard of now."""
+        t_ns = aid.t_ns
+        record = self._records.get(aid.source)
+        if record is None:
+            record = Series(aid.device, aid.locates, aid.moves, t_ns, aid.no_slip)
+            self._records[aid.source] = record
+        elif t_ns - record.heard_ns > FORGET_NS:
+            record.count = record.repeats = record.passes = 0
+            if not record.excluded:
+                record.refused, record.jumped = 0, False
+        record.heard_ns = t_ns
+        return record
+
+    def _prove(self, record: Series, t_ns: int, offer: PositionOffer, nav: Array) -> None:
+        """A position is fused: after an outage it must be seen to go with the motion, for the
+        filter has nothing as good to compare it with."""
+        v = float(nav[VN]), float(nav[VE])
+        if support.outage(self._records, t_ns):
+            record.proof = Proof(offer.lat_rad, offer.lon_rad, t_ns, t_ns, v)
+        if (p := record.proof) is None:
+            return
+        half_s = 0.5e-9 * (t_ns - p.t_ns)
+        way = p.way[0] + half_s * (v[0] + p.velocity[0]), p.way[1] + half_s * (v[1] + p.velocity[1])
+        moved = _apart(offer, p.lat_rad, p.lon_rad, float(nav[HEIGHT]))
+        z = Offset(moved.north + way[0], moved.east + way[1], moved.sd)
+        trend = p.trend.with_one(z, (t_ns - p.begin_ns) * 1e-9)
+        record.proof = (
+            None if trend.steady else p._replace(t_ns=t_ns, velocity=v, way=way, trend=trend)
+        )
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:
             self._doubts = (*self._doubts, t_ns)[-DOUBTS:]
         return action
 
-    @staticmethod
-    def _repeats(record: Series, offer: PositionOffer, nav: Array) -> bool:
-        value = offer.lat_rad, offer.lon_rad
-        same = value == record.value and math.hypot(nav[VN], nav[VE]) > MOVING_M_S
-        record.value, record.repeats = value, record.repeats + 1 if same else 0
-        return record.repeats >= REPEATED
-
-    def _refuse(
-        self, record: Series, t_ns: int, nis: float, offer: PositionOffer | None, nav: Array
-    ) -> Action:
+    def _slides(self, record: Series, t_ns: int) -> None:
+        """A constraint was refused."""
         record.refused += 1
         if record.refused == 1:
             record.refused_ns = t_ns
-            record.jumped = offer is not None and self._jumps(record, t_ns, nis, offer, nav)
+        lasts_ns = t_ns - record.refused_ns
+        if record.no_slip and record.refused >= SLIDING_COUNT and lasts_ns >= SLIDING_NS:
+            self._exclude(record, record.refused_ns, "disagrees", jumped=False)
+
+    def _refuse(self, record: Series, t_ns: int, nis: float, away: float) -> Action:
+        """A measurement was refused that is `away` (m or m/s) from the filter."""
+        record.refused += 1
+        if record.refused == 1:
+            record.refused_ns = t_ns
+            record.jumped = self._jumps(record, t_ns, nis, away)
         if record.refused < REFUSED_IN_A_ROW:
             return Action.NONE
         reason = "jumped" if record.jumped else "disagrees"
@@ -234,18 +251,17 @@ class Isolation:
             return Action.NONE
         return Action.DOUBT_MOTION
 
-    def _jumps(
-        self, record: Series, t_ns: int, nis: float, offer: PositionOffer, nav: Array
-    ) -> bool:
-        """Whether a refused position left the filter faster than an IMU's fault can explain."""
+    def _jumps(self, record: Series, t_ns: int, nis: float, away: float) -> bool:
+        """Whether a refused position or velocity left the filter faster than an IMU's fault can
+        explain."""
         if not math.isfinite(nis) or t_ns - record.fused_ns > FORGET_NS:
             return False
         apart_s = (t_ns - record.fused_ns) * 1e-9
-        before = 0.0 if self._supported(record.device, t_ns) else IMU_FAULT_M_S
-        felt = (before + 0.5 * IMU_FAULT_M_S2 * apart_s) * apart_s
-        z = _offset(offer, nav)
-        length = math.hypot(z.north, z.east)
-        return length > JUMP_SIGMAS * length / math.sqrt(nis) + felt
+        felt = IMU_FAULT_M_S2 * apart_s
+        if record.locates:
+            before = 0.0 if self._supported(record.device, t_ns) else IMU_FAULT_M_S
+            felt = (before + 0.5 * felt) * apart_s
+        return away > JUMP_SIGMAS * away / math.sqrt(nis) + felt
 
     @staticmethod
     def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
@@ -278,13 +294,11 @@ class Isolation:
         ):
             record.excluded, record.fused_ns = "", t_ns
             record.refused, record.jumped, record.count = 0, False, 0
+            record.proof = None
 
     def _supported(self, device: str, t_ns: int) -> bool:
         """Whether a velocity of the device agrees with the filter still."""
-        return any(
-            r.moves and r.device == device and r.believed and t_ns - r.fused_ns <= SUPPORT_NS
-            for r in self._records.values()
-        )
+        return support.supported(self._records, device, t_ns)
 
     # ------------------------------------------------------------------ the mean test
 
@@ -312,41 +326,47 @@ class Isolation:
         limit = gate_threshold(self._pass, degrees)
         if fast > limit * record.fast_spread or slow > limit * record.slow_spread:
             return True
-        record.fast_spread += LEARN * (max(fast / degrees, WHITE[0]) - record.fast_spread)
-        record.slow_spread += LEARN * (max(slow / degrees, WHITE[1]) - record.slow_spread)
+        record.learn(fast / degrees, slow / degrees)
         return False
 
-    def _blame(self, record: Series, aid: Aid, offer: PositionOffer | None, nav: Array) -> Action:
+    def _blame(self, record: Series, aid: Aid) -> Action:
         """A bias inside the gate: the series', where something else supports the filter."""
         record.count = 0
-        if offer is not None:
-            z = _offset(offer, nav)
-            seen_m = 0.5 * math.hypot(z.north, z.east)
-            source = self._supported(record.device, aid.t_ns) or self._others(record, aid, seen_m)
-        else:
-            source = self._others(record, aid, FINE_M)
+        sd_m = 0.5 * record.away_m if aid.locates else FINE_M
+        source = support.others(self._records, record, aid.t_ns, sd_m)
+        if not source and aid.locates:
+            source = self._supported(record.device, aid.t_ns)
         if not source:
             return Action.DOUBT_FILTER
         self._exclude(record, aid.t_ns, "drifts", jumped=record.locates)
         return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
 
-    def _others(self, record: Series, aid: Aid, sd_m: float) -> bool:
-        """Whether other positions, good to `sd_m`, have been believed lately: a coarse one cannot
-        say that a fine one is wrong."""
-        return any(
-            r.locates
-            and r is not record
-            and r.believed
-            and r.sd_m <= sd_m
-            and aid.t_ns - r.fused_ns <= OTHERS_NS
-            for r in self._records.values()
-        )
+
+def _value(offers: Sequence[Offer]) -> tuple[float, ...] | None:
+    """What a sensor that hangs repeats to the bit."""
+    for offer in offers:
+        match offer:
+            case PositionOffer():
+                return offer.lat_rad, offer.lon_rad
+            case VelocityOffer():
+                return offer.v_ned
+            case SpeedOffer():
+                return (offer.speed_m_s,)
+    return None
 
 
-def _offset(offer: PositionOffer, nav: Array) -> Offset:
-    """Of the body's origin; a lever arm of metres is left to the sigma."""
-    lat, height = float(nav[LAT]), float(nav[HEIGHT])
-    east = float(nav[LON]) - offer.lon_rad
+def _velocity_away(offers: Sequence[Offer], nav: Array) -> float:
+    """How far a measured velocity is from the filter's (m/s); a lever arm that turns is left to the
+    sigma. 0 where none was measured."""
+    velocity = next((o for o in offers if isinstance(o, VelocityOffer)), None)
+    if velocity is None:
+        return 0.0
+    return math.hypot(velocity.v_ned[0] - float(nav[VN]), velocity.v_ned[1] - float(nav[VE]))
+
+
+def _apart(offer: PositionOffer, lat: float, lon: float, height: float) -> Offset:
+    """From a measured position to a place; a lever arm of metres is left to the sigma."""
+    east = lon - offer.lon_rad
     east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
     return Offset(
         (lat - offer.lat_rad) * (meridian_radius(lat) + height),

@@ -18,6 +18,16 @@ PACES = (1.0 / 6.0, 1.0 / 30.0)
 # a series before it has shown its own: successive innovations share a fifth of their variance.
 WHITE = tuple(a / (2.0 - a) for a in PACES)
 ASSUMED = tuple(white + 0.2 for white in WHITE)
+# The variance that a series' means show by themselves is averaged over so many innovations: errors
+# that last (orbits, slip of a tyre) are ordinary, and a fault is what stands out of them. What is
+# assumed at first weighs as much as some of them: the time that the slow mean looks back.
+LEARN_COUNT, ASSUMED_COUNT = 300, 30
+# Position repeated to the bit so often while the vehicle moves: receivers print metres to the
+# centimetre or finer, so that two alike are chance, three are not.
+REPEATED = 2
+# Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
+# repeats the one before, as this series has shown it (average of so many).
+CHANCE, REPEATS_KEPT = 1e-9, 100.0
 # Before any instant that a clock can say.
 NEVER_NS = -(2**62)
 
@@ -57,17 +67,41 @@ class Trend(NamedTuple):
         )
 
     @property
-    def steady(self) -> bool:
-        """Whether the slope of a line through them is known to `TREND_SD_M_S`, and zero."""
-        spread = self.tt - self.t * self.t / self.n
-        if spread <= 0.0 or self.sd > TREND_SD_M_S * math.sqrt(spread):
-            return False
+    def slope(self) -> tuple[float, float]:
+        """How fast they run away (m/s), and the sigma of one of its axes; infinite where nothing is
+        known."""
+        spread = self.tt - self.t * self.t / self.n if self.n else 0.0
+        if spread <= 0.0:
+            return 0.0, math.inf
         north = (self.t_north - self.t * self.north / self.n) / spread
         east = (self.t_east - self.t * self.east / self.n) / spread
-        return math.hypot(north, east) <= 3.0 * TREND_SD_M_S
+        return math.hypot(north, east), self.sd / math.sqrt(spread)
+
+    @property
+    def steady(self) -> bool:
+        """Whether the slope of a line through them is known to `TREND_SD_M_S`, and zero."""
+        slope, sd = self.slope
+        return sd <= TREND_SD_M_S and slope <= 3.0 * TREND_SD_M_S
 
 
 NO_TREND = Trend()
+
+
+class Proof(NamedTuple):
+    """How a position goes with the motion of the filter: where it was first (rad, rad), the way
+    since then by the filter's velocity, north and east (m), that velocity (m/s) and instant (ns),
+    and the trend of what is between both ways.
+
+    Positions alone would not do: a filter follows what it has nothing better than.
+    """
+
+    lat_rad: float
+    lon_rad: float
+    begin_ns: int
+    t_ns: int
+    velocity: tuple[float, float]
+    way: tuple[float, float] = (0.0, 0.0)
+    trend: Trend = NO_TREND
 
 
 @dataclass(slots=True)
@@ -78,8 +112,11 @@ class Series:
     locates: bool
     moves: bool
     heard_ns: int
+    no_slip: bool = False
     fused_ns: int = NEVER_NS
     sd_m: float = 0.0
+    away_m: float = 0.0
+    """Horizontally, of a position: its last innovation."""
     refused: int = 0
     """Failures of the gate in a row, the first at `refused_ns`."""
     refused_ns: int = 0
@@ -95,12 +132,41 @@ class Series:
     slow: tuple[float, ...] = ()
     fast_spread: float = ASSUMED[0]
     slow_spread: float = ASSUMED[1]
+    learned: int = 0
+    """Innovations that the spreads have been learned from."""
     value: tuple[float, ...] | None = None
     repeats: int = 0
+    repeating: float = 1.0
+    """Probability that a value repeats the one before it, as shown so far in motion."""
+    proof: Proof | None = None
+    """Of a position that came back after an outage: what is seen of it until it is proven."""
 
     def copied(self) -> Series:
         """A copy for a checkpoint."""
         return Series(*[getattr(self, name) for name in Series.__slots__])
+
+    def learn(self, fast: float, slow: float) -> None:
+        """Take in the means' squares, by degree of freedom."""
+        share = 1.0 / min(ASSUMED_COUNT + self.learned + 1, LEARN_COUNT)
+        self.fast_spread += share * (max(fast, WHITE[0]) - self.fast_spread)
+        self.slow_spread += share * (max(slow, WHITE[1]) - self.slow_spread)
+        self.learned = min(self.learned + 1, LEARN_COUNT)
+
+    def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
+        """Whether a new value, of a vehicle that may be `moving`, makes so many alike to the bit
+        that it is no measurement."""
+        same = moving and value == self.value
+        self.value, self.repeats = value, self.repeats + 1 if same else 0
+        if self.locates:
+            return self.repeats >= REPEATED
+        if same and self.repeats >= self._most_repeats():
+            return True
+        if moving:
+            self.repeating += (same - self.repeating) / REPEATS_KEPT
+        return False
+
+    def _most_repeats(self) -> float:
+        return math.log(CHANCE) / math.log(min(max(self.repeating, 0.01), 1.0 - 1e-12))
 
     @property
     def believed(self) -> bool:

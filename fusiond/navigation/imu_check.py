@@ -3,6 +3,8 @@ r"""Whether an inertial sample can be a measurement: judged in order, each by th
     |x_k - x_g| <= n L_j,    L_j = 30 max(a_j, floor_j)       a leap is a `spike`
     r >= ln(1e-9) / ln(p)                                      a value that comes too often
 
+    |x_k - x_g| > 30 max(a_j, least_j) and back to a quarter of it with the next sample: a `spike`
+
 x_g is the last sample that was taken, n how many have come since (three at most), a_j the running
 mean of |dx| of axis j. p is the running probability that a sample repeats the one before it to the
 bit, r how often it has done so now: by chance that comes once in 1e9 samples, four months at
@@ -14,6 +16,7 @@ Figures, of four recordings of cars and a walker (MEMS units of 100 to 167 Hz; o
     all six values the same           3 samples in a row at most (of 320,000)
     one axis the same                 101 samples in a row (1.0 s, the coarse unit at rest)
     leap between samples              16 a_j in cars, 28 a_j of a walker
+    and back with the next            14 a_j in cars, 23 a_j of a walker, three of 300 a_j and more
     smallest specific force           3.6 m/s^2 in one sample (a shock)
 """
 
@@ -50,6 +53,10 @@ LEAPS_ALLOWED = 3.0
 # Mean leaps of a good sensor on a quiet ride; with LEAP they allow what a shock does from rest:
 # 0.9 rad/s and 15 m/s^2 from sample to sample. Cars showed 1.7 and 10, shaken long before.
 RATE_FLOOR_RAD_S, FORCE_FLOOR_M_S2 = 0.03, 0.5
+# The same of a sensor on a stand, for leaps that the next sample takes back: what shakes a vehicle
+# lasts for several samples, so that no allowance for shocks is needed.
+LEAST_RATE_RAD_S, LEAST_FORCE_M_S2 = 0.003, 0.05
+BACK = 0.25
 # Samples that the running mean of leaps and the running probability of repetition remember.
 LEAPS_KEPT, REPEATS_KEPT = 100.0, 500.0
 # A repetition as rare as this is none; and at least three times the longest seen.
@@ -162,6 +169,28 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
     return TAKEN
 
 
+@compiled("b1(f8[::1], f8[:, ::1], i8)")
+def _leaps(memory: Array, samples: Array, i: int) -> bool:
+    """Whether sample i may be a spike, if the next one is back."""
+    for j in range(6):
+        least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
+        if abs(samples[i, j] - memory[_GOOD + j]) > LEAP * max(least, memory[_LEAP + j]):
+            return True
+    return False
+
+
+@compiled("b1(f8[::1], f8[:, ::1], i8, i8)")
+def _comes_back(memory: Array, samples: Array, i: int, k: int) -> bool:
+    """Whether a leap of sample i is taken back by sample k, the next."""
+    for j in range(6):
+        least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
+        leap = abs(samples[i, j] - memory[_GOOD + j])
+        back = abs(samples[k, j] - memory[_GOOD + j])
+        if leap > LEAP * max(least, memory[_LEAP + j]) and back < BACK * leap:
+            return True
+    return False
+
+
 @compiled("void(f8[::1], f8[:, ::1], i8)")
 def _take(memory: Array, samples: Array, i: int) -> None:
     """Sample i is the one that the next is compared with."""
@@ -202,20 +231,23 @@ def _check(
             i += 1
             continue
         gap = times[i] - last_ns > hold_ns
-        if gap:
-            # Real if the next sample goes on from here; else this stamp was wrong.
-            k = i + 1
+        leaps = not gap and memory[_REFUSED] == 0.0 and _leaps(memory, samples, i)
+        k = i + 1
+        if gap or leaps:
             while k < m and times[k] <= last_ns:
                 k += 1
             if k == m:
                 return i
-            if times[k] <= times[i]:
-                codes[i] = STAMP_AHEAD
-                i += 1
-                continue
+        # A gap is real if the next sample goes on from here; else this stamp was wrong.
+        if gap and times[k] <= times[i]:
+            codes[i] = STAMP_AHEAD
+            i += 1
+            continue
         _count_repeats(memory, samples, i, limits[0])
         since_s = 1.0 / limits[0] if gap else (times[i] - last_ns) * 1e-9
         codes[i] = _judged(memory, samples, i, since_s, limits)
+        if codes[i] == TAKEN and leaps and _comes_back(memory, samples, i, k):
+            codes[i] = SPIKE
         # After a gap there is nothing to compare with.
         if codes[i] == TAKEN or (codes[i] == SPIKE and gap):
             codes[i] = TAKEN
@@ -239,8 +271,8 @@ class ImuCheck:
     """Judges samples in sensor axes, whatever the chunks they come in.
 
     `rate_hz` as configured; `rate_range` (rad/s) and `force_range` (m/s^2) are the sensor's full
-    scale, infinite where nobody knows. A sample after a pause waits for the one after it: until
-    then nobody can say which stamp is wrong.
+    scale, infinite where nobody knows. A sample after a pause, and one that leaps, wait for the one
+    after: until then nobody can say which stamp is wrong, or whether the leap lasts.
     """
 
     def __init__(self, rate_hz: float, rate_range: float, force_range: float) -> None:

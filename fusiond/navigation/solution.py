@@ -15,7 +15,8 @@ class Mode(StrEnum):
 
     WAITING: no IMU data yet. ALIGNING: levelling, or heading or position not known yet.
     NAVIGATING: aided within the last `coast_after_s`. COASTING: inertial alone for longer than
-    that. INVALID: sigma beyond what the configuration allows, or the IMU has stopped.
+    that, or aided by what nobody can check. INVALID: sigma beyond what the configuration allows, or
+    the IMU has stopped.
     """
 
     WAITING = "waiting"

@@ -239,17 +239,11 @@ class Navigator:
         e = self.estimator
         failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav)
         if failure is not None:
-            self._standing.given_up()
+            self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
-        wrong = self._afterwards and self._afterwards.refuted(
-            e.t_ns, e.nav, e.covariance, self._constraints.witnesses
-        )
-        if wrong:
-            self._event(*wrong)
-            self.reset(wrong[1])
-            self._aligner.known.told.add(wrong[0])
+        if self._refuted():
             return
         self._left_out.tell()
         if self.warm is not None and self.warm.refused_by is not None:
@@ -258,6 +252,21 @@ class Navigator:
             self.reset(why)
             return
         self._protection.tell()
+
+    def _refuted(self) -> bool:
+        """Whether the start has shown to be a wrong one; alignment then begins anew."""
+        e, start = self.estimator, self._afterwards
+        if start is None:
+            return False
+        wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.witnesses)
+        if wrong is None:
+            return False
+        if wrong[0] != "heading_contradicted":  # that was the claim's fault, not the sensors'
+            self._standing.given_up(e.t_ns)
+        self._event(*wrong)
+        self.reset(wrong[1])
+        self._aligner.known.told.add(wrong[0])
+        return True
 
     def _warm_start(self) -> Start | None:
         """The start from the state of the last run, at the first sample; there is one attempt."""
@@ -322,6 +331,9 @@ class Navigator:
             return Mode.INVALID, f"horizontal sigma {horizontal:.0f} m"
         if self.on_trial:
             return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"
+        if self._afterwards is not None and self._afterwards.unconfirmed:
+            how = self.started.how
+            return Mode.COASTING, f"heading from {how}; no motion has confirmed it yet"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
         shaken = self._standing.shaken(self.estimator.t_ns, self.timeline.isolation)

@@ -5,6 +5,7 @@ what follows for the operator:
 
     doubted    the motion was in doubt lately: the sigma was widened, and is not yet proven
     unchecked  positions come and none is believed: the IMU alone carries the solution
+    contested  what was left out may be right: nobody can tell
     given up   the filter is wrong, or cannot be told from wrong any more: alignment begins anew
 
 A filter that was given up and aligned anew is on trial for a while: its mode stays `invalid` until
@@ -14,11 +15,14 @@ it has gone on without a doubt.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.integrity.isolation import Isolation, Lost
+from fusiond.integrity.isolation import Isolation
+from fusiond.integrity.series import NEVER_NS
+from fusiond.integrity.support import Lost
 from fusiond.navigation.strapdown import VE, VN
 
 Array = NDArray[np.float64]
@@ -31,12 +35,18 @@ FILTER_WRONG_NS = 5_000_000_000
 # A source that jumped away is waited for while the IMU bounds the position: a minute is what a
 # vehicle's MEMS unit keeps to within a hundred metres.
 SOURCE_WRONG_NS = 60_000_000_000
-# After a doubt the innovations of a few seconds bring the widened sigma down again.
-DOUBTED_NS = 3_000_000_000
+# After a doubt the innovations of a few seconds bring the widened sigma down again, whether the IMU
+# is sound or not; the next seconds tell.
+DOUBTED_NS = 10_000_000_000
+# Driving straight on proves little of an IMU or of a clock: after a second doubt it takes twice as
+# long, and so on. Doubts this near to each other are one.
+LONGEST_DOUBT_NS, ONE_DOUBT_NS = 320_000_000_000, 3_000_000_000
 # More doubts than this within the time: what widens P does not cure the filter.
 MOST_DOUBTS, DOUBTS_NS = 3, 20_000_000_000
-# A start after a failure proves itself for so long before it is called navigation.
-TRIAL_NS = 10_000_000_000
+# A start after a failure proves itself for so long before it is called navigation, and twice as
+# long after each further one. What went well for ten times as long was none of a row.
+TRIAL_NS, LONGEST_TRIAL_NS = 10_000_000_000, 320_000_000_000
+LASTED = 10
 
 
 class Standing:
@@ -44,17 +54,18 @@ class Standing:
 
     def __init__(self, max_speed_m_s: float) -> None:
         self._max_speed = max_speed_m_s
-        self._trial_end_ns = 0
-        self._failed = False
+        self._trial_ns = 0
+        self._started_ns = 0
 
     def started(self, t_ns: int) -> None:
         """A navigation has begun."""
-        self._trial_end_ns = t_ns + TRIAL_NS if self._failed else t_ns
-        self._failed = False
+        self._started_ns = t_ns
 
-    def given_up(self) -> None:
+    def given_up(self, t_ns: int) -> None:
         """It was wrong: the next one is on trial."""
-        self._failed = True
+        lasted = t_ns - self._started_ns > LASTED * max(self._trial_ns, TRIAL_NS)
+        longer_ns = TRIAL_NS if lasted else max(TRIAL_NS, 2 * self._trial_ns)
+        self._trial_ns = min(longer_ns, LONGEST_TRIAL_NS)
 
     def failure(self, t_ns: int, isolation: Isolation, nav: Array) -> str | None:
         """Why navigation must begin anew; None while it need not.
@@ -64,10 +75,10 @@ class Standing:
         speed = math.hypot(nav[VN], nav[VE])
         if speed > self._max_speed:
             return f"{speed:.0f} m/s is faster than this vehicle can be"
-        if isolation.doubts(t_ns, DOUBTS_NS) > MOST_DOUBTS:
+        if sum(t_ns - doubt_ns <= DOUBTS_NS for doubt_ns in isolation.doubts) > MOST_DOUBTS:
             return "IMU and aids do not fit each other"
         lost = isolation.lost(t_ns)
-        if lost is None:
+        if lost is None or lost.disputed:
             return None
         patience_ns = FILTER_WRONG_NS if lost.cause == "filter" else SOURCE_WRONG_NS
         waited_ns = t_ns - lost.since_ns
@@ -77,18 +88,33 @@ class Standing:
 
     def unproven(self, t_ns: int) -> str | None:
         """Why a solution is not to be called valid yet: it is on trial."""
-        if t_ns >= self._trial_end_ns:
+        left_ns = self._started_ns + self._trial_ns - t_ns
+        if left_ns <= 0:
             return None
-        return f"on trial for {(self._trial_end_ns - t_ns) * 1e-9:.0f} s more after a failure"
+        return f"on trial for {left_ns * 1e-9:.0f} s more after a failure"
 
     def shaken(self, t_ns: int, isolation: Isolation) -> str | None:
         """Why a solution is coasting though aids come; None where it is not."""
         lost = isolation.lost(t_ns)
         if lost is not None and t_ns - lost.since_ns > UNCHECKED_NS:
             return f"{_told(lost)}: nothing else can check it"
-        if isolation.doubts(t_ns, DOUBTED_NS):
-            return "IMU and aids did not fit: sigma widened"
-        return None
+        left_ns = _doubted_until(isolation.doubts) - t_ns
+        if left_ns > 0:
+            return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
+        return isolation.contested(t_ns)
+
+
+def _doubted_until(doubts: Sequence[int]) -> int:
+    """Until when (ns) the motion is not yet proven."""
+    patience_ns, before_ns = 0, NEVER_NS
+    for doubt_ns in doubts:
+        apart_ns = doubt_ns - before_ns
+        if apart_ns > max(LASTED * patience_ns, ONE_DOUBT_NS):
+            patience_ns = DOUBTED_NS
+        elif apart_ns > ONE_DOUBT_NS:
+            patience_ns = min(2 * patience_ns, LONGEST_DOUBT_NS)
+        before_ns = doubt_ns
+    return before_ns + patience_ns
 
 
 def _told(lost: Lost) -> str:

@@ -4,62 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
-from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.integrity.isolation import MOTION, Action, Isolation
-from fusiond.navigation.earth import meridian_radius
-
-GATE = 0.9999
-S = 1_000_000_000
-NAV = np.array([0.53, 1.99, 40.0, 8.0, 3.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-LEVER = (0.0, 0.0, 0.0)
-SD_M = 1.0
-
-
-class Bench:
-    """A filter that stands at `NAV` and believes its innovations to be of variance one: what the
-    isolation is told of a receiver's fixes and velocities."""
-
-    def __init__(self) -> None:
-        self.isolation = Isolation()
-        self.rng = np.random.default_rng(3)
-
-    def fix(
-        self, t_s: float, north_m: float = 0.0, source: str = "gnss", sd_m: float = SD_M
-    ) -> Action:
-        """A fix `north_m` from the filter, beside its noise."""
-        y = self.rng.standard_normal(3)
-        y[0] += north_m / sd_m
-        lat = float(NAV[0]) - y[0] * sd_m / (meridian_radius(float(NAV[0])) + 40.0)
-        sd = (sd_m, sd_m, sd_m)
-        lon = float(NAV[1]) - y[1] * sd_m / 5.5e6
-        return self._judge(PositionAid(source, round(t_s * S), GATE, lat, lon, 40.0, sd, LEVER), y)
-
-    def velocity(self, t_s: float, bias: float = 0.0) -> Action:
-        """A velocity of the receiver, `bias` sigma off."""
-        y = self.rng.standard_normal(3)
-        y[1] += bias
-        aid = VelocityAid(
-            "gnss_velocity", round(t_s * S), GATE, (8.0, 3.0, 0.0), (0.05,) * 3, LEVER
-        )
-        return self._judge(aid, y)
-
-    def _judge(self, aid: PositionAid | VelocityAid, y: NDArray[np.float64]) -> Action:
-        nis = float(y @ y)
-        fused = nis <= gate_threshold(GATE, 3) and self.isolation.believes(aid.source)
-        name = "fused" if fused else "isolated"
-        if not fused and self.isolation.believes(aid.source):
-            name = "gated"
-        return self.isolation.judge(aid, Outcome(name, nis, 3, tuple(y.tolist())), NAV)
-
-    def both(self, seconds: range, north_m: float = 0.0) -> set[Action]:
-        """Fix and velocity each second."""
-        return {a for t in seconds for a in (self.fix(t, north_m), self.velocity(t))}
+from fusiond.estimators.base import Outcome
+from fusiond.integrity.isolation import MOTION, Action
+from tests.integrity.series_bench import GATE, LEVER, NAV, SD_M, Bench, S
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.3])

@@ -57,6 +57,8 @@ lever_arm_m = [0.0, 0.0, -1.0]
 heading = ["saved", "config"]
 heading_deg = 40.0
 """
+PARKED = Mode.COASTING
+"""Of a vehicle that stands, with the heading that was configured."""
 RDSS = '[sources.rdss]\ndriver = "rdss"\nport = "rdss"\nbaud = 115200\n'
 NO_MQTT = "[mqtt]\nenabled = false\n"
 # An IMU of single precision floats, which can say what integers cannot; each frame has the time.
@@ -156,14 +158,15 @@ async def test_it_aligns_navigates_and_says_how_each_device_is(bench: Bench) -> 
     vehicle = bench.vehicle(gnss_link=bench.folder / "gnss", rdss_link=bench.folder / "rdss")
     daemon = bench.daemon(RDSS, NO_MQTT)
     async with running(daemon, vehicle):
-        await bench.mode(Mode.NAVIGATING)
+        await bench.mode(PARKED)
         await until(lambda: bench.health["gnss"].fused >= 10)
         await until(lambda: {h.state for h in bench.health.values()} == {"running"})
         health, solution = bench.health, bench.seen[-1]
     modes = list(dict.fromkeys(s.mode for s in bench.seen))
-    assert modes[-2:] == [Mode.ALIGNING, Mode.NAVIGATING]
+    assert modes[-2:] == [Mode.ALIGNING, PARKED]
     assert modes[:-2] in ([], [Mode.WAITING])  # the first frames may come before the first tick
-    assert solution.reason == "heading from configured heading"
+    why = "heading from configured heading; no motion has confirmed it yet"
+    assert solution.reason == why
     true = vehicle.truth_at(solution.t_ns)
     sd = solution.sd_ned_m
     north = (solution.lat_rad - true.position[0, 0]) * 6.36e6
@@ -299,7 +302,7 @@ async def test_samples_that_cannot_be_true_are_named_and_survived(
             return time.monotonic_ns() - vehicle.start_ns
 
         async with running(daemon, vehicle):
-            await bench.mode(Mode.NAVIGATING)
+            await bench.mode(PARKED)
             # Between the samples, with their own times: no number, and beyond any sensor.
             say(now_ns() - 5_000_000, [math.nan] * 3, [math.inf] * 3)
             await until(lambda: count("not_finite") == 6)
@@ -312,14 +315,14 @@ async def test_samples_that_cannot_be_true_are_named_and_survived(
             await until(lambda: count("duplicates") + count("duplicate_stamp") >= 1)
             say(now_ns() - 300_000_000, [0.0] * 3, [0.0, 0.0, 9.8])
             await until(lambda: count("time_backward") + count("backward_stamp") >= 1)
-            assert bench.seen[-1].mode is Mode.NAVIGATING
+            assert bench.seen[-1].mode is PARKED
             # Silence.
             vehicle.unplug("imu")
             await bench.mode(Mode.INVALID)
             assert bench.seen[-1].reason.startswith("IMU silent for")
             await until(lambda: bench.health["imu"].state == "silent")
             vehicle.plug("imu")
-            await bench.mode(Mode.NAVIGATING)
+            await bench.mode(PARKED)
             assert count("gap") == 1
             solution = bench.seen[-1]
     true = vehicle.truth_at(solution.t_ns)
@@ -351,7 +354,7 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 reply = await ask("set_position", here)
                 assert reply["ok"], reply
                 assert reply["text"].startswith(("position taken: aligning", "position fused"))
-                await bench.mode(Mode.NAVIGATING)
+                await bench.mode(PARKED)
                 await until(lambda: bench.health["rdss"].state == "running")
                 reply = await ask("request_fix", {})
                 assert reply["ok"], reply
@@ -360,7 +363,7 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert (reply["ok"], reply["text"]) == (True, "aligning anew")
                 await bench.mode(Mode.ALIGNING)
                 reply = await ask("set_position", here)
-                await bench.mode(Mode.NAVIGATING)
+                await bench.mode(PARKED)
                 reply = await ask("set_position", {**here, "lat_deg": 91.0})
                 assert not reply["ok"]
                 assert "lat_deg" in reply["text"]
@@ -379,7 +382,7 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert reply["text"] == "position taken: aligning from it"
                 await bench.mode(Mode.ALIGNING)
     modes = [json.loads(p)["mode"] for p in listener.payloads("fusiond/test/status")]
-    assert {"waiting", "aligning", "navigating"} <= set(modes)
+    assert {"waiting", "aligning", "coasting"} <= set(modes)
 
 
 @asynccontextmanager

@@ -78,6 +78,18 @@ def test_one_sample_that_nothing_can_follow(axis: int, factor: float) -> None:
     assert _names(checked) == {"spike": 1}
 
 
+@pytest.mark.parametrize("axis", range(6))
+def test_a_leap_that_the_next_sample_takes_back_is_smaller_than_a_shock(axis: int) -> None:
+    leap = 0.3 if axis < 3 else 4.0
+    times, samples = FINE.samples(10.0)
+    samples[700, axis] += leap
+    checked = _feed(_check(), times, samples)
+    assert np.flatnonzero(checked.codes).tolist() == [700]
+    assert _names(checked) == {"spike": 1}
+    samples[700:710, axis] += leap  # what lasts is a shock
+    assert _names(_feed(_check(), times, samples)) == {}
+
+
 def test_full_scale() -> None:
     times, samples = FINE.samples(10.0)
     samples[700:800, 1] = -FULL_RATE

@@ -25,6 +25,7 @@ from drivers.measurements import (
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.timeline import Entry
 from tests import runs
 from tests.navigator.vehicle import (
@@ -214,7 +215,8 @@ def test_a_long_silence_aligns_anew() -> None:
     for first in range(0, len(parked), 10):
         navigator.add_imu(parked[first : first + 10], d.samples[first : first + 10])
         navigator.advance()
-    assert navigator.solution(int(parked[-1])).mode is Mode.NAVIGATING
+    assert navigator.started is not None
+    assert navigator.solution(int(parked[-1])).mode is Mode.COASTING  # heading as configured
 
 
 def test_a_stamp_far_ahead_does_not_silence_the_imu() -> None:
@@ -233,14 +235,18 @@ def test_a_stamp_far_ahead_does_not_silence_the_imu() -> None:
     # Half a second of samples, by chunks of ten, is what it took to believe them.
     assert navigator.imu.counters["backward_stamp"] == 30
     assert navigator.estimator.t_ns == parked[-1]
-    assert navigator.solution(int(parked[-1])).mode is Mode.NAVIGATING
+    assert navigator.started is not None
+    assert navigator.solution(int(parked[-1])).mode is Mode.COASTING  # heading as configured
 
 
 def test_coasting_and_invalid() -> None:
     d = drive()
     settings_ = {**CONFIG, "estimator": {"coast_after_s": 5.0, "invalid_sd_m": 20.0}}
     settings_["constraints"] = {"zero_velocity": {"enabled": False}}
-    navigator = Navigator(Config.model_validate(settings_))
+    settings_["alignment"] = {**CONFIG["alignment"], "heading": ["saved"]}
+    lat, lon, height = runs.ORIGIN
+    saved = SavedState(0.0, (lat, lon, height), 5.0, math.radians(41.0), math.radians(2.0))
+    navigator = Navigator(Config.model_validate(settings_), saved)
     seen: list[Mode] = []
     for row in range(0, len(d.times), 10):
         navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])

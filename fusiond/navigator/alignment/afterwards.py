@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.witnesses import Witnesses
 from fusiond.navigation.rotation import dcm_from_quaternion, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
-from fusiond.navigator.alignment.headings import CLAIMS
+from fusiond.navigator.alignment.headings import CLAIMS, CONFIGURED
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
 
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 # obstacle that the vehicle slides at takes less.
 HEADING_SIGMAS = 4.0
 CONTRADICTED_NS = 1_000_000_000
+# Of the sigma that was claimed: three quarters of what is known of the heading are then measured.
+DETERMINED = 0.5
 # Measured velocities of so long are averaged to a course.
 COURSE_NS = 1_000_000_000
 
@@ -30,6 +32,10 @@ class Afterwards:
     def __init__(self, options: AlignmentOptions, start: Start) -> None:
         self._options = options
         self._claim = start.how if start.how in CLAIMS else ""
+        self._sd_yaw = math.sqrt(start.covariance[2, 2])
+        self.unconfirmed = start.how == CONFIGURED
+        """Only the configuration vouches for the heading: a hypothesis until the first motion. One
+        that was saved was measured, before the vehicle was parked."""
         self._since_ns: int | None = None
 
     def refuted(
@@ -47,6 +53,8 @@ class Afterwards:
             )
         if not self._claim:
             return None
+        if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw:
+            self.unconfirmed = False
         velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
         return velocity and self._heading(t_ns, velocity, axes, math.sqrt(covariance[2, 2]))
 
@@ -64,7 +72,7 @@ class Afterwards:
         apart = abs(wrap_angle(course - yaw))
         sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
         if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
-            self._claim = ""  # confirmed
+            self._claim, self.unconfirmed = "", False
             return None
         if self._since_ns is None:
             self._since_ns = t_ns

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import HeadingOffer, HeightOffer, PositionOffer, VelocityOffer
-from fusiond.aiding.witnesses import Witnesses
+from fusiond.aiding.witnesses import LEAST_SD_M_S, Witnesses
+from fusiond.integrity.series import NO_TREND, Offset
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import FEWEST_SAMPLES, Window
@@ -33,8 +34,10 @@ BIAS_SIGMAS = 3.0
 CONTRADICTION_SIGMAS = 4.0
 # Of the way by velocity (scale): what the trapezoids between fixes leave out.
 WAY_SCALE = 0.05
+# One sigma (s) of the delay of a receiver's velocity against its position, which smoothing makes.
+LAG_SD_S = 0.1
 # After so long positions that are too coarse to confirm a velocity need not.
-CONFIRMED_NS = 15_000_000_000
+CONFIRMED_S = 15.0
 
 
 class Fix(NamedTuple):
@@ -88,6 +91,9 @@ class Collected:
         self.standing: Standing | None = None
         """The last standstill, also when the vehicle has moved off since."""
         self.ever_moved = False
+        self.unexplained = np.zeros(3)
+        """The largest rates (3,) of quiet windows that no bias of the data sheet explains: a turn,
+        or a gyro that is not what its sheet says."""
         self.heading: HeadingOffer | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
@@ -109,6 +115,8 @@ class Collected:
             return
         self._gravity_points_up(latest)
         turning = latest.quiet and self._turns(latest)
+        if turning:
+            self.unexplained = np.maximum(self.unexplained, np.abs(latest.mean_rate))
         if not latest.quiet or turning or self._speed > self._options.rest_speed_m_s:
             self._at_rest = False
             self.ever_moved = True
@@ -184,32 +192,37 @@ class Collected:
 
     def position_confirms(self, latest: Fix) -> bool:
         """Whether the positions have moved as the velocities say, so far that the opposite would
-        be seen."""
-        way, before = np.zeros(2), None
-        first: Fix | None = None
-        for fix in self.fixes:
-            if fix.position.t_ns > latest.position.t_ns:
-                break
-            if first is None:
-                first = fix
-            elif before is not None:
-                seconds = (fix.position.t_ns - before.position.t_ns) * 1e-9
-                v = np.add(fix.velocity.v_ned[:2], before.velocity.v_ned[:2])
-                way += 0.5 * seconds * v
-            before = fix
-        if first is None or first is latest:
+        be seen, and do not run away from them."""
+        way, before, trend = np.zeros(2), self.fixes[0], NO_TREND
+        first = before.position
+        if before is latest:
             return False
-        a, b = first.position, latest.position
-        metres = 1.0 / as_geodetic(np.ones(3), a.lat_rad)[:2]
-        east = math.remainder(b.lon_rad - a.lon_rad, 2.0 * math.pi)
-        moved = np.array([b.lat_rad - a.lat_rad, east]) * metres
-        span_ns = b.t_ns - a.t_ns
-        size = math.hypot(*way)
-        sd = math.hypot(max(a.sd[:2]), max(b.sd[:2]), WAY_SCALE * size)
-        sd = math.hypot(sd, max(latest.velocity.sd[:2]) * span_ns * 1e-9)
+        metres = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
+        moved, count = np.zeros(2), 0
+        for fix in self.fixes:
+            position = fix.position
+            if position.t_ns > latest.position.t_ns:
+                break
+            since_s = (position.t_ns - first.t_ns) * 1e-9
+            v = np.add(fix.velocity.v_ned[:2], before.velocity.v_ned[:2])
+            way += 0.5 * (position.t_ns - before.position.t_ns) * 1e-9 * v
+            east = math.remainder(position.lon_rad - first.lon_rad, 2.0 * math.pi)
+            moved = np.array([position.lat_rad - first.lat_rad, east]) * metres
+            north_m, east_m = (moved - way).tolist()
+            trend = trend.with_one(Offset(north_m, east_m, max(position.sd[:2])), since_s)
+            before, count = fix, count + 1
+        span_s = (latest.position.t_ns - first.t_ns) * 1e-9
+        size, sd_v = math.hypot(*way), max(latest.velocity.sd[:2])
+        sd = math.hypot(max(first.sd[:2]), max(latest.position.sd[:2]), WAY_SCALE * size)
+        sd = math.hypot(sd, sd_v * span_s)
         if math.hypot(*(moved - way)) > CONTRADICTION_SIGMAS * sd:
             return False
-        return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_ns >= CONFIRMED_NS
+        slope, sd_slope = trend.slope
+        lag = LAG_SD_S * math.hypot(*latest.velocity.v_ned[:2]) / max(span_s, 1.0)
+        sd_slope = math.hypot(sd_slope, max(sd_v / math.sqrt(count), LEAST_SD_M_S), lag)
+        if slope > CONTRADICTION_SIGMAS * sd_slope:
+            return False
+        return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_s >= CONFIRMED_S
 
     def _keep(self, fix: Fix) -> None:
         """In order of validity."""

@@ -215,7 +215,6 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
     shortest, longest = MOTION_NS
     oldest = max(velocity.t_ns - longest, imu.oldest_ns)
     usable = [f.velocity for f in by.known.fixes if oldest <= f.velocity.t_ns <= velocity.t_ns]
-    # Usable is none where the samples begin only after the newest fix: they came late, or anew.
     if not usable or velocity.t_ns - usable[0].t_ns < shortest:
         by.known.doubted("moving: collecting fixes")
         return None
@@ -293,4 +292,5 @@ def _build(
         how,
         bias=bias,
         levelled=bias is not None,
+        unexplained=by.known.unexplained,
     )

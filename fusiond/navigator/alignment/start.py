@@ -70,11 +70,13 @@ def build_start(
     bias: tuple[Array, float] | None = None,
     levelled: bool = False,
     compassed: bool = False,
+    unexplained: Array | None = None,
 ) -> Start:
     """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
     at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors.
+    `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
     """
     fix, where, sd_position = place
     lat, height = float(where[0]), float(where[2])
@@ -94,6 +96,10 @@ def build_start(
     xi = np.zeros(model.size)
     if bias is not None:
         _start_biases(model, p, xi, *bias)
+    if unexplained is not None:
+        for axis in range(3):
+            slot = model.parameters(9 + axis)[0]
+            p[slot, slot] += float(unexplained[axis]) ** 2
     if levelled:
         _correlate(model, p, dcm, lat, height, compassed)
     return Start(t_ns, nav, xi, p, how)

@@ -20,6 +20,8 @@ BURST_EVERY_NS = 1_000_000
 MULTIPATH_M = 80.0
 MULTIPATH_S, TUNNEL_S = 0.6, 60.0
 TINY_SD_M = 1e-9
+VELOCITY_RAMP_M_S2 = 0.1
+LATE_S = 0.8
 HUGE = 1e300
 FAST_M_S = 2000.0 * 1852.0 / 3600.0
 """2,000 knots."""
@@ -62,9 +64,9 @@ def _north(fix: PositionFix, north_m: float) -> PositionFix:
     return replace(fix, lat_rad=_north_of(fix.lat_rad, fix.height_m, north_m))
 
 
-def step(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Positions 500 m to the north."""
-    return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, STEP_M))
+def step(r: Recording, begin_s: float, length_s: float, north_m: float = STEP_M) -> Recording:
+    """Positions too far to the north."""
+    return _changed(r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, north_m))
 
 
 def null_island(r: Recording, begin_s: float, length_s: float) -> Recording:
@@ -96,10 +98,34 @@ def velocity_reversed(r: Recording, begin_s: float, length_s: float) -> Recordin
     return _changed(r, begin_s, length_s, PositionFix, turned)
 
 
-def drift(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Positions drift to the north at 0.5 m/s, velocity honest."""
+def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIFT_M_S) -> Recording:
+    """Positions drift to the north, velocity honest."""
     return _changed(
-        r, begin_s, length_s, PositionFix, lambda fix, since_s: _north(fix, DRIFT_M_S * since_s)
+        r, begin_s, length_s, PositionFix, lambda fix, since_s: _north(fix, north_m_s * since_s)
+    )
+
+
+def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Velocity to the north that grows by 0.1 m/s^2, position honest."""
+
+    def grown(fix: PositionFix, since_s: float) -> PositionFix:
+        assert fix.v_ned_m_s is not None
+        north, east, down = fix.v_ned_m_s
+        return replace(fix, v_ned_m_s=(north + VELOCITY_RAMP_M_S2 * since_s, east, down))
+
+    return _changed(r, begin_s, length_s, PositionFix, grown)
+
+
+def late(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """Fixes that are 0.8 s older than their stamps, as of a line that is slow from its first byte
+    on and a receiver whose time nobody knows."""
+    moved = set(_fixes(r, begin_s, begin_s + length_s))
+    ns = round(LATE_S * 1e9)
+    return r.with_received(
+        [
+            replace(item, t_ns=item.t_ns + ns, seen_ns=item.seen_ns + ns) if item in moved else item
+            for item in r.received
+        ]
     )
 
 

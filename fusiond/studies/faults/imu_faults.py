@@ -15,6 +15,7 @@ RATE_RANGE_RAD_S = 2000.0 * DEG
 FORCE_RANGE_M_S2 = 10.0 * STANDARD_GRAVITY_M_S2
 """Full scale, chosen as usual for a MEMS unit on a vehicle."""
 SPIKE_RAD_S = 99.0
+SMALL_SPIKE_RAD_S = 0.85
 STAMP_AHEAD_S = 0.7
 BIAS_STEP_RAD_S = 1.0 * DEG
 TURNED_RAD = 30.0 * DEG
@@ -74,6 +75,13 @@ def gyro_spike(r: Recording, begin_s: float, length_s: float) -> Recording:
     """One sample of the yaw gyro is far out of range."""
     samples = r.samples.copy()
     samples[np.flatnonzero(r.window(begin_s, length_s))[0], YAW_AXIS] = SPIKE_RAD_S
+    return replace(r, samples=samples)
+
+
+def small_spike(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """One sample of the yaw gyro is off by what a shock may be."""
+    samples = r.samples.copy()
+    samples[np.flatnonzero(r.window(begin_s, length_s))[0], YAW_AXIS] += SMALL_SPIKE_RAD_S
     return replace(r, samples=samples)
 
 

@@ -88,26 +88,27 @@ class Recording:
         return replace(self, received=tuple(sorted(received, key=lambda r: r.seen_ns)))
 
 
+TOWN_LEGS = (
+    Leg(8, speed_m_s=14.0),
+    Leg(12),
+    Leg(8, turn_deg=90.0),
+    Leg(8, speed_m_s=20.0),
+    Leg(12, turn_deg=-90.0),
+    Leg(27),
+    Leg(15, turn_deg=180.0),
+    Leg(10),
+    Leg(8, speed_m_s=0.0),
+    Leg(12),
+    Leg(8, speed_m_s=12.0),
+    Leg(10, turn_deg=-120.0),
+    Leg(20),
+    Leg(8, turn_deg=60.0),
+)
+
+
 def town(duration_s: float) -> Path:
     """Rest, town at 14 and 20 m/s with bends, a stop, and on."""
-    legs = (
-        Leg(REST_S),
-        Leg(8, speed_m_s=14.0),
-        Leg(12),
-        Leg(8, turn_deg=90.0),
-        Leg(8, speed_m_s=20.0),
-        Leg(12, turn_deg=-90.0),
-        Leg(27),
-        Leg(15, turn_deg=180.0),
-        Leg(10),
-        Leg(8, speed_m_s=0.0),
-        Leg(12),
-        Leg(8, speed_m_s=12.0),
-        Leg(10, turn_deg=-120.0),
-        Leg(20),
-        Leg(8, turn_deg=60.0),
-        Leg(duration_s),
-    )
+    legs = (Leg(REST_S), *TOWN_LEGS, Leg(duration_s))
     return follow(legs, duration_s, course_deg=40.0, bank_ratio=-0.08)
 
 
@@ -118,18 +119,19 @@ class Drive:
     path: Callable[[float], Path] = town
     wheels: bool = False
     gnss_rate_hz: float = 5.0
+    duration_s: float = DURATION_S
 
     def recorded(self, config: Config, seed: int) -> tuple[Truth, Recording]:
         """The truth, and what the sensors of the car of `fusiond simulate` say of it, mounted as
         the configuration has them; the same seed says the same."""
         car = replace(SCENARIOS["drive"], path=self.path).fitted(config)
-        truth = car.truth(DURATION_S)
+        truth = car.truth(self.duration_s)
         imu_rng, gnss_rng, rdss_rng, wheel_rng = random_streams(seed)
         imu = car.imu_output(truth, imu_rng)
         stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
         receiver = replace(car.gnss, rate_hz=self.gnss_rate_hz)
         received = gnss_fixes(GnssReceiver(truth, receiver, gnss_rng))
-        received += _rdss(RdssCentre(truth, car.rdss, rdss_rng))
+        received += _rdss(RdssCentre(truth, car.rdss, rdss_rng), self.duration_s)
         if self.wheels:
             received += _wheels(truth, wheel_rng)
         samples = np.hstack((imu.gyro, imu.accel))
@@ -158,9 +160,9 @@ def gnss_fixes(receiver: GnssReceiver) -> list[Received]:
     return found
 
 
-def _rdss(centre: RdssCentre) -> list[Received]:
+def _rdss(centre: RdssCentre, duration_s: float) -> list[Received]:
     found = []
-    for t_s in np.arange(RDSS_EVERY_S, DURATION_S, RDSS_EVERY_S).tolist():
+    for t_s in np.arange(RDSS_EVERY_S, duration_s, RDSS_EVERY_S).tolist():
         fix = centre.fix(t_s, None)
         t_ns, seen_ns = round(fix.t_s * 1e9), round(fix.t_arrival_s * 1e9)
         measured = DelayedFix(

@@ -71,14 +71,17 @@ def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
 
 def run_row(row: Row, seed: int) -> dict[str, Any]:
     """The figures of a row; the same seed gives the same."""
-    fault = FAULTS[row.fault]
-    begin_s = fault.begins_s(row.phase)
+    return {"fault": row.fault, "phase": row.phase, **run(FAULTS[row.fault], row.phase, seed)}
+
+
+def run(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
+    """The figures of a fault in a phase."""
+    begin_s = fault.begins_s(phase)
     harmless = fault.alter is None and fault.configure is None
     end_s = begin_s if harmless else min(begin_s + fault.length_s, DURATION_S)
-    reference = _unharmed(fault.drive, row.phase, seed)
-    course = reference if harmless else _driven(fault, row.phase, seed)
-    found = judge(course, reference, begin_s, end_s)
-    return {"fault": row.fault, "phase": row.phase, "begin_s": begin_s, "end_s": end_s, **found}
+    reference = _unharmed(fault.drive, phase, seed)
+    course = reference if harmless else _driven(fault, phase, seed)
+    return {"begin_s": begin_s, "end_s": end_s, **judge(course, reference, begin_s, end_s)}
 
 
 @lru_cache(maxsize=8)

@@ -85,7 +85,7 @@ def _sigma_m(nav: dict[str, Any]) -> float:
 
 async def _meet_refusals(heard: Heard, family: Family) -> None:
     """A wait, a beam that is gone and a request without an answer, each by its name."""
-    await heard.until("status", lambda m: m["why"] == "heading from configured heading")
+    await heard.until("status", lambda m: m["why"].startswith("heading from configured heading"))
     awaited = {"refused_frequency", NO_BEAM[family][0], "timeout_fix"}
     health = await heard.until(
         "health", lambda m: awaited <= m["sources"]["rdss"]["counters"].keys()
@@ -123,7 +123,8 @@ async def _end_within_sigma(heard: Heard, vehicle: VehicleProcess) -> None:
     while len(heard.all("nav", since)) < 20:
         await heard.until("nav")
     for nav in heard.all("nav", since):
-        assert nav["mode"] == "navigating"
+        # Without a velocity it takes two minutes until fixes confirm the configured heading.
+        assert nav["mode"] in ("coasting", "navigating")
         errors = nav_errors(nav, vehicle.truth(nav["t_ms"]))
         for name, (error, sigma) in errors.items():
             allowed = SIGMAS * sigma + PRINTED[name.split("_", 1)[1]]

@@ -1,0 +1,119 @@
+"""Who speaks for a filter: the series that are believed, and those that contradict it.
+
+`lost`       positions come and none is believed: the IMU alone carries the solution
+`contested`  something is believed, but what was left out may be right, and nobody can tell
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from fusiond.integrity.series import NEVER_NS, Series
+
+# What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
+FORGET_NS = 5_000_000_000
+# Another position supports the filter for as long as `coasting` is not said.
+OTHERS_NS = 10_000_000_000
+# A position of this sigma (m) sees within seconds what a wrong velocity does to the filter.
+FINE_M = 3.0
+# A position says nothing of what is finer than it by more than this.
+COARSER = 3.0
+# While the velocity of the same device was fused this lately, the filter's motion is supported.
+SUPPORT_NS = 2_000_000_000
+# A coarse position contradicts one that is so many of its sigmas away; it is asked for seldom, and
+# an IMU keeps within the same for a minute.
+DISPUTE_SIGMAS, DISPUTE_NS = 6.0, 60_000_000_000
+
+Records = Mapping[str, Series]
+
+
+class Lost(NamedTuple):
+    """No position is believed: since when, whether `source` or `filter` is to blame, and how the
+    first of them ended (`jumped`, `drifts`, ...). `disputed`: a coarse position that is believed
+    says that the source is wrong."""
+
+    since_ns: int
+    cause: str
+    device: str
+    reason: str
+    disputed: bool
+
+
+def lost(records: Records, t_ns: int) -> Lost | None:
+    """Set while positions come and none is believed."""
+    heard = [r for r in records.values() if r.locates and t_ns - r.heard_ns <= FORGET_NS]
+    if not heard or any(r.believed for r in heard):
+        return None
+    first = min(heard, key=lambda r: r.refused_ns)
+    source = all(r.jumped or supported(records, r.device, t_ns) for r in heard)
+    away_m = min(r.away_m for r in heard)
+    disputed = any(
+        r.locates
+        and r.believed
+        and t_ns - r.fused_ns <= DISPUTE_NS
+        and away_m > DISPUTE_SIGMAS * r.sd_m
+        for r in records.values()
+    )
+    reason = first.excluded or "refused"
+    cause = "source" if source else "filter"
+    return Lost(first.refused_ns, cause, first.device, reason, disputed)
+
+
+def contested(records: Records, t_ns: int) -> str | None:
+    """What may be right though it was left out, or was not checked yet."""
+    for name, r in records.items():
+        if r.no_slip and r.excluded:
+            return f"{name} does not hold: sliding, or the IMU has turned in its mounting"
+        if t_ns - r.heard_ns > OTHERS_NS:
+            continue
+        if r.locates and r.excluded and not fine_enough(records, r, t_ns):
+            return f"{name} is left out ({r.excluded}) and no other is as fine"
+        # A velocity that jumped away is wrong by itself; one that left slowly may be right.
+        if r.moves and r.excluded and not r.jumped and not _moving(records, r, t_ns):
+            return f"{name} is left out ({r.excluded}), or the IMU is wrong"
+        if r.proof and r.believed and not others(records, r, t_ns, FINE_M):
+            return f"{name} is back and not yet seen to go with the motion"
+    return None
+
+
+def supported(records: Records, device: str, t_ns: int) -> bool:
+    """Whether a velocity of the device agrees with the filter still."""
+    return any(
+        r.moves and r.device == device and r.believed and t_ns - r.fused_ns <= SUPPORT_NS
+        for r in records.values()
+    )
+
+
+def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:
+    """Whether other positions, good to `sd_m`, have been believed lately: a coarse one cannot
+    say that a fine one is wrong."""
+    return any(
+        r.locates
+        and r is not record
+        and r.believed
+        and r.proof is None
+        and r.sd_m <= sd_m
+        and t_ns - r.fused_ns <= OTHERS_NS
+        for r in records.values()
+    )
+
+
+def fine_enough(records: Records, record: Series, t_ns: int) -> bool:
+    """Whether a position that is left out is stood in for by one about as fine."""
+    return others(records, record, t_ns, max(FINE_M, COARSER * record.sd_m))
+
+
+def outage(records: Records, t_ns: int) -> bool:
+    """Whether there were fine positions, and none has been fused for as long as makes coasting."""
+    fine = [r.fused_ns for r in records.values() if r.locates and r.sd_m <= FINE_M]
+    latest_ns = max(fine, default=NEVER_NS)
+    return latest_ns > NEVER_NS and t_ns - latest_ns > OTHERS_NS
+
+
+def _moving(records: Records, record: Series, t_ns: int) -> bool:
+    """Whether another velocity is believed."""
+    return any(
+        r.moves and r is not record and r.believed and t_ns - r.fused_ns <= SUPPORT_NS
+        for r in records.values()
+    )

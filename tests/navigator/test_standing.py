@@ -1,0 +1,53 @@
+"""How long a doubt and a failed start weigh."""
+
+from __future__ import annotations
+
+from fusiond.integrity.isolation import Isolation
+from fusiond.navigator.standing import Standing
+
+S = 1_000_000_000
+
+
+class Doubted(Isolation):
+    """An isolation that has doubted the filter at these seconds."""
+
+    def __init__(self, *at_s: float) -> None:
+        super().__init__()
+        self._doubts = tuple(round(t * S) for t in at_s)
+
+
+def coasts_until_s(isolation: Isolation, last_s: int) -> int:
+    """The first second from the last doubt on at which nothing is doubted any more."""
+    standing = Standing(150.0)
+    return next(
+        t for t in range(last_s, last_s + 1000) if standing.shaken(t * S, isolation) is None
+    )
+
+
+def test_each_doubt_in_a_row_takes_twice_as_long_to_prove() -> None:
+    assert Standing(150.0).shaken(0, Isolation()) is None
+    assert coasts_until_s(Doubted(100), 100) == 110
+    assert coasts_until_s(Doubted(100, 130), 130) == 150
+    assert coasts_until_s(Doubted(100, 130, 200), 200) == 240
+    assert coasts_until_s(Doubted(100, 100.2, 102), 102) == 112  # one, told thrice
+    assert coasts_until_s(Doubted(100, 130, 900), 900) == 910  # forgotten by then
+    many = Doubted(*range(100, 180, 10))
+    assert coasts_until_s(many, 170) == 170 + 320
+
+
+def test_a_start_after_failures_in_a_row_is_longer_on_trial() -> None:
+    standing = Standing(150.0)
+    standing.started(0)
+    assert standing.unproven(0) is None
+    standing.given_up(5 * S)
+    standing.started(6 * S)
+    assert standing.unproven(15 * S) is not None
+    assert standing.unproven(16 * S) is None
+    standing.given_up(20 * S)
+    standing.started(21 * S)
+    assert standing.unproven(40 * S) is not None
+    assert standing.unproven(41 * S) is None
+    standing.given_up(400 * S)  # it went well for long
+    standing.started(401 * S)
+    assert standing.unproven(410 * S) is not None
+    assert standing.unproven(411 * S) is None
