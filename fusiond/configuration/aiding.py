@@ -182,13 +182,17 @@ class WheelAiding(Aiding):
     kind: Literal["wheel"] = "wheel"
     sd_m_s: PositiveFloat = 0.1
     """Where the device states none."""
+    scale: PositiveFloat = 1.0
+    """What the device says over the true speed; `fusiond calibrate` finds it."""
+    latency_s: float = 0.0
+    """How old a speed is when it comes."""
     correlation_s: NonNegativeFloat = 1.0
     """How long its errors last (slip, quantised steps): what comes more often counts less."""
     scale_sd: NonNegativeFloat = 0.02
-    """One sigma of the scale, which the filter estimates: tyres wear by 2 % of their radius. 0: the
-    speed is as it is said to be."""
+    """One sigma of what `scale` is wrong by, which the filter estimates: tyres wear by 2 % of their
+    radius. 0: nothing."""
     latency_sd_s: NonNegativeFloat = 0.2
-    """One sigma of how old a speed is when it comes, which the filter estimates. 0: new."""
+    """One sigma of what `latency_s` is wrong by, which the filter estimates. 0: nothing."""
 
 
 AnyAiding = Annotated[

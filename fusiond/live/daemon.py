@@ -19,6 +19,7 @@ from typing import Any
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config
+from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.live.events import Events
 from fusiond.live.operator import Operator
 from fusiond.live.process_usage import release_compiler_pages
@@ -55,8 +56,10 @@ class Daemon:
         navigator_event = partial(self._events.report, "navigator")
         self._state = StateKeeper(config, self.clock, navigator_event)
         self._warm = WarmKeeper(config, self.clock, navigator_event)
+        self._calibration = CalibrationKeeper(config, navigator_event)
         saved = self._state.load()
         self.navigator = Navigator(config, saved, on_event=navigator_event)
+        self._calibration.offer(self.navigator)
         if saved is None or "saved" not in config.alignment.heading:
             # A vehicle that stood knows more by what it kept then.
             self._warm.offer(self.navigator)
@@ -114,6 +117,7 @@ class Daemon:
             await _cancel(*work, stopped)
             await self._state.close(self.solution)
             await self._warm.close(self.solution, self.navigator)
+            await self._calibration.close(self.navigator)
             await _cancel(*outputs)
             self.service.close()
             log.info(
@@ -138,6 +142,7 @@ class Daemon:
             self._each_second(t_ns, solution)
         self._state.keep(t_ns, solution)
         self._warm.keep(t_ns, solution, self.navigator)
+        self._calibration.keep(t_ns, self.navigator)
 
     def _each_second(self, t_ns: int, solution: Solution) -> None:
         """Tell the service manager and the terminals how it stands."""

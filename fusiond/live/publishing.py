@@ -11,7 +11,9 @@ from fusiond.live.process_usage import ProcessUsage
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
 from fusiond.live.sources import Sources
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.calibration import CalibrationState
 from fusiond.navigator.navigator import Navigator
+from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.health import health_message
 from fusiond.outputs.messages.nav import nav_message
@@ -19,6 +21,8 @@ from fusiond.outputs.messages.status import status_message
 from fusiond.outputs.mqtt import MqttPublisher
 
 STATUS_EVERY_S = 1
+# A calibration moves over minutes; a state that changes goes out at once.
+CALIBRATION_EVERY_S = 30
 
 
 class Publishing:
@@ -46,6 +50,8 @@ class Publishing:
         self._nav = Every(round(SECOND_NS / config.mqtt.nav_rate_hz))
         self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
+        self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
+        self._calibrated: tuple[CalibrationState, ...] = ()
 
     def tick(self, t_ns: int, solution: Solution) -> None:
         """Publish what is due at the tick of `t_ns`, the status at every change of mode too."""
@@ -59,6 +65,16 @@ class Publishing:
             self._publish_status(t_ns, utc_ns, solution)
         if self._health.due(t_ns):
             self._publish_health(t_ns, utc_ns)
+        self._publish_calibration(t_ns, utc_ns)
+
+    def _publish_calibration(self, t_ns: int, utc_ns: int | None) -> None:
+        watch = self._navigator.calibrating
+        states = tuple(p.state for p in watch.parameters)
+        if not states or not (self._calibration.due(t_ns) or states != self._calibrated):
+            return
+        self._calibrated = states
+        message = calibration_message(utc_ns, watch.parameters, watch.settled)
+        self._mqtt.publish_calibration(message)
 
     def _publish_status(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         fused, rejected = _totals(self._navigator)
@@ -73,6 +89,7 @@ class Publishing:
                 scheduler=self._scheduler.status(),
                 fused=fused,
                 rejected=rejected,
+                calibrated=self._navigator.calibrating.settled,
                 mqtt=self._mqtt.counters,
             )
         )

@@ -47,7 +47,7 @@ class StateKeeper:
         on_event: Callable[[str, str], None],
         environ: Mapping[str, str] = os.environ,
     ) -> None:
-        self._path = _state_file(config, environ)
+        self._path = state_file(config, environ)
         self._max_age_s = config.alignment.saved_max_age_s
         self._clock = clock
         self._event = on_event
@@ -119,7 +119,8 @@ def _speed_m_s(solution: Solution) -> float:
     return math.hypot(*solution.v_ned_m_s)
 
 
-def _state_file(config: Config, environ: Mapping[str, str]) -> Path | None:
+def state_file(config: Config, environ: Mapping[str, str]) -> Path | None:
+    """Where a vehicle's state is kept; None where it is not."""
     if config.state_file is not None:
         return config.state_file
     directory = environ.get("STATE_DIRECTORY")

@@ -55,7 +55,7 @@ COEFFICIENTS = 58
 # Row widths of the arrays that `apply` works on: whole vectors of 4 or 8 doubles. A covariance has
 # rows of the first of WIDTHS that holds its states (the models of 15 and 17, of 21 and 23, and
 # those with more); CORE_STRIDE holds the nine navigation errors.
-WIDTHS = (20, 24, 32)
+WIDTHS = (20, 24, 32, 40)
 CORE_STRIDE = 16
 
 

@@ -28,6 +28,7 @@ from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
+from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
@@ -37,6 +38,7 @@ from fusiond.navigator.intake import Intake
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
 from fusiond.navigator.readout import solution_of
+from fusiond.navigator.saved_calibration import SavedCalibration, refuted, take_up
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
 from fusiond.navigator.state_file import RefusedStateError
@@ -103,6 +105,9 @@ class Navigator:
         self._afterwards: Afterwards | None = None
         self.warm: WarmStart | None = None
         """A start to be tried before any alignment, and its trial."""
+        self.calibration: SavedCalibration | None = None
+        """What an earlier drive has shown, taken up by each alignment until it is refuted."""
+        self.calibrating = CalibrationWatch(self.model, self._event)
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -221,6 +226,9 @@ class Navigator:
             start = self._warm_start() or self._aligner.attempt(self.imu)
             if start is None:
                 return
+            if self.calibration is not None and not self.on_trial:
+                start = take_up(start, self.model, self.calibration)
+            self.calibrating.restart()
             first = self.imu.index_after(start.t_ns) + self.imu.start
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             self.timeline.start()
@@ -252,6 +260,18 @@ class Navigator:
             self.reset(why)
             return
         self._protection.tell()
+        self._calibrate()
+
+    def _calibrate(self) -> None:
+        """Look at the calibration; one that was taken up and proves wrong is given up."""
+        e, watch = self.estimator, self.calibrating
+        if not watch.look(e.t_ns, e.xi, e.covariance) or self.calibration is None:
+            return
+        wrong = refuted(watch.parameters, self.calibration)
+        if wrong is not None:
+            self._event("calibration_refused", f"{wrong}: without it, aligning anew")
+            self.calibration = None
+            self.reset(f"the saved calibration is wrong: {wrong}")
 
     def _refuted(self) -> bool:
         """Whether the start has shown to be a wrong one; alignment then begins anew."""

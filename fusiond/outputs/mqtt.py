@@ -24,13 +24,24 @@ from fusiond.outputs import broker_access
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.messages.base import Message
+from fusiond.outputs.messages.calibration import CalibrationMessage
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.status import StatusMessage
 from fusiond.outputs.reconnecting import Reconnecting
-from fusiond.outputs.topics import CONSISTENCY, EVENT, HEALTH, NAV, REPLY, STATUS, Topic, base_topic
+from fusiond.outputs.topics import (
+    CALIBRATION,
+    CONSISTENCY,
+    EVENT,
+    HEALTH,
+    NAV,
+    REPLY,
+    STATUS,
+    Topic,
+    base_topic,
+)
 
 _PATIENCE_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
@@ -81,8 +92,9 @@ class MqttPublisher:
         self._heartbeat_s = options.keepalive_s / 4
         self._latest: dict[Topic, Message] = {}
         self._queue: deque[tuple[Topic, Message]] = deque(maxlen=options.queue)
-        self._status: StatusMessage | None = None
-        self._status_due = False
+        # The latest of what is retained and confirmed, and which of it is yet to be sent.
+        self._retained: dict[Topic, Message] = {}
+        self._due: dict[Topic, None] = {}
         self._latest_ready = asyncio.Event()
         self._confirmed_ready = asyncio.Event()
         self._flowing = asyncio.Event()
@@ -107,10 +119,10 @@ class MqttPublisher:
         self._replace(CONSISTENCY, message)
 
     def publish_status(self, message: StatusMessage) -> None:
-        self.counters["mqtt_dropped"] += self._status_due
-        self._status = message
-        self._status_due = True
-        self._confirmed_ready.set()
+        self._retain(STATUS, message)
+
+    def publish_calibration(self, message: CalibrationMessage) -> None:
+        self._retain(CALIBRATION, message)
 
     def publish_event(self, message: EventMessage) -> None:
         self._enqueue(EVENT, message)
@@ -119,6 +131,12 @@ class MqttPublisher:
         self.counters["mqtt_dropped"] += topic in self._latest
         self._latest[topic] = message
         self._latest_ready.set()
+
+    def _retain(self, topic: Topic, message: Message) -> None:
+        self.counters["mqtt_dropped"] += topic in self._due
+        self._retained[topic] = message
+        self._due[topic] = None
+        self._confirmed_ready.set()
 
     def _enqueue(self, topic: Topic, message: Message) -> None:
         self.counters["mqtt_dropped"] += len(self._queue) == self._queue.maxlen
@@ -212,7 +230,7 @@ class MqttPublisher:
         return str(errors[0])
 
     async def _say_farewell(self, client: aiomqtt.Client) -> None:
-        self._status_due = self._status is not None
+        self._due = dict.fromkeys(self._retained)
         await self._send_waiting(client)
         await self._publish(client, "online", b"offline", qos=1, retain=True)
 
@@ -243,7 +261,7 @@ class MqttPublisher:
 
     async def _send_confirmed(self, client: aiomqtt.Client) -> None:
         await self._confirm(client, "online", b"online", retain=True)
-        self._status_due = self._status is not None
+        self._due = dict.fromkeys(self._retained)
         while True:
             await self._send_waiting(client)
             self._confirmed_ready.clear()
@@ -251,18 +269,19 @@ class MqttPublisher:
                 async with asyncio.timeout(self._heartbeat_s):
                     await self._confirmed_ready.wait()
             except TimeoutError:
-                if self._status is None:
-                    await self._confirm(client, "online", b"online", retain=True)
+                if STATUS in self._retained:
+                    self._due[STATUS] = None
                 else:
-                    self._status_due = True
+                    await self._confirm(client, "online", b"online", retain=True)
 
     async def _send_waiting(self, client: aiomqtt.Client) -> None:
-        """Send the status if it is due and every queued message, which stays queued if it fails."""
-        while self._status_due or self._queue:
-            if self._status_due and self._status is not None:
-                message = self._status
-                self._status_due = False
-                await self._confirm(client, STATUS.name, _encoded(message), STATUS.retained)
+        """Send what is retained and due, and every queued message; one that fails stays queued."""
+        while self._due or self._queue:
+            if self._due:
+                topic = next(iter(self._due))
+                del self._due[topic]
+                payload = _encoded(self._retained[topic])
+                await self._confirm(client, topic.name, payload, topic.retained)
             if self._queue:
                 first = self._queue[0]
                 topic, queued = first

@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import BaseModel
 
+from fusiond.outputs.messages.calibration import CalibrationMessage
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.health import HealthMessage
@@ -29,9 +30,10 @@ NAV = Topic("nav", NavMessage, 0, False)
 STATUS = Topic("status", StatusMessage, 1, True)
 HEALTH = Topic("health", HealthMessage, 0, True)
 CONSISTENCY = Topic("consistency", ConsistencyMessage, 0, True)
+CALIBRATION = Topic("calibration", CalibrationMessage, 1, True)
 EVENT = Topic("event", EventMessage, 1, False)
 REPLY = Topic("reply", ReplyMessage, 1, False)
-TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, EVENT, REPLY)
+TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, CALIBRATION, EVENT, REPLY)
 
 
 def base_topic(vehicle: str) -> str:

@@ -355,6 +355,10 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert reply["ok"], reply
                 assert reply["text"].startswith(("position taken: aligning", "position fused"))
                 await bench.mode(PARKED)
+                payloads = await listener.until(lambda li: li.payloads("fusiond/test/calibration"))
+                calibration = json.loads(payloads[0])
+                assert calibration["parameters"]["gnss_time_s"]["state"] == "not_observed"
+                assert not calibration["settled"]
                 await until(lambda: bench.health["rdss"].state == "running")
                 reply = await ask("request_fix", {})
                 assert reply["ok"], reply

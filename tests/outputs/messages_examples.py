@@ -8,7 +8,9 @@ from typing import Any
 from fusiond.clock.clock import ClockStatus
 from fusiond.integrity.consistency import judge
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
+from fusiond.navigator.calibration import CalibrationState, Parameter
 from fusiond.outputs.messages.base import stamp
+from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
 from fusiond.outputs.messages.health import SchedulerStatus, SourceHealth, health_message
@@ -56,6 +58,7 @@ EXAMPLES: dict[str, Any] = {
         scheduler=SCHEDULER,
         fused=35_610,
         rejected=14,
+        calibrated=False,
         mqtt={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
     ),
     "health": health_message(
@@ -103,6 +106,39 @@ EXAMPLES: dict[str, Any] = {
                 (-0.4054, -0.0259, -0.0411, -0.0881, 0.1637, -0.1903, 0.0842, 0.1781),
             )
         },
+    ),
+    "calibration": calibration_message(
+        UTC_NS,
+        [
+            Parameter(
+                "mounting_pitch_deg",
+                "mounting",
+                "mounting",
+                -0.412,
+                0.07,
+                5.0,
+                CalibrationState.SETTLED,
+            ),
+            Parameter(
+                "axle_lever_m",
+                "axle_lever",
+                "axle_lever",
+                -0.3,
+                0.41,
+                1.0,
+                CalibrationState.OBSERVED,
+            ),
+            Parameter(
+                "wheel_scale",
+                "wheel_scale",
+                "wheel_scale",
+                0.0,
+                0.02,
+                0.02,
+                CalibrationState.NOT_OBSERVED,
+            ),
+        ],
+        False,
     ),
     "event": event_message(
         UTC_NS,

@@ -128,8 +128,9 @@ async def test_each_user_may_do_what_is_its_business(broker: Broker, certificate
             publisher.publish_status(EXAMPLES["status"])
             publisher.publish_health(EXAMPLES["health"])
             publisher.publish_consistency(EXAMPLES["consistency"])
+            publisher.publish_calibration(EXAMPLES["calibration"])
             publisher.publish_event(EXAMPLES["event"])
-            for topic in ("nav", "status", "health", "consistency", "event"):
+            for topic in ("nav", "status", "health", "consistency", "calibration", "event"):
                 await seen.until(lambda li, name=topic: li.payloads(f"fusiond/truck/{name}"))
             # The broker has confirmed, and dropped, the dashboard's command before the operator's.
             await dashboard_client.publish(COMMAND, b'{"id": "dashboard"}', qos=1)

@@ -27,7 +27,7 @@ from fusiond.outputs.reconnecting import (
     TAKEN_COUNT,
     Reconnecting,
 )
-from fusiond.outputs.topics import EVENT, HEALTH, NAV, STATUS
+from fusiond.outputs.topics import CALIBRATION, EVENT, HEALTH, NAV, STATUS
 from tests.broker import Broker, Listener, listening
 from tests.outputs.messages_examples import EXAMPLES
 from tests.patience import PATIENCE_S
@@ -102,8 +102,9 @@ async def test_every_topic_arrives_and_shutdown_says_offline(tmp_path: Path) -> 
                 p.publish_nav(EXAMPLES["nav"])
                 p.publish_status(EXAMPLES["status"])
                 p.publish_health(EXAMPLES["health"])
+                p.publish_calibration(EXAMPLES["calibration"])
                 p.publish_event(EXAMPLES["event"])
-                for topic in (NAV, STATUS, HEALTH, EVENT):
+                for topic in (NAV, STATUS, HEALTH, CALIBRATION, EVENT):
                     payload = (await listener.until(heard(topic.name)))[0]
                     assert topic.message.model_validate_json(payload) == EXAMPLES[topic.name]
                 assert heard("online")(listener) == [b"online"]
@@ -111,9 +112,9 @@ async def test_every_topic_arrives_and_shutdown_says_offline(tmp_path: Path) -> 
             await listener.until(lambda li: b"offline" in heard("online")(li))
             assert json.loads(heard("event")(listener)[-1])["text"] == "last words"
         async with listening(broker) as (late, _):
-            await late.until(lambda li: len(li.messages) >= 3)
+            await late.until(lambda li: len(li.messages) >= 4)
             kept = {m.topic.value.removeprefix(f"{BASE}/") for m in late.messages if m.retain}
-            assert kept == {"online", "status", "health"}
+            assert kept == {"online", "status", "health", "calibration"}
         assert it.publisher.counters["mqtt_dropped"] == 0
         assert it.publisher.counters["mqtt_reconnects"] == 0
 
@@ -165,17 +166,20 @@ async def test_broker_killed_and_restarted(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker)) as it:
             it.publisher.publish_status(EXAMPLES["status"])
+            it.publisher.publish_calibration(EXAMPLES["calibration"])
             async with listening(broker) as (listener, _):
                 await listener.until(heard("status"))
+                await listener.until(heard("calibration"))
             broker.kill()
             await it.until(lambda r: "mqtt_lost" in r.codes())
             it.publisher.publish_event(event("while it was away"))
             broker.start()
             async with listening(broker) as (listener, _):
                 await listener.until(heard("event"))
-                # The broker came back empty: presence and status are there again.
+                # The broker came back empty: presence, status and calibration are there again.
                 assert heard("online")(listener)[-1] == b"online"
                 await listener.until(heard("status"))
+                await listener.until(heard("calibration"))
             assert it.publisher.counters["mqtt_reconnects"] == 1
 
 

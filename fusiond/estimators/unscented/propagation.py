@@ -62,7 +62,9 @@ Indices = NDArray[np.int64]
 POINTS = 3
 
 # One kernel for all widths: it takes 4.6 s to compile, and a branch is nothing beside its points.
-_covariance_narrow, _covariance_middle, _covariance_wide = (covariance_for(w) for w in WIDTHS)
+_covariance_narrow, _covariance_middle, _covariance_wide, _covariance_widest = (
+    covariance_for(w) for w in WIDTHS
+)
 
 
 @compiled("void(f8[:, ::1], f8[:, ::1])")
@@ -220,8 +222,10 @@ def propagate_points(
                 _covariance_narrow(cov, step, c, h, *terms)
             elif width == WIDTHS[1]:
                 _covariance_middle(cov, step, c, h, *terms)
-            else:
+            elif width == WIDTHS[2]:
                 _covariance_wide(cov, step, c, h, *terms)
+            else:
+                _covariance_widest(cov, step, c, h, *terms)
 
             # Point 0 is the mean, 2 k + 1 and 2 k + 2 are the pair along L_k.
             for point in range(2 * POINTS + 1):

@@ -27,9 +27,9 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
     return [
         WheelSpeedAid(
             m.source,
-            when.t_ns,
+            when.t_ns - round(o.latency_s * 1e9),
             o.gate_probability,
-            m.speed_m_s,
+            m.speed_m_s / o.scale,
             sd_m_s,
             o.lever_arm_m,
             m.signed,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pydantic import Field
+
 from fusiond.navigation.solution import BoundState, Mode, Solution
 from fusiond.outputs.messages.base import Count, Message, stamp
 from fusiond.outputs.messages.health import SchedulerStatus
@@ -15,6 +17,7 @@ class StatusMessage(Message):
     mode: Mode
     why: str
     protection: BoundState
+    calibrated: bool = Field(description="all of `calibration` has settled")
     since_utc: str | None
     since_ms: int | None
     version: str
@@ -42,6 +45,7 @@ def status_message(
     scheduler: SchedulerStatus,
     fused: int,
     rejected: int,
+    calibrated: bool,
     mqtt: Mapping[str, int],
 ) -> StatusMessage:
     """`status`; `mqtt` are the publisher's counters."""
@@ -53,6 +57,7 @@ def status_message(
         mode=solution.mode,
         why=solution.reason,
         protection=solution.bound.state,
+        calibrated=calibrated,
         since_utc=since_utc,
         since_ms=since_ms,
         version=version,

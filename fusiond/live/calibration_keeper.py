@@ -1,0 +1,88 @@
+"""The calibration on disk: taken up at the start, renewed on the drive and at the end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from fusiond.configuration.schema import Config
+from fusiond.live.scheduler import SECOND_NS, Every
+from fusiond.live.state_keeper import state_file
+from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.saved_calibration import (
+    SavedCalibration,
+    load_calibration,
+    mounting_digest,
+    save_calibration,
+    saved_calibration,
+)
+from fusiond.navigator.state_file import DamagedStateError, RefusedStateError, set_aside
+
+log = logging.getLogger("fusiond")
+
+# A parameter takes minutes to settle; a power cut loses five of them, and flash is written 12 times
+# an hour.
+SAVE_EVERY_S = 300
+
+
+class CalibrationKeeper:
+    """Keeps one vehicle's calibration beside its saved state, where that is kept.
+
+    `on_event(code, text)` hears `calibration_damaged` and `calibration_refused`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        on_event: Callable[[str, str], None],
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        beside = state_file(config, environ)
+        self._path = None if beside is None else beside.with_suffix(".calibration.json")
+        self._digest = mounting_digest(config)
+        self._event = on_event
+        self._due = Every(SAVE_EVERY_S * SECOND_NS)
+        self._working: asyncio.Task[None] | None = None
+
+    def offer(self, navigator: Navigator) -> None:
+        """Let the navigator take up the calibration of the last run, if its mounting is this."""
+        if self._path is None:
+            return
+        try:
+            navigator.calibration = load_calibration(self._path, navigator.model, self._digest)
+        except DamagedStateError as error:
+            self._event("calibration_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
+        except RefusedStateError as error:
+            self._event("calibration_refused", f"{self._path}: {error}")
+
+    def keep(self, t_ns: int, navigator: Navigator) -> None:
+        """Renew the file, if it is due and something has been observed."""
+        busy = self._working is not None and not self._working.done()
+        if self._path is None or busy or not self._due.due(t_ns):
+            return
+        saved = self._of(navigator)
+        if saved is not None:
+            self._working = asyncio.create_task(asyncio.to_thread(_write, self._path, saved))
+
+    async def close(self, navigator: Navigator) -> None:
+        """Keep the last of it, after what is under way has ended."""
+        if self._working is not None:
+            await asyncio.wait([self._working])
+        saved = self._of(navigator)
+        if self._path is not None and saved is not None:
+            await asyncio.to_thread(_write, self._path, saved)
+
+    def _of(self, navigator: Navigator) -> SavedCalibration | None:
+        if navigator.started is None or navigator.on_trial:
+            return None
+        return saved_calibration(navigator.calibrating.parameters, self._digest)
+
+
+def _write(path: Path, saved: SavedCalibration) -> None:
+    try:
+        save_calibration(path, saved)
+    except OSError as error:
+        log.warning("calibration not saved: %s", error)

@@ -1,0 +1,202 @@
+"""What is calibrated: mounting, lever arms, offsets in time, scales, as the filter knows them now.
+
+A parameter is told in the units that the configuration takes (deg, m, s, a ratio), as what lies
+beyond the value configured there, with one sigma and one of three states:
+
+    not observed   the sigma is still that of the configuration: the vehicle has not shown it
+    observed       better known than configured, and still moving or still wide
+    settled        a fifth of the configured sigma or less, and the value has stayed for a minute
+
+An estimate of sigma s from a prior of sigma p holds the share (s / p)^2 of the prior's mean: at a
+fifth 4 %, so a settled value is the drive's and not the owner's. Where s is above 0.9 p, the drive
+has said less than a quarter of what the prior had said already.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.models.blocks import Block
+from fusiond.models.model import Model
+from fusiond.models.vehicle import (
+    ANTENNA_LEVER,
+    AXLE_LEVER,
+    FIX_TIME,
+    MOUNTING,
+    VELOCITY_TIME,
+    WHEEL_LATENCY,
+    WHEEL_SCALE,
+)
+
+Array = NDArray[np.float64]
+
+CALIBRATED = (
+    MOUNTING,
+    AXLE_LEVER,
+    WHEEL_SCALE,
+    WHEEL_LATENCY,
+    FIX_TIME,
+    VELOCITY_TIME,
+    ANTENNA_LEVER,
+)
+"""Blocks that are a calibration; a source's own has its name behind it (`wheel_scale_rear`)."""
+WANDERING = (WHEEL_LATENCY, FIX_TIME, VELOCITY_TIME)
+"""Those that are no constants: two clocks drift."""
+UNIT_SUFFIX = {"rad": "_deg", "m": "_m", "s": "_s", "1": ""}
+
+NOT_OBSERVED_SHARE = 0.9
+SETTLED_SHARE = 0.2
+# A value has stayed if in this time (s) it has moved by less than sigma, and what its own random
+# walk allows: a minute of town driving has a bend, a stop and a start in it.
+STAYS_S = 60.0
+LOOK_NS = 10_000_000_000
+"""The watch looks so often (ns of the filter's time)."""
+
+
+class CalibrationState(StrEnum):
+    """How well a parameter is known."""
+
+    NOT_OBSERVED = "not_observed"
+    OBSERVED = "observed"
+    SETTLED = "settled"
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """Where a parameter lives: its published name, the block's kind (of `CALIBRATED`) and name, its
+    slot in the model, published units per SI unit, prior sigma (published units) and random walk
+    (published units per root second)."""
+
+    name: str
+    kind: str
+    block: str
+    index: int
+    factor: float
+    prior_sd: float
+    walk: float
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter beyond its configured value, in published units: value, one sigma, and the
+    configured sigma."""
+
+    name: str
+    kind: str
+    block: str
+    value: float
+    sd: float
+    prior_sd: float
+    state: CalibrationState
+
+
+def kind_of(block: str) -> str | None:
+    """Which calibration a block is, None for one that is none."""
+    for kind in CALIBRATED:
+        if block == kind or block.startswith(f"{kind}_"):
+            return kind
+    return None
+
+
+def calibration_slots(model: Model) -> list[Slot]:
+    """The parameters of a model that are a calibration, in the order of its blocks."""
+    found = []
+    for block in model.blocks:
+        kind = kind_of(block.name)
+        if kind is None:
+            continue
+        factor = math.degrees(1.0) if block.unit == "rad" else 1.0
+        for state, index in zip(block.states, model.slots_of(block.name), strict=True):
+            found.append(
+                Slot(
+                    _published(block, state),
+                    kind,
+                    block.name,
+                    index,
+                    factor,
+                    factor * block.initial,
+                    factor * math.sqrt(block.white),
+                )
+            )
+    return found
+
+
+def _published(block: Block, state: str) -> str:
+    """A state's name outside: `mounting_pitch_deg`, `wheel_scale`."""
+    name = f"{block.name}_{state}" if len(block.states) > 1 else block.name
+    return name + UNIT_SUFFIX[block.unit]
+
+
+class CalibrationWatch:
+    """Follows the calibration of a filter of `model`; `on_event(code, text)` hears `calibrated`
+    when a parameter has settled, once for each, and when the last one has."""
+
+    def __init__(self, model: Model, on_event: Callable[[str, str], None]) -> None:
+        self._slots = calibration_slots(model)
+        self._indices = np.array([s.index for s in self._slots], dtype=np.int64)
+        self._event = on_event
+        self._told: set[str] = set()
+        self.restart()
+
+    def restart(self) -> None:
+        """The filter has been started anew."""
+        self._cell = -1
+        self._past: deque[tuple[int, Array]] = deque()
+        self.parameters: tuple[Parameter, ...] = ()
+        """As last looked at; empty before the filter has run."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether all that is estimated has settled."""
+        return bool(self.parameters) and all(
+            p.state is CalibrationState.SETTLED for p in self.parameters
+        )
+
+    def look(self, t_ns: int, xi: Array, covariance: Array) -> bool:
+        """The filter has come to `t_ns` with parameters (n,) and P (n, n); whether that was looked
+        at, which happens each `LOOK_NS`."""
+        cell = t_ns // LOOK_NS
+        if cell == self._cell or not self._slots:
+            return False
+        self._cell = cell
+        now = xi[self._indices].copy()
+        while len(self._past) > 1 and t_ns - self._past[1][0] >= STAYS_S * 1e9:
+            self._past.popleft()
+        before = None
+        if self._past and t_ns - self._past[0][0] >= STAYS_S * 1e9:
+            before = self._past[0][1]
+        sd = np.sqrt(covariance[self._indices, self._indices])
+        self._past.append((t_ns, now))
+        self.parameters = tuple(
+            _parameter(s, float(now[i]), float(sd[i]), None if before is None else before[i])
+            for i, s in enumerate(self._slots)
+        )
+        self._tell()
+        return True
+
+    def _tell(self) -> None:
+        for p in self.parameters:
+            if p.state is CalibrationState.SETTLED and p.name not in self._told:
+                self._told.add(p.name)
+                rest = "all that is estimated has settled" if self.settled else "others have not"
+                self._event("calibrated", f"{p.name} {p.value:+.4g}, sigma {p.sd:.2g}; {rest}")
+
+
+def _parameter(s: Slot, value: float, sd: float, before: float | None) -> Parameter:
+    """One parameter of SI values, `before` a minute ago; None where the filter is younger."""
+    value, sd = value * s.factor, sd * s.factor
+    state = CalibrationState.OBSERVED
+    if sd > NOT_OBSERVED_SHARE * s.prior_sd:
+        state = CalibrationState.NOT_OBSERVED
+    elif sd <= SETTLED_SHARE * s.prior_sd and before is not None:
+        moved = abs(value - before * s.factor)
+        if moved <= math.hypot(sd, s.walk * math.sqrt(STAYS_S)):
+            state = CalibrationState.SETTLED
+    return Parameter(s.name, s.kind, s.block, value, sd, s.prior_sd, state)

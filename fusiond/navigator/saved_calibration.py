@@ -1,0 +1,161 @@
+"""The calibration on disk: what one drive has shown serves the next start.
+
+It lies beside the saved state, in a file of its own, because it outlives a drive: that state is
+forgotten as soon as the vehicle moves. What it says lies beyond the values configured then, so it
+holds only while axes, mounting, lever arms and delays are configured as they were.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from fusiond.configuration.aiding import GnssAiding, WheelAiding
+from fusiond.configuration.schema import Config
+from fusiond.models.model import Model
+from fusiond.models.vehicle import (
+    ANTENNA_LEVER,
+    AXLE_LEVER,
+    FIX_TIME,
+    MOUNTING,
+    VELOCITY_TIME,
+    WHEEL_LATENCY,
+    WHEEL_SCALE,
+)
+from fusiond.navigator.alignment.start import Start
+from fusiond.navigator.calibration import (
+    WANDERING,
+    CalibrationState,
+    Parameter,
+    calibration_slots,
+)
+from fusiond.navigator.saved_state import STRICT
+from fusiond.navigator.state_file import (
+    DamagedStateError,
+    RefusedStateError,
+    read_state,
+    write_state,
+)
+
+# One sigma of what may have changed until the next start, in published units.
+CHANGES = {
+    # A full boot or back seat lets a car's rear down by 3 to 5 cm over a wheel base of 2.7 m: 0.6
+    # to 1 deg, in one load of several.
+    MOUNTING: 0.5,
+    # The point that does not slide moves with load and tyres.
+    AXLE_LEVER: 0.05,
+    # 0.3 bar or 40 K of a tyre change its rolling radius by 0.2 to 0.4 %.
+    WHEEL_SCALE: 0.004,
+    # A serial line or a bus gateway that is opened anew queues differently by one or two frames of
+    # its 50 or 100 Hz.
+    WHEEL_LATENCY: 0.02,
+    FIX_TIME: 0.02,
+    VELOCITY_TIME: 0.02,
+    # An antenna stays where it is screwed.
+    ANTENNA_LEVER: 0.01,
+}
+# A value this many configured sigmas off belongs to no vehicle of that configuration.
+MOST_SIGMAS = 6.0
+
+Name = Annotated[str, Field(min_length=1, max_length=128)]
+Value = Annotated[float, Field(ge=-1e3, le=1e3)]
+Sigma = Annotated[float, Field(gt=0.0, le=1e3)]
+
+
+@dataclass(frozen=True, slots=True, config=STRICT)
+class SavedCalibration:
+    """Value and one sigma of each observed parameter by its published name; `configuration` is the
+    digest of what they lie beyond. Raises pydantic's `ValidationError` for what is none."""
+
+    configuration: Annotated[str, Field(max_length=64)]
+    values: Annotated[dict[Name, tuple[Value, Sigma]], Field(max_length=64)]
+    version: Literal[1] = 1
+
+
+_SAVED = TypeAdapter(SavedCalibration)
+
+
+def mounting_digest(config: Config) -> str:
+    """Twelve hexadecimal digits that change with any value that a calibration lies beyond."""
+    imu, slip = config.imu, config.constraints.non_holonomic
+    about: dict[str, Any] = {
+        "axes": imu.axes,
+        "mounting_deg": imu.mounting_deg,
+        "time_offset_s": imu.time_offset_s,
+        "axle": slip.lever_arm_m,
+        "serial_latency_s": config.clock.serial_latency_s,
+    }
+    for name, section in config.aiding.items():
+        own: dict[str, Any] = {"kind": section.kind, "lever_arm_m": section.lever_arm_m}
+        if isinstance(section, GnssAiding):
+            own["velocity_delay_s"] = section.velocity_delay_s
+        if isinstance(section, WheelAiding):
+            own["scale"], own["latency_s"] = section.scale, section.latency_s
+        about[f"aiding.{name}"] = own
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def saved_calibration(parameters: Iterable[Parameter], digest: str) -> SavedCalibration | None:
+    """What is worth keeping of a calibration: all that has been observed; None for nothing."""
+    values = {
+        p.name: (p.value, p.sd) for p in parameters if p.state is not CalibrationState.NOT_OBSERVED
+    }
+    return SavedCalibration(digest, values) if values else None
+
+
+def save_calibration(path: Path, saved: SavedCalibration) -> None:
+    """Write atomically. OSError passes."""
+    write_state(path, _SAVED.dump_json(saved), durable=True)
+
+
+def load_calibration(path: Path, model: Model, digest: str) -> SavedCalibration | None:
+    """The saved calibration, None if there is none.
+
+    Raises `DamagedStateError` for what is none, `RefusedStateError` for one of another mounting.
+    """
+    saved = read_state(path, _SAVED)
+    if saved is None:
+        return None
+    if saved.configuration != digest:
+        raise RefusedStateError("axes, mounting, lever arms or delays are configured anew since")
+    for s in calibration_slots(model):
+        value, _ = saved.values.get(s.name, (0.0, 1.0))
+        if abs(value) > MOST_SIGMAS * s.prior_sd:
+            raise DamagedStateError(f"{s.name}: {value:g} is {MOST_SIGMAS:g} sigmas off or more")
+    return saved
+
+
+def take_up(start: Start, model: Model, saved: SavedCalibration) -> Start:
+    """The start with the parameters of `saved`: their sigma is that of then and what may have
+    changed, at most that of the configuration."""
+    xi, p = start.xi.copy(), start.covariance.copy()
+    for s in calibration_slots(model):
+        if s.name not in saved.values:
+            continue
+        value, sd = saved.values[s.name]
+        sd = min(math.hypot(sd, CHANGES[s.kind]), s.prior_sd) / s.factor
+        xi[s.index] = value / s.factor
+        p[s.index], p[:, s.index] = 0.0, 0.0
+        p[s.index, s.index] = sd**2
+    return replace(start, xi=xi, covariance=p)
+
+
+def refuted(parameters: Iterable[Parameter], saved: SavedCalibration) -> str | None:
+    """What speaks against a calibration that was taken up: a value that has left it by four sigma
+    of what may have changed, one time in 16,000 by chance. An offset in time may wander anywhere
+    on a long drive. None where nothing does."""
+    for p in parameters:
+        if p.name in saved.values and p.kind not in WANDERING:
+            value, sd = saved.values[p.name]
+            sd = min(math.hypot(sd, CHANGES[p.kind]), p.prior_sd)
+            if sd < p.prior_sd and abs(p.value - value) > 4.0 * sd:
+                return f"{p.name} was {value:+.3g} and is now {p.value:+.3g}"
+    return None

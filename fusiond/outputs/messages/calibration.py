@@ -1,0 +1,49 @@
+"""`calibration`: how the sensors sit on the vehicle and when they speak, as far as it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from fusiond.navigator.calibration import CalibrationState, Parameter
+from fusiond.outputs.messages.base import Message, stamp
+
+
+class CalibratedParameter(BaseModel):
+    """One parameter, in the unit that ends its name (none: a ratio)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    value: float = Field(description="beyond the configured value")
+    sd: float = Field(description="one sigma")
+    prior_sd: float = Field(description="the configured sigma, before anything is observed")
+    state: CalibrationState
+
+
+class CalibrationMessage(Message):
+    """What the filter has found of mounting, lever arms, offsets in time and scales."""
+
+    settled: bool = Field(description="all that is estimated has settled")
+    parameters: dict[str, CalibratedParameter]
+
+
+def calibration_message(
+    utc_ns: int | None, parameters: Iterable[Parameter], settled: bool
+) -> CalibrationMessage:
+    """`calibration` of what the navigator's watch has read; 1e-5 is 0.01 mm, 10 us, 0.04 arcsec."""
+    t_utc, t_ms = stamp(utc_ns)
+    return CalibrationMessage(
+        t_utc=t_utc,
+        t_ms=t_ms,
+        settled=settled,
+        parameters={
+            p.name: CalibratedParameter(
+                value=round(p.value, 5),
+                sd=round(p.sd, 5),
+                prior_sd=round(p.prior_sd, 5),
+                state=p.state,
+            )
+            for p in parameters
+        },
+    )

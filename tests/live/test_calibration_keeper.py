@@ -1,0 +1,81 @@
+"""The calibration on disk: of this mounting it serves the next start, anything else is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fusiond.configuration.schema import Config
+from fusiond.live.calibration_keeper import CalibrationKeeper
+from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.saved_calibration import (
+    SavedCalibration,
+    load_calibration,
+    mounting_digest,
+    save_calibration,
+)
+
+CONFIG: dict[str, Any] = {"constraints": {"non_holonomic": {"enabled": True}}}
+VALUES = {"mounting_yaw_deg": (2.0, 0.2)}
+
+
+def vehicle(folder: Path, **more: Any) -> Config:
+    return Config.model_validate({**CONFIG, **more, "state_file": folder / "truck.json"})
+
+
+def offered(config: Config) -> tuple[SavedCalibration | None, list[str]]:
+    """What a navigator of that configuration takes up, and the events."""
+    events: list[str] = []
+    navigator = Navigator(config)
+    CalibrationKeeper(config, lambda code, text: events.append(code)).offer(navigator)
+    return navigator.calibration, events
+
+
+def test_what_was_kept_is_taken_up(tmp_path: Path) -> None:
+    config = vehicle(tmp_path)
+    assert offered(config) == (None, [])
+    saved = SavedCalibration(mounting_digest(config), VALUES)
+    save_calibration(tmp_path / "truck.calibration.json", saved)
+    assert offered(config) == (saved, [])
+
+
+def test_another_mounting_voids_it(tmp_path: Path) -> None:
+    saved = SavedCalibration(mounting_digest(vehicle(tmp_path)), VALUES)
+    save_calibration(tmp_path / "truck.calibration.json", saved)
+    turned = vehicle(tmp_path, imu={"mounting_deg": [0.0, 0.0, 2.0]})
+    assert offered(turned) == (None, ["calibration_refused"])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"values": {"mounting_yaw_deg": [2.0, 0.0]}},
+        {"values": {"mounting_yaw_deg": [2.0]}},
+        {"values": {"mounting_yaw_deg": ["2.0", 0.2]}},
+        {"values": {"mounting_yaw_deg": [90.0, 0.2]}},
+        {"version": 2},
+        {"more": 1},
+    ],
+)
+def test_what_is_no_calibration_is_put_aside(tmp_path: Path, damage: dict[str, Any]) -> None:
+    config = vehicle(tmp_path)
+    path = tmp_path / "truck.calibration.json"
+    sound = {"configuration": mounting_digest(config), "values": {}, "version": 1}
+    path.write_text(json.dumps({**sound, **damage}))
+    assert offered(config) == (None, ["calibration_damaged"])
+    assert not path.exists()
+    assert path.with_name(path.name + ".bad").exists()
+    assert offered(config) == (None, [])
+
+
+async def test_nothing_is_kept_before_it_navigates(tmp_path: Path) -> None:
+    config = vehicle(tmp_path)
+    keeper = CalibrationKeeper(config, lambda code, text: None)
+    navigator = Navigator(config)
+    keeper.keep(1, navigator)
+    await keeper.close(navigator)
+    path = tmp_path / "truck.calibration.json"
+    assert load_calibration(path, navigator.model, mounting_digest(config)) is None
