@@ -1,14 +1,13 @@
 r"""Position of an antenna: a GNSS fix, with or without height.
 
     z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + b^
-        + v^ (tau^ - tau_0)
-      = dr + (C l) x phi + (tau^ - tau_0) dv - C dl - db - v dtau + noise
+        + v^ tau^
+      = dr + (C l) x phi + tau^ dv - C dl - db - v dtau + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
 ionosphere), tau how much later than its stamp the fix is valid; where the model has states for
-them they are estimated, true minus estimated in dl, db, dtau. The aid's instant has tau_0 in it
-already. A timing error of sigma s_t that is not shared moves the antenna by v s_t, which adds
-(v_i s_t)^2 to the variance of each axis.
+them they are estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is
+not shared moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis.
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3.
 """
@@ -76,8 +75,7 @@ class PositionAid(Aid):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 
     `bias`: the blocks whose states north, east, down are the error that the fixes share; `time`
-    that of their offset in time, of which `ahead_s` is in `t_ns`; `rest` that of what is left of
-    the lever arm.
+    that of their offset in time; `rest` that of what is left of the lever arm.
     """
 
     locates: ClassVar[bool] = True
@@ -90,7 +88,6 @@ class PositionAid(Aid):
     sd_time_s: float = 0.0
     bias: tuple[str, ...] = ()
     time: str = ""
-    ahead_s: float = 0.0
     rest: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
@@ -107,7 +104,7 @@ class PositionAid(Aid):
             h[row, slot] = -1.0
             z[row] += state.xi[slot]
         for slot in state.model.slots_of(self.time):
-            late_s = float(state.xi[slot]) - self.ahead_s
+            late_s = float(state.xi[slot])
             v = nav[VN : VN + rows]
             z += v * late_s
             h[:, slot] = -v

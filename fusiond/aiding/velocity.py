@@ -1,12 +1,11 @@
 r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 
-    z = v^ + C^ (w x l^) + a^ (tau^ - tau_0) - v_fix
-      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + (tau^ - tau_0) f x phi + noise
+    z = v^ + C^ (w x l^) + a^ tau^ - v_fix
+      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ f x phi + noise
 
 w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s
-per 10 m. tau is how much later than its stamp the velocity is valid, tau_0 what the aid's instant
-has of it already, a the acceleration, smoothed: with the noise of single samples in its Jacobian an
-offset would come out too small, and too sure.
+per 10 m. tau is how much later than its stamp the velocity is valid, a the acceleration, smoothed:
+with the noise of single samples in its Jacobian an offset would come out too small, and too sure.
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
@@ -74,8 +73,8 @@ def _velocity(
 
 @dataclass(frozen=True, slots=True)
 class VelocityAid(Aid):
-    """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three. `time`, `ahead_s`
-    and `rest` as of `PositionAid`."""
+    """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three. `time` and
+    `rest` as of `PositionAid`."""
 
     moves: ClassVar[bool] = True
 
@@ -83,7 +82,6 @@ class VelocityAid(Aid):
     sd: tuple[float, ...]
     lever: Vector3
     time: str = ""
-    ahead_s: float = 0.0
     rest: str = ""
 
     @property
@@ -101,7 +99,7 @@ class VelocityAid(Aid):
             h[:, levers] = -(state.dcm @ turn)[:rows]
         z -= self.v_ned[:rows]
         for slot in state.model.slots_of(self.time):
-            late_s = float(state.xi[slot]) - self.ahead_s
+            late_s = float(state.xi[slot])
             z += state.acceleration[:rows] * late_s
             h[:, slot] = -state.acceleration[:rows]
             x, y, w = state.step[STEP_SMOOTH_N : STEP_SMOOTH_N + 3]

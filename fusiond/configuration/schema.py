@@ -98,7 +98,8 @@ class Imu(Section):
     @classmethod
     def _of_its_class(cls, data: Any) -> Any:
         """What the class says stands where no key of its own does."""
-        known = CLASSES.get(data.get("sensor_class")) if isinstance(data, dict) else None
+        named = data.get("sensor_class") if isinstance(data, dict) else None
+        known = CLASSES.get(named) if named is not None else None
         return {**known, **data} if known else data
 
 

@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 @compiled("f8(f8[::1], f8[::1], i8)", forceinline=True)
 def _acceleration(nav: Array, step: Array, axis: int) -> float:
     """Smoothed, m/s^2, along north, east or down."""
-    force = step[STEP_SMOOTH_N + axis]
+    force: float = step[STEP_SMOOTH_N + axis]
     return force + gravity(nav[LAT], nav[HEIGHT]) if axis == 2 else force
 
 

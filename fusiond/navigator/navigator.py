@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
@@ -49,9 +46,6 @@ Array = NDArray[np.float64]
 
 # A measurement may be valid this far ahead of the arrivals around it (clock mapping, jitter).
 AHEAD_NS = 200_000_000
-# Offsets in time are taken out of an aid's instant in such steps (s), the rest by its Jacobian: a
-# car's acceleration changes by less than 0.05 m/s^2 in half of one.
-TIME_STEP_S = 0.01
 # An instant that may be off by a second or more has the error of a jump of UTC, alike in all
 # measurements until it ends: no filter's white noise. The clock says 0.5 s where it knows no UTC.
 UNKNOWN_TIME_S = 0.9
@@ -178,18 +172,8 @@ class Navigator:
             self._units.fix(m, t_ns, self.imu)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
-            self.timeline.insert(self._in_time(aid))
+            self.timeline.insert(aid)
         return "accepted"
-
-    def _in_time(self, aid: Aid) -> Aid:
-        """The aid at its instant by the filter's own clock, where it has an offset in time."""
-        if self.started is None or not isinstance(aid, PositionAid | VelocityAid):
-            return aid
-        slots = self.model.slots_of(aid.time)
-        if not slots:
-            return aid
-        ahead_s = round(float(self.estimator.xi[slots[0]]) / TIME_STEP_S) * TIME_STEP_S
-        return replace(aid, t_ns=aid.t_ns + round(ahead_s * 1e9), ahead_s=ahead_s)
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""

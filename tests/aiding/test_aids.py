@@ -187,12 +187,11 @@ IN_TIME: dict[str, Callable[[Array], Linearised]] = {
     "wheel": lambda nav: replace(
         WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER), scale=WHEEL_SCALE, latency=WHEEL_LATENCY
     ),
-    "position": lambda nav: replace(_position(nav), time=FIX_TIME, ahead_s=0.1, rest=ANTENNA_LEVER),
+    "position": lambda nav: replace(_position(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
     "horizontal position": lambda nav: replace(_position(nav, False), time=FIX_TIME),
     "velocity": lambda nav: replace(
         VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
         time=VELOCITY_TIME,
-        ahead_s=-0.05,
         rest=ANTENNA_LEVER,
     ),
 }
