@@ -46,7 +46,7 @@ def _root(
 # In the order of `--help`.
 for command in (
     *(live.run, live.demo, live.check, live.doctor),
-    *(offline.process, offline.simulate, offline.compare),
+    *(offline.process, offline.calibrate, offline.simulate, offline.compare),
     *(research.schema, research.study, research.model, research.bench),
 ):
     app.command()(command)

@@ -1,4 +1,4 @@
-"""Commands on files: process, simulate, compare."""
+"""Commands on files: process, calibrate, simulate, compare."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from fusiond.commands.shared import (
     config_errors,
     data_errors,
     load,
+    progress_bar,
     spinner,
     write_json,
 )
@@ -79,6 +80,48 @@ def process(
     if not result["solution_rows"]:
         typer.echo(f"fusiond: nothing was navigated: {result['why']}", err=True)
         raise typer.Exit(EXIT_DATA)
+
+
+def calibrate(
+    config: ConfigPath,
+    imu: Annotated[Path | None, typer.Option(metavar="F.csv", help="IMU samples.")] = None,
+    can: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="Recorded CAN bus of the sources: .log, .asc, .blf, .mf4."
+        ),
+    ] = None,
+    aid: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="F.toml", help="Write the lines of TOML there too.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML."""
+    aids = [_aid_argument(text) for text in aid or []]
+    if (imu is None) == (can is None):
+        raise typer.BadParameter("--imu or --can: the samples come of one of the two")
+    loaded = load(config)
+    from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
+    from fusiond.offline.can_log import MissingPackageError  # noqa: PLC0415
+
+    try:
+        with config_errors(), data_errors(), progress_bar("calibrating") as bar:
+            found = run_calibrate(loaded, imu, aids, can, bar or (lambda done, total: None))
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    if not found.result["solution_rows"]:
+        typer.echo(f"fusiond: nothing was navigated: {found.result['why']}", err=True)
+        raise typer.Exit(EXIT_DATA)
+    typer.echo(found.toml, nl=False, err=json_path == "-")
+    if out is not None:
+        with data_errors():
+            out.write_text(found.toml, encoding="utf-8")
+    write_json(found.as_json(), json_path)
 
 
 def simulate(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from drivers.measurements import (
     MonotonicStamp,
 )
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
-from fusiond.configuration.aiding import GnssAiding, RawAiding
+from fusiond.configuration.aiding import GnssAiding, RawAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError, counts
 from fusiond.files.solution_csv import STATUS, SolutionWriter
@@ -50,19 +50,21 @@ def process(
     out: Path | None = None,
     systems: tuple[System, ...] | None = None,
     can_log: Path | None = None,
+    watch: Callable[[Navigator], None] = lambda navigator: None,
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
     Of the solution: its rows, by mode too; when it begins; the sentence `why` where there is none.
     Samples whose units cannot be what the columns say are not navigated, and no `out` is written.
     `systems` are the satellite systems of raw data to use, instead of the configuration's.
-    `can_log` is the bus of the sources on CAN, in place of `imu_path`. Raises `TableError` for a
+    `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` sees the navigator
+    each time it has advanced. Raises `TableError` for a
     file that cannot be read as what it is said to be, and for an outage of a source that there is
     not; `MissingPackageError` for a format whose package is not installed.
     """
     with _imports_left_alone():
         read = _read(config, imu_path, aids, outages or (), systems, can_log)
-        return _process(read, out)
+        return _process(read, out, watch)
 
 
 @contextmanager
@@ -139,13 +141,14 @@ def _imu_read(imu: ImuTable) -> FileRead:
     return FileRead(span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)
 
 
-def _process(read: _Read, out: Path | None) -> dict[str, Any]:
+def _process(read: _Read, out: Path | None, watch: Callable[[Navigator], None]) -> dict[str, Any]:
     config, imu, arrivals, events = read.config, read.imu, read.arrivals, read.events
     navigator = Navigator(
         config, on_event=lambda code, text: events.append({"code": code, "text": text})
     )
     why = wrong_units(imu, config.imu, arrivals)
-    recorder = _Recorder(navigator, SolutionWriter(out) if out and why is None else None)
+    writer = SolutionWriter(out) if out and why is None else None
+    recorder = _Recorder(navigator, writer, watch)
     if why is None:
         _run(navigator, imu, arrivals, recorder)
     mode, reason = navigator.mode(navigator.imu.latest_ns)
@@ -277,6 +280,7 @@ def _is_late(arrival: Arrival, config: Config) -> bool:
         return True  # corrected for the place where the filter has come to
     section = config.aiding.get(m.source)
     delayed = isinstance(section, GnssAiding) and section.velocity_delay_s > 0.0
+    delayed |= isinstance(section, WheelAiding) and section.latency_s > 0.0
     return delayed or config.imu.time_offset_s > 0.0 or _valid_ns(m) < arrival.t_arrival_ns
 
 
@@ -287,9 +291,15 @@ def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
 class _Recorder:
     """Takes each sample's solution as it was first known; how many, in which modes, from when."""
 
-    def __init__(self, navigator: Navigator, writer: SolutionWriter | None) -> None:
+    def __init__(
+        self,
+        navigator: Navigator,
+        writer: SolutionWriter | None,
+        watch: Callable[[Navigator], None],
+    ) -> None:
         self._navigator = navigator
         self._writer = writer
+        self._watch = watch
         self._next = 0
         self.rows = 0
         self.modes: Counter[str] = Counter()
@@ -297,6 +307,7 @@ class _Recorder:
 
     def take(self) -> None:
         navigator = self._navigator
+        self._watch(navigator)
         if navigator.started is None:
             return
         imu, passed = navigator.imu, navigator.estimator.sample

@@ -47,7 +47,8 @@ def in_this_process(*args: str | Path) -> subprocess.CompletedProcess[str]:
 def test_version_and_help() -> None:
     assert fusiond("--version").stdout == f"fusiond {version('fusiond')}\n"
     text = fusiond("--help").stdout
-    for command in ("run", "demo", "check", "doctor", "process", "simulate", "compare", "bench"):
+    live = ("run", "demo", "check", "doctor")
+    for command in (*live, "process", "calibrate", "simulate", "compare", "bench"):
         assert command in text
 
 
