@@ -6,16 +6,16 @@ vehicle's by the mounting m:
     u = exp[m x] (C^T v + w x l),     l = l_0 + (l_x, 0, 0)
 
     no slip:      0 = u_right - s,   0 = u_down
-    wheel speed:  y = (1 + k) (u_forward - a_forward tau)
+    wheel speed:  y = (1 + k) (u_forward - a_forward tau) + s_w
 
 m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, wind: it lasts for
-seconds), the wheel's scale k and latency tau are estimated where the model has their blocks
-(fusiond.models.vehicle). With z = h(x^) - y, navigation errors computed minus true, parameters true
-minus estimated, and e_i the axis's unit vector:
+seconds), the wheel's drift s_w (slip, quantised steps), scale k and latency tau are estimated where
+the model has their blocks (fusiond.models.vehicle). With z = h(x^) - y, navigation errors computed
+minus true, parameters true minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
-        + tau e_i exp[m x] C^T [g x] phi) + v                                             (wheel)
+        + tau e_i exp[m x] C^T [g x] phi) - ds_w + v                                      (wheel)
 
 a_forward = f + C^T g is smoothed: one sample of a shaken sensor would make the latency look smaller
 than it is.
@@ -53,10 +53,10 @@ SIGN_SIGMAS = 3.0
 """A velocity beyond as many of its sigmas has the other sign once in 740."""
 
 
-def _slots(model: Model, scale: str = "", latency: str = "") -> Indices:
-    """Slots (6,) of the parameters, by the names of the wheel's own blocks."""
+def _slots(model: Model, drift: str, scale: str = "", latency: str = "") -> Indices:
+    """Slots (6,) of the parameters, by the names of the blocks of drift, scale and latency."""
     found = [*(model.slots_of(MOUNTING) or (-1, -1))]
-    for block in (AXLE_LEVER, SIDE_DRIFT, scale, latency):
+    for block in (AXLE_LEVER, drift, scale, latency):
         found += model.slots_of(block) or (-1,)
     return np.array(found, dtype=np.int64)
 
@@ -157,6 +157,9 @@ def _rows(
             if slot[SCALE] >= 0:
                 h[i, slot[SCALE]] = -z[i]
             z[i] *= gain
+            if slot[DRIFT] >= 0:
+                z[i] += xi[slot[DRIFT]]
+                h[i, slot[DRIFT]] = -1.0
 
 
 def _body_velocity(
@@ -187,14 +190,14 @@ class NonHolonomicAid(Aid):
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
         count = 1 if state.model.hold_height else 2  # right, down
-        z, h = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model))
+        z, h = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model, SIDE_DRIFT))
         return Innovation(z, h, np.square((self.sd_m_s, self.sd_down_m_s)[:count]))
 
 
 @dataclass(frozen=True, slots=True)
 class WheelSpeedAid(Aid):
-    """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `scale`
-    and `latency` name the blocks of the wheel's own errors.
+    """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
+    `scale` and `latency` name the blocks of the wheel's own errors.
 
     Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
     is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
@@ -205,11 +208,12 @@ class WheelSpeedAid(Aid):
     lever: Vector3
     signed: bool = True
     rounding_sd_m_s: float = 0.0
+    drift: str = ""
     scale: str = ""
     latency: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        slots = _slots(state.model, self.scale, self.latency)
+        slots = _slots(state.model, self.drift, self.scale, self.latency)
         z, h = _body_velocity(state, self.lever, FORWARD, 1, slots)
         speed = self.speed_m_s
         if not self.signed:

@@ -186,8 +186,11 @@ class WheelAiding(Aiding):
     """What the device says over the true speed; `fusiond calibrate` finds it."""
     latency_s: float = 0.0
     """How old a speed is when it comes."""
-    correlation_s: NonNegativeFloat = 1.0
-    """How long its errors last (slip, quantised steps): what comes more often counts less."""
+    drift_sd_m_s: NonNegativeFloat = 0.1
+    """Of what lasts (slip, a wheel's load, rounding at a steady speed): one sigma of a state; 0:
+    none."""
+    drift_s: PositiveFloat = 1.0
+    """Correlation time of that drift."""
     scale_sd: NonNegativeFloat = 0.02
     """One sigma of what `scale` is wrong by, which the filter estimates: tyres wear by 2 % of their
     radius. 0: nothing."""

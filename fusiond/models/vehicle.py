@@ -11,6 +11,7 @@ from fusiond.models.blocks import Block
 MOUNTING = "mounting"
 AXLE_LEVER = "axle_lever"
 SIDE_DRIFT = "side_drift"
+WHEEL_DRIFT = "wheel_drift"
 WHEEL_SCALE = "wheel_scale"
 WHEEL_LATENCY = "wheel_latency"
 FIX_TIME = "gnss_time"
@@ -33,9 +34,10 @@ def axle_lever(sd_m: float) -> Block:
     return _constant(AXLE_LEVER, "m", ("x",), sd_m)
 
 
-def side_drift(sd_m_s: float, lasts_s: float) -> Block:
-    """Velocity (m/s) to the right that tyres, a road's crown and wind leave for a while."""
-    return Block(SIDE_DRIFT, "m/s", ("right",), (-1,), initial=sd_m_s, steady=sd_m_s, tau_s=lasts_s)
+def drift(name: str, sd_m_s: float, lasts_s: float) -> Block:
+    """A velocity (m/s) that lasts for a while: sideways what tyres, a road's crown and wind leave,
+    of a wheel what slip and quantised steps do."""
+    return Block(name, "m/s", ("v",), (-1,), initial=sd_m_s, steady=sd_m_s, tau_s=lasts_s)
 
 
 def wheel_scale(name: str, sd: float) -> Block:

@@ -14,7 +14,7 @@ from fusiond.aiding.witnesses import Witnesses
 from fusiond.configuration.schema import Constraints, NonHolonomic
 from fusiond.configuration.settings import DEG, quiet_limits
 from fusiond.models.blocks import Block
-from fusiond.models.vehicle import axle_lever, mounting, side_drift
+from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window
 
@@ -39,7 +39,7 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
     if options.lever_arm_sd_m:
         found.append(axle_lever(options.lever_arm_sd_m))
     if options.drift_sd_m_s:
-        found.append(side_drift(options.drift_sd_m_s, options.drift_s))
+        found.append(drift(SIDE_DRIFT, options.drift_sd_m_s, options.drift_s))
     return found
 
 

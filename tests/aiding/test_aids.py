@@ -29,13 +29,15 @@ from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     FIX_TIME,
+    SIDE_DRIFT,
     VELOCITY_TIME,
+    WHEEL_DRIFT,
     WHEEL_LATENCY,
     WHEEL_SCALE,
     antenna_lever,
     axle_lever,
+    drift,
     mounting,
-    side_drift,
     time_offset,
     wheel_scale,
 )
@@ -67,16 +69,17 @@ def _model(name: str) -> Model:
 VEHICLE = (
     mounting(0.1),
     axle_lever(1.0),
-    side_drift(0.1, 5.0),
+    drift(SIDE_DRIFT, 0.1, 5.0),
+    drift(WHEEL_DRIFT, 0.1, 1.0),
     wheel_scale(WHEEL_SCALE, 0.02),
     time_offset(WHEEL_LATENCY, 0.2),
     time_offset(FIX_TIME, 0.1),
     time_offset(VELOCITY_TIME, 0.1),
     antenna_lever(ANTENNA_LEVER, 0.3),
 )
-# What the filter holds of them: mounting pitch and yaw, lever, drift, scale, latency, two offsets
-# in time, lever of the antenna.
-ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05)
+# What the filter holds of them: mounting pitch and yaw, lever, two drifts, scale, latency, two
+# offsets in time, lever of the antenna.
+ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.3, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05)
 ACCELERATION = (1.4, -0.8, 0.3)
 
 
@@ -185,7 +188,10 @@ def test_jacobian(kind: str, model: str) -> None:
 IN_TIME: dict[str, Callable[[Array], Linearised]] = {
     "no slip": AIDS["non-holonomic"],
     "wheel": lambda nav: replace(
-        WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER), scale=WHEEL_SCALE, latency=WHEEL_LATENCY
+        WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
+        drift=WHEEL_DRIFT,
+        scale=WHEEL_SCALE,
+        latency=WHEEL_LATENCY,
     ),
     "position": lambda nav: replace(_position(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
     "horizontal position": lambda nav: replace(_position(nav, False), time=FIX_TIME),
@@ -212,13 +218,13 @@ def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
     xi = np.zeros(model.size)
     xi[-len(ESTIMATED) :] = ESTIMATED
     state = _state(model, nav, xi)
-    pitch, yaw, lever, _, scale, latency, late, _, *rest = ESTIMATED
+    pitch, yaw, lever, _, slipping, scale, latency, late, _, *rest = ESTIMATED
     to_vehicle = Rotation.from_rotvec([0.0, pitch, yaw]).as_matrix()
     dcm = Rotation.from_euler("ZYX", RPY[::-1]).as_matrix()
     at_wheel = dcm.T @ VELOCITY + np.cross(RATE_SENSED, np.add(LEVER, (lever, 0.0, 0.0)))
     before = to_vehicle @ (at_wheel - dcm.T @ ACCELERATION * latency)
-    wheel = WheelSpeedAid(*SOURCE, float((1.0 + scale) * before[0]), 0.1, LEVER)
-    wheel = replace(wheel, scale=WHEEL_SCALE, latency=WHEEL_LATENCY)
+    wheel = WheelSpeedAid(*SOURCE, float((1.0 + scale) * before[0] + slipping), 0.1, LEVER)
+    wheel = replace(wheel, drift=WHEEL_DRIFT, scale=WHEEL_SCALE, latency=WHEEL_LATENCY)
     assert _innovation(wheel, state).z == pytest.approx([0.0], abs=1e-9)
     arm = dcm @ np.add(LEVER, rest)
     antenna = nav[:3] + (arm + np.array(VELOCITY) * late) / runs.metres(*nav[[0, 2]])

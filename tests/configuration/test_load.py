@@ -43,7 +43,8 @@ def test_examples_carry_the_data_sheets_figures() -> None:
     assert tactical.gyro_bias_instability_deg_h == 1.0
     assert tactical.accel_bias_instability_mg == 0.05
     assert imu["drive_0708"].axes == ("-x", "+y", "-z")
-    assert imu["drive_0708"].time_offset_s == -0.125
+    assert imu["drive_0708"].sensor_class == "mems"
+    assert imu["drive_0708"].gyro_bias_initial_deg_h == 1800.0
 
 
 @pytest.mark.parametrize(

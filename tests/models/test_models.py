@@ -42,8 +42,8 @@ def test_a_further_block_takes_the_place_of_its_namesake() -> None:
 
 
 def test_more_states_than_the_kernels_hold() -> None:
-    with pytest.raises(ValueError, match="at most 32 fit"):
-        make_model("ins23", imu_noise(IMU), *(misalignment(f"m{k}", 1e-3) for k in range(4)))
+    with pytest.raises(ValueError, match="at most 40 fit"):
+        make_model("ins23", imu_noise(IMU), *(misalignment(f"m{k}", 1e-3) for k in range(6)))
 
 
 def started(model: Model) -> KalmanEstimator:
@@ -160,7 +160,7 @@ def test_a_model_that_outgrows_the_kernels_is_a_mistake_of_the_configuration(
     ):
         result = runner.invoke(app, command)
         assert result.exit_code == 78, command
-        assert "36 states, at most 32" in result.stderr
+        assert "states, at most 40" in result.stderr
         assert "sar_misalignment" in result.stderr
     config.write_text(TOO_MANY + '[estimator]\nmodel = "ins15"\n')
     assert runner.invoke(app, ["check", "--compile", str(config)]).exit_code == 0

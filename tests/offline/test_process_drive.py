@@ -2,7 +2,7 @@
 
 0.10 m RMS to the RTK track after a minute; 5 m RMS of the largest error in each of eight 15 s
 outages (7.6 m is what others reach); the track inside two stated sigma in 90 to 99.5 % of the
-epochs inside them.
+epochs inside them. All of it from a configuration of signs of axes and a class of sensor.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _errors(solution: TrajectoryTable, track: GnssTable, rows: Any) -> tuple[Any
 
 def test_follows_the_track_from_nothing_but_the_data(tmp_path: Path) -> None:
     result, out = _process(tmp_path, [])
-    assert result["aligned"] == "GNSS course"
+    assert result["aligned"].startswith("GNSS course")
     assert result["mode"] == "navigating"
     report = compare(read_solution(out), read_truth(DRIVE / "gnss.csv"), after_s=60.0)
     assert report["horizontal_rms_m"] <= 0.10

@@ -34,7 +34,6 @@ class Sections:
             if isinstance(section, RawAiding)
         }
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
-        self._last_ns: dict[str, int] = {}
 
     def of(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""
@@ -45,12 +44,6 @@ class Sections:
             section = next((s for s in named if isinstance(s, kind)), None) or kind()
             self._found[source, kind] = section
         return section
-
-    def spacing_s(self, source: str, t_ns: int) -> float:
-        """How long (s) before `t_ns` the source's measurement before this one was valid."""
-        last_ns = self._last_ns.get(source, -(2**62))
-        self._last_ns[source] = t_ns
-        return (t_ns - last_ns) * 1e-9
 
     def own(self, block: str, source: str, section: Aiding) -> str:
         """The block's name: with the source's, where that has a section of its own that is not

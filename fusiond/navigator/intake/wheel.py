@@ -9,21 +9,21 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import WheelSpeedAid
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.models.blocks import Block
-from fusiond.models.vehicle import WHEEL_LATENCY, WHEEL_SCALE, time_offset, wheel_scale
+from fusiond.models.vehicle import (
+    WHEEL_DRIFT,
+    WHEEL_LATENCY,
+    WHEEL_SCALE,
+    drift,
+    time_offset,
+    wheel_scale,
+)
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
 def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
-    """The speed, with the section's sigma where the device states none, and what rounding adds.
-
-    Errors that last for T count as one in 2 T: n of them in that time get sqrt(n) times the sigma,
-    so that their mean is as good as one of them.
-    """
+    """The speed, with the section's sigma where the device states none, and what rounding adds."""
     o = sections.of(m.source, WheelAiding)
     sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
-    spacing_s = sections.spacing_s(m.source, when.t_ns)
-    if 0.0 < spacing_s < 2.0 * o.correlation_s:
-        sd_m_s *= math.sqrt(2.0 * o.correlation_s / spacing_s)
     return [
         WheelSpeedAid(
             m.source,
@@ -34,6 +34,7 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
             o.lever_arm_m,
             m.signed,
             m.rounding_sd_m_s,
+            sections.own(WHEEL_DRIFT, m.source, o),
             sections.own(WHEEL_SCALE, m.source, o),
             sections.own(WHEEL_LATENCY, m.source, o),
         )
@@ -41,8 +42,11 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
 
 
 def blocks(source: str, section: WheelAiding, sections: Sections) -> list[Block]:
-    """Scale and latency of the wheel's speed."""
+    """Drift, scale and latency of the wheel's speed."""
     found = []
+    if section.drift_sd_m_s:
+        name = sections.own(WHEEL_DRIFT, source, section)
+        found.append(drift(name, section.drift_sd_m_s, section.drift_s))
     if section.scale_sd:
         found.append(wheel_scale(sections.own(WHEEL_SCALE, source, section), section.scale_sd))
     if section.latency_sd_s:
