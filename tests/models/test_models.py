@@ -139,6 +139,7 @@ IMU_CSV = (
 TOO_MANY = """
 vehicle = "all"
 [aiding.raw]
+[aiding.gnss]
 [aiding.rdss]
 [aiding.star_tracker]
 [aiding.sar]
@@ -162,5 +163,6 @@ def test_a_model_that_outgrows_the_kernels_is_a_mistake_of_the_configuration(
         assert result.exit_code == 78, command
         assert "states, at most 40" in result.stderr
         assert "sar_misalignment" in result.stderr
+    assert "gnss_velocity_time" in result.stderr
     config.write_text(TOO_MANY + '[estimator]\nmodel = "ins15"\n')
     assert runner.invoke(app, ["check", "--compile", str(config)]).exit_code == 0

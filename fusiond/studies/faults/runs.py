@@ -32,6 +32,7 @@ VEHICLE = Config.model_validate(
     {
         "imu": {
             "axes": ("+x", "-y", "-z"),
+            "sensor_class": "mems",
             "rate_hz": 100.0,
             "gyro_range_deg_s": 2000.0,
             "accel_range_g": 10.0,
@@ -41,14 +42,15 @@ VEHICLE = Config.model_validate(
             "accel_bias_instability_mg": 0.1,
         },
         "aiding": {
-            "gnss": {"lever_arm_m": ANTENNA_M, "range_error_m": 3.0},
+            "gnss": {"lever_arm_m": ANTENNA_M, "range_error_m": 3.0, "bias_sd_m": 0.0},
             "rdss": {"lever_arm_m": ANTENNA_M},
         },
         "constraints": {"non_holonomic": {"enabled": True, "lever_arm_m": (-1.0, 0.0, 0.5)}},
         "estimator": {"model": "ins21"},
     }
 )
-"""`config/vehicle.toml` without its devices; a test holds them together."""
+"""`config/vehicle.toml` without its devices; a test holds them together. The recorded fixes share no
+error."""
 
 
 @dataclass(frozen=True, slots=True)
