@@ -67,7 +67,7 @@ class Bench:
 
     def no_slip(self, t_s: float, *, holds: bool) -> Action:
         """The constraint of no side slip."""
-        aid = NonHolonomicAid("non_holonomic", round(t_s * S), GATE, 0.1, 1.0, LEVER)
+        aid = NonHolonomicAid("non_holonomic", round(t_s * S), GATE, 0.1, 0.1, 1.0, LEVER)
         outcome = Outcome("fused", 0.5, 2, (0.5, 0.5)) if holds else Outcome("gated", 900.0, 2)
         return self.isolation.judge(aid, outcome, NAV)
 

@@ -46,7 +46,7 @@ CONFIG: dict[str, Any] = {
     "imu": {"rate_hz": RATE_HZ, "sensor_class": "mems"},
     "aiding": {
         "gnss": {"bias_sd_m": 0.0, "time_offset_sd_s": 0.05},
-        "wheel": {"correlation_s": 0.0},
+        "wheel": {"drift_sd_m_s": 0.0},
     },
     "constraints": {"non_holonomic": {"enabled": True}},
     "alignment": {

@@ -141,7 +141,7 @@ _FILTERS = {
     "tight_ukf": _Row(UnscentedEstimator, RAW),
     "tight_scaled": _Row(KalmanEstimator, RAW.model_copy(update={"sigma_scale": 2.0})),
     "loose": _Row(KalmanEstimator, LOOSE),
-    "loose_white": _Row(KalmanEstimator, GnssAiding(lever_arm_m=LEVER)),
+    "loose_white": _Row(KalmanEstimator, LOOSE.model_copy(update={"bias_sd_m": 0.0})),
     "coasting": _Row(KalmanEstimator, RAW, coasts=True),
 }
 

@@ -32,7 +32,6 @@ VEHICLE = Config.model_validate(
     {
         "imu": {
             "axes": ("+x", "-y", "-z"),
-            "sensor_class": "mems",
             "rate_hz": 100.0,
             "gyro_range_deg_s": 2000.0,
             "accel_range_g": 10.0,
@@ -49,7 +48,7 @@ VEHICLE = Config.model_validate(
         "estimator": {"model": "ins21"},
     }
 )
-"""`config/vehicle.toml` without its devices; a test holds them together. The recorded fixes share no
+"""`config/vehicle.toml` without its devices; a test holds them together. Its fixes share no
 error."""
 
 
