@@ -132,6 +132,7 @@ class ImuDoor:
             ends = ""
             if begin in breaks:
                 ends = "IMU was silent"
+                imu.counters["gap"] += 1
                 silent = f"IMU silent for {intervals[begin]:.1f} s"
                 self._event("imu_gap", f"{silent}: aligning anew")
             yield Run(times[begin:end], samples[begin:end], ends)
