@@ -12,6 +12,20 @@ from typer.testing import CliRunner
 from fusiond.bench import bench as timing
 from fusiond.commands.app import app
 
+FIGURES = (
+    "numpy_product_us",
+    "block_step_ratio",
+    "single_step_ratio",
+    "rewind_2s_ratio",
+    "raw_epoch_40_ratio",
+    "multiscale_step_ratio",
+    "federated_step_ratio",
+    "unscented_step_ratio",
+    "unscented_propagation_step_ratio",
+    "process_epoch_ratio",
+    "reduced_order_step_ratio",
+)
+
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -26,6 +40,9 @@ def test_bench_prints_a_table_and_writes_json(tmp_path: Path) -> None:
     printed = CliRunner().invoke(app, ["bench", "--json", str(path)])
     assert printed.exit_code == 0, printed.output
     figures = json.loads(path.read_text())
+    assert list(figures)[: len(FIGURES)] == list(FIGURES)
+    assert all(figures[name] > 0.0 for name in FIGURES)  # how large they are is not tested
+    assert figures["cpu"]
     for name, value in figures.items():
         shown = f"{value:.4g}" if name.endswith("_ratio") else str(value)
         assert shown in printed.output, name
