@@ -128,10 +128,15 @@ async def _lose_broker(broker: Broker, before: dict[str, float]) -> None:
     assert status["ticks"] - before["ticks"] > 0.5 * periods
 
 
+# The path of `drive` with 8 s of rest before it stands from 101 s on for 20 s.
+STANDS_UNTIL_S = 121.0
+
+
 async def _restart_at_rest(
     heard: Heard, daemon: DaemonProcess, vehicle: VehicleProcess, folder: Path
 ) -> None:
-    """Stopped where the vehicle stands, it starts again with the heading it had."""
+    """Stopped where the vehicle stands, it starts again with the heading it had; on a machine so
+    busy that the vehicle has driven off by then, with that of its course."""
     stands = await heard.until(
         "nav", lambda m: hypot(m["v_n_m_s"], m["v_e_m_s"]) < 0.05, patience_s=400.0
     )
@@ -145,7 +150,10 @@ async def _restart_at_rest(
     await daemon.ready()
     await heard.online(b"online")
     status = await heard.until("status", lambda m: m["mode"] == "navigating")
-    assert status["why"] == "heading from saved state"
+    found = {"heading from saved state"}
+    if vehicle.t_s(status["t_ms"]) > STANDS_UNTIL_S:
+        found.add("heading from GNSS course, on the move")
+    assert status["why"] in found, heard.all("status")
     print(f"navigates {status['uptime_s']:.1f} s after the restart")
     await _check_against_truth(heard, vehicle)
 
