@@ -127,29 +127,28 @@ async def measure(folder: Path, seconds: float, name: str, raw: bool) -> dict[st
     vehicle = multiprocessing.get_context("spawn").Process(
         target=_vehicle, args=(str(folder), interface, channel, raw), daemon=True
     )
-    daemon = DaemonProcess(config)
     try:
         with broker:
-            start_s = time.monotonic()
-            await daemon.start()
-            while ": mode_" not in daemon.log:  # noqa: ASYNC110 - the first tick logs its mode
-                await asyncio.sleep(0.01)
-            first_tick_s = time.monotonic() - start_s
-            vehicle.start()
-            async with listening(broker) as (listener, _):
-                heard = Heard(listener, "load")
-                await heard.until("nav", lambda m: m["mode"] == "navigating")
-                await asyncio.sleep(SETTLE_S)
-                since, before = heard.count, await heard.until("health")
-                start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
-                await asyncio.sleep(seconds)
-                elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
-                resident_mb = _resident_mb(daemon.pid)
-                after = await heard.until("health")
-                nav = len(heard.all("nav", since))
-            await daemon.terminate()
+            async with DaemonProcess(config) as daemon:
+                start_s = time.monotonic()
+                await daemon.start()
+                while ": mode_" not in daemon.log:  # noqa: ASYNC110 - the first tick logs its mode
+                    await asyncio.sleep(0.01)
+                first_tick_s = time.monotonic() - start_s
+                vehicle.start()
+                async with listening(broker) as (listener, _):
+                    heard = Heard(listener, "load")
+                    await heard.until("nav", lambda m: m["mode"] == "navigating")
+                    await asyncio.sleep(SETTLE_S)
+                    since, before = heard.count, await heard.until("health")
+                    start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
+                    await asyncio.sleep(seconds)
+                    elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
+                    resident_mb = _resident_mb(daemon.pid)
+                    after = await heard.until("health")
+                    nav = len(heard.all("nav", since))
+                await daemon.terminate()
     finally:
-        await daemon.kill()
         vehicle.kill()
     return {
         "filter": name,
