@@ -48,7 +48,7 @@ def _errors(solution: TrajectoryTable, track: GnssTable, rows: Any) -> tuple[Any
 
 def test_follows_the_track_from_nothing_but_the_data(tmp_path: Path) -> None:
     result, out = _process(tmp_path, [])
-    assert result["aligned"].startswith("GNSS course")
+    assert result["aligned"] == "GNSS course, on the move"
     assert result["mode"] == "navigating"
     report = compare(read_solution(out), read_truth(DRIVE / "gnss.csv"), after_s=60.0)
     assert report["horizontal_rms_m"] <= 0.10

@@ -168,7 +168,7 @@ async def test_the_drive_ends_where_the_offline_run_ends(
         [("gnss", _write(tmp_path / "gnss.csv", (*SHARED, *velocity), gnss))],
         out=solution,
     )
-    assert offline["aligned"].startswith("GNSS course")
+    assert offline["aligned"] == "GNSS course, on the move"
     events = _events(imu, gnss)
 
     with can.Bus(interface="socketcan", channel="vcan0") as bus:
