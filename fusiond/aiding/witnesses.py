@@ -56,6 +56,8 @@ class Witnesses:
     def __init__(self) -> None:
         self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
+        self._told: dict[tuple[int, int], Measured] = {}
+        """What `measured` has said of spans since the last speed: it is asked at every tick."""
 
     def hear(self, aids: Sequence[Aid]) -> None:
         """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
@@ -74,6 +76,7 @@ class Witnesses:
     def _keep(
         self, source: str, t_ns: int, v: tuple[float, ...], sd: float, rounding: float = 0.0
     ) -> None:
+        self._told.clear()
         speeds = self._speeds[source]
         insort(speeds, _Speed(t_ns, v, sd, rounding))
         if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
@@ -81,6 +84,12 @@ class Witnesses:
 
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
         """What was measured from `begin_ns` to `end_ns`, both included."""
+        span = begin_ns, end_ns
+        if span not in self._told:
+            self._told[span] = self._measured(begin_ns, end_ns)
+        return self._told[span]
+
+    def _measured(self, begin_ns: int, end_ns: int) -> Measured:
         contradicts, best = False, math.inf
         for speeds in self._speeds.values():
             first = bisect_left(speeds, (begin_ns,))

@@ -26,21 +26,25 @@ if TYPE_CHECKING:
     from fusiond.offline.outages import Outage
 
 AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
+# What was recorded, as `process` and `calibrate` take it.
+ImuFile = Annotated[Path | None, typer.Option("--imu", metavar="F.csv", help="IMU samples.")]
+CanLog = Annotated[
+    Path | None,
+    typer.Option(
+        "--can", metavar="LOG", help="Recorded CAN bus of the sources: .log, .asc, .blf, .mf4."
+    ),
+]
+AidFiles = Annotated[
+    list[str] | None,
+    typer.Option("--aid", metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
+]
 
 
 def process(
     config: ConfigPath,
-    imu: Annotated[Path | None, typer.Option(metavar="F.csv", help="IMU samples.")] = None,
-    can: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="LOG", help="Recorded CAN bus of the sources: .log, .asc, .blf, .mf4."
-        ),
-    ] = None,
-    aid: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
-    ] = None,
+    imu: ImuFile = None,
+    can: CanLog = None,
+    aid: AidFiles = None,
     outage: Annotated[
         list[str] | None,
         typer.Option(
@@ -84,17 +88,9 @@ def process(
 
 def calibrate(
     config: ConfigPath,
-    imu: Annotated[Path | None, typer.Option(metavar="F.csv", help="IMU samples.")] = None,
-    can: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="LOG", help="Recorded CAN bus of the sources: .log, .asc, .blf, .mf4."
-        ),
-    ] = None,
-    aid: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KIND=F", help=f"Aid, repeatable: {', '.join(AID_KINDS)}."),
-    ] = None,
+    imu: ImuFile = None,
+    can: CanLog = None,
+    aid: AidFiles = None,
     out: Annotated[
         Path | None, typer.Option(metavar="F.toml", help="Write the lines of TOML there too.")
     ] = None,
