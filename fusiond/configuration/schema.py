@@ -30,10 +30,10 @@ from fusiond.configuration.aiding import (
     Section,
     Vector,
 )
+from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
-from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -190,74 +190,6 @@ class Alignment(Section):
         if "config" in self.heading and self.heading_deg is None:
             raise ValueError("heading lists 'config': set heading_deg too")
         return self
-
-
-def _orthonormal(wavelet: str) -> str:
-    wavelet_matrix(wavelet, 1)  # ValueError, with those that would do
-    return wavelet
-
-
-class Multiscale(Section):
-    """The filter `multiscale`; see `docs/estimators.md`."""
-
-    scales: Annotated[int, Field(ge=1, le=MOST_SCALES)] = 2
-    """N: blocks of 2^(N-1) epochs. 1 is the filter `kalman`."""
-    wavelet: Annotated[str, AfterValidator(_orthonormal)] = "haar"
-    """Any orthonormal wavelet, by its PyWavelets name."""
-
-
-class Federated(Section):
-    """The federated filter, where `filter = "federated"`; see `docs/estimators.md`."""
-
-    sources: tuple[str, ...] = ()
-    """Which `[aiding.NAME]` have a local filter; empty: all of them."""
-    mode: Literal["no_reset", "fusion_reset", "zero_reset", "rescale"] = "no_reset"
-    """What becomes of the local filters after a fusion; only `no_reset` keeps a fault in its own
-    filter."""
-    sharing: Literal["fixed", "adaptive"] = "fixed"
-    """Whether the sharing factors stay or follow the local covariances."""
-    shares: dict[str, PositiveFloat] = Field(default_factory=dict)
-    """Relative factors by local filter, brought to a sum of 1; empty: all equal."""
-    master_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Of the process noise, for the master's own estimate in `rescale`."""
-    retained: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Of its information, what an updated local filter keeps in `rescale`."""
-    fault_detection: bool = True
-    """Whether a local filter that fails its tests is left out."""
-    false_alarm_probability: Probability = 1e-6
-    """Of one innovation or difference test."""
-    window: Annotated[int, Field(ge=2, le=100)] = 10
-    """Innovations judged together."""
-    readmit_after: PositiveInt = 20
-    """Innovations in a row that must fit the master before a source is taken back."""
-
-
-class Unscented(Section):
-    """The filter `unscented`."""
-
-    spread: Annotated[float, Field(ge=0.1, le=5.0)] = 1.7320508
-    """Sigmas from the mean to a sigma point: sqrt(3) by the fourth moment of a Gaussian."""
-    propagation: bool = False
-    """Sigma points in the propagation too: dearer, honest for large attitude errors."""
-
-
-class Estimator(Section):
-    filter: Literal["kalman", "unscented", "federated", "multiscale"] = "kalman"
-    """Which estimator; see `docs/estimators.md`."""
-    model: Literal["ins15", "ins21", "ins17", "ins23", "planar10", "planar15"] = "ins21"
-    """Error state; see `docs/navigation.md`."""
-    buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
-    """History that late measurements may rewind into; at least 10 s."""
-    checkpoint_s: PositiveFloat = 0.5
-    """Spacing of the points that a rewind starts from."""
-    coast_after_s: PositiveFloat = 10.0
-    """Without a fused position for longer the mode is `coasting`."""
-    invalid_sd_m: PositiveFloat = 5000.0
-    """Horizontal sigma beyond which the mode is `invalid`."""
-    federated: Federated = Federated()
-    """The section of that name below."""
-    multiscale: Multiscale = Multiscale()
-    unscented: Unscented = Unscented()
 
 
 class ConsistencyTest(Section):

@@ -7,6 +7,7 @@ import re
 import pytest
 
 from fusiond.configuration import aiding as config_aiding
+from fusiond.configuration import estimator
 from fusiond.configuration import schema as config
 from fusiond.configuration.integrity import Integrity
 from tests.places import REPOSITORY
@@ -26,10 +27,10 @@ SECTIONS = {
     "[constraints.zero_velocity]": config.ZeroVelocity,
     "[constraints.non_holonomic]": config.NonHolonomic,
     "[alignment]": config.Alignment,
-    "[estimator]": config.Estimator,
-    "[estimator.multiscale]": config.Multiscale,
-    "[estimator.federated]": config.Federated,
-    "[estimator.unscented]": config.Unscented,
+    "[estimator]": estimator.Estimator,
+    "[estimator.multiscale]": estimator.Multiscale,
+    "[estimator.federated]": estimator.Federated,
+    "[estimator.unscented]": estimator.Unscented,
     "[consistency]": config.ConsistencyTest,
     "[integrity]": Integrity,
     "[scheduler]": config.Scheduler,
