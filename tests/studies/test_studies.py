@@ -179,12 +179,12 @@ def test_tables_show_every_strategy_of_every_case() -> None:
 
 def test_study_as_text_json_and_picture(tmp_path: Path) -> None:
     json_path, png = tmp_path / "r.json", tmp_path / "r.png"
-    done = fusiond("rdss-static", "--runs", "1", "--json", json_path, "--plot", png)
+    done = fusiond("rdss-static", "--runs", "2", "--json", json_path, "--plot", png)
     assert (done.returncode, done.stderr) == (0, "")
     for name in NAMES:
         assert f"\n{name} " in done.stdout
     found = json.loads(json_path.read_text())
-    assert found["runs"] == 1
+    assert found["runs"] == 2
     assert found["finding"] in done.stdout
     assert png.read_bytes().startswith(b"\x89PNG")
 
