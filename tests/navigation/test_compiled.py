@@ -117,6 +117,14 @@ def test_counts_of_two_processes_do_not_meet(run: Run) -> None:
     assert abs(first - second) > 100_000
 
 
+def test_what_compiling_needs_is_loaded_when_a_kernel_is_missing(run: Run) -> None:
+    code = IN_ORDER + "; import sys; print('numba.np.linalg' in sys.modules)"
+    assert run(code.format((4,))).stdout.split()[-1] == "True"
+    assert run(code.format((4,))).stdout.split()[-1] == "False"
+    # One of two is new: it calls, and inlines, one that was only linked.
+    assert run(code.format((4, 6))).stdout == "[2.0, 3.0]\nTrue\n"
+
+
 def test_a_second_kernel_of_the_same_name_is_refused() -> None:
     def make() -> None:
         @compiled("f8(f8)")
