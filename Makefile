@@ -12,7 +12,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires soak load lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load lock clean \
 	kernels test-packages
 
 help: ## this list
@@ -84,6 +84,9 @@ faults: $(STAMP) ## fault matrix as a table; ARGS="--only step_500m --phase coas
 
 wires: $(STAMP) test-packages ## faults of wires, clocks and the host; ARGS="--only gnss_late_3s"
 	$(BIN)/python benchmarks/wire_faults.py $(ARGS)
+
+pairs: $(STAMP) ## every ordered pair of commands from an empty kernel cache
+	$(BIN)/python -m tests.commands.pairs
 
 soak: $(STAMP) test-packages ## the daemon for HOURS of real time, with faults now and then
 	$(BIN)/python benchmarks/soak.py $(HOURS) $(ARGS)

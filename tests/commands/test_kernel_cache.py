@@ -10,7 +10,7 @@ with what four processes compiled:
 `simulate` starts from nothing, and compiles a quarter of all kernels. Of those that it leaves, four
 of five are then laid in from the tests' own cache, as other processes compiled them, and the rest
 is left to the commands that follow: each links what it compiles with kernels of all before it and
-of others. To compile everything anew would take a minute more and show the same.
+of others. To compile everything anew would take a minute more and show the same; `make pairs` does.
 
 `process` loads all that any of them loads but three kernels of the simulation, so the other pairs
 (`simulate` and `process`, `model` and `process` ...) differ from these steps only in which of two
@@ -21,11 +21,8 @@ in both.
 
 from __future__ import annotations
 
-import os
 import pickle
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,64 +31,17 @@ import numpy as np
 import pytest
 
 from fusiond.navigation.compiled import FOLDER
-
-CONFIG = """
-[imu]
-axes = ["+x", "-y", "-z"]
-[aiding.gnss]
-lever_arm_m = [0.0, 0.0, -1.0]
-[constraints.non_holonomic]
-enabled = true
-lever_arm_m = [-1.0, 0.0, 0.5]
-[estimator]
-model = "ins21"
-[alignment]
-heading = ["config"]
-heading_deg = 40.0
-"""
-COMMANDS = {
-    "simulate": ("simulate", "drive", "--duration", "30", "--out", "drive"),
-    "study": ("study", "rdss-static", "--runs", "2", "--json", "study.json"),
-    "model": ("model", "ins21", "--config", "C.toml", "--json", "model.json"),
-    "check": ("check", "--compile", "C.toml"),
-    "process": (
-        *("process", "C.toml", "--imu", "drive/imu.csv", "--aid", "gnss=drive/gnss.csv"),
-        *("--out", "solution.csv"),
-    ),
-}
-RESULTS = {
-    "simulate": ("drive/imu.csv", "drive/gnss.csv"),
-    "study": ("study.json",),
-    "model": ("model.json",),
-    "check": (),
-    "process": ("solution.csv",),
-}
-
-
-def _start(command: str, folder: Path, cache: Path | None) -> list[str]:
-    """Run a command in `folder`, with the tests' own cache if none; the lines that it wrote."""
-    (folder / "C.toml").write_text(CONFIG)
-    own = {} if cache is None else {"NUMBA_CACHE_DIR": str(cache)}
-    done = subprocess.run(
-        [sys.executable, "-m", "fusiond", *COMMANDS[command]],
-        env=os.environ | own,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=1800,  # only bounds a run that hangs; four minutes of compiling were seen
-        check=False,
-    )
-    assert done.returncode == 0, f"{command}: {done.returncode} {done.stderr}"
-    assert "compiled anew" not in done.stderr
-    lines = [line for name in RESULTS[command] for line in (folder / name).read_text().splitlines()]
-    return [line for line in lines if "time_per_step_us" not in line]  # what a study took
+from tests.commands.cached_commands import RESULTS, start
 
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     """What each command writes with kernels that are all in the cache before it starts."""
     folder = tmp_path_factory.mktemp("expected")
-    return {command: _start(command, folder, None) for command in COMMANDS if RESULTS[command]}
+    return {command: start(command, folder, None) for command in IN_TURN if RESULTS[command]}
+
+
+IN_TURN = ("simulate", "study", "model", "check", "process")
 
 
 class InTurn(NamedTuple):
@@ -113,8 +63,8 @@ def in_turn(tmp_path_factory: pytest.TempPathFactory, expected: dict[str, list[s
     compiled: list[str] = []
     from_nothing: list[str] = []
     laid_in: set[str] = set()
-    for command in COMMANDS:
-        wrote[command] = _start(command, folder, cache.parent)
+    for command in IN_TURN:
+        wrote[command] = start(command, folder, cache.parent)
         new = {file.name for file in cache.glob("*.kernel")} - laid_in - set(compiled)
         needs_none = command in ("model", "process")
         assert new or needs_none, f"{command} compiled nothing: choose another order"
@@ -149,7 +99,7 @@ def test_kernels_of_different_processes_work_together(
         shutil.copy(FOLDER / name, mixed)
     shutil.copytree(in_turn.cache.parents[1] / "drive", tmp_path / "drive")
     kernels = len(list(mixed.iterdir()))
-    assert _start("process", tmp_path, mixed.parent) == expected["process"]
+    assert start("process", tmp_path, mixed.parent) == expected["process"]
     assert len(list(mixed.iterdir())) == kernels, "it compiled: the files were of no use"
 
 
