@@ -39,8 +39,8 @@ from tests.places import DATA, REPOSITORY
 from tests.runs import metres
 
 DRIVE = DATA / "drive_0708"
-FROM_S, UNTIL_S = 243288.0, 243358.0
-"""GPS second of week: 10 s of rest, then 60 s of driving."""
+FROM_S, UNTIL_S = 243288.0, 243333.0
+"""GPS second of week: 10 s of rest, then 35 s of driving."""
 GPS_WEEK_UTC = datetime(2025, 7, 6, tzinfo=UTC) - timedelta(seconds=18)  # less the leap seconds
 SERIAL_LATENCY_S = 0.05
 QUALITY = {"1": "4", "2": "5"}  # fixed and float, as GGA has them
