@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.offers import VelocityOffer
-from fusiond.aiding.position import antenna
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import gravity
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import Q0, STEP_RATE_B, STEP_SMOOTH_N, VN
+from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_RATE_B, STEP_SMOOTH_N, VN
 
 Array = NDArray[np.float64]
 
@@ -33,18 +33,26 @@ SUFFIX = "_velocity"
 Indices = NDArray[np.int64]
 
 
-@compiled("void(f8[::1], f8[::1], i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])")
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])"
+)
 def _velocity(
     nav: Array,
+    xi: Array,
     step: Array,
     column_of: Indices,
+    time: Indices,
+    rest: Indices,
     l0: float,
     l1: float,
     l2: float,
     z: Array,
     h: Array,
 ) -> None:
-    """Write the antenna's velocity z (m,) and H (m, n), zero before: the first m of n, e, d."""
+    """Write the antenna's velocity z (m,) and H (m, n), zero before: the first m of n, e, d.
+    `time` (0 or 1,), `rest` (0 or 3,): slots in `xi`."""
+    if rest.size:
+        l0, l1, l2 = l0 + xi[rest[0]], l1 + xi[rest[1]], l2 + xi[rest[2]]
     c = dcm_elements(nav[Q0:])
     w0, w1, w2 = step[STEP_RATE_B], step[STEP_RATE_B + 1], step[STEP_RATE_B + 2]
     u0, u1, u2 = w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0
@@ -69,6 +77,26 @@ def _velocity(
                 h[i, slot] = a * l2 - e * l0
             elif axis == 2:
                 h[i, slot] = b * l0 - a * l1
+        if rest.size:
+            h[i, rest[0]] = e * w1 - b * w2
+            h[i, rest[1]] = a * w2 - e * w0
+            h[i, rest[2]] = b * w0 - a * w1
+    f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
+    for slot in time:
+        late_s = xi[slot]
+        z[0] += f0 * late_s
+        z[1] += f1 * late_s
+        h[0, slot], h[1, slot] = -f0, -f1
+        h[0, 1] -= late_s * f2
+        h[0, 2] += late_s * f1
+        h[1, 0] += late_s * f2
+        h[1, 2] -= late_s * f0
+        if z.shape[0] > 2:
+            down = f2 + gravity(nav[LAT], nav[HEIGHT])
+            z[2] += down * late_s
+            h[2, slot] = -down
+            h[2, 0] -= late_s * f1
+            h[2, 1] += late_s * f0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,22 +117,12 @@ class VelocityAid(Aid):
         return self.source.removesuffix(SUFFIX)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        rows = 2 if state.model.hold_height else len(self.v_ned)
-        z, h = np.empty(rows), np.zeros((rows, state.model.size))
-        lever, levers = antenna(state, self.lever, self.rest)
-        _velocity(state.nav, state.step, state.model.column_of, *lever, z, h)
-        if levers:
-            x, y, w = state.rate_b
-            turn = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
-            h[:, levers] = -(state.dcm @ turn)[:rows]
+        model = state.model
+        rows = 2 if model.hold_height else len(self.v_ned)
+        z, h = np.empty(rows), np.zeros((rows, model.size))
+        slots = model.column_of, model.slots_of_all((self.time,)), model.slots_of_all((self.rest,))
+        _velocity(state.nav, state.xi, state.step, *slots, *self.lever, z, h)
         z -= self.v_ned[:rows]
-        for slot in state.model.slots_of(self.time):
-            late_s = float(state.xi[slot])
-            z += state.acceleration[:rows] * late_s
-            h[:, slot] = -state.acceleration[:rows]
-            x, y, w = state.step[STEP_SMOOTH_N : STEP_SMOOTH_N + 3]
-            force = np.array([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]])
-            h[:, :3] += late_s * force[:rows]
         return Innovation(z, h, np.square(self.sd[:rows]))
 
     def offers(self) -> tuple[VelocityOffer, ...]:
