@@ -373,6 +373,14 @@ class Clock:
         utc_ns = t_ns - self._mapping(None)[0]
         return utc_ns if EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS else None
 
+    @property
+    def sets_others(self) -> bool:
+        """Whether others may set a clock by `utc_ns`: a receiver has told UTC and there is no doubt
+        about it, or the system clock is configured to be what keeps it."""
+        if self._options.utc == "system":
+            return True
+        return self._reference is not None and self._utc[self._reference].settled
+
     def status(self) -> ClockStatus:
         """A snapshot for `health`."""
         system_error_s = None

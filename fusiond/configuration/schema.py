@@ -32,6 +32,7 @@ from fusiond.configuration.aiding import (
 )
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
+from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
 
@@ -274,6 +275,7 @@ class Config(Section):
     scheduler: Scheduler = Scheduler()
     clock: ClockOptions = ClockOptions()
     mqtt: Mqtt = Mqtt()
+    outputs: Outputs = Outputs()
 
     @property
     def plausibility(self) -> Plausibility:

@@ -1,6 +1,6 @@
 """MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
 
-`publish_*` put a message in its place and return: they never wait and never raise. One task sends
+`take` puts a message in its place and returns: it never waits and never raises. One task sends
 the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
 the next); both belong to one connection and end with it. A broker that accepts bytes and does
 nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
@@ -24,24 +24,8 @@ from fusiond.outputs import broker_access
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.messages.base import Message
-from fusiond.outputs.messages.calibration import CalibrationMessage
-from fusiond.outputs.messages.consistency import ConsistencyMessage
-from fusiond.outputs.messages.event import EventMessage
-from fusiond.outputs.messages.health import HealthMessage
-from fusiond.outputs.messages.nav import NavMessage
-from fusiond.outputs.messages.status import StatusMessage
 from fusiond.outputs.reconnecting import Reconnecting
-from fusiond.outputs.topics import (
-    CALIBRATION,
-    CONSISTENCY,
-    EVENT,
-    HEALTH,
-    NAV,
-    REPLY,
-    STATUS,
-    Topic,
-    base_topic,
-)
+from fusiond.outputs.topics import REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
@@ -71,6 +55,9 @@ class MqttPublisher:
     Raises `ConfigError` for a password file or TLS files that cannot be used.
     """
 
+    name = "mqtt"
+    sets_clocks = False
+
     def __init__(
         self,
         options: Mqtt,
@@ -81,6 +68,7 @@ class MqttPublisher:
         utc_now: Callable[[], int | None] = lambda: None,
     ) -> None:
         self._options = options
+        self.nav_rate_hz = options.nav_rate_hz
         self._base = base_topic(vehicle)
         # A stable name: when we come back before the broker has noticed the old connection's
         # end, it closes that one, and its will is out before our new `online`.
@@ -109,23 +97,15 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ for the tick
 
-    def publish_nav(self, message: NavMessage) -> None:
-        self._replace(NAV, message)
-
-    def publish_health(self, message: HealthMessage) -> None:
-        self._replace(HEALTH, message)
-
-    def publish_consistency(self, message: ConsistencyMessage) -> None:
-        self._replace(CONSISTENCY, message)
-
-    def publish_status(self, message: StatusMessage) -> None:
-        self._retain(STATUS, message)
-
-    def publish_calibration(self, message: CalibrationMessage) -> None:
-        self._retain(CALIBRATION, message)
-
-    def publish_event(self, message: EventMessage) -> None:
-        self._enqueue(EVENT, message)
+    def take(self, topic: Topic, message: Message) -> None:
+        """Put a message into its place: with QoS 0 the latest counts, what is retained is
+        confirmed and sent again after each connection, all else is queued."""
+        if topic.qos == 0:
+            self._replace(topic, message)
+        elif topic.retained:
+            self._retain(topic, message)
+        else:
+            self._enqueue(topic, message)
 
     def _replace(self, topic: Topic, message: Message) -> None:
         self.counters["mqtt_dropped"] += topic in self._latest

@@ -13,7 +13,12 @@ from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
-from fusiond.outputs.messages.health import SchedulerStatus, SourceHealth, health_message
+from fusiond.outputs.messages.health import (
+    OutputHealth,
+    SchedulerStatus,
+    SourceHealth,
+    health_message,
+)
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import status_message
@@ -87,6 +92,18 @@ EXAMPLES: dict[str, Any] = {
                 latency_s=1.42,
                 counters={"no_beam": 12, "requests": 61},
                 verdict="coloured",
+            ),
+        },
+        outputs={
+            "mqtt": OutputHealth(
+                state="running",
+                detail="localhost:1883",
+                counters={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
+            ),
+            "gpsd": OutputHealth(
+                state="running",
+                detail="127.0.0.1:2947, 2 connected",
+                counters={"clients": 5, "requests": 5, "sent": 7204, "skipped": 12},
             ),
         },
         scheduler=SCHEDULER,

@@ -1,4 +1,4 @@
-"""`health`: the devices by name, the scheduler, the clock and the process."""
+"""`health`: the devices and the outputs by name, the scheduler, the clock and the process."""
 
 from __future__ import annotations
 
@@ -51,6 +51,16 @@ class SourceHealth(BaseModel):
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
 
 
+class OutputHealth(BaseModel):
+    """One way out: what it is doing, and what became of what it was given."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    state: State
+    detail: str = ""
+    counters: dict[str, Count] = Field(default_factory=dict)
+
+
 @dataclass(frozen=True, slots=True)
 class SchedulerStatus:
     """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
@@ -66,9 +76,10 @@ class SchedulerStatus:
 
 
 class HealthMessage(Message):
-    """Devices by name; the scheduler, the clock and the process."""
+    """Devices and outputs by name; the scheduler, the clock and the process."""
 
     sources: dict[str, SourceHealth]
+    outputs: dict[str, OutputHealth]
     ticks: Count
     overruns: Count
     lateness_p50_ms: float
@@ -87,6 +98,7 @@ def health_message(
     utc_ns: int | None,
     *,
     sources: Mapping[str, SourceHealth],
+    outputs: Mapping[str, OutputHealth],
     scheduler: SchedulerStatus,
     clock: ClockStatus,
     cpu_percent: float,
@@ -98,6 +110,7 @@ def health_message(
         t_utc=t_utc,
         t_ms=t_ms,
         sources=dict(sources),
+        outputs=dict(outputs),
         ticks=scheduler.ticks,
         overruns=scheduler.overruns,
         lateness_p50_ms=round(scheduler.lateness_p50_ms, 3),

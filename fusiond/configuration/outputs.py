@@ -1,0 +1,60 @@
+"""Sections `[outputs.NAME]`: what leaves besides MQTT. A section that stands there is served."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from fusiond.configuration.aiding import Section
+
+Port = Annotated[int, Field(ge=1, le=65535)]
+Rate = Annotated[float, Field(ge=0.1, le=100.0)]
+
+
+class Served(Section):
+    """What every server of TCP clients has."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at; `0.0.0.0` lets the whole network in, unasked for a name."""
+    rate_hz: Rate = 1.0
+    """Epochs a second, as receivers send them."""
+
+
+class Gpsd(Served):
+    """gpsd's JSON protocol, in the place of gpsd."""
+
+    port: Port = 2947
+    """As registered for gpsd."""
+
+
+class NmeaServed(Served):
+    """NMEA 0183 over TCP; what a receiver's sentences come in by is `[sources.NAME]`."""
+
+    port: Port = 10110
+    """As registered for NMEA 0183."""
+    sentences: tuple[Literal["RMC", "GGA", "VTG", "GST", "THS", "HDT", "PASHR"], ...] = (
+        "RMC",
+        "GGA",
+        "VTG",
+        "GST",
+        "THS",
+    )
+    """`THS` has the heading. `PASHR` adds roll and pitch. `HDT` not together with `GST`: gpsd 3.22
+    makes JSON of it that cannot be read."""
+
+    @model_validator(mode="after")
+    def _gpsd_can_read(self) -> NmeaServed:
+        if {"HDT", "GST"} <= set(self.sentences):
+            raise ValueError("HDT and GST together confuse gpsd 3.22: leave one out")
+        return self
+
+
+class Outputs(Section):
+    """What several of them need, and a section each."""
+
+    geoid_separation_m: Annotated[float, Field(ge=-120.0, le=100.0)] | None = None
+    """Height of the geoid above the ellipsoid where the vehicle drives; without it no height above
+    sea level is told."""
+    gpsd: Gpsd | None = None
+    nmea: NmeaServed | None = None

@@ -1,0 +1,50 @@
+"""The outputs there are: a section of the configuration each, and what serves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from fusiond.configuration.schema import Config
+from fusiond.outputs.base import Output, Surroundings
+from fusiond.outputs.commands import Handler
+from fusiond.outputs.gpsd.server import GpsdServer
+from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.nmea import NmeaServer
+
+MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
+    "gpsd": GpsdServer,
+    "nmea": NmeaServer,
+}
+"""By the section's name below `[outputs]`."""
+
+
+def make_outputs(
+    config: Config,
+    *,
+    on_event: Callable[[str, str, str], None],
+    on_command: Handler,
+    utc_now: Callable[[], int | None],
+) -> dict[str, Output]:
+    """Those that are configured, by name, MQTT first. `on_event(source, code, text)` hears them.
+
+    Raises `ConfigError` for one that cannot be as it is configured.
+    """
+    made: dict[str, Output] = {}
+    if config.mqtt.enabled:
+        made["mqtt"] = MqttPublisher(
+            config.mqtt,
+            config.vehicle,
+            on_event=partial(on_event, "mqtt"),
+            on_command=on_command,
+            utc_now=utc_now,
+        )
+    for name, make in MAKERS.items():
+        section = getattr(config.outputs, name)
+        if section is not None:
+            around = Surroundings(
+                config.vehicle, partial(on_event, name), config.outputs.geoid_separation_m
+            )
+            made[name] = make(section, around)
+    return made
