@@ -50,6 +50,14 @@ class NmeaServed(Served):
         return self
 
 
+class Prometheus(Section):
+    """Metrics for Prometheus at `/metrics`."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at."""
+    port: Port = 9947
+
+
 class Outputs(Section):
     """What several of them need, and a section each."""
 
@@ -58,3 +66,4 @@ class Outputs(Section):
     sea level is told."""
     gpsd: Gpsd | None = None
     nmea: NmeaServed | None = None
+    prometheus: Prometheus | None = None

@@ -12,10 +12,12 @@ from fusiond.outputs.commands import Handler
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.nmea import NmeaServer
+from fusiond.outputs.prometheus import PrometheusEndpoint
 
 MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "gpsd": GpsdServer,
     "nmea": NmeaServer,
+    "prometheus": PrometheusEndpoint,
 }
 """By the section's name below `[outputs]`."""
 

@@ -40,6 +40,7 @@ SECTIONS = {
     "[outputs]": outputs.Outputs,
     "[outputs.gpsd]": outputs.Gpsd,
     "[outputs.nmea]": outputs.NmeaServed,
+    "[outputs.prometheus]": outputs.Prometheus,
 }
 
 

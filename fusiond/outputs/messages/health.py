@@ -70,6 +70,9 @@ class SchedulerStatus:
     lateness_p50_ms: float
     lateness_p99_ms: float
     lateness_max_ms: float
+    lateness_sum_s: float
+    lateness_at_most: tuple[tuple[float, int], ...]
+    """Ticks that were no later than so many seconds, cumulative."""
     gc_collections: int
     gc_forced: int
     gc_max_ms: float
@@ -85,6 +88,10 @@ class HealthMessage(Message):
     lateness_p50_ms: float
     lateness_p99_ms: float
     lateness_max_ms: float
+    lateness_sum_s: float = Field(description="of all ticks")
+    lateness_at_most_s: dict[str, Count] = Field(
+        description="ticks that were no later than so many seconds"
+    )
     gc_max_ms: float
     utc_source: str
     utc_settled: bool
@@ -116,6 +123,8 @@ def health_message(
         lateness_p50_ms=round(scheduler.lateness_p50_ms, 3),
         lateness_p99_ms=round(scheduler.lateness_p99_ms, 3),
         lateness_max_ms=round(scheduler.lateness_max_ms, 3),
+        lateness_sum_s=round(scheduler.lateness_sum_s, 6),
+        lateness_at_most_s={f"{edge:.3g}": n for edge, n in scheduler.lateness_at_most},
         gc_max_ms=round(scheduler.gc_max_ms, 3),
         utc_source=clock.utc_source,
         utc_settled=clock.settled,
