@@ -58,6 +58,13 @@ class Prometheus(Section):
     port: Port = 9947
 
 
+class HomeAssistant(Section):
+    """Home Assistant's discovery, through the broker of `[mqtt]`."""
+
+    prefix: Annotated[str, Field(pattern=r"^[^#+\s]+$")] = "homeassistant"
+    """The discovery prefix of its MQTT integration."""
+
+
 class Outputs(Section):
     """What several of them need, and a section each."""
 
@@ -67,3 +74,9 @@ class Outputs(Section):
     gpsd: Gpsd | None = None
     nmea: NmeaServed | None = None
     prometheus: Prometheus | None = None
+    home_assistant: HomeAssistant | None = None
+
+    @property
+    def through_the_broker(self) -> tuple[str, ...]:
+        """Those that are configured and go out by MQTT."""
+        return tuple(n for n in ("home_assistant",) if getattr(self, n) is not None)

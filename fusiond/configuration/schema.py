@@ -297,6 +297,12 @@ class Config(Section):
         return data
 
     @model_validator(mode="after")
+    def _broker_for_what_needs_it(self) -> Config:
+        if self.outputs.through_the_broker and not self.mqtt.enabled:
+            raise ValueError(f"[outputs.{self.outputs.through_the_broker[0]}] needs [mqtt] enabled")
+        return self
+
+    @model_validator(mode="after")
     def _one_raw_receiver(self) -> Config:
         raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
         if len(raw) > 1:

@@ -21,7 +21,8 @@ from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.health import OutputHealth, health_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.status import status_message
-from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, Topic
+from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, TRACKER, Topic
+from fusiond.outputs.tracking import Tracking
 
 STATUS_EVERY_S = 1
 # A calibration moves over minutes; a state that changes goes out at once.
@@ -52,6 +53,7 @@ class Publishing:
         self._mode: Mode | None = None
         self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
         self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
+        self._tracking = Tracking()
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
         self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
         self._calibrated: tuple[CalibrationState, ...] = ()
@@ -78,6 +80,9 @@ class Publishing:
         if not due:
             return
         message = settled = nav_message(solution, utc_ns)
+        tracker = self._tracking.due(t_ns, message)
+        if tracker is not None:
+            self._tell(TRACKER, tracker)
         if utc_ns is not None and not self._clock.sets_others:
             settled = message.model_copy(update={"t_utc": None, "t_ms": None})
         for output in due:

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from drivers.base import DriverStatus
 from fusiond.outputs.messages.base import Message
+from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import Topic
 
 
@@ -44,3 +45,11 @@ class Surroundings:
     vehicle: str
     on_event: Callable[[str, str], None]
     geoid_separation_m: float | None = None
+    sources: tuple[str, ...] = ()
+    """Names of the devices."""
+    mqtt: MqttPublisher | None = None
+
+    def broker(self) -> MqttPublisher:
+        """For outputs that go out by MQTT; the configuration has seen to it that there is one."""
+        assert self.mqtt is not None
+        return self.mqtt

@@ -10,6 +10,7 @@ from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.gpsd.server import GpsdServer
+from fusiond.outputs.home_assistant import HomeAssistantDiscovery
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.nmea import NmeaServer
 from fusiond.outputs.prometheus import PrometheusEndpoint
@@ -17,6 +18,7 @@ from fusiond.outputs.prometheus import PrometheusEndpoint
 MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "gpsd": GpsdServer,
     "nmea": NmeaServer,
+    "home_assistant": HomeAssistantDiscovery,
     "prometheus": PrometheusEndpoint,
 }
 """By the section's name below `[outputs]`."""
@@ -34,8 +36,9 @@ def make_outputs(
     Raises `ConfigError` for one that cannot be as it is configured.
     """
     made: dict[str, Output] = {}
+    mqtt: MqttPublisher | None = None
     if config.mqtt.enabled:
-        made["mqtt"] = MqttPublisher(
+        made["mqtt"] = mqtt = MqttPublisher(
             config.mqtt,
             config.vehicle,
             on_event=partial(on_event, "mqtt"),
@@ -46,7 +49,11 @@ def make_outputs(
         section = getattr(config.outputs, name)
         if section is not None:
             around = Surroundings(
-                config.vehicle, partial(on_event, name), config.outputs.geoid_separation_m
+                config.vehicle,
+                partial(on_event, name),
+                config.outputs.geoid_separation_m,
+                tuple(config.sources),
+                mqtt,
             )
             made[name] = make(section, around)
     return made

@@ -41,6 +41,7 @@ SECTIONS = {
     "[outputs.gpsd]": outputs.Gpsd,
     "[outputs.nmea]": outputs.NmeaServed,
     "[outputs.prometheus]": outputs.Prometheus,
+    "[outputs.home_assistant]": outputs.HomeAssistant,
 }
 
 

@@ -22,6 +22,7 @@ from fusiond.outputs.messages.health import (
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import status_message
+from fusiond.outputs.messages.tracker import tracker_message
 
 UTC_NS = 1_795_217_587_123_456_789
 
@@ -169,6 +170,7 @@ EXAMPLES: dict[str, Any] = {
         ],
         False,
     ),
+    "tracker": tracker_message(nav_message(SOLUTION, UTC_NS)),
     "event": event_message(
         UTC_NS,
         source="rdss",
