@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -65,6 +66,22 @@ class HomeAssistant(Section):
     """The discovery prefix of its MQTT integration."""
 
 
+class OwnTracks(Section):
+    """A location for OwnTracks' maps, through the broker of `[mqtt]`."""
+
+    user: Annotated[str, Field(pattern=r"^[^/#+\s]+$")] = "fusiond"
+    """Second part of the topic `owntracks/<user>/<vehicle>`."""
+    tid: Annotated[str, Field(pattern=r"^[A-Za-z0-9]{2}$")] | None = None
+    """Two characters on the map; by default the last two of `vehicle`."""
+
+
+class Chrony(Section):
+    """Time for chrony's reference clock `SOCK`."""
+
+    socket: Path = Path("/run/chrony.fusiond.sock")
+    """As in chrony.conf; Debian's AppArmor profile lets chronyd make `/run/chrony.*.sock`."""
+
+
 class Outputs(Section):
     """What several of them need, and a section each."""
 
@@ -75,8 +92,10 @@ class Outputs(Section):
     nmea: NmeaServed | None = None
     prometheus: Prometheus | None = None
     home_assistant: HomeAssistant | None = None
+    owntracks: OwnTracks | None = None
+    chrony: Chrony | None = None
 
     @property
     def through_the_broker(self) -> tuple[str, ...]:
         """Those that are configured and go out by MQTT."""
-        return tuple(n for n in ("home_assistant",) if getattr(self, n) is not None)
+        return tuple(n for n in ("home_assistant", "owntracks") if getattr(self, n) is not None)

@@ -303,6 +303,14 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _chrony_hears_another_clock(self) -> Config:
+        if self.outputs.chrony is not None and self.clock.utc == "system":
+            raise ValueError(
+                "[outputs.chrony] with clock.utc 'system' would set the system clock by itself"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _one_raw_receiver(self) -> Config:
         raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
         if len(raw) > 1:

@@ -76,7 +76,7 @@ class Daemon:
             config,
             on_event=self._events.report,
             on_command=Operator(self.navigator, self.sources).carry_out,
-            utc_now=lambda: self.clock.utc_ns(self.clock.now_ns()),
+            clock=self.clock,
         )
         for output in self.outputs.values():
             self._events.listen(partial(output.take, EVENT))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.base import DriverStatus
+from fusiond.clock.clock import Clock
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import Topic
@@ -48,8 +49,14 @@ class Surroundings:
     sources: tuple[str, ...] = ()
     """Names of the devices."""
     mqtt: MqttPublisher | None = None
+    clock: Clock | None = None
 
     def broker(self) -> MqttPublisher:
         """For outputs that go out by MQTT; the configuration has seen to it that there is one."""
         assert self.mqtt is not None
         return self.mqtt
+
+    def time(self) -> Clock:
+        """For an output that tells time."""
+        assert self.clock is not None
+        return self.clock

@@ -6,18 +6,23 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
+from fusiond.outputs.chrony import ChronySocket
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.home_assistant import HomeAssistantDiscovery
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.nmea import NmeaServer
+from fusiond.outputs.owntracks import OwnTracksLocations
 from fusiond.outputs.prometheus import PrometheusEndpoint
 
 MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "gpsd": GpsdServer,
     "nmea": NmeaServer,
+    "owntracks": OwnTracksLocations,
+    "chrony": ChronySocket,
     "home_assistant": HomeAssistantDiscovery,
     "prometheus": PrometheusEndpoint,
 }
@@ -29,7 +34,7 @@ def make_outputs(
     *,
     on_event: Callable[[str, str, str], None],
     on_command: Handler,
-    utc_now: Callable[[], int | None],
+    clock: Clock,
 ) -> dict[str, Output]:
     """Those that are configured, by name, MQTT first. `on_event(source, code, text)` hears them.
 
@@ -43,7 +48,7 @@ def make_outputs(
             config.vehicle,
             on_event=partial(on_event, "mqtt"),
             on_command=on_command,
-            utc_now=utc_now,
+            utc_now=lambda: clock.utc_ns(clock.now_ns()),
         )
     for name, make in MAKERS.items():
         section = getattr(config.outputs, name)
@@ -54,6 +59,7 @@ def make_outputs(
                 config.outputs.geoid_separation_m,
                 tuple(config.sources),
                 mqtt,
+                clock,
             )
             made[name] = make(section, around)
     return made

@@ -42,6 +42,8 @@ SECTIONS = {
     "[outputs.nmea]": outputs.NmeaServed,
     "[outputs.prometheus]": outputs.Prometheus,
     "[outputs.home_assistant]": outputs.HomeAssistant,
+    "[outputs.owntracks]": outputs.OwnTracks,
+    "[outputs.chrony]": outputs.Chrony,
 }
 
 
