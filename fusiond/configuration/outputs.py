@@ -59,6 +59,15 @@ class Prometheus(Section):
     port: Port = 9947
 
 
+class Foxglove(Served):
+    """Foxglove's WebSocket protocol; needs the extra `foxglove`."""
+
+    port: Port = 8765
+    """As Foxglove proposes it."""
+    rate_hz: Rate = 10.0
+    """Of position and attitude."""
+
+
 class HomeAssistant(Section):
     """Home Assistant's discovery, through the broker of `[mqtt]`."""
 
@@ -91,6 +100,7 @@ class Outputs(Section):
     gpsd: Gpsd | None = None
     nmea: NmeaServed | None = None
     prometheus: Prometheus | None = None
+    foxglove: Foxglove | None = None
     home_assistant: HomeAssistant | None = None
     owntracks: OwnTracks | None = None
     chrony: Chrony | None = None

@@ -11,6 +11,7 @@ from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.chrony import ChronySocket
 from fusiond.outputs.commands import Handler
+from fusiond.outputs.foxglove.server import FoxgloveServer
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.home_assistant import HomeAssistantDiscovery
 from fusiond.outputs.mqtt import MqttPublisher
@@ -25,6 +26,7 @@ MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "chrony": ChronySocket,
     "home_assistant": HomeAssistantDiscovery,
     "prometheus": PrometheusEndpoint,
+    "foxglove": FoxgloveServer,
 }
 """By the section's name below `[outputs]`."""
 

@@ -42,6 +42,7 @@ SECTIONS = {
     "[outputs.nmea]": outputs.NmeaServed,
     "[outputs.prometheus]": outputs.Prometheus,
     "[outputs.home_assistant]": outputs.HomeAssistant,
+    "[outputs.foxglove]": outputs.Foxglove,
     "[outputs.owntracks]": outputs.OwnTracks,
     "[outputs.chrony]": outputs.Chrony,
 }
