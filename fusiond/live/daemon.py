@@ -32,7 +32,8 @@ from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import WarmKeeper
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
-from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.catalogue import make_outputs
+from fusiond.outputs.topics import EVENT
 
 log = logging.getLogger("fusiond")
 
@@ -71,19 +72,18 @@ class Daemon:
             now=self.clock.now_ns,
             on_time=self.service.feed_watchdog,
         )
-        self.mqtt: MqttPublisher | None = None
+        self.outputs = make_outputs(
+            config,
+            on_event=self._events.report,
+            on_command=Operator(self.navigator, self.sources).carry_out,
+            clock=self.clock,
+        )
+        for output in self.outputs.values():
+            self._events.listen(partial(output.take, EVENT))
         self._publishing: Publishing | None = None
-        if config.mqtt.enabled:
-            self.mqtt = MqttPublisher(
-                config.mqtt,
-                config.vehicle,
-                on_event=partial(self._events.report, "mqtt"),
-                on_command=Operator(self.navigator, self.sources).carry_out,
-                utc_now=lambda: self.clock.utc_ns(self.clock.now_ns()),
-            )
-            self._events.listen(self.mqtt.publish_event)
+        if self.outputs:
             self._publishing = Publishing(
-                config, self.clock, self.navigator, self.sources, self.scheduler, self.mqtt
+                config, self.clock, self.navigator, self.sources, self.scheduler, self.outputs
             )
         self.solution: Solution | None = None
         self._on_solution = on_solution
@@ -99,10 +99,16 @@ class Daemon:
             self.config.vehicle,
             config_digest(self.config),
         )
-        outputs = []
-        if self.mqtt is not None:
-            fault = partial(self._events.report, "mqtt", "output_fault")
-            outputs.append(asyncio.create_task(supervise("output mqtt", self.mqtt.run, fault)))
+        outputs = [
+            asyncio.create_task(
+                supervise(
+                    f"output {name}",
+                    output.run,
+                    partial(self._events.report, name, "output_fault"),
+                )
+            )
+            for name, output in self.outputs.items()
+        ]
         work = [
             asyncio.create_task(self.sources.run(), name="sources"),
             asyncio.create_task(self.scheduler.run(), name="scheduler"),

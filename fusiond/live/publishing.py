@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import version
 
 from fusiond.clock.clock import Clock
@@ -13,12 +14,15 @@ from fusiond.live.sources import Sources
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.calibration import CalibrationState
 from fusiond.navigator.navigator import Navigator
+from fusiond.outputs.base import Output
+from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
-from fusiond.outputs.messages.health import health_message
+from fusiond.outputs.messages.health import OutputHealth, health_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.status import status_message
-from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, TRACKER, Topic
+from fusiond.outputs.tracking import Tracking
 
 STATUS_EVERY_S = 1
 # A calibration moves over minutes; a state that changes goes out at once.
@@ -26,7 +30,7 @@ CALIBRATION_EVERY_S = 30
 
 
 class Publishing:
-    """Makes a vehicle's messages in the tick and puts them into their places at the publisher."""
+    """Makes a vehicle's messages in the tick and hands them to every output, which keeps them."""
 
     def __init__(
         self,
@@ -35,20 +39,21 @@ class Publishing:
         navigator: Navigator,
         sources: Sources,
         scheduler: Scheduler,
-        mqtt: MqttPublisher,
+        outputs: Mapping[str, Output],
     ) -> None:
         self._clock = clock
         self._navigator = navigator
         self._sources = sources
         self._scheduler = scheduler
-        self._mqtt = mqtt
+        self._outputs = outputs
         self._usage = ProcessUsage()
         self._version = version("fusiond")
         self._digest = config_digest(config)
         self._started_ns = self._since_ns = clock.now_ns()
         self._mode: Mode | None = None
-        self._nav = Every(round(SECOND_NS / config.mqtt.nav_rate_hz))
+        self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
         self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
+        self._tracking = Tracking()
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
         self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
         self._calibrated: tuple[CalibrationState, ...] = ()
@@ -59,13 +64,29 @@ class Publishing:
         if changed:
             self._mode, self._since_ns = solution.mode, t_ns
         utc_ns = self._clock.utc_ns(t_ns)
-        if self._nav.due(t_ns):
-            self._mqtt.publish_nav(nav_message(solution, utc_ns))
+        self._publish_nav(t_ns, utc_ns, solution)
         if self._status.due(t_ns) or changed:
             self._publish_status(t_ns, utc_ns, solution)
         if self._health.due(t_ns):
             self._publish_health(t_ns, utc_ns)
         self._publish_calibration(t_ns, utc_ns)
+
+    def _tell(self, topic: Topic, message: Message) -> None:
+        for output in self._outputs.values():
+            output.take(topic, message)
+
+    def _publish_nav(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
+        due = [output for output, every in self._nav if every.due(t_ns)]
+        if not due:
+            return
+        message = settled = nav_message(solution, utc_ns)
+        tracker = self._tracking.due(t_ns, message)
+        if tracker is not None:
+            self._tell(TRACKER, tracker)
+        if utc_ns is not None and not self._clock.sets_others:
+            settled = message.model_copy(update={"t_utc": None, "t_ms": None})
+        for output in due:
+            output.take(NAV, settled if output.sets_clocks else message)
 
     def _publish_calibration(self, t_ns: int, utc_ns: int | None) -> None:
         watch = self._navigator.calibrating
@@ -74,11 +95,13 @@ class Publishing:
             return
         self._calibrated = states
         message = calibration_message(utc_ns, watch.parameters, watch.settled)
-        self._mqtt.publish_calibration(message)
+        self._tell(CALIBRATION, message)
 
     def _publish_status(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         fused, rejected = _totals(self._navigator)
-        self._mqtt.publish_status(
+        mqtt = self._outputs.get("mqtt")
+        self._tell(
+            STATUS,
             status_message(
                 solution,
                 utc_ns,
@@ -90,25 +113,33 @@ class Publishing:
                 fused=fused,
                 rejected=rejected,
                 calibrated=self._navigator.calibrating.settled,
-                mqtt=self._mqtt.counters,
-            )
+                mqtt={} if mqtt is None else mqtt.counters,
+            ),
         )
 
     def _publish_health(self, t_ns: int, utc_ns: int | None) -> None:
         cpu_percent, memory_mb = self._usage.sample()
-        self._mqtt.publish_health(
+        self._tell(
+            HEALTH,
             health_message(
                 utc_ns,
                 sources=self._sources.health(t_ns),
+                outputs={name: _health(output) for name, output in self._outputs.items()},
                 scheduler=self._scheduler.status(),
                 clock=self._clock.status(),
                 cpu_percent=cpu_percent,
                 memory_mb=memory_mb,
-            )
+            ),
         )
         reports = self._navigator.verdicts.reports()
         if reports:
-            self._mqtt.publish_consistency(consistency_message(utc_ns, reports))
+            self._tell(CONSISTENCY, consistency_message(utc_ns, reports))
+
+
+def _health(output: Output) -> OutputHealth:
+    counters = {name: int(count) for name, count in output.counters.items() if count}
+    status = output.status
+    return OutputHealth(state=status.state, detail=status.detail, counters=counters)
 
 
 def _totals(navigator: Navigator) -> tuple[int, int]:
