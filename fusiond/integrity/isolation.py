@@ -14,7 +14,8 @@ Repetition    what is the same to the bit while the filter moves, more often tha
 
 A series that fails the mean test is measured against the rest: where another position, or the
 velocity of the same device, is believed, the series is excluded; where nothing is left to compare
-with, the filter's own motion and sensor errors are doubted, which widens P.
+with, the filter's own motion and sensor errors are doubted, which widens P. So they are when the
+aids that are fused correct its tilt more than its P allows (fusiond.integrity.tilt).
 
 An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
 over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
@@ -48,6 +49,7 @@ from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.series import NO_TREND, PACES, Offset, Proof, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
+from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VE, VN
 
@@ -100,6 +102,7 @@ class Memory(NamedTuple):
 
     records: dict[str, Series]
     doubts: tuple[int, ...]
+    tilting: Tilting
 
 
 class Isolation:
@@ -108,6 +111,7 @@ class Isolation:
     def __init__(self, false_alarm: float = FALSE_ALARM) -> None:
         self._records: dict[str, Series] = {}
         self._doubts: tuple[int, ...] = ()
+        self._tilting = NOT_TILTING
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -137,17 +141,18 @@ class Isolation:
 
     def snapshot(self) -> Memory:
         """A copy of everything."""
-        return Memory({name: r.copied() for name, r in self._records.items()}, self._doubts)
+        records = {name: r.copied() for name, r in self._records.items()}
+        return Memory(records, self._doubts, self._tilting)
 
     def restore(self, memory: Memory) -> None:
         """Back to a snapshot."""
         self._records = {name: r.copied() for name, r in memory.records.items()}
-        self._doubts = memory.doubts
+        self._doubts, self._tilting = memory.doubts, memory.tilting
 
     def reset(self) -> None:
         """The filter starts anew: nobody is suspected."""
         self._records.clear()
-        self._doubts = ()
+        self._doubts, self._tilting = (), NOT_TILTING
 
     # ------------------------------------------------------------------ judgement
 
@@ -188,6 +193,14 @@ class Isolation:
         if not self._biased(record):
             return Action.NONE
         return self._doubted(self._blame(record, aid), t_ns)
+
+    def corrected(self, t_ns: int, before: Attitude, after: Attitude) -> Action:
+        """A position or velocity was fused; what the filter shall do about the attitude."""
+        self._tilting = self._tilting.with_one(t_ns, before, after)
+        if not self._tilting.too_far:
+            return Action.NONE
+        self._tilting = NOT_TILTING
+        return self._doubted(Action.DOUBT_MOTION, t_ns)
 
     def _record(self, aid: Aid) -> Series:
         """The series of an aid, which is heard of now."""
