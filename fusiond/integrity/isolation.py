@@ -47,7 +47,7 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
-from fusiond.integrity.series import NO_TREND, PACES, Offset, Proof, Series
+from fusiond.integrity.series import DRIFTS, NO_TREND, PACES, Offset, Proof, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -190,7 +190,7 @@ class Isolation:
             self._prove(record, t_ns, offer, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         self._average(record, outcome.whitened)
-        if not self._biased(record):
+        if not self._biased(record, t_ns):
             return Action.NONE
         return self._doubted(self._blame(record, aid), t_ns)
 
@@ -230,7 +230,7 @@ class Isolation:
         z = Offset(moved.north + way[0], moved.east + way[1], moved.sd)
         trend = p.trend.with_one(z, (t_ns - p.begin_ns) * 1e-9)
         record.proof = (
-            None if trend.steady else p._replace(t_ns=t_ns, velocity=v, way=way, trend=trend)
+            None if trend.steady() else p._replace(t_ns=t_ns, velocity=v, way=way, trend=trend)
         )
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
@@ -302,8 +302,8 @@ class Isolation:
         if (
             record.passes >= READMIT_COUNT
             and t_ns - record.passing_ns >= READMIT_NS
-            and (offset is None or record.trend.steady)
-            and not self._biased(record)
+            and (offset is None or record.trend.steady(record.least_trend_sd))
+            and not self._biased(record, t_ns)
         ):
             record.excluded, record.fused_ns = "", t_ns
             record.refused, record.jumped, record.count = 0, False, 0
@@ -327,7 +327,7 @@ class Isolation:
         record.slow = tuple([m + b * (y - m) for m, y in zip(record.slow, whitened, strict=True)])
         record.count += 1
 
-    def _biased(self, record: Series) -> bool:
+    def _biased(self, record: Series, t_ns: int) -> bool:
         count = record.count
         if count < FEWEST:
             return False
@@ -338,8 +338,9 @@ class Isolation:
             slow += s * s
         limit = gate_threshold(self._pass, degrees)
         if fast > limit * record.fast_spread or slow > limit * record.slow_spread:
+            record.forget_shown()
             return True
-        record.learn(fast / degrees, slow / degrees)
+        record.learn(t_ns, fast / degrees, slow / degrees)
         return False
 
     def _blame(self, record: Series, aid: Aid) -> Action:
@@ -351,7 +352,7 @@ class Isolation:
             source = self._supported(record.device, aid.t_ns)
         if not source:
             return Action.DOUBT_FILTER
-        self._exclude(record, aid.t_ns, "drifts", jumped=record.locates)
+        self._exclude(record, aid.t_ns, DRIFTS, jumped=record.locates)
         return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
 
 
