@@ -33,6 +33,7 @@ from tests.broker import free_port
 from tests.outputs.messages_examples import EXAMPLES
 from tests.outputs.serving import Around, TcpClient, at_work, connected, feed, nav
 from tests.patience import until
+from tests.places import REPOSITORY
 
 WATCH = b'?WATCH={"enable":true,"json":true}'
 
@@ -288,6 +289,13 @@ async def test_the_service_managers_socket_is_ours() -> None:
         async with connected(held.getsockname()) as client:
             assert await client.line() == b"ours"
         assert await process.wait() == 0
+
+
+def test_the_shipped_socket_has_our_name_and_port() -> None:
+    unit = (REPOSITORY / "systemd" / "fusiond-gpsd.socket").read_text()
+    options = Gpsd()
+    assert f"\nListenStream={options.host}:{options.port}\n" in unit
+    assert f"\nFileDescriptorName={GpsdServer.name}\n" in unit
 
 
 async def test_the_service_managers_socket_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
