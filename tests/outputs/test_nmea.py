@@ -78,6 +78,10 @@ def test_no_time_while_utc_is_not_settled() -> None:
     assert said["RMC"].lat == pytest.approx(31.025438871, abs=2e-9)
 
 
+def test_time_is_cut_off_not_rounded() -> None:
+    assert sentences(nav(t_ms=1_795_217_579_999), ("GGA",), None).startswith(b"$GNGGA,233259.99,")
+
+
 def test_pashr_comes_first_and_has_roll_and_pitch() -> None:
     epoch = sentences(nav(), ALL, GEOID_M)
     assert epoch.startswith(b"$PASHR,233307.12,346.09,T,+0.41,-1.21,,0.080,0.080,0.600,1,1*")
