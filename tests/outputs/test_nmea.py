@@ -130,7 +130,7 @@ def test_every_solution_can_be_read_back(
 async def test_everyone_gets_whole_epochs() -> None:
     server = NmeaServer(NmeaServed(port=free_port()), Around().surroundings)
     async with at_work(server):
-        address = server.server.address
+        address = server.server.port.address
         async with connected(address) as one, connected(address) as two:
             two.writer.write(b"whatever a plotter says\r\n")
             await until(lambda: len(server.server.clients) == 2)
