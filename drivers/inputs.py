@@ -25,8 +25,8 @@ Handler = Callable[[Any, int], None]
 
 
 class Inputs:
-    """The inputs of one driver by kind. `heard(kind, t_ns, payload)` is told each after it has
-    been handled, and what the driver `sent`."""
+    """The inputs of one driver by kind. `heard(kind, t_ns, payload)` is told each before it is
+    handled, and what the driver `sent`."""
 
     def __init__(self, host_now_ns: Now) -> None:
         self._host_now_ns = host_now_ns
@@ -48,13 +48,13 @@ class Inputs:
         """Handle an input that came at `t_ns`, now by default. KeyError for an unknown kind."""
         t_ns = self._host_now_ns() if t_ns is None else t_ns
         handler = self._handlers[kind]
+        if self.heard is not None:
+            self.heard(kind, t_ns, payload)
         self._held_ns = t_ns
         try:
             handler(payload, t_ns)
         finally:
             self._held_ns = None
-            if self.heard is not None:
-                self.heard(kind, t_ns, payload)
 
     def sent(self, data: bytes) -> None:
         """Tell who listens what the driver has sent to its device."""

@@ -22,7 +22,7 @@ Host time is injected; with the same host time and the same calls the answers ar
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import hypot
 from typing import NamedTuple, assert_never
@@ -140,6 +140,14 @@ class Clock:
     def now_ns(self) -> int:
         """The host's monotonic clock, ns."""
         return self._host.monotonic_ns()
+
+    def system_state(self) -> dict[str, int | None]:
+        """What is known of the system clock, for a replay (`restore_system`)."""
+        return self._system.state()
+
+    def restore_system(self, state: Mapping[str, int | None]) -> None:
+        """Know of the system clock what another `Clock` did at its start."""
+        self._system.restore(state)
 
     def look(self) -> int:
         """Sample the host's clocks; realtime minus monotonic, ns."""

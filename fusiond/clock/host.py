@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Literal, Protocol
 
 SECOND_NS = 1_000_000_000
@@ -31,6 +31,13 @@ _BELIEVE_STEP_NS = 120 * SECOND_NS
 """A step that is taken back within two minutes was a mistake (chrony makes its own at start)."""
 
 ReadClock = Literal["realtime", "boottime"]
+
+
+_KNOWN = (
+    *("_sampled_ns", "offset_ns", "_boot_ns", "before_step_ns", "held_ns", "slept_ns", "changes"),
+    *("last_step_ns", "_queued_ns", "_stepped_ns"),
+)
+"""The attributes that are a `SystemClock`'s state."""
 
 
 class HostTime(Protocol):
@@ -140,6 +147,15 @@ class SystemClock:
             self.held_ns = offset
         self._sampled_ns, self.offset_ns = now, offset
         return offset
+
+    def state(self) -> dict[str, int | None]:
+        """All that it knows, for `restore`."""
+        return {name: getattr(self, name) for name in _KNOWN}
+
+    def restore(self, state: Mapping[str, int | None]) -> None:
+        """Go on as the one did whose state this is. KeyError where something is missing."""
+        for name in _KNOWN:
+            setattr(self, name, state[name])
 
     def _sleep(self) -> int:
         """What boottime has gained on monotonic since it was last asked, ns: 0 for no sleep."""

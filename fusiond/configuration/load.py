@@ -145,4 +145,6 @@ def _absolute(section: BaseModel, base: Path) -> dict[str, Path]:
 
 def _resolve_paths(config: Config, base: Path) -> Config:
     mqtt = config.mqtt.model_copy(update=_absolute(config.mqtt, base))
-    return config.model_copy(update={**_absolute(config, base), "mqtt": mqtt})
+    recording = config.recording.model_copy(update=_absolute(config.recording, base))
+    of_sections = {"mqtt": mqtt, "recording": recording}
+    return config.model_copy(update={**_absolute(config, base), **of_sections})

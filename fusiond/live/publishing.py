@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import version
 
-from fusiond.clock.clock import Clock
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
+from fusiond.live.chain import Chain
 from fusiond.live.process_usage import ProcessUsage
-from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
-from fusiond.live.sources import Sources
+from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.calibration import CalibrationState
 from fusiond.navigator.navigator import Navigator
+from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
-from fusiond.outputs.messages.health import health_message
+from fusiond.outputs.messages.health import SchedulerStatus, health_message
 from fusiond.outputs.messages.nav import nav_message
-from fusiond.outputs.messages.status import status_message
+from fusiond.outputs.messages.status import RecordingStatus, status_message
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, Topic
+from fusiond.recording.recorder import Recorder
 
 STATUS_EVERY_S = 1
 # A calibration moves over minutes; a state that changes goes out at once.
@@ -31,21 +34,22 @@ class Publishing:
     def __init__(
         self,
         config: Config,
-        clock: Clock,
-        navigator: Navigator,
-        sources: Sources,
-        scheduler: Scheduler,
-        mqtt: MqttPublisher,
+        chain: Chain,
+        scheduler: Callable[[], SchedulerStatus],
+        mqtt: MqttPublisher | None,
+        recorder: Recorder | None = None,
     ) -> None:
-        self._clock = clock
-        self._navigator = navigator
-        self._sources = sources
+        self._clock = chain.clock
+        self._navigator = chain.navigator
+        self._sources = chain.sources
+        self._injection = chain.injection
         self._scheduler = scheduler
         self._mqtt = mqtt
+        self._recorder = recorder
         self._usage = ProcessUsage()
         self._version = version("fusiond")
         self._digest = config_digest(config)
-        self._started_ns = self._since_ns = clock.now_ns()
+        self._started_ns = self._since_ns = chain.clock.now_ns()
         self._mode: Mode | None = None
         self._nav = Every(round(SECOND_NS / config.mqtt.nav_rate_hz))
         self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
@@ -58,14 +62,22 @@ class Publishing:
         changed = solution.mode is not self._mode
         if changed:
             self._mode, self._since_ns = solution.mode, t_ns
+        if self._mqtt is None and (self._recorder is None or not self._recorder.active):
+            return
         utc_ns = self._clock.utc_ns(t_ns)
         if self._nav.due(t_ns):
-            self._mqtt.publish_nav(nav_message(solution, utc_ns))
+            self._publish(NAV, nav_message(solution, utc_ns))
         if self._status.due(t_ns) or changed:
             self._publish_status(t_ns, utc_ns, solution)
         if self._health.due(t_ns):
             self._publish_health(t_ns, utc_ns)
         self._publish_calibration(t_ns, utc_ns)
+
+    def _publish(self, topic: Topic, message: Message) -> None:
+        if self._mqtt is not None:
+            self._mqtt.publish(topic, message)
+        if self._recorder is not None:
+            self._recorder.publish(topic, message)
 
     def _publish_calibration(self, t_ns: int, utc_ns: int | None) -> None:
         watch = self._navigator.calibrating
@@ -74,11 +86,13 @@ class Publishing:
             return
         self._calibrated = states
         message = calibration_message(utc_ns, watch.parameters, watch.settled)
-        self._mqtt.publish_calibration(message)
+        self._publish(CALIBRATION, message)
 
     def _publish_status(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         fused, rejected = _totals(self._navigator)
-        self._mqtt.publish_status(
+        recorder = self._recorder
+        self._publish(
+            STATUS,
             status_message(
                 solution,
                 utc_ns,
@@ -86,29 +100,32 @@ class Publishing:
                 version=self._version,
                 config_digest=self._digest,
                 uptime_s=(t_ns - self._started_ns) * 1e-9,
-                scheduler=self._scheduler.status(),
+                scheduler=self._scheduler(),
                 fused=fused,
                 rejected=rejected,
                 calibrated=self._navigator.calibrating.settled,
-                mqtt=self._mqtt.counters,
-            )
+                recording=recorder.status if recorder is not None else RecordingStatus(),
+                injected=self._injection.active,
+                mqtt=self._mqtt.counters if self._mqtt is not None else {},
+            ),
         )
 
     def _publish_health(self, t_ns: int, utc_ns: int | None) -> None:
         cpu_percent, memory_mb = self._usage.sample()
-        self._mqtt.publish_health(
+        self._publish(
+            HEALTH,
             health_message(
                 utc_ns,
                 sources=self._sources.health(t_ns),
-                scheduler=self._scheduler.status(),
+                scheduler=self._scheduler(),
                 clock=self._clock.status(),
                 cpu_percent=cpu_percent,
                 memory_mb=memory_mb,
-            )
+            ),
         )
         reports = self._navigator.verdicts.reports()
         if reports:
-            self._mqtt.publish_consistency(consistency_message(utc_ns, reports))
+            self._publish(CONSISTENCY, consistency_message(utc_ns, reports))
 
 
 def _totals(navigator: Navigator) -> tuple[int, int]:

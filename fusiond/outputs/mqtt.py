@@ -1,6 +1,6 @@
 """MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
 
-`publish_*` put a message in its place and return: they never wait and never raise. One task sends
+`publish` puts a message in its place and returns: it never waits and never raises. One task sends
 the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
 the next); both belong to one connection and end with it. A broker that accepts bytes and does
 nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
@@ -24,24 +24,8 @@ from fusiond.outputs import broker_access
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.messages.base import Message
-from fusiond.outputs.messages.calibration import CalibrationMessage
-from fusiond.outputs.messages.consistency import ConsistencyMessage
-from fusiond.outputs.messages.event import EventMessage
-from fusiond.outputs.messages.health import HealthMessage
-from fusiond.outputs.messages.nav import NavMessage
-from fusiond.outputs.messages.status import StatusMessage
 from fusiond.outputs.reconnecting import Reconnecting
-from fusiond.outputs.topics import (
-    CALIBRATION,
-    CONSISTENCY,
-    EVENT,
-    HEALTH,
-    NAV,
-    REPLY,
-    STATUS,
-    Topic,
-    base_topic,
-)
+from fusiond.outputs.topics import REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
@@ -109,23 +93,15 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ for the tick
 
-    def publish_nav(self, message: NavMessage) -> None:
-        self._replace(NAV, message)
-
-    def publish_health(self, message: HealthMessage) -> None:
-        self._replace(HEALTH, message)
-
-    def publish_consistency(self, message: ConsistencyMessage) -> None:
-        self._replace(CONSISTENCY, message)
-
-    def publish_status(self, message: StatusMessage) -> None:
-        self._retain(STATUS, message)
-
-    def publish_calibration(self, message: CalibrationMessage) -> None:
-        self._retain(CALIBRATION, message)
-
-    def publish_event(self, message: EventMessage) -> None:
-        self._enqueue(EVENT, message)
+    def publish(self, topic: Topic, message: Message) -> None:
+        """Put a message in its place: what is confirmed and not retained waits in the queue, of all
+        else the latest counts."""
+        if topic.qos == 0:
+            self._replace(topic, message)
+        elif topic.retained:
+            self._retain(topic, message)
+        else:
+            self._enqueue(topic, message)
 
     def _replace(self, topic: Topic, message: Message) -> None:
         self.counters["mqtt_dropped"] += topic in self._latest

@@ -36,6 +36,7 @@ SECTIONS = {
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,
     "[mqtt]": config.Mqtt,
+    "[recording]": config.Recording,
 }
 
 

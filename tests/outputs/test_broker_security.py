@@ -19,6 +19,7 @@ import pytest
 from fusiond.configuration.schema import Mqtt
 from fusiond.outputs.commands import Command
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, EVENT, HEALTH, NAV, STATUS
 from tests.broker import Broker, Listener, listening
 from tests.outputs.messages_examples import EXAMPLES
 from tests.patience import PATIENCE_S
@@ -124,12 +125,12 @@ async def test_each_user_may_do_what_is_its_business(broker: Broker, certificate
         ):
             for listener in (seen, heard):
                 await listener.until(lambda li: li.payloads("fusiond/truck/online") == [b"online"])
-            publisher.publish_nav(EXAMPLES["nav"])
-            publisher.publish_status(EXAMPLES["status"])
-            publisher.publish_health(EXAMPLES["health"])
-            publisher.publish_consistency(EXAMPLES["consistency"])
-            publisher.publish_calibration(EXAMPLES["calibration"])
-            publisher.publish_event(EXAMPLES["event"])
+            publisher.publish(NAV, EXAMPLES["nav"])
+            publisher.publish(STATUS, EXAMPLES["status"])
+            publisher.publish(HEALTH, EXAMPLES["health"])
+            publisher.publish(CONSISTENCY, EXAMPLES["consistency"])
+            publisher.publish(CALIBRATION, EXAMPLES["calibration"])
+            publisher.publish(EVENT, EXAMPLES["event"])
             for topic in ("nav", "status", "health", "consistency", "calibration", "event"):
                 await seen.until(lambda li, name=topic: li.payloads(f"fusiond/truck/{name}"))
             # The broker has confirmed, and dropped, the dashboard's command before the operator's.
