@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from drivers.base import Driver, Emitted
 from drivers.inputs import Inputs
-from drivers.measurements import DeviceEvent, ImuSample, TimeReport
-from drivers.raw.messages import Ephemeris, Klobuchar
-from fusiond.clock.clock import Clock
+from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.clock.clock import Clock, Instant
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.live.injection import Injection
@@ -67,6 +67,8 @@ class Sources:
         self._imu: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=IMU_QUEUE)
         self._imu_source: str | None = None
         self.counters: Counter[str] = Counter()
+        self.on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None] | None = None
+        """Hears every measurement with its instant."""
         self.all: dict[str, Source] = {}
         points = driver_entry_points()
         for name, section in config.sources.items():
@@ -115,6 +117,8 @@ class Sources:
         source.last_seen_ns = item.t_seen_ns
         instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
         source.latency_s = (item.t_seen_ns - instant.t_valid_ns) * 1e-9
+        if self.on_arrival is not None:
+            self.on_arrival(item, instant)
         if isinstance(item, ImuSample):
             self._imu_source = self._imu_source or item.source
             if item.source != self._imu_source:

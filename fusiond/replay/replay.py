@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from fusiond.clock.clock import Clock
+from drivers.measurements import Measurement
+from drivers.raw.messages import RawGnssEpoch
+from fusiond.clock.clock import Clock, Instant
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
@@ -35,6 +37,9 @@ from fusiond.recording.records import Kind, Record, Tick, input_of, tick_of
 from fusiond.replay.recorded_time import RecordedReadings, RecordedTime
 
 log = logging.getLogger("fusiond")
+
+
+Arrival = Callable[[Measurement | RawGnssEpoch, Instant], None]
 
 
 class Divergence(NamedTuple):
@@ -68,7 +73,8 @@ class Replay:
     """One run through a log with a configuration. `exact` says whether the log's own digests should
     come out: it does not for another configuration, nor from the middle of a drive.
 
-    `on_event` and `on_outcome` hear what the daemon's parts say.
+    `on_event`, `on_outcome` and `on_arrival` (of each measurement, with its instant) hear what the
+    daemon's parts say. Without `navigate` the filter does not run, and there are no ticks.
     """
 
     def __init__(
@@ -78,7 +84,10 @@ class Replay:
         same: bool = True,
         on_event: Callable[[EventMessage], None] | None = None,
         on_outcome: Callable[[Entry], None] | None = None,
+        navigate: bool = True,
+        on_arrival: Arrival | None = None,
     ) -> None:
+        self._navigate, self._on_arrival = navigate, on_arrival
         self._log = recording
         self._config = config
         self._same = same
@@ -133,6 +142,7 @@ class Replay:
             loaded.offer(self.chain)
         except DamagedStateError as error:
             self.began = f"an alignment: the log's state is of another filter ({error})"
+        self.chain.sources.on_arrival = self._on_arrival
         for name, inputs in self.chain.sources.inputs.items():
             inputs.heard = self._listener(name)
         self.exact = self._same and from_start and self._log.first_part
@@ -165,6 +175,8 @@ class Replay:
         self._time.t_ns = record.t_ns
         self._readings.give(record.readings)
         match record.kind:
+            case Kind.TICK if not self._navigate:
+                self.chain.sources.take_imu()
             case Kind.TICK:
                 yield self._tick(record)
             case Kind.COMMAND:
