@@ -34,7 +34,7 @@ class Edited:
 def merge(paths: Sequence[Path], out: Path) -> Edited:
     """All parts of one recording as one file. Raises `LogError`, OSError."""
     recording = Log(paths)
-    written = _write(out, recording.about, {}, recording.messages())
+    written = write_log(out, recording.about, {}, recording.messages())
     return Edited(out, written, "what the recording began with", tuple(recording.problems))
 
 
@@ -56,13 +56,13 @@ def trim(paths: Sequence[Path], from_s: float, to_s: float, out: Path) -> Edited
     recording.problems.clear()
     if from_s <= 0.0:
         chosen = (m for m in recording.messages() if m.t_log_ns <= end_ns)
-        written = _write(out, recording.about, {}, chosen)
+        written = write_log(out, recording.about, {}, chosen)
         return Edited(out, written, "what the recording began with", tuple(recording.problems))
     start_ns = states[-1] if states else begin_ns
     head = _head(recording, start_ns)
     chosen = (m for m in recording.messages() if start_ns <= m.t_log_ns <= end_ns)
     cut = {"cut_from_s": f"{(start_ns - first_ns) / SECOND_NS:.3f}"}
-    written = _write(out, recording.about, cut, chain([head], chosen))
+    written = write_log(out, recording.about, cut, chain([head], chosen))
     begins = "a state of the log" if states else "no state: a replay aligns first"
     return Edited(out, written, begins, tuple(recording.problems))
 
@@ -102,9 +102,10 @@ def _head(recording: Log, t_log_ns: int) -> LogMessage:
     return LogMessage(INPUT, t_log_ns, pack(record), max(0, sequence))
 
 
-def _write(
+def write_log(
     out: Path, about: Described, more: dict[str, str], messages: Iterable[LogMessage]
 ) -> int:
+    """Messages as a log of their own, with `more` in its metadata; how many they are."""
     attachments = tuple(
         Attachment(name, _TYPES.get(Path(name).suffix, "text/plain"), data)
         for name, data in about.attachments.items()

@@ -115,6 +115,7 @@ class LogWriter:
         try:
             self._look_at_the_disk()
             self._file = self._open(self._t_log_ns)
+            self._keep_newest()
             while not self._closing.wait(WRITE_S):
                 self._write_waiting()
                 self._file.sync()

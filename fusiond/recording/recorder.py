@@ -90,6 +90,7 @@ class Recorder:
         self._count = 0
         self._message_ns = now_ns
         self._state_ns: int | None = None
+        self._state_part = 0
 
     # ------------------------------------------------------------------ what is asked of it
 
@@ -230,13 +231,15 @@ class Recorder:
             self._put(Item(INNOVATION, t_log_ns, innovation(source, t_ns, outcome)))
 
     def state_due(self, t_ns: int) -> bool:
-        """Whether `keep_state` should be called: now and then, and first of all."""
-        due = self._state_ns is None or t_ns - self._state_ns >= STATE_EVERY_NS
-        return due and self.active
+        """Whether `keep_state` should be called: now and then, and first of all in each file."""
+        old = self._state_ns is None or t_ns - self._state_ns >= STATE_EVERY_NS
+        parts = 0 if self._writer is None else self._writer.parts
+        return self.active and (old or parts != self._state_part)
 
     def keep_state(self, t_ns: int, kept: bytes) -> None:
         """A navigation state as the warm start takes it (JSON): where a cut log can begin."""
         self._state_ns = t_ns
+        self._state_part = 0 if self._writer is None else self._writer.parts
         self._put(Item(STATE, t_ns + self._epoch_ns, kept))
 
     # ------------------------------------------------------------------ inside

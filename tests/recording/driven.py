@@ -22,6 +22,7 @@ from fusiond.live.publishing import Publishing
 from fusiond.live.scheduler import Scheduler
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.solution import Solution
+from fusiond.outputs.commands import NAMES, Command
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -97,6 +98,12 @@ class Drive:
     def take(self, source: str, kind: str, payload: Any = None) -> None:
         self.host.mono += 30_000  # each input takes its time
         self.inputs[source].take(kind, payload, self.host.mono)
+
+    def command(self, command: Command) -> str:
+        """An operator says something."""
+        self.host.mono += 30_000
+        self.recorder.command(self.host.mono, NAMES[type(command)], command)
+        return self.chain.operator.carry_out(command, self.host.mono)
 
     def run(self, until_s: float, at_tick: Callable[[int], None] | None = None) -> None:
         """Drive until `until_s` of the drive."""
