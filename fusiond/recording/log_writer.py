@@ -62,6 +62,7 @@ class Item:
 class LogWriter:
     """Writes one recording into files `STEM_0000.mcap`, ... of `folder` until it is closed.
 
+    `about()` describes it; it is called in the thread, since it reads files.
     `on_stop(why)` is called from the thread when it has to stop by itself. The other attributes may
     be read at any time: `path` of the file under way, `dropped` messages, `free_mb` of the disk.
     """
@@ -70,12 +71,14 @@ class LogWriter:
         self,
         folder: Path,
         stem: str,
-        about: About,
+        vehicle: str,
+        about: Callable[[], About],
         options: Recording,
         t_log_ns: int,
         on_stop: Callable[[str], None],
     ) -> None:
-        self._folder, self._stem, self._about = folder, stem, about
+        self._folder, self._stem, self._vehicle = folder, stem, vehicle
+        self._describe = about
         self._options = options
         self._on_stop = on_stop
         self._queue: deque[Item] = deque()
@@ -114,6 +117,7 @@ class LogWriter:
     def _run(self) -> None:
         try:
             self._look_at_the_disk()
+            self._about = self._describe()
             self._file = self._open(self._t_log_ns)
             self._keep_newest()
             while not self._closing.wait(WRITE_S):
@@ -176,7 +180,7 @@ class LogWriter:
         if now_ns - self._looked_ns < KEEP_EVERY_NS:
             return
         self._looked_ns = now_ns
-        logs = sorted(logs_of(self._folder, self._about.metadata["vehicle"]), key=_age)
+        logs = sorted(logs_of(self._folder, self._vehicle), key=_age)
         sizes = [_size(path) for path in logs]
         excess = sum(sizes) - self._options.keep_mb * MB
         for path, size in zip(logs, sizes, strict=True):

@@ -250,9 +250,10 @@ class Recorder:
             raise RecordingRefusedError("recording.directory is not configured")
         run = uuid4().hex
         t_log_ns = self._clock.now_ns() + self._epoch_ns
-        about = about_run(self._config, run, self._epoch_ns, self._numbers)
-        stem = log_stem(self._config.vehicle, t_log_ns, run)
-        return LogWriter(folder, stem, about, self._options, t_log_ns, self._stop)
+        vehicle = self._config.vehicle
+        about = partial(about_run, self._config, run, self._epoch_ns, list(self._numbers))
+        stem = log_stem(vehicle, t_log_ns, run)
+        return LogWriter(folder, stem, vehicle, about, self._options, t_log_ns, self._stop)
 
     def _stop(self, why: str) -> None:
         """From the writer's thread: the next tick notices."""

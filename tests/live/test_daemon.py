@@ -28,8 +28,8 @@ from fusiond.configuration.load import load_config
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.saved_state import SavedState, save_state
-from fusiond.outputs.messages.health import SourceHealth
 from fusiond.outputs.commands import COMMANDS
+from fusiond.outputs.messages.health import SourceHealth
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.replay.run import Wish, replay
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
