@@ -42,7 +42,7 @@ log = logging.getLogger("fusiond")
 WRITE_S = 0.5
 """Between two writes with sync: with the disk's own time still below the 2 s that may be lost."""
 QUEUE = 20_000
-"""Messages that may wait: half a minute of 500 a second, 15 MB; a disk that hangs longer loses."""
+"""Messages that may wait: over a minute of 200 a second, 15 MB; a disk that hangs longer loses."""
 KEEP_EVERY_NS = 10 * SECOND_NS
 """Between two looks at which logs are too many: at most 10 MB come in that time."""
 MB = 1_000_000
