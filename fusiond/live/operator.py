@@ -35,6 +35,10 @@ class Operator:
                 if command.source not in self._sources.all:
                     there = ", ".join(self._sources.all)
                     raise CommandRefusedError(f"no source {command.source!r}; there are {there}")
+                raw = command.source in self._navigator.raw
+                if raw and command.fault not in ("drop", "delay"):
+                    text = "raw satellite data can be dropped and delayed, no more"
+                    raise CommandRefusedError(text)
                 return self._injection.inject(command, t_ns)
             case SetPosition():
                 return self._set_position(command)

@@ -143,7 +143,8 @@ class Replay:
         except DamagedStateError as error:
             self.began = f"an alignment: the log's state is of another filter ({error})"
         self.chain.sources.on_arrival = self._on_arrival
-        for name, inputs in self.chain.sources.inputs.items():
+        self._doors = self.chain.sources.inputs
+        for name, inputs in self._doors.items():
             inputs.heard = self._listener(name)
         self.exact = self._same and from_start and self._log.first_part
         self._finish(record)
@@ -195,14 +196,13 @@ class Replay:
             self.chain.clock.look()
 
     def _take(self, record: Record) -> None:
-        assert self.chain is not None
         name = self._sources[record.source]
-        source = self.chain.sources.all.get(name)
-        if source is None:  # another configuration, without it
+        door = self._doors.get(name)
+        if door is None:  # another configuration, without it
             return
         kind, payload = input_of(record)
         try:
-            self.chain.sources.inputs[name].take(kind, payload, record.t_ns)
+            door.take(kind, payload, record.t_ns)
         except KeyError:
             self._fault(f"{name}: its driver knows no input {kind!r}")
         except Exception as error:  # the daemon restarts a driver that raises
