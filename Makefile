@@ -101,6 +101,9 @@ lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for n
 	cp requirements-dev.lock requirements.lock
 	$(COMPILE) --extra demo --extra raw --output-file requirements.lock pyproject.toml
 
+golden: $(STAMP) ## what the kept recordings give now, into tests/golden; git diff shows what changed
+	$(BIN)/python -m tests.golden.golden $(ARGS)
+
 clean: ## remove what the other targets made
 	rm -rf $(VENV) build dist *.egg-info .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
