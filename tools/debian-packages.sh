@@ -26,6 +26,7 @@ for purpose in "$@"; do
         ;;
     test)
         need mosquitto "MQTT broker of the tests"
+        need gpsd "reads what we serve as gpsd and as NMEA"
         need iproute2 "sets up vcan0"
         need kmod "loads the CAN modules of the test kernel"
         need can-utils "candump, to look at a bus by hand"

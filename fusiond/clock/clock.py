@@ -12,9 +12,7 @@ lives in the year 2100 is late by as much as any. UTC itself is another matter: 
 a plausible date has lasted for minutes, and with an event.
 
 It is the only place that knows leap seconds and weeks: UTC is POSIX nanoseconds, a leap second
-repeats the second before, and shows here as a jump of UTC that is learnt again and counted. Dates
-from before the last rollover of the ten-bit GPS week are moved by 1024 weeks (IS-GPS-200,
-20.3.3.3.1.1).
+repeats the second before, and shows here as a jump of UTC that is learnt again and counted.
 
 Host time is injected; with the same host time and the same calls the answers are the same.
 """
@@ -37,6 +35,7 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
+from fusiond.clock import dates
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import (
     MILLISECOND_NS,
@@ -68,12 +67,9 @@ _RESUMED_NS = 60 * SECOND_NS
 _BETTER_NS = 5 * MILLISECOND_NS
 _TOLD_NS = 500 * MILLISECOND_NS
 """A change of UTC this large is an event when another source becomes the reference."""
-WEEKS_1024_NS = 1024 * 7 * 86400 * SECOND_NS
-EARLIEST_UTC_NS = 1554595200 * SECOND_NS
-"""2019-04-07, the last rollover of the ten-bit GPS week: earlier dates are mistakes."""
-LATEST_UTC_NS = 1793491200 * SECOND_NS + WEEKS_1024_NS
-"""1024 weeks (19.6 years) after this release, 2026-11-01: no date is believed that has come out of
-a rollover moved once too often, nor one beyond the service life of this code."""
+
+_SETS_CLOCKS_SD_S = 2e-2
+"""After eight reports of a receiver; one of whole seconds, late by up to a second, takes fifty."""
 
 _KERNEL_SD_S = 1e-4
 _DEVICE_SD_S = 5e-4
@@ -111,10 +107,18 @@ class ClockStatus:
     counters: dict[str, int] = field(default_factory=dict)
 
 
+class TimeSample(NamedTuple):
+    """What CLOCK_REALTIME said when a report of the reference came in, and true UTC then (ns)."""
+
+    system_ns: int
+    utc_ns: int
+
+
 class Clock:
     """Turns stamps into instants. `counters` names everything it refused, guessed or learnt.
 
-    `on_event(code, text)` hears of `utc_jumped`, `system_clock_stepped` and `host_resumed`.
+    `on_event(code, text)` hears of `utc_jumped`, `system_clock_stepped` and `host_resumed`;
+    `on_time` has every report by which the system clock may be set.
     """
 
     def __init__(
@@ -129,6 +133,7 @@ class Clock:
         self._serial_latency_ns = round(options.serial_latency_s * SECOND_NS)
         self.counters: Counter[str] = Counter()
         self.on_event: Callable[[str, str], None] | None = None
+        self.on_time: Callable[[TimeSample], None] | None = None
         self._system = SystemClock(self.readings, self.counters)
         self._slept_ns = 0
         self._devices: dict[str, DeviceClock] = {}
@@ -197,7 +202,7 @@ class Clock:
                 t_ns = device.to_monotonic(stamp.ticks_ns, t_seen_ns)
                 return Instant(t_ns, _DEVICE_SD_S, "device")
             case UtcStamp():
-                return self._from_utc(_rolled_over(stamp.utc_ns), source, t_seen_ns)
+                return self._from_utc(dates.rolled_over(stamp.utc_ns), source, t_seen_ns)
             case TimeOfDayStamp():
                 return self._from_time_of_day(stamp, source, t_seen_ns)
             case MonotonicStamp():
@@ -301,11 +306,11 @@ class Clock:
         if not report.trusted:
             self.counters["utc_report_untrusted"] += 1
             if report.source in self._utc:
-                utc_ns = _rolled_over(report.utc_ns)
+                utc_ns = dates.rolled_over(report.utc_ns)
                 self._utc[report.source].untrusted(utc_ns, report.t_seen_ns)
             return
-        utc_ns = _rolled_over(report.utc_ns)
-        plausible = EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS
+        utc_ns = dates.rolled_over(report.utc_ns)
+        plausible = dates.plausible(utc_ns)
         self.counters["utc_report_implausible"] += not plausible
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
         envelope = self._utc.get(report.source)
@@ -317,6 +322,17 @@ class Clock:
             self._jumped(jumped_ns, f"{report.source} has said so for minutes")
         if plausible:
             self._choose_reference(report.source, envelope)
+            self._pass_on(report.source, utc_ns, report.t_seen_ns)
+
+    def _pass_on(self, source: str, utc_ns: int, t_seen_ns: int) -> None:
+        """Hand a report of the reference on as it came: who sets a clock has a filter of its own,
+        and the envelope, on a clock that he slews, would answer with what he did."""
+        if self.on_time is None or source != self._reference or self._options.utc == "system":
+            return
+        reference = self._utc[source]
+        if reference.settled and reference.sd_s < _SETS_CLOCKS_SD_S:
+            system_ns = t_seen_ns + self._system.offset_ns
+            self.on_time(TimeSample(system_ns, utc_ns + self._serial_latency_ns))
 
     def known(self) -> tuple[UtcKnown, ...]:
         """UTC as its sources have told it, for `resume`; none of which there is a doubt."""
@@ -334,7 +350,7 @@ class Clock:
         for each in known:
             if not 0 <= now_ns - each.t_seen_ns <= _RESUMED_NS:
                 continue
-            if not EARLIEST_UTC_NS <= each.utc_ns < LATEST_UTC_NS:
+            if not dates.plausible(each.utc_ns):
                 continue
             envelope = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
             envelope.resume(each)
@@ -388,11 +404,18 @@ class Clock:
         """POSIX UTC (ns) of a monotonic instant; None while no plausible UTC is known.
 
         From the receiver once it has reported, before that from the system clock if its date is
-        later than `EARLIEST_UTC_NS` (a computer without a battery starts in 1970) and before
-        `LATEST_UTC_NS`.
+        plausible (a computer without a battery starts in 1970).
         """
         utc_ns = t_ns - self._mapping(None)[0]
-        return utc_ns if EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS else None
+        return utc_ns if dates.plausible(utc_ns) else None
+
+    @property
+    def sets_others(self) -> bool:
+        """Whether others may set a clock by `utc_ns`: a receiver has told UTC and there is no doubt
+        about it, or the system clock is configured to be what keeps it."""
+        if self._options.utc == "system":
+            return True
+        return self._reference is not None and self._utc[self._reference].settled
 
     def status(self) -> ClockStatus:
         """A snapshot for `health`."""
@@ -413,10 +436,3 @@ class Clock:
             rdss_zone_h={n: r.zone_h for n, r in self._rdss.items() if r.zone_h is not None},
             counters=dict(self.counters),
         )
-
-
-def _rolled_over(utc_ns: int) -> int:
-    """The date moved by 1024 weeks once if it lies before the last rollover and then is not."""
-    if utc_ns < EARLIEST_UTC_NS <= utc_ns + WEEKS_1024_NS:
-        return utc_ns + WEEKS_1024_NS
-    return utc_ns

@@ -32,6 +32,7 @@ from fusiond.configuration.aiding import (
 )
 from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
+from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
@@ -281,6 +282,7 @@ class Config(Section):
     clock: ClockOptions = ClockOptions()
     mqtt: Mqtt = Mqtt()
     recording: Recording = Recording()
+    outputs: Outputs = Outputs()
 
     @property
     def plausibility(self) -> Plausibility:
@@ -300,6 +302,20 @@ class Config(Section):
             }
             data = {**data, "aiding": aiding}
         return data
+
+    @model_validator(mode="after")
+    def _broker_for_what_needs_it(self) -> Config:
+        if self.outputs.through_the_broker and not self.mqtt.enabled:
+            raise ValueError(f"[outputs.{self.outputs.through_the_broker[0]}] needs [mqtt] enabled")
+        return self
+
+    @model_validator(mode="after")
+    def _chrony_hears_another_clock(self) -> Config:
+        if self.outputs.chrony is not None and self.clock.utc == "system":
+            raise ValueError(
+                "[outputs.chrony] with clock.utc 'system' would set the system clock by itself"
+            )
+        return self
 
     @model_validator(mode="after")
     def _one_raw_receiver(self) -> Config:

@@ -220,7 +220,7 @@ class _Run:
 
     def _summary(self, duration_s: float) -> dict[str, Any]:
         daemon = self._daemon
-        assert daemon.mqtt is not None
+        mqtt = daemon.outputs["mqtt"].counters
         scheduler = daemon.scheduler.status()
         health = daemon.sources.health(daemon.clock.now_ns())
         return {
@@ -229,8 +229,8 @@ class _Run:
             "overruns": scheduler.overruns,
             "lateness_p99_ms": round(scheduler.lateness_p99_ms, 3),
             **self._score.against(self._vehicle),
-            "mqtt_published": daemon.mqtt.counters["mqtt_published"],
-            "mqtt_dropped": daemon.mqtt.counters["mqtt_dropped"],
+            "mqtt_published": mqtt["mqtt_published"],
+            "mqtt_dropped": mqtt["mqtt_dropped"],
             "fused": sum(s.fused for n, s in health.items() if n != "imu"),
             "rejected": sum(sum(s.rejected.values()) for s in health.values()),
             "fused_by_source": {name: source.fused for name, source in health.items()},

@@ -32,6 +32,8 @@ from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.timeline import Entry
+from fusiond.outputs.base import Output
+from fusiond.outputs.catalogue import make_outputs
 from fusiond.outputs.commands import (
     NAMES,
     Command,
@@ -39,7 +41,6 @@ from fusiond.outputs.commands import (
     StartRecording,
     StopRecording,
 )
-from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
@@ -85,18 +86,23 @@ class Daemon:
             now=self.clock.now_ns,
             on_time=self.service.feed_watchdog,
         )
-        self.mqtt: MqttPublisher | None = None
-        if config.mqtt.enabled:
-            self.mqtt = MqttPublisher(
-                config.mqtt,
-                config.vehicle,
-                on_event=partial(self._events.report, "mqtt"),
-                on_command=self._carry_out,
-                utc_now=lambda: self.clock.utc_ns(self.clock.now_ns()),
-            )
-        self._publishing = Publishing(
-            config, self._chain, self.scheduler.status, self.mqtt, self.recorder
+        self.outputs: dict[str, Output] = make_outputs(
+            config,
+            on_event=self._events.report,
+            on_command=self._carry_out,
+            clock=self.clock,
         )
+        if config.recording.directory is not None:
+            self.outputs["recording"] = self.recorder
+        self._publishing: Publishing | None = None
+        if self.outputs:
+            self._publishing = Publishing(
+                config,
+                self._chain,
+                self.scheduler.status,
+                self.outputs,
+                lambda: self.recorder.recording,
+            )
         self._on_solution = on_solution
         self._started_ns = self.clock.now_ns()
         self._ready = False
@@ -117,13 +123,17 @@ class Daemon:
         )
         self.recorder.listen(self.sources.inputs)
         self.recorder.arm(LOADED.dump_python(self._loaded, mode="json"))
-        outputs = []
-        if self.mqtt is None:
-            self._events.listen(self.recorder.event)
-        else:
-            self._events.listen(partial(self.mqtt.publish, EVENT), self.recorder.event)
-            fault = partial(self._events.report, "mqtt", "output_fault")
-            outputs.append(asyncio.create_task(supervise("output mqtt", self.mqtt.run, fault)))
+        self._events.listen(*(partial(output.take, EVENT) for output in self.outputs.values()))
+        outputs = [
+            asyncio.create_task(
+                supervise(
+                    f"output {name}",
+                    output.run,
+                    partial(self._events.report, name, "output_fault"),
+                )
+            )
+            for name, output in self.outputs.items()
+        ]
         work = [
             asyncio.create_task(self.sources.run(), name="sources"),
             asyncio.create_task(self.scheduler.run(), name="scheduler"),
@@ -139,7 +149,6 @@ class Daemon:
             await self._state.close(self.solution)
             await self._warm.close(self.solution, self.navigator)
             await self._calibration.close(self.navigator)
-            await asyncio.to_thread(self.recorder.close)
             await _cancel(*outputs)
             self.service.close()
             log.info(
@@ -156,7 +165,8 @@ class Daemon:
             self._keep_in_log(t_ns, solution)
         if self._on_solution is not None:
             self._on_solution(solution)
-        self._publishing.tick(t_ns, solution)
+        if self._publishing is not None:
+            self._publishing.tick(t_ns, solution)
         if self._second.due(t_ns) or self._chain.changed:
             self._each_second(t_ns, solution)
         self._state.keep(t_ns, solution)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 
 from fusiond.configuration.load import config_digest
@@ -13,15 +13,15 @@ from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.calibration import CalibrationState
 from fusiond.navigator.navigator import Navigator
+from fusiond.outputs.base import Output
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
-from fusiond.outputs.messages.health import SchedulerStatus, health_message
+from fusiond.outputs.messages.health import OutputHealth, SchedulerStatus, health_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.status import RecordingStatus, status_message
-from fusiond.outputs.mqtt import MqttPublisher
-from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, Topic
-from fusiond.recording.recorder import Recorder
+from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, TRACKER, Topic
+from fusiond.outputs.tracking import Tracking
 
 STATUS_EVERY_S = 1
 # A calibration moves over minutes; a state that changes goes out at once.
@@ -29,30 +29,31 @@ CALIBRATION_EVERY_S = 30
 
 
 class Publishing:
-    """Makes a vehicle's messages in the tick and puts them into their places at the publisher."""
+    """Makes a vehicle's messages in the tick and hands them to every output, which keeps them."""
 
     def __init__(
         self,
         config: Config,
         chain: Chain,
         scheduler: Callable[[], SchedulerStatus],
-        mqtt: MqttPublisher | None,
-        recorder: Recorder | None = None,
+        outputs: Mapping[str, Output],
+        recording: Callable[[], RecordingStatus] = RecordingStatus,
     ) -> None:
         self._clock = chain.clock
         self._navigator = chain.navigator
         self._sources = chain.sources
         self._injection = chain.injection
         self._scheduler = scheduler
-        self._mqtt = mqtt
-        self._recorder = recorder
+        self._outputs = outputs
+        self._recording = recording
         self._usage = ProcessUsage()
         self._version = version("fusiond")
         self._digest = config_digest(config)
         self._started_ns = self._since_ns = chain.clock.now_ns()
         self._mode: Mode | None = None
-        self._nav = Every(round(SECOND_NS / config.mqtt.nav_rate_hz))
+        self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
         self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
+        self._tracking = Tracking()
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
         self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
         self._calibrated: tuple[CalibrationState, ...] = ()
@@ -62,22 +63,30 @@ class Publishing:
         changed = solution.mode is not self._mode
         if changed:
             self._mode, self._since_ns = solution.mode, t_ns
-        if self._mqtt is None and (self._recorder is None or not self._recorder.active):
-            return
         utc_ns = self._clock.utc_ns(t_ns)
-        if self._nav.due(t_ns):
-            self._publish(NAV, nav_message(solution, utc_ns))
+        self._publish_nav(t_ns, utc_ns, solution)
         if self._status.due(t_ns) or changed:
             self._publish_status(t_ns, utc_ns, solution)
         if self._health.due(t_ns):
             self._publish_health(t_ns, utc_ns)
         self._publish_calibration(t_ns, utc_ns)
 
-    def _publish(self, topic: Topic, message: Message) -> None:
-        if self._mqtt is not None:
-            self._mqtt.publish(topic, message)
-        if self._recorder is not None:
-            self._recorder.publish(topic, message)
+    def _tell(self, topic: Topic, message: Message) -> None:
+        for output in self._outputs.values():
+            output.take(topic, message)
+
+    def _publish_nav(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
+        due = [output for output, every in self._nav if every.due(t_ns)]
+        if not due:
+            return
+        message = settled = nav_message(solution, utc_ns)
+        tracker = self._tracking.due(t_ns, message)
+        if tracker is not None:
+            self._tell(TRACKER, tracker)
+        if utc_ns is not None and not self._clock.sets_others:
+            settled = message.model_copy(update={"t_utc": None, "t_ms": None})
+        for output in due:
+            output.take(NAV, settled if output.sets_clocks else message)
 
     def _publish_calibration(self, t_ns: int, utc_ns: int | None) -> None:
         watch = self._navigator.calibrating
@@ -86,12 +95,12 @@ class Publishing:
             return
         self._calibrated = states
         message = calibration_message(utc_ns, watch.parameters, watch.settled)
-        self._publish(CALIBRATION, message)
+        self._tell(CALIBRATION, message)
 
     def _publish_status(self, t_ns: int, utc_ns: int | None, solution: Solution) -> None:
         fused, rejected = _totals(self._navigator)
-        recorder = self._recorder
-        self._publish(
+        mqtt = self._outputs.get("mqtt")
+        self._tell(
             STATUS,
             status_message(
                 solution,
@@ -104,19 +113,20 @@ class Publishing:
                 fused=fused,
                 rejected=rejected,
                 calibrated=self._navigator.calibrating.settled,
-                recording=recorder.status if recorder is not None else RecordingStatus(),
+                recording=self._recording(),
                 injected=self._injection.active,
-                mqtt=self._mqtt.counters if self._mqtt is not None else {},
+                mqtt={} if mqtt is None else mqtt.counters,
             ),
         )
 
     def _publish_health(self, t_ns: int, utc_ns: int | None) -> None:
         cpu_percent, memory_mb = self._usage.sample()
-        self._publish(
+        self._tell(
             HEALTH,
             health_message(
                 utc_ns,
                 sources=self._sources.health(t_ns),
+                outputs={name: _health(output) for name, output in self._outputs.items()},
                 scheduler=self._scheduler(),
                 clock=self._clock.status(),
                 cpu_percent=cpu_percent,
@@ -125,7 +135,13 @@ class Publishing:
         )
         reports = self._navigator.verdicts.reports()
         if reports:
-            self._publish(CONSISTENCY, consistency_message(utc_ns, reports))
+            self._tell(CONSISTENCY, consistency_message(utc_ns, reports))
+
+
+def _health(output: Output) -> OutputHealth:
+    counters = {name: int(count) for name, count in output.counters.items() if count}
+    status = output.status
+    return OutputHealth(state=status.state, detail=status.detail, counters=counters)
 
 
 def _totals(navigator: Navigator) -> tuple[int, int]:

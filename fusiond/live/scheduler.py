@@ -53,6 +53,7 @@ class LatenessHistogram:
         self.bins = [0] * _BINS
         self.count = 0
         self.max_ns = 0
+        self.sum_ns = 0
 
     def add(self, lateness_ns: int) -> None:
         index = 0
@@ -61,6 +62,7 @@ class LatenessHistogram:
         self.bins[index] += 1
         self.count += 1
         self.max_ns = max(self.max_ns, lateness_ns)
+        self.sum_ns += lateness_ns
 
     def quantile_ms(self, p: float) -> float:
         """Upper edge of the bin that holds the quantile (at most 26 % high), in ms; 0 if empty."""
@@ -72,6 +74,15 @@ class LatenessHistogram:
                 edge_ns = _FIRST_BIN_NS * pow(10.0, index / _BINS_PER_DECADE)
                 return min(float(edge_ns), self.max_ns) / 1e6
         return 0.0
+
+    def at_most(self) -> tuple[tuple[float, int], ...]:
+        """Ticks that were no later than each edge (s): two edges a decade, 0.1 ms to 1 s."""
+        half = _BINS_PER_DECADE // 2
+        edges = range(2 * half, 5 * _BINS_PER_DECADE + 1, half)
+        return tuple(
+            (_FIRST_BIN_NS * 1e-9 * pow(10.0, k / _BINS_PER_DECADE), sum(self.bins[: k + 1]))
+            for k in edges
+        )
 
 
 class _Collector:
@@ -182,6 +193,8 @@ class Scheduler:
             lateness_p50_ms=self.lateness.quantile_ms(0.5),
             lateness_p99_ms=self.lateness.quantile_ms(0.99),
             lateness_max_ms=self.lateness.max_ns / 1e6,
+            lateness_sum_s=self.lateness.sum_ns / SECOND_NS,
+            lateness_at_most=self.lateness.at_most(),
             gc_collections=self._collector.collections,
             gc_forced=self._collector.forced,
             gc_max_ms=self._collector.max_ns / 1e6,

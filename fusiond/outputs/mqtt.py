@@ -1,6 +1,6 @@
 """MQTT: a supervisor that keeps one connection, and bounded places for what is to be sent.
 
-`publish` puts a message in its place and returns: it never waits and never raises. One task sends
+`take` puts a message in its place and returns: it never waits and never raises. One task sends
 the latest-value places (QoS 0), another the status and the events (QoS 1, each confirmed before
 the next); both belong to one connection and end with it. A broker that accepts bytes and does
 nothing is noticed by a confirmation that does not come: something with QoS 1 goes out at least
@@ -17,13 +17,13 @@ from collections import Counter, deque
 from collections.abc import Callable
 
 import aiomqtt
+from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
 from fusiond.outputs import broker_access
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import Handler
-from fusiond.outputs.messages.base import Message
 from fusiond.outputs.reconnecting import Reconnecting
 from fusiond.outputs.topics import REPLY, STATUS, Topic, base_topic
 
@@ -55,6 +55,9 @@ class MqttPublisher:
     Raises `ConfigError` for a password file or TLS files that cannot be used.
     """
 
+    name = "mqtt"
+    sets_clocks = False
+
     def __init__(
         self,
         options: Mqtt,
@@ -65,7 +68,9 @@ class MqttPublisher:
         utc_now: Callable[[], int | None] = lambda: None,
     ) -> None:
         self._options = options
+        self.nav_rate_hz = options.nav_rate_hz
         self._base = base_topic(vehicle)
+        self._online = f"{self._base}/online"
         # A stable name: when we come back before the broker has noticed the old connection's
         # end, it closes that one, and its will is out before our new `online`.
         self._client_id = options.client_id or f"fusiond-{vehicle}"
@@ -74,11 +79,12 @@ class MqttPublisher:
         self._on_event = on_event
         self._confirm_s = max(1.0, options.keepalive_s / 2)
         self._heartbeat_s = options.keepalive_s / 4
-        self._latest: dict[Topic, Message] = {}
-        self._queue: deque[tuple[Topic, Message]] = deque(maxlen=options.queue)
+        self._latest: dict[Topic, BaseModel] = {}
+        self._queue: deque[tuple[Topic, BaseModel]] = deque(maxlen=options.queue)
         # The latest of what is retained and confirmed, and which of it is yet to be sent.
-        self._retained: dict[Topic, Message] = {}
+        self._retained: dict[Topic, BaseModel] = {}
         self._due: dict[Topic, None] = {}
+        self._heard: dict[str, Callable[[bytes], None]] = {}
         self._latest_ready = asyncio.Event()
         self._confirmed_ready = asyncio.Event()
         self._flowing = asyncio.Event()
@@ -93,9 +99,13 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ for the tick
 
-    def publish(self, topic: Topic, message: Message) -> None:
-        """Put a message in its place: what is confirmed and not retained waits in the queue, of all
-        else the latest counts."""
+    def listen(self, address: str, heard: Callable[[bytes], None]) -> None:
+        """Let `heard` have what others publish at `address`; before `run`."""
+        self._heard[address] = heard
+
+    def take(self, topic: Topic, message: BaseModel) -> None:
+        """Put a message into its place: with QoS 0 the latest counts, what is retained is
+        confirmed and sent again after each connection, all else is queued."""
         if topic.qos == 0:
             self._replace(topic, message)
         elif topic.retained:
@@ -103,18 +113,18 @@ class MqttPublisher:
         else:
             self._enqueue(topic, message)
 
-    def _replace(self, topic: Topic, message: Message) -> None:
+    def _replace(self, topic: Topic, message: BaseModel) -> None:
         self.counters["mqtt_dropped"] += topic in self._latest
         self._latest[topic] = message
         self._latest_ready.set()
 
-    def _retain(self, topic: Topic, message: Message) -> None:
+    def _retain(self, topic: Topic, message: BaseModel) -> None:
         self.counters["mqtt_dropped"] += topic in self._due
         self._retained[topic] = message
         self._due[topic] = None
         self._confirmed_ready.set()
 
-    def _enqueue(self, topic: Topic, message: Message) -> None:
+    def _enqueue(self, topic: Topic, message: BaseModel) -> None:
         self.counters["mqtt_dropped"] += len(self._queue) == self._queue.maxlen
         self._queue.append((topic, message))
         self._confirmed_ready.set()
@@ -172,7 +182,7 @@ class MqttPublisher:
             username=options.username,
             password=self._password,
             identifier=self._client_id,
-            will=aiomqtt.Will(f"{self._base}/online", b"offline", qos=1, retain=True),
+            will=aiomqtt.Will(self._online, b"offline", qos=1, retain=True),
             keepalive=options.keepalive_s,
             timeout=self._confirm_s,
             max_queued_incoming_messages=_INCOMING,
@@ -208,14 +218,14 @@ class MqttPublisher:
     async def _say_farewell(self, client: aiomqtt.Client) -> None:
         self._due = dict.fromkeys(self._retained)
         await self._send_waiting(client)
-        await self._publish(client, "online", b"offline", qos=1, retain=True)
+        await self._publish(client, self._online, b"offline", qos=1, retain=True)
 
     # ------------------------------------------------------------------ sending
 
     async def _publish(
-        self, client: aiomqtt.Client, topic: str, payload: bytes, qos: int, retain: bool
+        self, client: aiomqtt.Client, address: str, payload: bytes, qos: int, retain: bool
     ) -> None:
-        await client.publish(f"{self._base}/{topic}", payload, qos=qos, retain=retain)
+        await client.publish(address, payload, qos=qos, retain=retain)
         self.counters["mqtt_published"] += 1
         _honour_cancellation()
 
@@ -228,7 +238,8 @@ class MqttPublisher:
                 topic = next(iter(self._latest))
                 payload = _encoded(self._latest.pop(topic))
                 try:
-                    await self._publish(client, topic.name, payload, topic.qos, topic.retained)
+                    address = topic.address(self._base)
+                    await self._publish(client, address, payload, topic.qos, topic.retained)
                 except aiomqtt.MqttError:
                     self.counters["mqtt_dropped"] += 1
                     raise
@@ -236,7 +247,7 @@ class MqttPublisher:
                 self._latest_ready.set()
 
     async def _send_confirmed(self, client: aiomqtt.Client) -> None:
-        await self._confirm(client, "online", b"online", retain=True)
+        await self._confirm(client, self._online, b"online", retain=True)
         self._due = dict.fromkeys(self._retained)
         while True:
             await self._send_waiting(client)
@@ -248,7 +259,7 @@ class MqttPublisher:
                 if STATUS in self._retained:
                     self._due[STATUS] = None
                 else:
-                    await self._confirm(client, "online", b"online", retain=True)
+                    await self._confirm(client, self._online, b"online", retain=True)
 
     async def _send_waiting(self, client: aiomqtt.Client) -> None:
         """Send what is retained and due, and every queued message; one that fails stays queued."""
@@ -257,22 +268,23 @@ class MqttPublisher:
                 topic = next(iter(self._due))
                 del self._due[topic]
                 payload = _encoded(self._retained[topic])
-                await self._confirm(client, topic.name, payload, topic.retained)
+                await self._confirm(client, topic.address(self._base), payload, topic.retained)
             if self._queue:
                 first = self._queue[0]
                 topic, queued = first
-                await self._confirm(client, topic.name, _encoded(queued), topic.retained)
+                address = topic.address(self._base)
+                await self._confirm(client, address, _encoded(queued), topic.retained)
                 if self._queue and self._queue[0] is first:
                     self._queue.popleft()
 
     async def _confirm(
-        self, client: aiomqtt.Client, topic: str, payload: bytes, retain: bool
+        self, client: aiomqtt.Client, address: str, payload: bytes, retain: bool
     ) -> None:
         """Publish with QoS 1; the QoS 0 flow stops while the confirmation is overdue."""
         loop = asyncio.get_running_loop()
         overdue = loop.call_later(_PATIENCE_S, self._flowing.clear)
         try:
-            await self._publish(client, topic, payload, qos=1, retain=retain)
+            await self._publish(client, address, payload, qos=1, retain=retain)
         finally:
             overdue.cancel()
         self._flowing.set()
@@ -285,16 +297,24 @@ class MqttPublisher:
         if self._commands is not None:
             await client.subscribe(f"{prefix}+", 1)
             _honour_cancellation()
+        for address in self._heard:
+            await client.subscribe(address, 1)
+            _honour_cancellation()
         async for message in client.messages:
             payload = message.payload
-            if self._commands is not None and isinstance(payload, bytes):
+            if not isinstance(payload, bytes):
+                continue
+            heard = self._heard.get(message.topic.value)
+            if heard is not None:
+                heard(payload)
+            elif self._commands is not None:
                 name = message.topic.value.removeprefix(prefix)
                 reply = self._commands.answer(name, payload, message.retain)
                 if reply is not None:
                     self._enqueue(REPLY, reply)
 
 
-def _encoded(message: Message) -> bytes:
+def _encoded(message: BaseModel) -> bytes:
     return message.model_dump_json().encode()
 
 

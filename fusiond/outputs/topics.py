@@ -14,6 +14,7 @@ from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import StatusMessage
+from fusiond.outputs.messages.tracker import TrackerMessage
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,11 @@ class Topic:
     message: type[BaseModel]
     qos: Literal[0, 1]
     retained: bool
+    absolute: bool = False
+
+    def address(self, base: str) -> str:
+        """Where it stands at the broker; an `absolute` one stands outside `base`."""
+        return self.name if self.absolute else f"{base}/{self.name}"
 
 
 NAV = Topic("nav", NavMessage, 0, False)
@@ -31,9 +37,10 @@ STATUS = Topic("status", StatusMessage, 1, True)
 HEALTH = Topic("health", HealthMessage, 0, True)
 CONSISTENCY = Topic("consistency", ConsistencyMessage, 0, True)
 CALIBRATION = Topic("calibration", CalibrationMessage, 1, True)
+TRACKER = Topic("tracker", TrackerMessage, 1, True)
 EVENT = Topic("event", EventMessage, 1, False)
 REPLY = Topic("reply", ReplyMessage, 1, False)
-TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, CALIBRATION, EVENT, REPLY)
+TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, CALIBRATION, TRACKER, EVENT, REPLY)
 
 
 def base_topic(vehicle: str) -> str:

@@ -8,7 +8,6 @@ what is there, closes the chunk and syncs: a power cut loses that and what the d
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import re
@@ -19,22 +18,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
-from pydantic import BaseModel, TypeAdapter
+from pydantic import TypeAdapter
 
 from fusiond.clock.host import SECOND_NS
 from fusiond.configuration.recording import Recording
-from fusiond.outputs.messages.event import EventMessage
-from fusiond.outputs.messages.nav import NavMessage
-from fusiond.recording.channels import (
-    CHANNELS,
-    LOCATION,
-    LOG,
-    InnovationMessage,
-    location,
-    log_line,
-)
+from fusiond.outputs.messages.base import Message
+from fusiond.recording.channels import CHANNELS, OF_FOXGLOVE, InnovationMessage
 from fusiond.recording.log_file import SUFFIX, About, LogFile
 
 log = logging.getLogger("fusiond")
@@ -55,7 +45,7 @@ class Item:
 
     topic: str
     t_log_ns: int
-    payload: bytes | BaseModel | InnovationMessage | dict[str, Any]
+    payload: bytes | Message | InnovationMessage
     sequence: int = 0
 
 
@@ -204,20 +194,17 @@ class _DiskFullError(Exception):
 def _worded(item: Item) -> list[tuple[str, bytes]]:
     """The messages of an item, as topic and bytes: some have one for other tools beside them."""
     payload = item.payload
-    found: list[tuple[str, Any]] = []
     match payload:
         case bytes():
             return [(item.topic, payload)]
         case InnovationMessage():
             return [(item.topic, _INNOVATION.dump_json(payload))]
-        case NavMessage():
-            found.append((LOCATION, location(payload, item.t_log_ns)))
-        case EventMessage():
-            found.append((LOG, log_line(payload, item.t_log_ns)))
-    worded = [(topic, json.dumps(made).encode()) for topic, made in found if made is not None]
-    if isinstance(payload, BaseModel):
-        return [(item.topic, payload.model_dump_json().encode()), *worded]
-    return [(item.topic, json.dumps(payload).encode())]
+    made = [(item.topic, payload.model_dump_json().encode())]
+    for channel in OF_FOXGLOVE:
+        beside = channel.payload(payload) if item.topic == f"/{channel.topic.name}" else None
+        if beside is not None:
+            made.append((channel.name, beside))
+    return made
 
 
 def log_stem(vehicle: str, utc_ns: int, run: str) -> str:

@@ -7,8 +7,9 @@ by one message of inputs a tick and a few derived ones, at whatever rate the dev
 
 from __future__ import annotations
 
+import asyncio
 import json
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from uuid import uuid4
 
 from pydantic import BaseModel
 
+from drivers.base import DriverStatus
 from drivers.can.bus import CanFrame
 from drivers.inputs import Inputs
 from fusiond.clock.clock import Clock
@@ -27,7 +29,7 @@ from fusiond.estimators.base import Outcome
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.status import RecordingState, RecordingStatus
-from fusiond.outputs.topics import EVENT, Topic
+from fusiond.outputs.topics import Topic
 from fusiond.recording.about import about_run
 from fusiond.recording.channels import INNOVATION, INPUT, STATE, innovation
 from fusiond.recording.log_writer import Item, LogWriter, log_stem
@@ -54,9 +56,9 @@ class RecordingRefusedError(Exception):
 
 
 class Recorder:
-    """Recordings of one daemon. `on_event(code, text)` hears `recording_started`,
-    `recording_stopped` and `recording_failed`.
+    """Recordings of one daemon: an output as any other (`fusiond.outputs.base`), and more.
 
+    `on_event(code, text)` hears `recording_started`, `recording_stopped` and `recording_failed`.
     `begin` and `end` may be called whenever; `listen` connects the drivers.
     """
 
@@ -165,11 +167,51 @@ class Recorder:
         return self.state in ("recording", "waiting")
 
     @property
-    def status(self) -> RecordingStatus:
+    def recording(self) -> RecordingStatus:
+        """As `status` has it."""
         writer = self._writer
         if writer is None:
             return RecordingStatus(self.state)
         return RecordingStatus(self.state, str(writer.path), writer.dropped, writer.free_mb)
+
+    # ------------------------------------------------------------------ as an output
+
+    @property
+    def name(self) -> str:
+        return "recording"
+
+    @property
+    def nav_rate_hz(self) -> float:
+        return self._config.mqtt.nav_rate_hz
+
+    @property
+    def sets_clocks(self) -> bool:
+        return False
+
+    @property
+    def counters(self) -> Counter[str]:
+        return Counter(recording_dropped=self.recording.dropped)
+
+    @property
+    def status(self) -> DriverStatus:
+        detail = self.recording.file or self.state
+        return DriverStatus("failed" if self.state == "failed" else "running", detail)
+
+    def take(self, topic: Topic, message: Message) -> None:
+        """A message of a topic goes into the log; an event of `recording.events` starts it where
+        that is wanted."""
+        t_ns = self._clock.now_ns()
+        if self.active:
+            self._put(Item(f"/{topic.name}", t_ns + self._epoch_ns, message))
+        if isinstance(message, EventMessage):
+            self._look_at(message, t_ns)
+
+    async def run(self) -> None:
+        """Until cancelled; then everything is on the disk when this returns."""
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.to_thread(self.close)
 
     # ------------------------------------------------------------------ what happens
 
@@ -197,33 +239,6 @@ class Recorder:
         if self._until_ns is not None and t_ns > self._until_ns:
             self.end(f"{self._options.after_s:.0f} s after the last event")
 
-    def event(self, message: EventMessage) -> None:
-        """An event goes into the log; one of `recording.events` starts it where that is wanted."""
-        t_ns = self._clock.now_ns()
-        self.publish(EVENT, message, t_ns)
-        if self._options.when != "event" or not self.active:
-            return
-        wanted = any(code in message.code for code in self._options.events)
-        if not wanted or message.source == "recording":
-            return
-        if self.state == "waiting":
-            try:
-                self.begin()
-            except RecordingRefusedError as error:
-                self.state = "failed"
-                self._detach()
-                self._event("recording_failed", str(error))
-                return
-            self._until_ns = t_ns
-        if self._until_ns is not None:
-            self._until_ns = t_ns + round(self._options.after_s * SECOND_NS)
-
-    def publish(self, topic: Topic, message: Message, t_ns: int | None = None) -> None:
-        """A message of a topic, of the instant `t_ns`, now by default."""
-        if self.active:
-            t_ns = self._clock.now_ns() if t_ns is None else t_ns
-            self._put(Item(f"/{topic.name}", t_ns + self._epoch_ns, message))
-
     def innovation(self, source: str, t_ns: int, outcome: Outcome) -> None:
         """How an aid valid at `t_ns` ended."""
         if self.active:
@@ -243,6 +258,24 @@ class Recorder:
         self._put(Item(STATE, t_ns + self._epoch_ns, kept))
 
     # ------------------------------------------------------------------ inside
+
+    def _look_at(self, message: EventMessage, t_ns: int) -> None:
+        if self._options.when != "event" or not self.active:
+            return
+        wanted = any(code in message.code for code in self._options.events)
+        if not wanted or message.source == "recording":
+            return
+        if self.state == "waiting":
+            try:
+                self.begin()
+            except RecordingRefusedError as error:
+                self.state = "failed"
+                self._detach()
+                self._event("recording_failed", str(error))
+                return
+            self._until_ns = t_ns
+        if self._until_ns is not None:
+            self._until_ns = t_ns + round(self._options.after_s * SECOND_NS)
 
     def _open(self) -> LogWriter:
         folder = self._options.directory

@@ -18,7 +18,7 @@ import numpy as np
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.live.publishing import Publishing
-from fusiond.live.scheduler import LatenessHistogram
+from fusiond.live.scheduler import SECOND_NS, LatenessHistogram
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.event import EventMessage
@@ -150,6 +150,8 @@ class _Run:
             lateness_p50_ms=self._lateness.quantile_ms(0.5),
             lateness_p99_ms=self._lateness.quantile_ms(0.99),
             lateness_max_ms=self._lateness.max_ns / 1e6,
+            lateness_sum_s=self._lateness.sum_ns / SECOND_NS,
+            lateness_at_most=self._lateness.at_most(),
             gc_collections=0,
             gc_forced=0,
             gc_max_ms=0.0,
@@ -185,7 +187,7 @@ class _Run:
 async def _publish(run: _Run, config: Config, speed: float) -> None:
     """At `speed` times real time, what the daemon would publish."""
     mqtt = MqttPublisher(config.mqtt, config.vehicle, on_event=lambda code, text: None)
-    run.listeners.append(partial(mqtt.publish, EVENT))
+    run.listeners.append(partial(mqtt.take, EVENT))
     sending = asyncio.create_task(mqtt.run())
     loop = asyncio.get_running_loop()
     publishing: Publishing | None = None
@@ -194,7 +196,7 @@ async def _publish(run: _Run, config: Config, speed: float) -> None:
             t_ns = tick.solution.t_ns
             if publishing is None:
                 assert run.replay.chain is not None
-                publishing = Publishing(config, run.replay.chain, run.scheduler, mqtt)
+                publishing = Publishing(config, run.replay.chain, run.scheduler, {"mqtt": mqtt})
                 start_s, start_ns = loop.time(), t_ns
             run.take(tick)
             publishing.tick(t_ns, tick.solution)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from typing import get_args
 
 import pytest
 
 from fusiond.configuration import aiding as config_aiding
-from fusiond.configuration import estimator
+from fusiond.configuration import estimator, outputs
 from fusiond.configuration import schema as config
 from fusiond.configuration.integrity import Integrity
 from tests.places import REPOSITORY
@@ -37,6 +38,14 @@ SECTIONS = {
     "[clock]": config.ClockOptions,
     "[mqtt]": config.Mqtt,
     "[recording]": config.Recording,
+    "[outputs]": outputs.Outputs,
+    "[outputs.gpsd]": outputs.Gpsd,
+    "[outputs.nmea]": outputs.NmeaServed,
+    "[outputs.prometheus]": outputs.Prometheus,
+    "[outputs.home_assistant]": outputs.HomeAssistant,
+    "[outputs.foxglove]": outputs.Foxglove,
+    "[outputs.owntracks]": outputs.OwnTracks,
+    "[outputs.chrony]": outputs.Chrony,
 }
 
 
@@ -56,10 +65,9 @@ def test_every_section_is_in_the_list() -> None:
     def sections(model: type[config_aiding.Section]) -> set[type]:
         found = set()
         for field in model.model_fields.values():
-            if isinstance(field.annotation, type) and issubclass(
-                field.annotation, config_aiding.Section
-            ):
-                found |= {field.annotation} | sections(field.annotation)
+            for kind in (field.annotation, *get_args(field.annotation)):
+                if isinstance(kind, type) and issubclass(kind, config_aiding.Section):
+                    found |= {kind} | sections(kind)
         return found
 
     listed = set(SECTIONS.values()) | {config.Constraints}

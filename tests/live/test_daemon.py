@@ -37,7 +37,7 @@ from fusiond.simulation.gnss.receiver import sentence
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
-from tests.broker import Broker, Listener, listening
+from tests.broker import Broker, Listener, free_port, listening
 from tests.patience import PATIENCE_S, until
 from tests.pty_device import Device
 
@@ -454,6 +454,45 @@ async def test_an_output_that_raises_is_restarted(
         async with listening(broker) as (listener, _), running(daemon):
             await listener.until(lambda heard: heard.payloads("fusiond/test/nav"))
     assert len(bench.events("output_fault")) == 1
+
+
+async def test_configured_outputs_are_served_and_stand_in_health(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """The receiver settles UTC; before it nothing goes out as time."""
+    vehicle = bench.vehicle(gnss_link=bench.folder / "gnss")
+    ports = free_port(), free_port()
+    with Broker(tmp_path) as broker:
+        sections = (
+            f'[mqtt]\nhost = "127.0.0.1"\nport = {broker.port}',
+            f"[outputs.gpsd]\nport = {ports[0]}\nrate_hz = 10.0",
+            f"[outputs.nmea]\nport = {ports[1]}\nrate_hz = 10.0",
+        )
+        daemon = bench.daemon(*sections)
+        async with listening(broker) as (listener, _), running(daemon, vehicle):
+            await until(lambda: daemon.outputs["gpsd"].status.state == "running")
+            reader, writer = await asyncio.open_connection("127.0.0.1", ports[0])
+            writer.write(b'?WATCH={"enable":true,"json":true};')
+            said: list[dict[str, Any]] = []
+            async with asyncio.timeout(PATIENCE_S):
+                while not (said and said[-1].get("mode") == 3 and "time" in said[-1]):
+                    report = json.loads(await reader.readline())
+                    if report["class"] == "TPV":
+                        said.append(report)
+            writer.close()
+            health = json.loads(
+                await listener.until(
+                    lambda heard: next(
+                        (p for p in heard.payloads("fusiond/test/health") if b'"requests":1' in p),
+                        None,
+                    )
+                )
+            )
+    assert {o["state"] for o in health["outputs"].values()} == {"running"}
+    assert list(health["outputs"]) == ["mqtt", "gpsd", "nmea"]
+    assert health["utc_settled"]
+    dated = [x for x in said if "time" in x]
+    assert dated[0]["time"][:4] == str(1970 + vehicle.utc_start_ns // (31_556_952 * 10**9))
 
 
 # --------------------------------------------------------------------------- the state on disk

@@ -13,10 +13,16 @@ from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
-from fusiond.outputs.messages.health import SchedulerStatus, SourceHealth, health_message
+from fusiond.outputs.messages.health import (
+    OutputHealth,
+    SchedulerStatus,
+    SourceHealth,
+    health_message,
+)
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import RecordingStatus, status_message
+from fusiond.outputs.messages.tracker import tracker_message
 
 UTC_NS = 1_795_217_587_123_456_789
 
@@ -41,6 +47,18 @@ SCHEDULER = SchedulerStatus(
     lateness_p50_ms=0.631,
     lateness_p99_ms=1.259,
     lateness_max_ms=31.4,
+    lateness_sum_s=225.1,
+    lateness_at_most=(
+        (0.0001, 2),
+        (0.000316228, 61_022),
+        (0.001, 350_117),
+        (0.00316228, 360_397),
+        (0.01, 360_409),
+        (0.0316228, 360_412),
+        (0.1, 360_412),
+        (0.316228, 360_412),
+        (1.0, 360_412),
+    ),
     gc_collections=1811,
     gc_forced=0,
     gc_max_ms=2.1,
@@ -96,6 +114,18 @@ EXAMPLES: dict[str, Any] = {
                 verdict="coloured",
             ),
         },
+        outputs={
+            "mqtt": OutputHealth(
+                state="running",
+                detail="localhost:1883",
+                counters={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
+            ),
+            "gpsd": OutputHealth(
+                state="running",
+                detail="127.0.0.1:2947, 2 connected",
+                counters={"clients": 5, "requests": 5, "sent": 7204, "skipped": 12},
+            ),
+        },
         scheduler=SCHEDULER,
         clock=ClockStatus(
             utc_source="gnss", settled=True, system_error_s=-0.012, counters={"utc_jump": 0}
@@ -147,6 +177,7 @@ EXAMPLES: dict[str, Any] = {
         ],
         False,
     ),
+    "tracker": tracker_message(nav_message(SOLUTION, UTC_NS)),
     "event": event_message(
         UTC_NS,
         source="rdss",

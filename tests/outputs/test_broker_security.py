@@ -125,12 +125,12 @@ async def test_each_user_may_do_what_is_its_business(broker: Broker, certificate
         ):
             for listener in (seen, heard):
                 await listener.until(lambda li: li.payloads("fusiond/truck/online") == [b"online"])
-            publisher.publish(NAV, EXAMPLES["nav"])
-            publisher.publish(STATUS, EXAMPLES["status"])
-            publisher.publish(HEALTH, EXAMPLES["health"])
-            publisher.publish(CONSISTENCY, EXAMPLES["consistency"])
-            publisher.publish(CALIBRATION, EXAMPLES["calibration"])
-            publisher.publish(EVENT, EXAMPLES["event"])
+            publisher.take(NAV, EXAMPLES["nav"])
+            publisher.take(STATUS, EXAMPLES["status"])
+            publisher.take(HEALTH, EXAMPLES["health"])
+            publisher.take(CONSISTENCY, EXAMPLES["consistency"])
+            publisher.take(CALIBRATION, EXAMPLES["calibration"])
+            publisher.take(EVENT, EXAMPLES["event"])
             for topic in ("nav", "status", "health", "consistency", "calibration", "event"):
                 await seen.until(lambda li, name=topic: li.payloads(f"fusiond/truck/{name}"))
             # The broker has confirmed, and dropped, the dashboard's command before the operator's.

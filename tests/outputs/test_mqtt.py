@@ -99,16 +99,16 @@ async def test_every_topic_arrives_and_shutdown_says_offline(tmp_path: Path) -> 
         async with listening(broker) as (listener, _):
             async with running(options(broker)) as it:
                 p = it.publisher
-                p.publish(NAV, EXAMPLES["nav"])
-                p.publish(STATUS, EXAMPLES["status"])
-                p.publish(HEALTH, EXAMPLES["health"])
-                p.publish(CALIBRATION, EXAMPLES["calibration"])
-                p.publish(EVENT, EXAMPLES["event"])
+                p.take(NAV, EXAMPLES["nav"])
+                p.take(STATUS, EXAMPLES["status"])
+                p.take(HEALTH, EXAMPLES["health"])
+                p.take(CALIBRATION, EXAMPLES["calibration"])
+                p.take(EVENT, EXAMPLES["event"])
                 for topic in (NAV, STATUS, HEALTH, CALIBRATION, EVENT):
                     payload = (await listener.until(heard(topic.name)))[0]
                     assert topic.message.model_validate_json(payload) == EXAMPLES[topic.name]
                 assert heard("online")(listener) == [b"online"]
-                p.publish(EVENT, event("last words"))
+                p.take(EVENT, event("last words"))
             await listener.until(lambda li: b"offline" in heard("online")(li))
             assert json.loads(heard("event")(listener)[-1])["text"] == "last words"
         async with listening(broker) as (late, _):
@@ -123,7 +123,6 @@ DAEMON = """
 import asyncio, sys
 from fusiond.configuration.schema import Mqtt
 from fusiond.outputs.mqtt import MqttPublisher
-from fusiond.outputs.topics import CALIBRATION, EVENT, HEALTH, NAV, STATUS
 
 async def main():
     options = Mqtt(host="127.0.0.1", port=int(sys.argv[1]))
@@ -149,8 +148,8 @@ async def test_slow_broker_gets_the_newest_and_the_rest_is_counted(tmp_path: Pat
     broker = Broker(tmp_path)
     async with running(options(broker, queue=3)) as it:
         for k in range(10):
-            it.publisher.publish(NAV, nav(float(k)))
-            it.publisher.publish(EVENT, event(str(k)))
+            it.publisher.take(NAV, nav(float(k)))
+            it.publisher.take(EVENT, event(str(k)))
         assert it.publisher.counters["mqtt_dropped"] == 9 + 7
         await it.until(lambda r: "mqtt_absent" in r.codes())
         assert it.publisher.status.state == "absent"
@@ -166,14 +165,14 @@ async def test_slow_broker_gets_the_newest_and_the_rest_is_counted(tmp_path: Pat
 async def test_broker_killed_and_restarted(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker)) as it:
-            it.publisher.publish(STATUS, EXAMPLES["status"])
-            it.publisher.publish(CALIBRATION, EXAMPLES["calibration"])
+            it.publisher.take(STATUS, EXAMPLES["status"])
+            it.publisher.take(CALIBRATION, EXAMPLES["calibration"])
             async with listening(broker) as (listener, _):
                 await listener.until(heard("status"))
                 await listener.until(heard("calibration"))
             broker.kill()
             await it.until(lambda r: "mqtt_lost" in r.codes())
-            it.publisher.publish(EVENT, event("while it was away"))
+            it.publisher.take(EVENT, event("while it was away"))
             broker.start()
             async with listening(broker) as (listener, _):
                 await listener.until(heard("event"))
@@ -187,7 +186,7 @@ async def test_broker_killed_and_restarted(tmp_path: Path) -> None:
 async def test_frozen_broker_is_noticed_and_costs_no_tick(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker, keepalive_s=2)) as it:
-            it.publisher.publish(STATUS, EXAMPLES["status"])
+            it.publisher.take(STATUS, EXAMPLES["status"])
             async with listening(broker) as (listener, _):
                 await listener.until(heard("status"))
             broker.freeze()
@@ -196,7 +195,7 @@ async def test_frozen_broker_is_noticed_and_costs_no_tick(tmp_path: Path) -> Non
             def lost(r: Running) -> bool:
                 nonlocal ticks
                 ticks += 1
-                r.publisher.publish(NAV, nav(float(ticks)))
+                r.publisher.take(NAV, nav(float(ticks)))
                 return r.publisher.status.state == "absent"
 
             await it.until(lost)
@@ -220,14 +219,14 @@ async def test_shutdown_with_a_frozen_broker_ends(tmp_path: Path) -> None:
             async with running(options(broker, keepalive_s=600)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 broker.freeze()
-                it.publisher.publish(EVENT, event("nobody hears this"))
+                it.publisher.take(EVENT, event("nobody hears this"))
 
 
 async def test_heartbeat_keeps_an_idle_connection(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         async with running(options(broker, keepalive_s=1)) as it, listening(broker) as (li, _):
             await li.until(lambda li: len(heard("online")(li)) >= 4)
-            it.publisher.publish(STATUS, EXAMPLES["status"])
+            it.publisher.take(STATUS, EXAMPLES["status"])
             await li.until(lambda li: len(heard("status")(li)) >= 4)
             assert it.codes() == ["mqtt_connected"]
 
@@ -383,7 +382,7 @@ async def test_commands_that_are_not_configured_do_nothing(tmp_path: Path) -> No
             async with running(options(broker), on_command=handler(taken)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"3"}', qos=1)
-                it.publisher.publish(EVENT, event("after the command"))
+                it.publisher.take(EVENT, event("after the command"))
                 await listener.until(heard("event"))
     assert [c.id for c in taken] == ["2"]
 
@@ -397,33 +396,38 @@ async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(tmp_path
 
     with Broker(tmp_path) as broker:
         async with (
-            listening(broker, f"{BASE}/#") as (listener, client),
-            running(options(broker, commands=("reset_filter",)), on_command=handler(taken)) as it,
+            listening(broker, f"{BASE}/+") as (listener, client),
+            running(
+                options(broker, commands=("reset_filter",), keepalive_s=60),
+                on_command=handler(taken),
+            ) as it,
         ):
+            # Not at the commands: the broker drops what comes faster than a busy listener reads.
             await listener.until(heard("online"))
             sender = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-c", FLOOD, str(broker.port), str(flood))
             )
             sent = 0
             while sender.returncode is None:
-                it.publisher.publish(NAV, nav(float(sent)))
+                it.publisher.take(NAV, nav(float(sent)))
                 sent += 1
                 await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
-            it.publisher.publish(EVENT, event("after the flood"))
+            it.publisher.take(EVENT, event("after the flood"))
             await listener.until(heard("event"))
             # Commands and replies keep their order: whoever has the reply to a later one has all of
             # the flood's. One of too many is not answered, so it is asked for until it is.
             while "later" not in [r["id"] for r in replies(listener)]:
                 await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"later"}', qos=1)
-                it.publisher.publish(NAV, nav(float(sent)))
+                it.publisher.take(NAV, nav(float(sent)))
                 sent += 1
                 await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
     answers = replies(listener)
     refused = [r for r in answers if not r["ok"]]
-    carried_out = [c for c in taken if c.id == "flood"]
+    carried_out = {c.id for c in taken if c.id.startswith("flood")}
     assert it.publisher.counters["mqtt_commands_limited"] > 0
     assert len(carried_out) >= BURST
-    assert [r["id"] for r in answers if r["ok"]].count("flood") == len(carried_out)
+    # With QoS 1 a reply may come twice, where the host was too busy to confirm it in time.
+    assert {r["id"] for r in answers if r["ok"]} - {"later"} == carried_out
     assert len(refused) < 5
     assert all("too many commands" in r["text"] for r in refused)
 
@@ -434,8 +438,8 @@ import paho.mqtt.client as mqtt
 client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
 client.connect("127.0.0.1", int(sys.argv[1]))
 client.loop_start()
-for _ in range(int(sys.argv[2])):
-    last = client.publish("fusiond/truck/cmd/reset_filter", b'{"id": "flood"}', qos=1)
+for k in range(int(sys.argv[2])):
+    last = client.publish("fusiond/truck/cmd/reset_filter", '{"id": "flood%d"}' % k, qos=1)
 last.wait_for_publish()
 """
 

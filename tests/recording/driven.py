@@ -7,6 +7,7 @@ turns.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from fusiond.live.scheduler import Scheduler
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.commands import NAMES, Command
+from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -64,7 +66,7 @@ class Drive:
         self._warm = WarmKeeper(self.config, self.clock, lambda code, text: None, {})
         scheduler = Scheduler(50.0, lambda t_ns: None, now=self.clock.now_ns)
         self._publishing = Publishing(
-            self.config, self.chain, scheduler.status, None, self.recorder
+            self.config, self.chain, scheduler.status, {"recording": self.recorder}
         )
         self.unplugged: set[str] = set()
         self.solutions: list[Solution] = []
@@ -73,7 +75,7 @@ class Drive:
         self.recorder.listen(self.inputs)
         self.recorder.arm(LOADED.dump_python(Loaded(), mode="json"))
         self._hear_requests()
-        self.events.listen(self.recorder.event)
+        self.events.listen(partial(self.recorder.take, EVENT))
         for name in ("imu", "gnss", "rdss"):
             self.take(name, "open")
 

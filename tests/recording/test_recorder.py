@@ -16,6 +16,7 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.outputs.messages.event import event_message
+from fusiond.outputs.topics import EVENT
 from fusiond.recording import log_writer
 from fusiond.recording.log_file import LogFile
 from fusiond.recording.log_writer import logs_of
@@ -46,7 +47,7 @@ class Bench:
         self.event(code, "recording")
 
     def event(self, code: str, source: str = "navigator") -> None:
-        self.recorder.event(event_message(None, source=source, code=code, text=code))
+        self.recorder.take(EVENT, event_message(None, source=source, code=code, text=code))
 
     def tick(self, count: int = 1, payload: bytes = b"$GNGGA") -> None:
         """Ticks of 10 ms, each after a read."""
@@ -106,10 +107,10 @@ def test_it_begins_and_ends_when_told(make: Callable[..., Bench]) -> None:
     name = bench.recorder.begin()
     with pytest.raises(RecordingRefusedError, match=name):
         bench.recorder.begin()
-    assert bench.recorder.status.state == "recording"
+    assert bench.recorder.recording.state == "recording"
     bench.tick(2)
     assert bench.recorder.end("told") == name
-    assert bench.recorder.status.state == "off"
+    assert bench.recorder.recording.state == "off"
     assert bench.inputs.heard is None
     bench.tick(2)
     bench.recorder.close()
@@ -128,15 +129,15 @@ def test_an_event_keeps_what_was_before_it(make: Callable[..., Bench]) -> None:
     bench = make(when="event", before_s=1.0, after_s=2.0, events=("diverged",))
     bench.recorder.arm({})
     bench.tick(500)
-    assert bench.recorder.status.state == "waiting"
+    assert bench.recorder.recording.state == "waiting"
     bench.event("mode_navigating")
-    assert bench.recorder.status.state == "waiting"
+    assert bench.recorder.recording.state == "waiting"
     at_ns = bench.host.mono
     bench.event("diverged")
     bench.tick(100)
     bench.event("diverged")  # again: the end moves on
     bench.tick(500)
-    assert bench.recorder.status.state == "waiting"
+    assert bench.recorder.recording.state == "waiting"
     bench.recorder.close()
     ticks = bench.ticks()
     assert at_ns - ticks[0] == pytest.approx(S, abs=30 * MS)
@@ -190,7 +191,7 @@ async def test_a_full_disk_ends_the_recording_not_the_daemon(
 
     def failed() -> bool:
         bench.tick()
-        return bench.recorder.status.state == "failed"
+        return bench.recorder.recording.state == "failed"
 
     await until(failed)
     code, text = bench.events[-1]
@@ -210,7 +211,7 @@ async def test_where_nothing_can_be_written_it_says_why(
 
     def failed() -> bool:
         bench.tick()
-        return bench.recorder.status.state == "failed"
+        return bench.recorder.recording.state == "failed"
 
     await until(failed)
     why = bench.events[-1][1]
@@ -234,13 +235,13 @@ async def test_a_slow_disk_costs_messages_and_no_tick(
     bench = make()
     bench.recorder.arm({})
     bench.tick(1000)
-    assert bench.recorder.status.dropped > 500
+    assert bench.recorder.recording.dropped > 500
     released.set()
 
     def taken() -> bool:
-        before = bench.recorder.status.dropped
+        before = bench.recorder.recording.dropped
         bench.tick()
-        return bench.recorder.status.dropped == before
+        return bench.recorder.recording.dropped == before
 
     await until(taken)
     bench.recorder.close()

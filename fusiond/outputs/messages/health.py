@@ -1,4 +1,4 @@
-"""`health`: the devices by name, the scheduler, the clock and the process."""
+"""`health`: the devices and the outputs by name, the scheduler, the clock and the process."""
 
 from __future__ import annotations
 
@@ -51,6 +51,16 @@ class SourceHealth(BaseModel):
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
 
 
+class OutputHealth(BaseModel):
+    """One way out: what it is doing, and what became of what it was given."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    state: State
+    detail: str = ""
+    counters: dict[str, Count] = Field(default_factory=dict)
+
+
 @dataclass(frozen=True, slots=True)
 class SchedulerStatus:
     """A snapshot for `health`. `gc_forced` collections may have delayed a tick."""
@@ -60,20 +70,28 @@ class SchedulerStatus:
     lateness_p50_ms: float
     lateness_p99_ms: float
     lateness_max_ms: float
+    lateness_sum_s: float
+    lateness_at_most: tuple[tuple[float, int], ...]
+    """Ticks that were no later than so many seconds, cumulative."""
     gc_collections: int
     gc_forced: int
     gc_max_ms: float
 
 
 class HealthMessage(Message):
-    """Devices by name; the scheduler, the clock and the process."""
+    """Devices and outputs by name; the scheduler, the clock and the process."""
 
     sources: dict[str, SourceHealth]
+    outputs: dict[str, OutputHealth]
     ticks: Count
     overruns: Count
     lateness_p50_ms: float
     lateness_p99_ms: float
     lateness_max_ms: float
+    lateness_sum_s: float = Field(description="of all ticks")
+    lateness_at_most_s: dict[str, Count] = Field(
+        description="ticks that were no later than so many seconds"
+    )
     gc_max_ms: float
     utc_source: str
     utc_settled: bool
@@ -87,6 +105,7 @@ def health_message(
     utc_ns: int | None,
     *,
     sources: Mapping[str, SourceHealth],
+    outputs: Mapping[str, OutputHealth],
     scheduler: SchedulerStatus,
     clock: ClockStatus,
     cpu_percent: float,
@@ -98,11 +117,14 @@ def health_message(
         t_utc=t_utc,
         t_ms=t_ms,
         sources=dict(sources),
+        outputs=dict(outputs),
         ticks=scheduler.ticks,
         overruns=scheduler.overruns,
         lateness_p50_ms=round(scheduler.lateness_p50_ms, 3),
         lateness_p99_ms=round(scheduler.lateness_p99_ms, 3),
         lateness_max_ms=round(scheduler.lateness_max_ms, 3),
+        lateness_sum_s=round(scheduler.lateness_sum_s, 6),
+        lateness_at_most_s={f"{edge:.3g}": n for edge, n in scheduler.lateness_at_most},
         gc_max_ms=round(scheduler.gc_max_ms, 3),
         utc_source=clock.utc_source,
         utc_settled=clock.settled,

@@ -1,0 +1,111 @@
+"""Sections `[outputs.NAME]`: what leaves besides MQTT. A section that stands there is served."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from fusiond.configuration.aiding import Section
+
+Port = Annotated[int, Field(ge=1, le=65535)]
+Rate = Annotated[float, Field(ge=0.1, le=100.0)]
+
+
+class Served(Section):
+    """What every server of TCP clients has."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at; `0.0.0.0` lets the whole network in, unasked for a name."""
+    rate_hz: Rate = 1.0
+    """Epochs a second, as receivers send them."""
+
+
+class Gpsd(Served):
+    """gpsd's JSON protocol, in the place of gpsd."""
+
+    port: Port = 2947
+    """As registered for gpsd."""
+
+
+class NmeaServed(Served):
+    """NMEA 0183 over TCP; what a receiver's sentences come in by is `[sources.NAME]`."""
+
+    port: Port = 10110
+    """As registered for NMEA 0183."""
+    sentences: tuple[Literal["RMC", "GGA", "VTG", "GST", "THS", "HDT", "PASHR"], ...] = (
+        "RMC",
+        "GGA",
+        "VTG",
+        "GST",
+        "THS",
+    )
+    """`THS` has the heading. `PASHR` adds roll and pitch. `HDT` not together with `GST`: gpsd 3.22
+    makes JSON of it that cannot be read."""
+
+    @model_validator(mode="after")
+    def _gpsd_can_read(self) -> NmeaServed:
+        if {"HDT", "GST"} <= set(self.sentences):
+            raise ValueError("HDT and GST together confuse gpsd 3.22: leave one out")
+        return self
+
+
+class Prometheus(Section):
+    """Metrics for Prometheus at `/metrics`."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at."""
+    port: Port = 9947
+
+
+class Foxglove(Served):
+    """Foxglove's WebSocket protocol; needs the extra `foxglove`."""
+
+    port: Port = 8765
+    """As Foxglove proposes it."""
+    rate_hz: Rate = 10.0
+    """Of position and attitude."""
+
+
+class HomeAssistant(Section):
+    """Home Assistant's discovery, through the broker of `[mqtt]`."""
+
+    prefix: Annotated[str, Field(pattern=r"^[^#+\s]+$")] = "homeassistant"
+    """The discovery prefix of its MQTT integration."""
+
+
+class OwnTracks(Section):
+    """A location for OwnTracks' maps, through the broker of `[mqtt]`."""
+
+    user: Annotated[str, Field(pattern=r"^[^/#+\s]+$")] = "fusiond"
+    """Second part of the topic `owntracks/<user>/<vehicle>`."""
+    tid: Annotated[str, Field(pattern=r"^[A-Za-z0-9]{2}$")] | None = None
+    """Two characters on the map; by default the last two of `vehicle`."""
+
+
+class Chrony(Section):
+    """Time for chrony's reference clock `SOCK`."""
+
+    socket: Path = Path("/run/chrony.fusiond.sock")
+    """As in chrony.conf; Debian's AppArmor profile lets chronyd make `/run/chrony.*.sock`."""
+
+
+class Outputs(Section):
+    """What several of them need, and a section each."""
+
+    geoid_separation_m: Annotated[float, Field(ge=-120.0, le=100.0)] | None = None
+    """Height of the geoid above the ellipsoid where the vehicle drives; without it no height above
+    sea level is told."""
+    gpsd: Gpsd | None = None
+    nmea: NmeaServed | None = None
+    prometheus: Prometheus | None = None
+    foxglove: Foxglove | None = None
+    home_assistant: HomeAssistant | None = None
+    owntracks: OwnTracks | None = None
+    chrony: Chrony | None = None
+
+    @property
+    def through_the_broker(self) -> tuple[str, ...]:
+        """Those that are configured and go out by MQTT."""
+        return tuple(n for n in ("home_assistant", "owntracks") if getattr(self, n) is not None)

@@ -1,0 +1,62 @@
+"""What every output is: it takes the vehicle's messages in the tick and sends them in its task."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.base import DriverStatus
+from fusiond.clock.clock import Clock
+from fusiond.outputs.messages.base import Message
+from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.topics import Topic
+
+
+class Output(Protocol):
+    """One way out. `counters` and `status` stand in `health`, under `name`.
+
+    `nav_rate_hz`: how often it takes `nav`. `sets_clocks`: whether who receives it may take its
+    time of day for a clock; its `nav` then has no `t_utc` and `t_ms` before UTC is settled.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def nav_rate_hz(self) -> float: ...
+    @property
+    def sets_clocks(self) -> bool: ...
+    @property
+    def counters(self) -> Counter[str]: ...
+    @property
+    def status(self) -> DriverStatus: ...
+
+    def take(self, topic: Topic, message: Message) -> None:
+        """Keep a message, of which the task may send the latest; never waits, never raises."""
+
+    async def run(self) -> None:
+        """Send until cancelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What an output may know of the rest: `on_event(code, text)` hears what it reports."""
+
+    vehicle: str
+    on_event: Callable[[str, str], None]
+    geoid_separation_m: float | None = None
+    sources: tuple[str, ...] = ()
+    """Names of the devices."""
+    mqtt: MqttPublisher | None = None
+    clock: Clock | None = None
+
+    def broker(self) -> MqttPublisher:
+        """For outputs that go out by MQTT; the configuration has seen to it that there is one."""
+        assert self.mqtt is not None
+        return self.mqtt
+
+    def time(self) -> Clock:
+        """For an output that tells time."""
+        assert self.clock is not None
+        return self.clock

@@ -1,0 +1,67 @@
+"""The outputs there are: a section of the configuration each, and what serves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import Config
+from fusiond.outputs.base import Output, Surroundings
+from fusiond.outputs.chrony import ChronySocket
+from fusiond.outputs.commands import Handler
+from fusiond.outputs.foxglove.server import FoxgloveServer
+from fusiond.outputs.gpsd.server import GpsdServer
+from fusiond.outputs.home_assistant import HomeAssistantDiscovery
+from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.outputs.nmea import NmeaServer
+from fusiond.outputs.owntracks import OwnTracksLocations
+from fusiond.outputs.prometheus import PrometheusEndpoint
+
+MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
+    "gpsd": GpsdServer,
+    "nmea": NmeaServer,
+    "owntracks": OwnTracksLocations,
+    "chrony": ChronySocket,
+    "home_assistant": HomeAssistantDiscovery,
+    "prometheus": PrometheusEndpoint,
+    "foxglove": FoxgloveServer,
+}
+"""By the section's name below `[outputs]`."""
+
+
+def make_outputs(
+    config: Config,
+    *,
+    on_event: Callable[[str, str, str], None],
+    on_command: Handler,
+    clock: Clock,
+) -> dict[str, Output]:
+    """Those that are configured, by name, MQTT first. `on_event(source, code, text)` hears them.
+
+    Raises `ConfigError` for one that cannot be as it is configured.
+    """
+    made: dict[str, Output] = {}
+    mqtt: MqttPublisher | None = None
+    if config.mqtt.enabled:
+        made["mqtt"] = mqtt = MqttPublisher(
+            config.mqtt,
+            config.vehicle,
+            on_event=partial(on_event, "mqtt"),
+            on_command=on_command,
+            utc_now=lambda: clock.utc_ns(clock.now_ns()),
+        )
+    for name, make in MAKERS.items():
+        section = getattr(config.outputs, name)
+        if section is not None:
+            around = Surroundings(
+                config.vehicle,
+                partial(on_event, name),
+                config.outputs.geoid_separation_m,
+                tuple(config.sources),
+                mqtt,
+                clock,
+            )
+            made[name] = make(section, around)
+    return made

@@ -1,0 +1,66 @@
+"""What clients are told of a solution beyond its own figures: speed, course and 95 % errors.
+
+    speed  = hypot(v_n, v_e)
+    course = atan2(v_e, v_n)
+    along  = sqrt((v_n sd_n)^2 + (v_e sd_e)^2) / speed     sigma of the speed
+    across = sqrt((v_e sd_n)^2 + (v_n sd_e)^2) / speed     sigma of the velocity's other part
+
+Sigma of velocity is taken for uncorrelated between north and east, which is all that `nav` tells.
+"""
+
+from __future__ import annotations
+
+from math import atan2, degrees, hypot, isfinite
+from typing import NamedTuple
+
+from fusiond.navigation.solution import Mode
+from fusiond.outputs.messages.nav import NavMessage
+
+TWO_SIDED_95 = 1.959964
+"""Sigmas of a Gaussian within which 95 % lie."""
+
+
+class Motion(NamedTuple):
+    """Over the ground: m/s, degrees from true north (None: too slow to have a direction), 95 %
+    errors of both."""
+
+    speed_m_s: float
+    speed_error_m_s: float
+    course_deg: float | None
+    course_error_deg: float
+
+
+def usable(nav: NavMessage) -> bool:
+    """Whether position and velocity may be used."""
+    return nav.mode in (Mode.NAVIGATING, Mode.COASTING)
+
+
+def known(value: float | None) -> float | None:
+    """A figure, None where it is not known: messages made here hold NaN, those read back null."""
+    return value if value is not None and isfinite(value) else None
+
+
+def motion(nav: NavMessage) -> Motion | None:
+    """Speed and course over the ground; None without a velocity.
+
+    Slower than its own 95 % error it may as well go the other way: no course.
+    """
+    figures = [known(x) for x in (nav.v_n_m_s, nav.v_e_m_s, nav.sd_vn_m_s, nav.sd_ve_m_s)]
+    if any(x is None for x in figures):
+        return None
+    north, east, sd_north, sd_east = (x for x in figures if x is not None)
+    speed = hypot(north, east)
+    if speed == 0.0:
+        return Motion(0.0, TWO_SIDED_95 * max(sd_north, sd_east), None, 180.0)
+    along = TWO_SIDED_95 * hypot(north * sd_north, east * sd_east) / speed
+    across = TWO_SIDED_95 * hypot(east * sd_north, north * sd_east) / speed
+    course = degrees(atan2(east, north)) % 360.0
+    slow = speed < max(along, across)
+    return Motion(speed, along, None if slow else course, degrees(atan2(across, speed)))
+
+
+def horizontal_rms_m(nav: NavMessage) -> float | None:
+    """Root of the sum of both variances: 63 to 68 % of errors are smaller, 95 to 98 % than twice
+    it, by the ellipse's shape."""
+    north, east = known(nav.sd_n_m), known(nav.sd_e_m)
+    return None if north is None or east is None else hypot(north, east)

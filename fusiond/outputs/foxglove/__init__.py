@@ -1,0 +1,1 @@
+"""Foxglove's WebSocket protocol: channels, and the server that Foxglove and Lichtblick open."""

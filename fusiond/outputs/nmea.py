@@ -1,0 +1,192 @@
+"""NMEA 0183 over TCP: an epoch of sentences at a time to everyone who connects.
+
+RMC, GGA, VTG, GST and THS, with the talker GN. Mode letter A while it navigates, E and quality 6
+while it coasts (dead reckoning), N, quality 0 and RMC's status V otherwise. Sentences have no field
+for a height above the ellipsoid: GGA has a height where the geoid is configured.
+
+Source: NMEA 0183 v4.11 as the u-blox ZED-F9P interface manual prints it; THS and PASHR as the
+Trimble and u-blox manuals do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from functools import reduce
+from math import floor
+from operator import xor
+
+from drivers.base import DriverStatus
+from fusiond.configuration.outputs import NmeaServed
+from fusiond.navigation.solution import Mode
+from fusiond.outputs.base import Surroundings
+from fusiond.outputs.figures import known, motion, usable
+from fusiond.outputs.latest import Latest
+from fusiond.outputs.messages.base import Message
+from fusiond.outputs.messages.nav import NavMessage
+from fusiond.outputs.tcp import Client, TcpServer
+from fusiond.outputs.topics import NAV, Topic
+
+SATELLITES = "04"
+"""In GGA: the solution is no receiver's and has no number of satellites, but gpsd 3.22 takes fewer
+than four for no fix, while dead reckoning too."""
+DEFAULT = ("RMC", "GGA", "VTG", "GST", "THS")
+KNOT_M_S = 1852.0 / 3600.0
+KMH_M_S = 1.0 / 3.6
+_MODE = {Mode.NAVIGATING: "A", Mode.COASTING: "E"}
+_QUALITY = {Mode.NAVIGATING: "1", Mode.COASTING: "6"}
+_READ_BYTES = 4096
+
+
+class NmeaServer:
+    """Sentences at `host:port`. Counters: those of `TcpServer`. What a client sends is not read
+    for anything but its end."""
+
+    name = "nmea"
+    sets_clocks = True
+
+    def __init__(self, section: NmeaServed, around: Surroundings) -> None:
+        self.nav_rate_hz = section.rate_hz
+        self._kinds = section.sentences
+        self._geoid_m = around.geoid_separation_m
+        self._nav: Latest[NavMessage] = Latest()
+        self.server = TcpServer(self.name, section.host, section.port, self._serve, around.on_event)
+        self.counters = self.server.counters
+
+    @property
+    def status(self) -> DriverStatus:
+        return self.server.status
+
+    def take(self, topic: Topic, message: Message) -> None:
+        if topic is NAV and isinstance(message, NavMessage):
+            self._nav.put(message)
+
+    async def run(self) -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.server.run())
+            group.create_task(self._send())
+
+    async def _send(self) -> None:
+        while True:
+            epoch = sentences(await self._nav.next(), self._kinds, self._geoid_m)
+            await self.server.send(lambda _, epoch=epoch: epoch)  # type: ignore[misc]
+
+    async def _serve(self, client: Client) -> None:
+        while await client.reader.read(_READ_BYTES):
+            pass
+
+
+def sentences(nav: NavMessage, kinds: Sequence[str], geoid_separation_m: float | None) -> bytes:
+    """An epoch: the sentences of `kinds`, in the order in which gpsd understands them.
+
+    GST and PASHR only while there is a solution: they have no field that says there is none.
+    """
+    epoch = _Epoch(nav, geoid_separation_m)
+    makers: dict[str, Callable[[], list[str] | None]] = {
+        "PASHR": epoch.pashr,  # last in the epoch it makes gpsd 3.22 print no TPV
+        "RMC": epoch.rmc,
+        "GGA": epoch.gga,
+        "VTG": epoch.vtg,
+        "GST": epoch.gst,
+        "THS": epoch.ths,
+        "HDT": epoch.hdt,
+    }
+    made = [(kind, make()) for kind, make in makers.items() if kind in kinds]
+    return b"".join(_sentence(kind, fields) for kind, fields in made if fields is not None)
+
+
+def _sentence(kind: str, fields: list[str]) -> bytes:
+    body = ",".join(["PASHR" if kind == "PASHR" else f"GN{kind}", *fields]).encode()
+    return b"$%b*%02X\r\n" % (body, reduce(xor, body))
+
+
+class _Epoch:
+    """One `nav` in the words of NMEA; a field that is not known is empty."""
+
+    def __init__(self, nav: NavMessage, geoid_separation_m: float | None) -> None:
+        self._nav = nav
+        self._usable = usable(nav)
+        self._geoid_m = geoid_separation_m
+        self._motion = motion(nav) if self._usable else None
+        self._mode = _MODE.get(nav.mode, "N")
+        self._time = self._date = ""
+        if nav.t_ms is not None:
+            # Hundredths, cut off: rounding could say 60.00 s.
+            at = datetime.fromtimestamp(nav.t_ms // 1000, UTC)
+            self._time = f"{at:%H%M%S}.{nav.t_ms % 1000 // 10:02d}"
+            self._date = f"{at:%d%m%y}"
+
+    def _of(self, value: float | None, decimals: int, scale: float = 1.0) -> str:
+        figure = known(value) if self._usable else None
+        return "" if figure is None else f"{figure * scale:.{decimals}f}"
+
+    def _angle(self, value: float | None, decimals: int) -> str:
+        """0 to 360, which rounding must not reach."""
+        figure = known(value) if self._usable else None
+        return "" if figure is None else f"{round(figure, decimals) % 360.0:.{decimals}f}"
+
+    def _position(self) -> list[str]:
+        nav = self._nav
+        return [*self._coordinate(nav.lat_deg, 2, "NS"), *self._coordinate(nav.lon_deg, 3, "EW")]
+
+    def _coordinate(self, value: float | None, digits: int, signs: str) -> list[str]:
+        """Degrees and minutes, to 0.2 mm."""
+        figure = known(value) if self._usable else None
+        if figure is None:
+            return ["", ""]
+        units = round(abs(figure) * 60e7)
+        degrees = floor(units / 60e7)
+        minutes = (units - degrees * 600_000_000) / 1e7
+        return [f"{degrees:0{digits}d}{minutes:010.7f}", signs[figure < 0.0]]
+
+    def _course(self) -> float | None:
+        return None if self._motion is None else self._motion.course_deg
+
+    def _speed(self, unit_m_s: float) -> str:
+        return "" if self._motion is None else f"{self._motion.speed_m_s / unit_m_s:.3f}"
+
+    def rmc(self) -> list[str]:
+        status = "A" if self._usable else "V"
+        moving = [self._speed(KNOT_M_S), self._angle(self._course(), 2)]
+        return [self._time, status, *self._position(), *moving, self._date, "", "", self._mode, "V"]
+
+    def gga(self) -> list[str]:
+        quality = _QUALITY.get(self._nav.mode, "0")
+        satellites = SATELLITES if self._usable else "00"
+        height = ["", "M", "", "M"]
+        above = known(self._nav.height_m)
+        vertical = known(self._nav.sd_d_m) is not None
+        if self._usable and self._geoid_m is not None and above is not None and vertical:
+            height = [f"{above - self._geoid_m:.3f}", "M", f"{self._geoid_m:.3f}", "M"]
+        return [self._time, *self._position(), quality, satellites, "", *height, "", ""]
+
+    def vtg(self) -> list[str]:
+        course = self._angle(self._course(), 2)
+        return [course, "T", "", "M", self._speed(KNOT_M_S), "N", self._speed(KMH_M_S), "K",
+                self._mode]  # fmt: skip
+
+    def gst(self) -> list[str] | None:
+        nav = self._nav
+        if not self._usable:
+            return None
+        sd = [self._of(x, 3) for x in (nav.sd_n_m, nav.sd_e_m, nav.sd_d_m)]
+        return [self._time, "", "", "", "", *sd]
+
+    def ths(self) -> list[str]:
+        heading = self._angle(self._nav.yaw_deg, 2)
+        return [heading, self._mode if heading else "V"]
+
+    def hdt(self) -> list[str]:
+        return [self._angle(self._nav.yaw_deg, 2), "T"]
+
+    def pashr(self) -> list[str] | None:
+        nav = self._nav
+        # Without a time pynmeagps 1.1 takes it for another PASHR and raises IndexError.
+        if not self._usable or not self._time:
+            return None
+        tilt = [known(x) for x in (nav.roll_deg, nav.pitch_deg)]
+        angles = ["" if x is None else f"{x:+.2f}" for x in tilt]
+        sd = [self._of(x, 3) for x in (nav.sd_roll_deg, nav.sd_pitch_deg, nav.sd_yaw_deg)]
+        heading = self._angle(nav.yaw_deg, 2)
+        return [self._time, heading, "T", *angles, "", *sd, "1", "1"]

@@ -1,0 +1,47 @@
+"""When a `tracker` is due: every 10 s, and sooner after 20 m, but for one a second."""
+
+from __future__ import annotations
+
+from math import cos, hypot, radians
+
+from fusiond.outputs.messages.nav import NavMessage
+from fusiond.outputs.messages.tracker import TrackerMessage, tracker_message
+
+SECOND_NS = 1_000_000_000
+LONGEST_NS = 10 * SECOND_NS
+SHORTEST_NS = SECOND_NS
+"""Recorders of such positions (Home Assistant's) keep every one."""
+MOVED_M = 20.0
+_METRES_A_DEGREE = 111_195.0
+"""On a sphere of 6371 km."""
+
+
+class Tracking:
+    """Remembers what was told last. Time is the tick's."""
+
+    def __init__(self) -> None:
+        self._told: TrackerMessage | None = None
+        self._told_ns = 0
+
+    def due(self, t_ns: int, nav: NavMessage) -> TrackerMessage | None:
+        """The message to send at `t_ns`; None if there is none to send."""
+        since_ns = t_ns - self._told_ns
+        if self._told is not None and since_ns < SHORTEST_NS:
+            return None
+        message = tracker_message(nav)
+        if message is None:
+            return None
+        if (
+            self._told is not None
+            and since_ns < LONGEST_NS
+            and _apart_m(self._told, message) < MOVED_M
+        ):
+            return None
+        self._told, self._told_ns = message, t_ns
+        return message
+
+
+def _apart_m(one: TrackerMessage, other: TrackerMessage) -> float:
+    north = other.latitude - one.latitude
+    east = (other.longitude - one.longitude + 180.0) % 360.0 - 180.0
+    return _METRES_A_DEGREE * hypot(north, east * cos(radians(one.latitude)))

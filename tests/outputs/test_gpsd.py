@@ -1,0 +1,367 @@
+"""gpsd's protocol as gpsd's clients speak it; a real gpsd reads ours."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import socket
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fusiond.configuration.outputs import Gpsd, NmeaServed
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.outputs import tcp
+from fusiond.outputs.gpsd import reports
+from fusiond.outputs.gpsd.requests import MOST_BYTES, Malformed, Request, RequestReader
+from fusiond.outputs.gpsd.server import GpsdServer
+from fusiond.outputs.messages.health import SkyHealth
+from fusiond.outputs.messages.nav import nav_message
+from fusiond.outputs.nmea import NmeaServer
+from fusiond.outputs.tcp import MOST_CLIENTS, MOST_SKIPPED
+from fusiond.outputs.topics import HEALTH, NAV
+from tests.broker import free_port
+from tests.outputs.messages_examples import EXAMPLES
+from tests.outputs.serving import Around, TcpClient, at_work, connected, feed, nav
+from tests.patience import until
+
+WATCH = b'?WATCH={"enable":true,"json":true}'
+
+
+@asynccontextmanager
+async def serving(**options: Any) -> AsyncIterator[GpsdServer]:
+    server = GpsdServer(Gpsd(port=free_port(), **options), Around().surroundings)
+    async with at_work(server):
+        yield server
+
+
+async def watching(server: GpsdServer, client: TcpClient, request: bytes) -> list[bytes]:
+    """Greeting and answer to a request to watch, which has been taken when this returns."""
+    client.writer.write(request)
+    lines = [await client.line() for _ in range(3)]
+    await until(lambda: any(server.wanted(c).enable for c in server.server.clients))
+    return lines
+
+
+# ------------------------------------------------------------------ requests
+
+
+@pytest.mark.parametrize(
+    ("data", "requests"),
+    [
+        (
+            b'?WATCH={"enable":true,"json":true};',
+            [Request("WATCH", {"enable": True, "json": True})],
+        ),
+        (b'?WATCH={"json":true}', [Request("WATCH", {"json": True})]),  # gps3
+        (b'?WATCH={"json":true}\n?POLL\r\n', [Request("WATCH", {"json": True}), Request("POLL")]),
+        (b"?DEVICES;?VERSION;\r\n", [Request("DEVICES"), Request("VERSION")]),
+        (b'?WATCH={"device":"a;}\\"b"};', [Request("WATCH", {"device": 'a;}"b'})]),
+        (b"?POLL", []),
+        (b'?WATCH={"enable"', []),
+        (b";;\n\n", []),
+    ],
+)
+def test_requests_however_they_end_and_are_cut(data: bytes, requests: list[Request]) -> None:
+    for size in (1, 2, 7, len(data)):
+        reader = RequestReader()
+        pieces = [data[k : k + size] for k in range(0, len(data), size)]
+        assert [r for piece in pieces for r in reader.feed(piece)] == requests
+
+
+@pytest.mark.parametrize(
+    "data", [b"GET / HTTP/1.1\r\n", b"?WATCH={nonsense};", b"?WATCH=7;", b"?;", b"x" * 20_000]
+)
+def test_what_is_no_request_is_said_to_be_none(data: bytes) -> None:
+    reader = RequestReader()
+    assert [type(r) for r in reader.feed(data)] == [Malformed]
+    assert list(reader.feed(b"?POLL;")) == [Request("POLL")]
+
+
+@settings(max_examples=40)
+@given(st.lists(st.binary(max_size=60), max_size=8))
+def test_the_reader_survives_everything(pieces: list[bytes]) -> None:
+    reader = RequestReader()
+    for piece in pieces:
+        for found in reader.feed(piece):
+            assert isinstance(found, Request | Malformed)
+    list(reader.feed(b'"' + b"}" * 50 + b"x" * MOST_BYTES))
+    assert list(reader.feed(b"?POLL;"))[-1:] == [Request("POLL")]
+
+
+# ------------------------------------------------------------------ reports
+
+
+def test_reports_have_no_spaces_and_nothing_unknown() -> None:
+    """cgps reads `"mode": 3` as no fix; the protocol knows neither null nor NaN."""
+    message = nav(height_m=nan, sd_d_m=None, v_d_m_s=nan, sd_vd_m_s=nan)
+    line = reports.encoded(reports.tpv("fusiond://truck", message, 11.3))
+    assert b" " not in line
+    assert line.startswith(b'{"class":"TPV","device":"fusiond://truck","status":6,"mode":2,')
+    said = json.loads(line, parse_constant=pytest.fail)
+    assert None not in said.values()
+    assert not {"altHAE", "altMSL", "alt", "epv", "climb", "velD", "epc"} & said.keys()
+
+
+def test_tpv_is_the_solution_in_gpsds_units() -> None:
+    said = reports.tpv("d", nav(), 11.3)
+    assert (said["mode"], said["status"]) == (3, 6)
+    assert (said["lat"], said["lon"], said["altHAE"]) == (31.025438871, 121.441209483, 17.42)
+    assert (said["altMSL"], said["alt"]) == (6.12, 6.12)
+    assert (said["climb"], said["velD"]) == (-0.041, 0.041)
+    assert said["track"] == pytest.approx(346.0902, abs=1e-4)
+    assert said["speed"] == pytest.approx(8.4611, abs=1e-4)
+    # 1.96 sigma each axis; the horizontal one at twice the root of the summed variances.
+    assert (said["epx"], said["epy"], said["epv"]) == (1.666, 1.764, 3.332)
+    assert said["eph"] == pytest.approx(2.476, abs=1e-3)
+    assert said["time"] == "2026-11-20T23:33:07.123Z"
+    assert "altMSL" not in reports.known_only(reports.tpv("d", nav(), None))
+
+
+def test_what_may_not_be_used_is_no_fix() -> None:
+    waiting = nav_message(Solution(0, Mode.WAITING, "no IMU data yet"), None)
+    assert json.loads(reports.encoded(reports.tpv("d", waiting, 11.3))) == {
+        "class": "TPV",
+        "device": "d",
+        "mode": 1,
+    }
+    invalid = nav(mode=Mode.INVALID)
+    assert reports.tpv("d", invalid, 11.3).keys() == {"class", "device", "mode", "time"}
+    assert reports.att("d", invalid) is None
+    assert reports.gst("d", invalid) is None
+    assert reports.tpv("d", nav(mode=Mode.COASTING), None)["status"] == 5
+
+
+def test_a_vehicle_at_rest_has_no_course() -> None:
+    creeping = reports.tpv("d", nav(v_n_m_s=0.05, v_e_m_s=-0.05), None)
+    assert creeping["track"] is None
+    assert creeping["speed"] == pytest.approx(0.0707)
+    assert creeping["epd"] > 45.0
+    still = reports.tpv("d", nav(v_n_m_s=0.0, v_e_m_s=0.0), None)
+    assert (still["track"], still["speed"], still["epd"]) == (None, 0.0, 180.0)
+
+
+def test_satellites_by_gpsds_numbers() -> None:
+    said = reports.sky(
+        "d", None, SkyHealth(used=("C21", "G07"), refused={"E30": "gated"}, hdop=0.9)
+    )
+    assert (said["nSat"], said["uSat"], said["hdop"]) == (3, 2, 0.9)
+    assert [s["PRN"] for s in said["satellites"]] == [421, 7, 330]
+    assert [s["used"] for s in said["satellites"]] == [True, True, False]
+
+
+# ------------------------------------------------------------------ the server
+
+
+async def test_a_client_watches_and_polls() -> None:
+    async with serving() as server, connected(server.server.address) as client:
+        server.take(HEALTH, EXAMPLES["health"])
+        lines = [json.loads(x) for x in await watching(server, client, WATCH)]
+        assert [x["class"] for x in lines] == ["VERSION", "DEVICES", "WATCH"]
+        assert lines[0]["proto_major"] == 3
+        assert lines[2]["enable"] is lines[2]["json"] is True
+        server.take(NAV, nav())
+        epoch = [json.loads(await client.line()) for _ in range(4)]
+        assert [x["class"] for x in epoch] == ["TPV", "ATT", "GST", "SKY"]
+        assert {x["device"] for x in epoch} == {"fusiond://truck"}
+        client.writer.write(b"?POLL;")
+        polled = json.loads(await client.line())
+        assert polled["tpv"] == [epoch[0]]
+        assert (polled["att"], polled["gst"]) == ([epoch[1]], [epoch[2]])
+        assert polled["sky"][0]["satellites"] == []  # gpsd-py3 takes the last of them
+        client.writer.write(b'?WATCH={"enable":false};?NONSENSE;')
+        answers = [json.loads(await client.line()) for _ in range(3)]
+        assert [x["class"] for x in answers] == ["DEVICES", "WATCH", "ERROR"]
+        server.take(NAV, nav())
+        client.writer.write(b"?VERSION;")
+        assert json.loads(await client.line())["class"] == "VERSION"
+        assert server.counters["malformed"] == 1
+        assert server.counters["requests"] == 5
+
+
+async def test_a_client_without_semicolon_and_one_that_wants_nmea() -> None:
+    async with serving() as server:
+        async with connected(server.server.address) as gps3:
+            await watching(server, gps3, b'?WATCH={"enable":true,"json":true}')
+            server.take(NAV, nav())
+            assert json.loads(await gps3.line())["class"] == "TPV"
+        async with connected(server.server.address) as gpspipe:
+            await watching(server, gpspipe, b'?WATCH={"enable":true,"nmea":true};\n')
+            server.take(NAV, nav())
+            assert (await gpspipe.line()).startswith(b"$GNRMC,233307.12,A,3101.5263323,N,")
+        async with connected(server.server.address) as kismet:
+            await watching(server, kismet, b'?WATCH={"json":true};\n')
+            server.take(NAV, nav())
+            assert json.loads(await kismet.line())["class"] == "TPV"
+
+
+async def test_clients_that_leave_at_once_or_ask_nonsense_harm_nobody() -> None:
+    async with serving() as server, connected(server.server.address) as patient:
+        await watching(server, patient, WATCH)
+        for _ in range(20):
+            async with connected(server.server.address) as hasty:
+                hasty.writer.write(b"?WATCH=" + b"{" * 100)
+        async with connected(server.server.address) as rude:
+            rude.writer.write(b"\x00\xff" * 20_000 + b'?WATCH={"enable":7};')
+            await rude.line()
+            assert json.loads(await rude.line())["class"] == "ERROR"
+        await until(lambda: len(server.server.clients) == 1)
+        server.take(NAV, nav())
+        assert json.loads(await patient.line())["class"] == "TPV"
+
+
+async def test_a_client_that_does_not_read_is_skipped_then_dropped_alone() -> None:
+    async with serving() as server, connected(server.server.address) as quick:
+        await watching(server, quick, WATCH)
+        with socket.socket() as stuck:
+            stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            stuck.setblocking(False)
+            await asyncio.get_running_loop().sock_connect(stuck, server.server.address)
+            await asyncio.get_running_loop().sock_sendall(stuck, WATCH)
+            reading = asyncio.create_task(quick.ended())
+            await feed(server, lambda: server.counters["clients_dropped"] > 0)
+        assert server.counters["skipped"] >= MOST_SKIPPED
+        assert server.counters["clients_dropped"] == 1
+        assert len(server.server.clients) == 1
+        reading.cancel()
+
+
+async def test_more_clients_than_there_may_be_are_sent_away() -> None:
+    async with serving() as server:
+        socks = [await asyncio.open_connection(*server.server.address) for _ in range(MOST_CLIENTS)]
+        await until(lambda: len(server.server.clients) == MOST_CLIENTS)
+        async with connected(server.server.address) as surplus:
+            await surplus.ended()
+        assert server.counters["clients_refused"] == 1
+        assert server.status.detail.endswith(f"{MOST_CLIENTS} connected")
+        for _, writer in socks:
+            writer.transport.abort()
+
+
+async def test_a_port_that_is_taken_is_said_and_tried_again() -> None:
+    around = Around()
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        server = GpsdServer(Gpsd(port=port), around.surroundings)
+        task = asyncio.create_task(server.run())
+        await until(lambda: server.status.state == "absent")
+        assert [code for code, _ in around.events] == ["gpsd_absent"]
+    await until(lambda: server.status.state == "running")
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert len(around.events) == 1
+
+
+# Descriptors 3 and 4, of which the second is ours.
+ACTIVATED = """
+import os, sys
+from fusiond.outputs.activation import activated
+os.dup2(int(sys.argv[1]), 4)
+environ = {"LISTEN_FDS": "2", "LISTEN_FDNAMES": "other:gpsd:more"}
+assert activated("gpsd", environ) is None
+assert activated("gpsd", environ | {"LISTEN_PID": str(os.getpid() + 1)}) is None
+environ["LISTEN_PID"] = str(os.getpid())
+assert activated("more", environ) is activated("nmea", environ) is None
+activated("gpsd", environ).close()
+activated("gpsd", environ).accept()[0].sendall(b"ours\\r\\n")
+"""
+
+
+async def test_the_service_managers_socket_is_ours() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as held:
+        number = held.fileno()
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", ACTIVATED, str(number), pass_fds=[number]
+        )
+        async with connected(held.getsockname()) as client:
+            assert await client.line() == b"ours"
+        assert await process.wait() == 0
+
+
+async def test_the_service_managers_socket_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as held:
+        monkeypatch.setattr(tcp, "activated", lambda name: held.dup() if name == "gpsd" else None)
+        async with serving() as server:
+            assert server.server.address == held.getsockname()
+            async with connected(held.getsockname()) as client:
+                assert json.loads(await client.line())["class"] == "VERSION"
+
+
+# ------------------------------------------------------------------ a real gpsd
+
+
+@asynccontextmanager
+async def real_gpsd(source: str, folder: Path) -> AsyncIterator[TcpClient]:
+    """Debian's gpsd on a source of ours, and a client that watches it."""
+    binary = shutil.which("gpsd", path=f"{os.environ['PATH']}:/usr/sbin")
+    assert binary is not None, "gpsd is missing: apt-get install gpsd"
+    port = free_port()
+    with (folder / "gpsd.log").open("wb") as log:
+        process = await asyncio.create_subprocess_exec(
+            binary, "-N", "-n", "-S", str(port), source, stdout=log, stderr=log
+        )
+    try:
+
+        def listens() -> bool:
+            assert process.returncode is None, (folder / "gpsd.log").read_text()
+            with socket.socket() as s:
+                return s.connect_ex(("127.0.0.1", port)) == 0
+
+        await until(listens)
+        async with connected(("127.0.0.1", port)) as client:
+            client.writer.write(b'?WATCH={"enable":true,"json":true};\n')
+            yield client
+    finally:
+        process.terminate()
+        await process.wait()
+
+
+async def first(client: TcpClient, name: str, fix: int) -> dict[str, Any]:
+    """The first report of that class that has the fix, or any for a class without one."""
+    while True:
+        report: dict[str, Any] = json.loads(await client.line())
+        if report["class"] == name and report.get("mode", fix) == fix:
+            return report
+
+
+@pytest.mark.parametrize("output", ["gpsd", "nmea"])
+async def test_a_real_gpsd_takes_our_fixes(output: str, tmp_path: Path) -> None:
+    port = free_port()
+    around = Around().surroundings
+    if output == "gpsd":
+        source, server = f"gpsd://127.0.0.1:{port}", GpsdServer(Gpsd(port=port), around)
+    else:
+        source, server = f"tcp://127.0.0.1:{port}", NmeaServer(NmeaServed(port=port), around)
+    async with at_work(server), real_gpsd(source, tmp_path) as client:
+        feeding = asyncio.create_task(feed_seconds(server))
+        try:
+            said = await first(client, "TPV", 3)
+        finally:
+            feeding.cancel()
+    assert said["lat"] == pytest.approx(31.025438871, abs=1e-8)
+    assert said["lon"] == pytest.approx(121.441209483, abs=1e-8)
+    assert said["altHAE"] == pytest.approx(17.42, abs=0.01)
+    assert said["altMSL"] == pytest.approx(6.12, abs=0.01)
+    assert said["speed"] == pytest.approx(8.461, abs=0.01)
+    assert said["time"].startswith("2026-11-20T23:33:")
+
+
+async def feed_seconds(server: GpsdServer | NmeaServer) -> None:
+    """Epochs of their own second each: gpsd tells epochs apart by it."""
+    t_ms = EXAMPLES["nav"].t_ms
+    assert t_ms is not None
+    for second in range(10_000):
+        at = t_ms % 60_000 // 1000 + second
+        server.take(
+            NAV, nav(t_ms=t_ms + 1000 * second, t_utc=f"2026-11-20T23:33:{at % 60:02d}.123Z")
+        )
+        await asyncio.sleep(0.05)
