@@ -7,6 +7,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+# All extras but fuzz, which `make fuzz` installs where it is to be had.
+TOOLS := demo foxglove mf4 raw report ros dev
 COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
 	--no-emit-trusted-host --no-emit-options
@@ -95,9 +97,12 @@ load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
-	$(COMPILE) --all-extras $(ARGS) --output-file requirements-dev.lock pyproject.toml
+	$(COMPILE) $(TOOLS:%=--extra %) $(ARGS) --output-file requirements-dev.lock pyproject.toml
 	cp requirements-dev.lock requirements.lock
 	$(COMPILE) --extra demo --extra raw --output-file requirements.lock pyproject.toml
+
+golden: $(STAMP) ## what the kept recordings give now, into tests/golden; git diff shows what changed
+	$(BIN)/python -m tests.golden.golden $(ARGS)
 
 clean: ## remove what the other targets made
 	rm -rf $(VENV) build dist *.egg-info .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -10,9 +10,11 @@ import asyncio
 import contextlib
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Protocol
 
 from drivers.base import DriverStatus, Emit, Now, State, state_event
+from drivers.inputs import Inputs
 from drivers.measurements import Measurement, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent
 from drivers.serial_line import SerialLine
@@ -53,8 +55,16 @@ class ReceiverDriver:
         self._baud = baud
         self._timeout_s = timeout_s
         self._emit = emit
-        self._now_ns = now_ns
+        self.inputs = Inputs(now_ns)
+        self.inputs.on("read", self._on_bytes)
+        self.inputs.on("open", self._on_open)
+        self.inputs.on("close", self._on_close)
+        self.inputs.on("silence", self._on_silence)
+        self.inputs.on("watch", self._on_watch)
+        self._now_ns = self.inputs.now_ns
         self._line = SerialLine(port, baud, now_ns)
+        self._open = False
+        self._why_closed = ""
         self.counters: Counter[str] = self._line.counters
         self._decoder = self._make_decoder()
         self._silence: asyncio.TimerHandle | None = None
@@ -81,40 +91,55 @@ class ReceiverDriver:
         """Serve the receiver until cancelled."""
         watch = asyncio.create_task(self._watch())
         try:
-            await self._line.run(self._on_bytes, self._on_open, self._on_close)
+            await self._line.run(self._read, partial(self.inputs.take, "open"), self._closed)
         finally:
             watch.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await watch
 
-    def _on_open(self) -> None:
-        self._mark_alive()
-        self._useful_ns = self._alive_ns
-        self.status.state, self.status.detail = "starting", "open, nothing verified yet"
+    # ------------------------------------------------------------------ the line and the timer
 
-    def _on_close(self, why: str) -> None:
+    def _read(self, data: bytes, t_seen_ns: int) -> None:
         self._stop_timer()
-        self._hand_over(self._decoder.flush())
-
-    def _on_bytes(self, data: bytes, t_seen_ns: int) -> None:
-        self._stop_timer()
-        before = self._signs_of_life()
-        self._hand_over(self._decoder.feed(data, t_seen_ns))
-        if self._signs_of_life() > before:
-            self._mark_alive()
-            self._set_state("running", self._running_detail())
+        self.inputs.take("read", data, t_seen_ns)
         if self._decoder.epoch_open:
             loop = asyncio.get_running_loop()
-            self._silence = loop.call_later(SILENCE_S, self._on_silence)
+            self._silence = loop.call_later(SILENCE_S, self._fell_silent)
 
-    def _on_silence(self) -> None:
+    def _closed(self, why: str) -> None:
+        self._stop_timer()
+        self.inputs.take("close", why)
+
+    def _fell_silent(self) -> None:
         self._silence = None
-        self._hand_over(self._decoder.silence())
+        self.inputs.take("silence")
 
     def _stop_timer(self) -> None:
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
+
+    # ------------------------------------------------------------------ inputs
+
+    def _on_open(self, _: None, t_ns: int) -> None:
+        self._open = True
+        self._mark_alive()
+        self._useful_ns = self._alive_ns
+        self.status.state, self.status.detail = "starting", "open, nothing verified yet"
+
+    def _on_close(self, why: str, t_ns: int) -> None:
+        self._open, self._why_closed = False, why
+        self._hand_over(self._decoder.flush())
+
+    def _on_bytes(self, data: bytes, t_seen_ns: int) -> None:
+        before = self._signs_of_life()
+        self._hand_over(self._decoder.feed(data, t_seen_ns))
+        if self._signs_of_life() > before:
+            self._mark_alive()
+            self._set_state("running", self._running_detail())
+
+    def _on_silence(self, _: None, t_ns: int) -> None:
+        self._hand_over(self._decoder.silence())
 
     def _hand_over(self, found: Sequence[Measurement | RawEvent]) -> None:
         for measurement in found:
@@ -127,12 +152,15 @@ class ReceiverDriver:
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(STATUS_INTERVAL_S)
-            if not self._line.is_open:
-                self._set_state("absent", self._line.detail)
-            elif self._now_ns() - self._alive_ns > self._timeout_s * 1e9:
-                self._set_state("silent", self._silent_detail())
-            elif self.status.state == "running":
-                self._set_state("running", self._running_detail())
+            self.inputs.take("watch")
+
+    def _on_watch(self, _: None, t_ns: int) -> None:
+        if not self._open:
+            self._set_state("absent", self._line.detail or self._why_closed)
+        elif t_ns - self._alive_ns > self._timeout_s * 1e9:
+            self._set_state("silent", self._silent_detail())
+        elif self.status.state == "running":
+            self._set_state("running", self._running_detail())
 
     def _signs_of_life(self) -> int:
         return sum(self.counters[name] for name in self.alive_by)

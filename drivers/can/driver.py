@@ -26,6 +26,7 @@ from drivers.base import (
 )
 from drivers.can.bus import CanBus, CanFilter, CanFrame, Interface
 from drivers.can.errors import ControllerState
+from drivers.inputs import Inputs
 from drivers.measurements import (
     ArrivalStamp,
     DeviceEvent,
@@ -113,7 +114,13 @@ class CanDriver(Generic[O]):
         self.counters: Counter[str] = Counter()
         self.status = DriverStatus()
         self._emit = emit
-        self._now_ns = now_ns
+        self.inputs = Inputs(now_ns)
+        self.inputs.on("frame", lambda frame, t_ns: self.feed(frame))
+        self.inputs.on("open", self._on_open)
+        self.inputs.on("close", self._on_close)
+        self.inputs.on("controller", self._on_controller)
+        self.inputs.on("watch", self._on_watch)
+        self._now_ns = self.inputs.now_ns
         self._decoder = self.Decoder(name, options, self.counters)
         # The other interfaces filter in Python, which the decoder does anyhow.
         filters = self._decoder.filters if options.interface == "socketcan" else ()
@@ -121,6 +128,7 @@ class CanDriver(Generic[O]):
             options.interface, options.channel, filters, self.counters, now_ns=now_ns
         )
         self._up = False
+        self._controller: ControllerState = "active"
         self._was_down = False
         self._restarts = 0
         self._sample_ns = 0
@@ -130,7 +138,12 @@ class CanDriver(Generic[O]):
         """Serve the device until cancelled."""
         watch = asyncio.create_task(self._watch())
         try:
-            await self._bus.run(self.feed, self._on_link, self._on_controller)
+            take = self.inputs.take
+            await self._bus.run(
+                lambda frame: take("frame", frame, frame.t_seen_ns),
+                lambda up, why: take("open") if up else take("close", why),
+                lambda state: take("controller", state),
+            )
         finally:
             watch.cancel()
 
@@ -148,39 +161,45 @@ class CanDriver(Generic[O]):
         for measurement in measurements:
             self._emit(measurement)
 
-    def _on_link(self, up: bool, why: str) -> None:
-        self._up = up
-        self._sample_ns = self._now_ns()
-        if up:
-            self.status.state, self.status.detail = "silent", "open, nothing heard yet"
-            if self._was_down:
-                self._event("interface_up", f"{self.options.channel} is back")
-            return
+    def _on_open(self, _: None, t_ns: int) -> None:
+        self._up = True
+        self._sample_ns = t_ns
+        self._controller = "active"
+        self.status.state, self.status.detail = "silent", "open, nothing heard yet"
+        if self._was_down:
+            self._event("interface_up", f"{self.options.channel} is back")
+
+    def _on_close(self, why: str, t_ns: int) -> None:
+        self._up = False
+        self._sample_ns = t_ns
         self._decoder.reset()
         self._was_down = True
         self.status.state, self.status.detail = "absent", why
         self._event("interface_down", why)
 
-    def _on_controller(self, state: ControllerState) -> None:
+    def _on_controller(self, state: ControllerState, t_ns: int) -> None:
+        self._controller = state
         code, text = CONTROLLER_EVENTS[state]
         text = text.format(channel=self.options.channel)
         if state == "bus_off":
             self.status.state, self.status.detail = "silent", text
-        now_ns = self._now_ns()
-        if now_ns - self._told_ns.get(code, now_ns - EVENT_SPACING_NS) >= EVENT_SPACING_NS:
-            self._told_ns[code] = now_ns
+        if t_ns - self._told_ns.get(code, t_ns - EVENT_SPACING_NS) >= EVENT_SPACING_NS:
+            self._told_ns[code] = t_ns
             self._event(code, f"{self.options.channel}: {text}")
 
     async def _watch(self) -> None:
         """Say `silent` when samples stop."""
         while True:
             await asyncio.sleep(self.options.timeout_s / 2)
-            missing = self._decoder.take_missing()
-            quiet_s = (self._now_ns() - self._sample_ns) * 1e-9
-            if self._up and quiet_s >= self.options.timeout_s:
-                if self._bus.controller != "bus_off":
-                    self.status.state, self.status.detail = "silent", self._explain(missing)
-                self._decoder.reset()
+            self.inputs.take("watch")
+
+    def _on_watch(self, _: None, t_ns: int) -> None:
+        missing = self._decoder.take_missing()
+        quiet_s = (t_ns - self._sample_ns) * 1e-9
+        if self._up and quiet_s >= self.options.timeout_s:
+            if self._controller != "bus_off":
+                self.status.state, self.status.detail = "silent", self._explain(missing)
+            self._decoder.reset()
 
     def _explain(self, missing: list[str]) -> str:
         if not missing:

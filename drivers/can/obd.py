@@ -187,6 +187,7 @@ class ObdSpeedDriver(CanDriver[ObdSpeedOptions]):
         frame = request(self.options.identifiers)
         while True:
             if self._up:
+                self.inputs.sent(frame.data)
                 sent = self._bus.send(frame)
                 self.counters["asked" if sent else "not_sent"] += 1
             await asyncio.sleep(1.0 / self.options.ask_hz)

@@ -16,6 +16,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveFloat
 
 from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
+from drivers.inputs import Inputs
 from drivers.measurements import DelayedFix, DeviceEvent, TimeOfDayStamp, TimeReport
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_ANTENNA_M, MAX_ORDINARY_HEIGHT_M
@@ -87,7 +88,14 @@ class RdssDriver:
         self.counters: Counter[str] = Counter()
         self.status = DriverStatus()
         self._emit = emit
-        self._now_ns = now_ns
+        self.inputs = Inputs(now_ns)
+        self.inputs.on("read", self._on_bytes)
+        self.inputs.on("open", self._on_open)
+        self.inputs.on("close", self._on_close)
+        self.inputs.on("due", self._on_due)
+        self._now_ns = self.inputs.now_ns
+        self._open = False
+        self._why_closed = ""
         bauds = PROBE_BAUDS if options.baud == "auto" else (options.baud,)
         families: tuple[Family, ...] = (
             ("4.0", "2.1") if options.family == "auto" else (options.family,)
@@ -117,28 +125,35 @@ class RdssDriver:
     async def run(self) -> None:
         """Serve the terminal until cancelled."""
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._line.run(self._on_bytes, self._on_open, self._on_close))
+            take = self.inputs.take
+            serve = self._line.run(
+                lambda data, t_ns: take("read", data, t_ns),
+                lambda: take("open"),
+                lambda why: take("close", why),
+            )
+            tasks.create_task(serve)
             tasks.create_task(self._keep_time())
 
-    def height_hint(self, height_m: float, sd_m: float) -> None:
-        """Ellipsoidal height of the terminal's antenna from the solution, one sigma, as of now."""
-        self._terminal.height_hint(height_m, sd_m, self._now_ns())
+    def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
+        """Ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one sigma."""
+        self._terminal.height_hint(height_m, sd_m, t_ns)
 
-    def request_now(self) -> str:
+    def request_now(self, t_ns: int) -> str:
         """Ask for a fix as soon as the card's spacing allows; when, or why not, in words."""
-        text = self._terminal.request_now(self._now_ns()).text
+        text = self._terminal.request_now(t_ns).text
         self._wake.set()
         return text
 
     # ------------------------------------------------------------------ line
 
-    def _on_open(self) -> None:
+    def _on_open(self, _: None, t_ns: int) -> None:
+        self._open = True
         self._listen()
-        self._perform(self._terminal.opened(self._now_ns()), 0)
+        self._perform(self._terminal.opened(t_ns), 0)
         self._wake.set()
 
-    def _on_close(self, why: str) -> None:
-        t_ns = self._now_ns()
+    def _on_close(self, why: str, t_ns: int) -> None:
+        self._open, self._why_closed = False, why
         self._perform(self._terminal.closed(t_ns), t_ns)
         self._notify(t_ns, "rdss_closed", why)
         self._wake.set()
@@ -158,13 +173,7 @@ class RdssDriver:
         """Call the state machine when it is due, and give up frames whose rest does not come."""
         while True:
             self._wake.clear()
-            t_ns = self._now_ns()
-            if self._overdue_ns is not None and t_ns >= self._overdue_ns:
-                self._give_up_frames(t_ns)
-            self._perform(self._terminal.tick(t_ns), t_ns)
-            if not self._terminal.answered and len(self._decoders) < len(self._families):
-                self._listen()
-            self._say_status()
+            self.inputs.take("due")
             due = [d for d in (self._terminal.next_deadline_ns, self._overdue_ns) if d is not None]
             wait_s = STATUS_S
             if due:
@@ -175,18 +184,27 @@ class RdssDriver:
             except TimeoutError:
                 continue
 
+    def _on_due(self, _: None, t_ns: int) -> None:
+        if self._overdue_ns is not None and t_ns >= self._overdue_ns:
+            self._give_up_frames(t_ns)
+        self._perform(self._terminal.tick(t_ns), t_ns)
+        if not self._terminal.answered and len(self._decoders) < len(self._families):
+            self._listen()
+        self._say_status()
+
     def _say_status(self) -> None:
         """`silent` once every baud rate has been probed in vain, or nobody answers any more."""
         state: State = "starting"
-        if not self._line.is_open:
-            state = "absent" if self._line.detail else "starting"
+        absent = self._line.detail or self._why_closed
+        if not self._open:
+            state = "absent" if absent else "starting"
         elif self._terminal.answered:
             state = "running"
         elif self._terminal.unanswered_round or self.status.state in ("running", "silent"):
             state = "silent"
         changed = state != self.status.state
         self.status.state = state
-        self.status.detail = self._terminal.detail if self._line.is_open else self._line.detail
+        self.status.detail = self._terminal.detail if self._open else absent
         if changed and state != "starting":
             self._emit(state_event(self.name, self._now_ns(), self._line.port, self.status))
 
@@ -228,6 +246,7 @@ class RdssDriver:
         for action in actions:
             match action:
                 case Send():
+                    self.inputs.sent(action.data)
                     self._line.write(action.data)
                 case SetBaud():
                     self._line.set_baud(action.baud)

@@ -20,7 +20,7 @@ Host time is injected; with the same host time and the same calls the answers ar
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import hypot
 from typing import assert_never
 
@@ -37,7 +37,14 @@ from drivers.measurements import (
 from fusiond.clock import dates
 from fusiond.clock.answers import ClockStatus, Instant, TimeSample
 from fusiond.clock.device_clock import DeviceClock
-from fusiond.clock.host import MILLISECOND_NS, SECOND_NS, HostTime, SystemClock, SystemTime
+from fusiond.clock.host import (
+    MILLISECOND_NS,
+    SECOND_NS,
+    HostTime,
+    Readings,
+    SystemClock,
+    SystemTime,
+)
 from fusiond.clock.time_of_day import RdssTimeOfDay, nearest
 from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown
 from fusiond.configuration.schema import ClockOptions
@@ -82,14 +89,20 @@ class Clock:
     `on_time` has every report by which the system clock may be set.
     """
 
-    def __init__(self, options: ClockOptions, host: HostTime | None = None) -> None:
+    def __init__(
+        self,
+        options: ClockOptions,
+        host: HostTime | None = None,
+        readings: Readings | None = None,
+    ) -> None:
         self._options = options
         self._host: HostTime = SystemTime() if host is None else host
+        self.readings = Readings(self._host) if readings is None else readings
         self._serial_latency_ns = round(options.serial_latency_s * SECOND_NS)
         self.counters: Counter[str] = Counter()
         self.on_event: Callable[[str, str], None] | None = None
         self.on_time: Callable[[TimeSample], None] | None = None
-        self._system = SystemClock(self._host, self.counters)
+        self._system = SystemClock(self.readings, self.counters)
         self._slept_ns = 0
         self._devices: dict[str, DeviceClock] = {}
         self._utc: dict[str, UtcEnvelope] = {}
@@ -101,7 +114,15 @@ class Clock:
         """The host's monotonic clock, ns."""
         return self._host.monotonic_ns()
 
-    def _look(self) -> int:
+    def system_state(self) -> dict[str, int | None]:
+        """What is known of the system clock, for a replay (`restore_system`)."""
+        return self._system.state()
+
+    def restore_system(self, state: Mapping[str, int | None]) -> None:
+        """Know of the system clock what another `Clock` did at its start."""
+        self._system.restore(state)
+
+    def look(self) -> int:
         """Sample the host's clocks; realtime minus monotonic, ns."""
         changes = self._system.changes
         offset_ns = self._system.sample()
@@ -162,7 +183,7 @@ class Clock:
 
     def _from_kernel(self, stamp: KernelStamp, t_seen_ns: int) -> Instant:
         latency_ns = round(stamp.latency_s * SECOND_NS)
-        t_ns = stamp.realtime_ns - self._look()
+        t_ns = stamp.realtime_ns - self.look()
         # After a step, frames stamped before it are still queued: of the two readings that one
         # is right which is the younger without lying in the future.
         before = self._system.before_step_ns
@@ -183,7 +204,7 @@ class Clock:
         return Instant(t_seen_ns - latency_ns, _ARRIVAL_SD_S, "arrival")
 
     def _from_utc(self, utc_ns: int, source: str, t_seen_ns: int) -> Instant:
-        self._look()
+        self.look()
         own = self._utc.get(source) if self._options.utc == "gnss" else None
         if own is None:
             return self._from_others_utc(utc_ns, source, t_seen_ns)
@@ -249,7 +270,7 @@ class Clock:
         Counters: `utc_report_untrusted`, `utc_report_implausible`, `gps_week_rollover`,
         `utc_source_changed`, `utc_jumped`, and those of `UtcEnvelope`.
         """
-        self._look()
+        self.look()
         if not report.trusted:
             self.counters["utc_report_untrusted"] += 1
             if report.source in self._utc:
@@ -332,7 +353,7 @@ class Clock:
         whether for the better: stamps are mapped as before it for two minutes, and sigma is the
         step, or what it is without any UTC. UTC itself (None) is what the system clock says.
         """
-        system_ns = self._look()
+        system_ns = self.look()
         if self._options.utc == "gnss":
             own = self._utc.get(source) if source is not None else None
             if own is not None:
@@ -372,7 +393,7 @@ class Clock:
             utc_source = self._reference
             settled = self._utc[self._reference].settled
             offset_ns = self._mapping(None)[0]
-            system_error_s = (self._look() + offset_ns) / SECOND_NS
+            system_error_s = (self.look() + offset_ns) / SECOND_NS
         else:
             utc_source = "none" if self.utc_ns(self.now_ns()) is None else "system"
         return ClockStatus(

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from typing import Literal, Protocol
 
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
@@ -29,6 +29,15 @@ _AFTER_STEP_NS = 2 * SECOND_NS
 """Frames stamped before a step of the system clock are out of the kernel's queue by then."""
 _BELIEVE_STEP_NS = 120 * SECOND_NS
 """A step that is taken back within two minutes was a mistake (chrony makes its own at start)."""
+
+ReadClock = Literal["realtime", "boottime"]
+
+
+_KNOWN = (
+    *("_sampled_ns", "offset_ns", "_boot_ns", "before_step_ns", "held_ns", "slept_ns", "changes"),
+    *("last_step_ns", "_queued_ns", "_stepped_ns"),
+)
+"""The attributes that are a `SystemClock`'s state."""
 
 
 class HostTime(Protocol):
@@ -53,27 +62,26 @@ class SystemTime:
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-class SystemClock:
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC: as it is, before its last step, and as it is held.
+class Readings:
+    """How far two clocks of the host are ahead of the monotonic one: `(t_ns, ahead_ns)` each.
 
-    `held_ns` follows slews and sleep at once, a step only after two minutes: a step does not move
-    the instants of measurements. Counters: `system_clock_stepped`.
+    `heard(clock, t_ns, ahead_ns)` is told every reading, of clock `realtime` or `boottime`: with
+    them, all that a `Clock` takes from the host can be recorded.
     """
 
-    def __init__(self, host: HostTime, counters: Counter[str]) -> None:
+    def __init__(self, host: HostTime) -> None:
         self._host = host
-        self._counters = counters
-        self._sampled_ns, self.offset_ns = self._read(host.realtime_ns)
-        self._boot_ns = self._read(host.boottime_ns)[1]
-        self.before_step_ns: int | None = None
-        self.held_ns = self.offset_ns
-        self.slept_ns = 0
-        self.changes = 0
-        self.last_step_ns = 0
-        self._queued_ns = self._stepped_ns = self._sampled_ns
+        self.heard: Callable[[ReadClock, int, int], None] | None = None
 
-    def _read(self, other_ns: Callable[[], int]) -> tuple[int, int]:
-        """Monotonic time and how far the other clock is ahead of it, ns."""
+    def realtime(self) -> tuple[int, int]:
+        """CLOCK_REALTIME against CLOCK_MONOTONIC, ns."""
+        return self._read("realtime", self._host.realtime_ns)
+
+    def boottime(self) -> tuple[int, int]:
+        """CLOCK_BOOTTIME against CLOCK_MONOTONIC, ns."""
+        return self._read("boottime", self._host.boottime_ns)
+
+    def _read(self, clock: ReadClock, other_ns: Callable[[], int]) -> tuple[int, int]:
         best: tuple[int, int, int] | None = None
         for _ in range(3):
             before = self._host.monotonic_ns()
@@ -85,7 +93,29 @@ class SystemClock:
             if best[0] <= _BRACKET_NS:
                 break
         assert best is not None
+        if self.heard is not None:
+            self.heard(clock, best[1], best[2])
         return best[1], best[2]
+
+
+class SystemClock:
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC: as it is, before its last step, and as it is held.
+
+    `held_ns` follows slews and sleep at once, a step only after two minutes: a step does not move
+    the instants of measurements. Counters: `system_clock_stepped`.
+    """
+
+    def __init__(self, readings: Readings, counters: Counter[str]) -> None:
+        self._readings = readings
+        self._counters = counters
+        self._sampled_ns, self.offset_ns = readings.realtime()
+        self._boot_ns = readings.boottime()[1]
+        self.before_step_ns: int | None = None
+        self.held_ns = self.offset_ns
+        self.slept_ns = 0
+        self.changes = 0
+        self.last_step_ns = 0
+        self._queued_ns = self._stepped_ns = self._sampled_ns
 
     def sample(self) -> int:
         """Read the clock again, notice sleep and steps; realtime minus monotonic in ns.
@@ -93,7 +123,7 @@ class SystemClock:
         `slept_ns` is the sleep since this was made, `changes` the number of sleeps and steps,
         `last_step_ns` the step that was part of the last one.
         """
-        now, offset = self._read(self._host.realtime_ns)
+        now, offset = self._readings.realtime()
         slack = _STEP_NS + max(0, now - self._sampled_ns) // _SLEW_PER_NS
         change = offset - self.offset_ns
         if abs(change) > slack:
@@ -118,9 +148,18 @@ class SystemClock:
         self._sampled_ns, self.offset_ns = now, offset
         return offset
 
+    def state(self) -> dict[str, int | None]:
+        """All that it knows, for `restore`."""
+        return {name: getattr(self, name) for name in _KNOWN}
+
+    def restore(self, state: Mapping[str, int | None]) -> None:
+        """Go on as the one did whose state this is. KeyError where something is missing."""
+        for name in _KNOWN:
+            setattr(self, name, state[name])
+
     def _sleep(self) -> int:
         """What boottime has gained on monotonic since it was last asked, ns: 0 for no sleep."""
-        boot_ns = self._read(self._host.boottime_ns)[1]
+        boot_ns = self._readings.boottime()[1]
         slept = boot_ns - self._boot_ns
         if slept < _SLEPT_NS:
             return 0

@@ -4,31 +4,49 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fusiond.commands.shared import EXIT_UNAVAILABLE, ConfigPath, config_errors, load, plain
 
+if TYPE_CHECKING:
+    from fusiond.configuration.schema import Config
 
-def run(config: ConfigPath) -> None:
+RecordPath = Annotated[
+    Path | None,
+    typer.Option("--record", metavar="DIR", help="Record all of it into files of this folder."),
+]
+
+
+def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
-    loaded = load(config)
+    loaded = recorded(load(config), record)
     from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
 
     run_daemon(loaded, config)
 
 
+def recorded(config: Config, folder: Path | None) -> Config:
+    """The configuration, with all recorded into `folder` if there is one."""
+    if folder is None:
+        return config
+    update = {"directory": folder.absolute(), "when": "always"}
+    return config.model_copy(update={"recording": config.recording.model_copy(update=update)})
+
+
 def demo(
     duration: Annotated[float, typer.Option(min=1.0, help="Seconds.")] = 60.0,
     headless: Annotated[bool, typer.Option("--headless", help="No live view.")] = False,
+    record: RecordPath = None,
 ) -> None:
     """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
     from fusiond.demo.broker import DemoError  # noqa: PLC0415
     from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
 
     try:
-        summary = run_demo(duration, headless or not sys.stdout.isatty())
+        summary = run_demo(duration, headless or not sys.stdout.isatty(), record)
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error

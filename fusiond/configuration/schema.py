@@ -34,6 +34,7 @@ from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
+from fusiond.configuration.recording import Recording
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
 
 
@@ -222,6 +223,11 @@ class ClockOptions(Section):
     max_clock_drift_ppm: PositiveFloat = 100.0
 
 
+CommandName = Literal[
+    "set_position", "request_fix", "reset_filter", "start_recording", "stop_recording", "inject"
+]
+
+
 class Mqtt(Section):
     """Broker. Passwords come from FUSIOND_MQTT_PASSWORD or from `password_file`, never from
     here."""
@@ -241,7 +247,7 @@ class Mqtt(Section):
     health_rate_hz: Annotated[float, Field(ge=0.1, le=10.0)] = 1.0
     queue: Annotated[int, Field(ge=1, le=10000)] = 64
     """Messages that may wait for the broker; beyond it the oldest is dropped and counted."""
-    commands: tuple[Literal["set_position", "request_fix", "reset_filter"], ...] = ()
+    commands: tuple[CommandName, ...] = ()
     """Commands accepted on `cmd/<name>`; none by default."""
 
 
@@ -275,6 +281,7 @@ class Config(Section):
     scheduler: Scheduler = Scheduler()
     clock: ClockOptions = ClockOptions()
     mqtt: Mqtt = Mqtt()
+    recording: Recording = Recording()
     outputs: Outputs = Outputs()
 
     @property

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from drivers.shipped import shipped
 from fusiond.configuration.load import load_config
+from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config, Source
 from fusiond.demo.broker import DemoBroker
 from fusiond.demo.view import HeadlessView, Live, LiveView
@@ -63,8 +64,8 @@ _TOWN = (
 )
 
 
-def demo(duration_s: float, headless: bool) -> dict[str, Any]:
-    """Run for `duration_s`, or until Ctrl-C; the summary.
+def demo(duration_s: float, headless: bool, record: Path | None = None) -> dict[str, Any]:
+    """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`.
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
@@ -78,7 +79,7 @@ def demo(duration_s: float, headless: bool) -> dict[str, Any]:
         tempfile.TemporaryDirectory(prefix="fusiond-demo-") as folder,
         _log_kept_out(headless),
     ):
-        run = _Run(duration_s, headless, broker.port, Path(folder))
+        run = _Run(duration_s, headless, broker.port, Path(folder), record)
         return asyncio.run(run.run())
 
 
@@ -114,11 +115,16 @@ class View(Protocol):
 
 
 class _Run:
-    def __init__(self, duration_s: float, headless: bool, port: int, folder: Path) -> None:
+    def __init__(
+        self, duration_s: float, headless: bool, port: int, folder: Path, record: Path | None
+    ) -> None:
         self._duration_s = duration_s
         self._port = port
         links = folder / "gnss", folder / "rdss"
         config = demo_config(port, *links)
+        if record is not None:
+            recording = Recording(directory=record.absolute())
+            config = config.model_copy(update={"recording": recording})
         self._vehicle = SimulatedVehicle(
             demo_scenario(config),
             duration_s=duration_s + 10.0,

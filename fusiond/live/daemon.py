@@ -20,20 +20,30 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
+from fusiond.live.chain import Chain
 from fusiond.live.events import Events
-from fusiond.live.operator import Operator
+from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.process_usage import release_compiler_pages
 from fusiond.live.publishing import Publishing
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
 from fusiond.live.service_manager import ServiceManager
-from fusiond.live.sources import Sources
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
-from fusiond.live.warm_keeper import WarmKeeper
-from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigator.navigator import Navigator
+from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
+from fusiond.navigation.solution import Solution
+from fusiond.navigator.timeline import Entry
+from fusiond.outputs.base import Output
 from fusiond.outputs.catalogue import make_outputs
+from fusiond.outputs.commands import (
+    NAMES,
+    Command,
+    CommandRefusedError,
+    StartRecording,
+    StopRecording,
+)
 from fusiond.outputs.topics import EVENT
+from fusiond.recording.digest import state_digest
+from fusiond.recording.recorder import Recorder, RecordingRefusedError
 
 log = logging.getLogger("fusiond")
 
@@ -58,13 +68,17 @@ class Daemon:
         self._state = StateKeeper(config, self.clock, navigator_event)
         self._warm = WarmKeeper(config, self.clock, navigator_event)
         self._calibration = CalibrationKeeper(config, navigator_event)
+        recording_event = partial(self._events.report, "recording")
+        self.recorder = Recorder(config, self.clock, recording_event)
         saved = self._state.load()
-        self.navigator = Navigator(config, saved, on_event=navigator_event)
+        self._chain = Chain(config, self.clock, self._events, saved, self._on_outcome)
+        self.navigator = self._chain.navigator
+        self.sources = self._chain.sources
         self._calibration.offer(self.navigator)
         if saved is None or "saved" not in config.alignment.heading:
             # A vehicle that stood knows more by what it kept then.
             self._warm.offer(self.navigator)
-        self.sources = Sources(config, self.clock, self.navigator, self._events.report)
+        self._loaded = Loaded(saved, self._warm.loaded, self.navigator.calibration)
         self.service = ServiceManager()
         self.scheduler = Scheduler(
             config.scheduler.rate_hz,
@@ -72,24 +86,32 @@ class Daemon:
             now=self.clock.now_ns,
             on_time=self.service.feed_watchdog,
         )
-        self.outputs = make_outputs(
+        self.outputs: dict[str, Output] = make_outputs(
             config,
             on_event=self._events.report,
-            on_command=Operator(self.navigator, self.sources).carry_out,
+            on_command=self._carry_out,
             clock=self.clock,
         )
-        for output in self.outputs.values():
-            self._events.listen(partial(output.take, EVENT))
+        if config.recording.directory is not None:
+            self.outputs["recording"] = self.recorder
         self._publishing: Publishing | None = None
         if self.outputs:
             self._publishing = Publishing(
-                config, self.clock, self.navigator, self.sources, self.scheduler, self.outputs
+                config,
+                self._chain,
+                self.scheduler.status,
+                self.outputs,
+                lambda: self.recorder.recording,
             )
-        self.solution: Solution | None = None
         self._on_solution = on_solution
         self._started_ns = self.clock.now_ns()
         self._ready = False
         self._second = Every(SECOND_NS)
+
+    @property
+    def solution(self) -> Solution | None:
+        """Of the last tick."""
+        return self._chain.solution
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until `stop` is set."""
@@ -99,6 +121,9 @@ class Daemon:
             self.config.vehicle,
             config_digest(self.config),
         )
+        self.recorder.listen(self.sources.inputs)
+        self.recorder.arm(LOADED.dump_python(self._loaded, mode="json"))
+        self._events.listen(*(partial(output.take, EVENT) for output in self.outputs.values()))
         outputs = [
             asyncio.create_task(
                 supervise(
@@ -131,35 +156,56 @@ class Daemon:
             )
 
     def _tick(self, t_ns: int) -> None:
-        arrived = self.sources.take_imu()
-        if arrived is not None:
-            self.navigator.add_imu(*arrived)
-        self.navigator.advance()
-        solution = self.navigator.solution(t_ns)
-        before, self.solution = self.solution, solution
+        late_ns = self.clock.now_ns() - t_ns
+        self.recorder.tick_begins(t_ns)
+        solution = self._chain.tick(t_ns)
+        if self.recorder.active:
+            digest = state_digest(self.navigator, solution)
+            self.recorder.tick_ended(t_ns, late_ns, self.scheduler.overruns, digest)
+            self._keep_in_log(t_ns, solution)
         if self._on_solution is not None:
             self._on_solution(solution)
-        changed = before is None or before.mode is not solution.mode
-        if changed:
-            self._events.report("navigator", f"mode_{solution.mode}", solution.reason)
         if self._publishing is not None:
             self._publishing.tick(t_ns, solution)
-        if self._second.due(t_ns) or changed:
+        if self._second.due(t_ns) or self._chain.changed:
             self._each_second(t_ns, solution)
         self._state.keep(t_ns, solution)
         self._warm.keep(t_ns, solution, self.navigator)
         self._calibration.keep(t_ns, self.navigator)
 
+    def _keep_in_log(self, t_ns: int, solution: Solution) -> None:
+        """A state that a part of the log can be replayed from, now and then."""
+        if self.recorder.state_due(t_ns):
+            state = self._warm.state(solution, self.navigator)
+            if state is not None:
+                self.recorder.keep_state(t_ns, KEPT_STATE.dump_json(state))
+
+    def _on_outcome(self, entry: Entry) -> None:
+        if entry.outcome is not None:
+            self.recorder.innovation(entry.aid.source, entry.key[0], entry.outcome)
+
+    def _carry_out(self, command: Command) -> str:
+        """An operator's command, and what was done. Raises `CommandRefusedError`."""
+        try:
+            match command:
+                case StartRecording():
+                    return f"recording into {self.recorder.begin()}"
+                case StopRecording():
+                    return f"recorded {self.recorder.end('an operator said so')}"
+        except RecordingRefusedError as error:
+            raise CommandRefusedError(str(error)) from error
+        t_ns = self.clock.now_ns()
+        self.recorder.command(t_ns, NAMES[type(command)], command)
+        return self._chain.operator.carry_out(command, t_ns)
+
     def _each_second(self, t_ns: int, solution: Solution) -> None:
-        """Tell the service manager and the terminals how it stands."""
+        """Tell the service manager how it stands."""
         text = f"{solution.mode}: {solution.reason}"
         if self._ready:
             self.service.status(text)
         elif self.sources.all_running or (t_ns - self._started_ns) * 1e-9 > READY_AFTER_S:
             self._ready = True
             self.service.ready(text)
-        if solution.mode in (Mode.NAVIGATING, Mode.COASTING):
-            self.sources.height_hint(solution.height_m, solution.sd_ned_m[2])
 
 
 async def _cancel(*tasks: asyncio.Task[Any]) -> None:

@@ -42,6 +42,7 @@ WARNINGS = (
     "damaged",
     "taken",
     "protection_level",
+    "injected",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 
@@ -67,11 +68,13 @@ class Events:
         self._listeners: list[Callable[[EventMessage], None]] = []
         self._unheard: deque[EventMessage] = deque(maxlen=MOST_UNHEARD)
 
-    def listen(self, listener: Callable[[EventMessage], None]) -> None:
-        """Tell `listener` every event from now on, and what nobody has heard yet."""
-        self._listeners.append(listener)
+    def listen(self, *listeners: Callable[[EventMessage], None]) -> None:
+        """Tell `listeners` every event from now on, and what nobody has heard yet."""
+        self._listeners.extend(listeners)
         while self._unheard:
-            listener(self._unheard.popleft())
+            message = self._unheard.popleft()
+            for listener in listeners:
+                listener(message)
 
     def report(self, source: str, code: str, text: str) -> None:
         level = level_of(code)

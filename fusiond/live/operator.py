@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 from fusiond.configuration.settings import DEG
+from fusiond.live.injection import Injection
 from fusiond.live.sources import Sources
 from fusiond.navigator.navigator import Navigator
 from fusiond.outputs.commands import (
     Command,
     CommandRefusedError,
+    Inject,
     RequestFix,
     ResetFilter,
     SetPosition,
@@ -21,17 +23,27 @@ EARTH_RADIUS_M = 6.371e6  # mean; the distance is told to people
 class Operator:
     """Carries out the commands of `outputs.commands`, whichever way they come in."""
 
-    def __init__(self, navigator: Navigator, sources: Sources) -> None:
+    def __init__(self, navigator: Navigator, sources: Sources, injection: Injection) -> None:
         self._navigator = navigator
         self._sources = sources
+        self._injection = injection
 
-    def carry_out(self, command: Command) -> str:
-        """What was done. Raises `CommandRefusedError` for what cannot be done now."""
+    def carry_out(self, command: Command, t_ns: int) -> str:
+        """What was done at `t_ns`. Raises `CommandRefusedError` for what cannot be done now."""
         match command:
+            case Inject():
+                if command.source not in self._sources.all:
+                    there = ", ".join(self._sources.all)
+                    raise CommandRefusedError(f"no source {command.source!r}; there are {there}")
+                raw = command.source in self._navigator.raw
+                if raw and command.fault not in ("drop", "delay"):
+                    text = "raw satellite data can be dropped and delayed, no more"
+                    raise CommandRefusedError(text)
+                return self._injection.inject(command, t_ns)
             case SetPosition():
                 return self._set_position(command)
             case RequestFix():
-                said = self._sources.request_fix()
+                said = self._sources.request_fix(t_ns)
                 if not said:
                     raise CommandRefusedError("there is no RDSS terminal")
                 return "; ".join(said)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 
-from fusiond.clock.clock import Clock
 from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
+from fusiond.live.chain import Chain
 from fusiond.live.process_usage import ProcessUsage
-from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
-from fusiond.live.sources import Sources
+from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.calibration import CalibrationState
 from fusiond.navigator.navigator import Navigator
@@ -18,9 +17,9 @@ from fusiond.outputs.base import Output
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
-from fusiond.outputs.messages.health import OutputHealth, health_message
+from fusiond.outputs.messages.health import OutputHealth, SchedulerStatus, health_message
 from fusiond.outputs.messages.nav import nav_message
-from fusiond.outputs.messages.status import status_message
+from fusiond.outputs.messages.status import RecordingStatus, status_message
 from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, TRACKER, Topic
 from fusiond.outputs.tracking import Tracking
 
@@ -35,21 +34,22 @@ class Publishing:
     def __init__(
         self,
         config: Config,
-        clock: Clock,
-        navigator: Navigator,
-        sources: Sources,
-        scheduler: Scheduler,
+        chain: Chain,
+        scheduler: Callable[[], SchedulerStatus],
         outputs: Mapping[str, Output],
+        recording: Callable[[], RecordingStatus] = RecordingStatus,
     ) -> None:
-        self._clock = clock
-        self._navigator = navigator
-        self._sources = sources
+        self._clock = chain.clock
+        self._navigator = chain.navigator
+        self._sources = chain.sources
+        self._injection = chain.injection
         self._scheduler = scheduler
         self._outputs = outputs
+        self._recording = recording
         self._usage = ProcessUsage()
         self._version = version("fusiond")
         self._digest = config_digest(config)
-        self._started_ns = self._since_ns = clock.now_ns()
+        self._started_ns = self._since_ns = chain.clock.now_ns()
         self._mode: Mode | None = None
         self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
         self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
@@ -109,10 +109,12 @@ class Publishing:
                 version=self._version,
                 config_digest=self._digest,
                 uptime_s=(t_ns - self._started_ns) * 1e-9,
-                scheduler=self._scheduler.status(),
+                scheduler=self._scheduler(),
                 fused=fused,
                 rejected=rejected,
                 calibrated=self._navigator.calibrating.settled,
+                recording=self._recording(),
+                injected=self._injection.active,
                 mqtt={} if mqtt is None else mqtt.counters,
             ),
         )
@@ -125,7 +127,7 @@ class Publishing:
                 utc_ns,
                 sources=self._sources.health(t_ns),
                 outputs={name: _health(output) for name, output in self._outputs.items()},
-                scheduler=self._scheduler.status(),
+                scheduler=self._scheduler(),
                 clock=self._clock.status(),
                 cpu_percent=cpu_percent,
                 memory_mb=memory_mb,

@@ -17,11 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import Driver, Emitted
-from drivers.measurements import DeviceEvent, ImuSample, TimeReport
-from drivers.raw.messages import Ephemeris, Klobuchar
+from drivers.inputs import Inputs
+from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
+from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
+from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.raw_gnss import Seen
@@ -51,9 +54,15 @@ class Sources:
     """All devices of a configuration. `on_event(source, code, text)` hears what they report."""
 
     def __init__(
-        self, config: Config, clock: Clock, navigator: Navigator, on_event: EventSink
+        self,
+        config: Config,
+        clock: Clock,
+        navigator: Navigator,
+        injection: Injection,
+        on_event: EventSink,
     ) -> None:
         self._config = config
+        self._injection = injection
         self._clock = clock
         self._navigator = navigator
         self._on_event = on_event
@@ -61,6 +70,8 @@ class Sources:
         self._imu: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=IMU_QUEUE)
         self._imu_source: str | None = None
         self.counters: Counter[str] = Counter()
+        self.on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None] | None = None
+        """Hears every measurement with its instant."""
         self.all: dict[str, Source] = {}
         points = driver_entry_points()
         for name, section in config.sources.items():
@@ -83,6 +94,18 @@ class Sources:
     # ------------------------------------------------------------------ arrivals
 
     def _emit(self, item: Emitted) -> None:
+        if not self._injection.faults:
+            self._take(item)
+            return
+        for left in self._injection.pass_on(item):
+            self._take(left)
+
+    def release(self, t_ns: int) -> None:
+        """Take in what an injected delay has held back until the tick at `t_ns`."""
+        for item in self._injection.tick(t_ns):
+            self._take(item)
+
+    def _take(self, item: Emitted) -> None:
         if isinstance(item, DeviceEvent):
             self._on_event(item.source, item.code, item.text)
             return
@@ -97,6 +120,8 @@ class Sources:
         source.last_seen_ns = item.t_seen_ns
         instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
         source.latency_s = (item.t_seen_ns - instant.t_valid_ns) * 1e-9
+        if self.on_arrival is not None:
+            self.on_arrival(item, instant)
         if isinstance(item, ImuSample):
             self._imu_source = self._imu_source or item.source
             if item.source != self._imu_source:
@@ -123,7 +148,13 @@ class Sources:
         """Whether every device sends."""
         return all(s.driver.status.state == "running" for s in self.all.values())
 
-    def height_hint(self, height_m: float, sd_m: float) -> None:
+    @property
+    def inputs(self) -> dict[str, Inputs]:
+        """What moves each driver from outside; not of those that have no such door."""
+        doors = {name: getattr(s.driver, "inputs", None) for name, s in self.all.items()}
+        return {name: door for name, door in doors.items() if door is not None}
+
+    def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
         """Tell the terminals that can use it the height of their antenna by the solution.
 
         Of the lever arm only its upward part counts: tilt moves a roof antenna by centimetres.
@@ -133,12 +164,12 @@ class Sources:
             if hint is not None:
                 section = self._config.aiding.get(name)
                 down = section.lever_arm_m[2] if section is not None else 0.0
-                hint(height_m - down, sd_m)
+                hint(height_m - down, sd_m, t_ns)
 
-    def request_fix(self) -> list[str]:
+    def request_fix(self, t_ns: int) -> list[str]:
         """Ask every terminal for a fix; what each said. Empty if there is no terminal."""
         asks = (getattr(s.driver, "request_now", None) for s in self.all.values())
-        return [ask() for ask in asks if ask is not None]
+        return [ask(t_ns) for ask in asks if ask is not None]
 
     def health(self, now_ns: int) -> dict[str, SourceHealth]:
         """`health` by source; what the filter makes by itself (`zero_velocity`) has its own

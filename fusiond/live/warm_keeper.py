@@ -82,6 +82,8 @@ class WarmKeeper:
         self._due = Every(SNAPSHOT_NS)
         self._working: asyncio.Task[None] | None = None
         self._failing = False
+        self.loaded: KeptState | None = None
+        """What was offered to the navigator."""
 
     def offer(self, navigator: Navigator) -> None:
         """Let clock and navigator go on from the state of the last run, if it is one of this
@@ -95,6 +97,7 @@ class WarmKeeper:
             same_run(state.navigation, self._config, self._boot_id, _asleep_ns())
             navigator.warm = WarmStart(state.navigation, navigator.model)
             self._clock.resume(state.utc)
+            self.loaded = state
         except DamagedStateError as error:
             self._event("warm_state_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
         except RefusedStateError as error:
@@ -105,7 +108,7 @@ class WarmKeeper:
         busy = self._working is not None and not self._working.done()
         if self._path is None or busy or not self._due.due(t_ns):
             return
-        state = self._state(solution, navigator)
+        state = self.state(solution, navigator)
         if state is not None:
             self._working = asyncio.create_task(asyncio.to_thread(self._write, self._path, state))
 
@@ -113,11 +116,12 @@ class WarmKeeper:
         """Keep the last state, after what is under way has ended: `restart` is a gap, too."""
         if self._working is not None:
             await asyncio.wait([self._working])
-        state = None if solution is None else self._state(solution, navigator)
+        state = None if solution is None else self.state(solution, navigator)
         if self._path is not None and state is not None:
             await asyncio.to_thread(self._write, self._path, state)
 
-    def _state(self, solution: Solution, navigator: Navigator) -> KeptState | None:
+    def state(self, solution: Solution, navigator: Navigator) -> KeptState | None:
+        """The state as it is, None where it is not worth keeping."""
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.on_trial or not usable:
             return None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 MAX_PAYLOAD_BYTES = 4096
 """The longest command is some 200 bytes; what is larger is refused unread."""
@@ -41,11 +41,50 @@ class ResetFilter(Command):
     """Forget the navigation state and align again."""
 
 
+class StartRecording(Command):
+    """Record from now on, into `recording.directory`."""
+
+
+class StopRecording(Command):
+    """Finish the log that is being written."""
+
+
+class Inject(Command):
+    """Falsify what a source sends, for a time: to see what comes of it, never on the road.
+
+    `drop`: nothing comes. `delay`: everything comes `size` s later. `jump`, `drift`, `noise`: an
+    error of `size`, of `size` a second, or of one sigma `size`, in the measurement's unit: m of a
+    position (towards `direction_deg`, clockwise from north) or height, m/s of a speed, deg of a
+    heading, attitude (yaw) or bearing (azimuth); of an IMU deg/s (`gyro`) or m/s^2 (`accel`) of the
+    sensor's `axis`. `freeze`: the values of the first measurement come again and again.
+    """
+
+    source: Annotated[str, Field(min_length=1, max_length=64)]
+    fault: Literal["drop", "delay", "jump", "freeze", "drift", "noise"]
+    duration_s: Annotated[float, Field(gt=0.0, le=3600.0)]
+    size: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    direction_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    part: Literal["gyro", "accel"] = "gyro"
+    axis: Literal["x", "y", "z"] = "z"
+
+    @model_validator(mode="after")
+    def _sized(self) -> Inject:
+        if self.fault in ("delay", "jump", "drift", "noise") and self.size == 0.0:
+            raise ValueError(f"{self.fault} needs a size")
+        if self.fault in ("delay", "noise") and self.size < 0.0:
+            raise ValueError(f"the size of {self.fault} is positive")
+        return self
+
+
 COMMANDS: dict[str, type[Command]] = {
     "set_position": SetPosition,
     "request_fix": RequestFix,
     "reset_filter": ResetFilter,
+    "start_recording": StartRecording,
+    "stop_recording": StopRecording,
+    "inject": Inject,
 }
+NAMES = {command: name for name, command in COMMANDS.items()}
 
 Handler = Callable[[Command], str]
 """Carries a command out at once and says what was done, or raises `CommandRefusedError`."""

@@ -37,6 +37,7 @@ SECTIONS = {
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,
     "[mqtt]": config.Mqtt,
+    "[recording]": config.Recording,
     "[outputs]": outputs.Outputs,
     "[outputs.gpsd]": outputs.Gpsd,
     "[outputs.nmea]": outputs.NmeaServed,

@@ -28,6 +28,7 @@ from fusiond.demo.demo import (
 )
 from fusiond.demo.view import Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.replay.run import Wish, replay
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.patience import PATIENCE_S
 
@@ -53,9 +54,12 @@ def command() -> list[str]:
     return [str(Path(sys.executable).with_name("fusiond")), "demo", "--headless"]
 
 
-def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(command: list[str]) -> None:
+def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(
+    command: list[str], tmp_path: Path
+) -> None:
+    """And what it recorded gives the same bits once more."""
     with subprocess.Popen(
-        [*command, "--duration", "300"],
+        [*command, "--duration", "300", "--record", str(tmp_path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -84,6 +88,10 @@ def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(command: list
     assert summary["nees"] > 0.0
     assert summary["mqtt_published"] > 0
     assert "Traceback" not in err
+    again = replay(list(tmp_path.glob("*.mcap")), Wish())
+    assert again["identical"] is True, again["first_difference"]
+    assert again["compared"] == summary["ticks"]
+    assert again["problems"] == again["driver_faults"] == []
 
 
 def test_ends_after_its_duration_and_what_never_navigated_is_null(command: list[str]) -> None:

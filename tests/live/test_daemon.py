@@ -28,8 +28,10 @@ from fusiond.configuration.load import load_config
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.saved_state import SavedState, save_state
+from fusiond.outputs.commands import COMMANDS
 from fusiond.outputs.messages.health import SourceHealth
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.replay.run import Wish, replay
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss.receiver import sentence
 from fusiond.simulation.scenarios import SCENARIOS
@@ -337,8 +339,9 @@ async def test_samples_that_cannot_be_true_are_named_and_survived(
 async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
         mqtt = f'[mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
-        mqtt += 'commands = ["set_position", "request_fix", "reset_filter"]\n'
-        daemon = bench.daemon(RDSS, mqtt)
+        mqtt += f"commands = {json.dumps(list(COMMANDS))}\n"
+        recording = f'[recording]\ndirectory = "{tmp_path / "logs"}"\n'
+        daemon = bench.daemon(RDSS, mqtt, recording)
         here = {"lat_deg": 30.5276, "lon_deg": 114.3556, "height_m": 38.0, "sd_m": 5.0}
         vehicle = bench.vehicle(rdss_link=bench.folder / "rdss")
         async with (
@@ -385,8 +388,27 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
                 assert reply["ok"], reply
                 assert reply["text"] == "position taken: aligning from it"
                 await bench.mode(Mode.ALIGNING)
+                await ask("set_position", here)
+                reply = await ask("inject", {"source": "roof", "fault": "drop", "duration_s": 1.0})
+                assert (reply["ok"], "there are imu, gnss, rdss" in reply["text"]) == (False, True)
+                reply = await ask("inject", {"source": "imu", "fault": "drop", "duration_s": 1.0})
+                assert (reply["ok"], reply["text"]) == (True, "imu: drop for 1 s")
+                await bench.mode(Mode.INVALID)
+                await until(lambda: bench.events("injection_ended") != [])
+                reply = await ask("stop_recording", {})
+                assert reply["ok"], reply
+                reply = await ask("start_recording", {})
+                assert reply["text"].startswith("recording into test_")
     modes = [json.loads(p)["mode"] for p in listener.payloads("fusiond/test/status")]
     assert {"waiting", "aligning", "coasting"} <= set(modes)
+    status = [json.loads(p) for p in listener.payloads("fusiond/test/status")]
+    assert ["imu: drop for 1 s"] in [m["injected"] for m in status]
+    assert {"recording", "off"} >= {m["recording"] for m in status}
+    first, second = sorted((tmp_path / "logs").iterdir(), key=lambda p: p.stat().st_mtime)
+    again = replay([first], Wish())  # commands and all
+    assert again["identical"] is True, again["first_difference"]
+    assert again["outcomes"]["operator"]["gated"] >= 1
+    assert replay([second], Wish())["identical"] is None  # it was started on the way
 
 
 @asynccontextmanager

@@ -10,6 +10,7 @@ import pytest
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.live.events import Events, level_of
+from fusiond.live.injection import Injection
 from fusiond.live.sources import Sources
 from fusiond.outputs.messages.event import EventMessage
 from tests.clock.host_time import Host, S
@@ -69,7 +70,7 @@ def test_what_happens_to_the_clock_is_an_event() -> None:
     events = Events(clock)
     heard: list[EventMessage] = []
     events.listen(heard.append)
-    Sources(Config(), clock, cast(Any, None), events.report)
+    Sources(Config(), clock, cast(Any, None), Injection(events.report), events.report)
     host.suspend(20 * S)
     host.system_error = 2 * S
     clock.utc_ns(host.mono)

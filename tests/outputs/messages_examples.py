@@ -21,7 +21,7 @@ from fusiond.outputs.messages.health import (
 )
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
-from fusiond.outputs.messages.status import status_message
+from fusiond.outputs.messages.status import RecordingStatus, status_message
 from fusiond.outputs.messages.tracker import tracker_message
 
 UTC_NS = 1_795_217_587_123_456_789
@@ -77,6 +77,13 @@ EXAMPLES: dict[str, Any] = {
         fused=35_610,
         rejected=14,
         calibrated=False,
+        recording=RecordingStatus(
+            "recording",
+            "/var/lib/fusiond/logs/truck_20261120T223307Z_5e0c1f9a_0001.mcap",
+            0,
+            41_290.4,
+        ),
+        injected=(),
         mqtt={"mqtt_published": 43_211, "mqtt_dropped": 120, "mqtt_reconnects": 1},
     ),
     "health": health_message(

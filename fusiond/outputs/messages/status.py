@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 from pydantic import Field
 
 from fusiond.navigation.solution import BoundState, Mode, Solution
-from fusiond.outputs.messages.base import Count, Message, stamp
+from fusiond.outputs.messages.base import Count, Message, Number, stamp
 from fusiond.outputs.messages.health import SchedulerStatus
+
+RecordingState = Literal["off", "waiting", "recording", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingStatus:
+    """How a recording is."""
+
+    state: RecordingState = "off"
+    file: str | None = None
+    dropped: int = 0
+    free_mb: float | None = None
 
 
 class StatusMessage(Message):
@@ -27,6 +41,11 @@ class StatusMessage(Message):
     overruns: Count
     fused: Count
     rejected: Count
+    recording: RecordingState = Field(description="of the log; `waiting`: for an event")
+    recording_file: str | None = Field(description="the file that is being written")
+    recording_dropped: Count = Field(description="messages that the disk was too slow for")
+    disk_free_mb: Number = Field(description="where it is written, 10^6 bytes")
+    injected: tuple[str, ...] = Field(description="faults put in by `cmd/inject`, while they last")
     mqtt_published: Count
     mqtt_dropped: Count
     mqtt_reconnects: Count
@@ -46,6 +65,8 @@ def status_message(
     fused: int,
     rejected: int,
     calibrated: bool,
+    recording: RecordingStatus,
+    injected: tuple[str, ...],
     mqtt: Mapping[str, int],
 ) -> StatusMessage:
     """`status`; `mqtt` are the publisher's counters."""
@@ -67,6 +88,11 @@ def status_message(
         overruns=scheduler.overruns,
         fused=fused,
         rejected=rejected,
+        recording=recording.state,
+        recording_file=recording.file,
+        recording_dropped=recording.dropped,
+        disk_free_mb=None if recording.free_mb is None else round(recording.free_mb, 1),
+        injected=injected,
         mqtt_published=mqtt.get("mqtt_published", 0),
         mqtt_dropped=mqtt.get("mqtt_dropped", 0),
         mqtt_reconnects=mqtt.get("mqtt_reconnects", 0),

@@ -129,7 +129,7 @@ async def test_finds_the_terminal_asks_and_hands_on_the_fix(family: Family, rate
     async with running({"port": terminal.port}) as (driver, said):
 
         def fix_came_while_hinting() -> bool:
-            driver.height_hint(438.4, 3.0)
+            driver.height_hint(438.4, 3.0, time.monotonic_ns())
             return bool(of(DelayedFix, said))
 
         await until(fix_came_while_hinting)
@@ -150,7 +150,7 @@ async def test_finds_the_terminal_asks_and_hands_on_the_fix(family: Family, rate
         assert driver.status.state == "running"
         assert driver.counters["fixes"] == driver.counters["multi_value"] == 1
         assert driver.counters["garbage_bytes"] > 0
-        assert driver.request_now().startswith("request in")
+        assert driver.request_now(time.monotonic_ns()).startswith("request in")
         assert "rdss_card" in [e.code for e in of(DeviceEvent, said)]
         assert len([m for m in terminal.heard if isinstance(m, PositionRequest)]) == 1
     terminal.close()

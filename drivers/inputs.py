@@ -1,0 +1,62 @@
+"""The door of a driver: what moves it from outside comes in here, one thing after the other.
+
+A driver is a function of its inputs. While one of them is handled the driver's time stands at the
+instant at which it came, so that the same inputs, taken again from a recording, give the same
+measurements, requests and events.
+
+    read     bytes off a serial line, as one read gave them
+    frame    a frame off a CAN bus
+    open     the line or bus was opened            close    it went away: why, in words
+    controller  a CAN controller's state           other    a timer of the driver's own, by its name
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from drivers.base import Now
+
+if TYPE_CHECKING:
+    from drivers.can.bus import CanFrame
+
+Handler = Callable[[Any, int], None]
+"""Takes the payload and the instant (monotonic ns)."""
+
+
+class Inputs:
+    """The inputs of one driver by kind. `heard(kind, t_ns, payload)` is told each before it is
+    handled, and what the driver `sent`."""
+
+    def __init__(self, host_now_ns: Now) -> None:
+        self._host_now_ns = host_now_ns
+        self._handlers: dict[str, Handler] = {}
+        self._held_ns: int | None = None
+        self.heard: Callable[[str, int, bytes | str | CanFrame | None], None] | None = None
+
+    def on(self, kind: str, handler: Handler) -> None:
+        """Who handles the inputs of a kind."""
+        self._handlers[kind] = handler
+
+    def now_ns(self) -> int:
+        """The driver's time: that of the input that is being handled, else the host's."""
+        return self._host_now_ns() if self._held_ns is None else self._held_ns
+
+    def take(
+        self, kind: str, payload: bytes | str | CanFrame | None = None, t_ns: int | None = None
+    ) -> None:
+        """Handle an input that came at `t_ns`, now by default. KeyError for an unknown kind."""
+        t_ns = self._host_now_ns() if t_ns is None else t_ns
+        handler = self._handlers[kind]
+        if self.heard is not None:
+            self.heard(kind, t_ns, payload)
+        self._held_ns = t_ns
+        try:
+            handler(payload, t_ns)
+        finally:
+            self._held_ns = None
+
+    def sent(self, data: bytes) -> None:
+        """Tell who listens what the driver has sent to its device."""
+        if self.heard is not None:
+            self.heard("sent", self.now_ns(), data)

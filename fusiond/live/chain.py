@@ -1,0 +1,65 @@
+"""From inputs to the solution: clock, drivers, navigator, put together without any I/O of its own.
+
+It is a function of what it had loaded, its drivers' inputs, an operator's commands and its ticks.
+The daemon feeds it from devices, a replay from a recording: the same bits come of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import Config
+from fusiond.live.events import Events
+from fusiond.live.injection import Injection
+from fusiond.live.operator import Operator
+from fusiond.live.scheduler import SECOND_NS, Every
+from fusiond.live.sources import Sources
+from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.saved_state import SavedState
+from fusiond.navigator.timeline import Entry
+
+
+class Chain:
+    """One vehicle's way from inputs to the solution. `saved` is the state that a start may align
+    from; `on_outcome` hears how each aid ended."""
+
+    def __init__(
+        self,
+        config: Config,
+        clock: Clock,
+        events: Events,
+        saved: SavedState | None = None,
+        on_outcome: Callable[[Entry], None] | None = None,
+    ) -> None:
+        self.config = config
+        self.clock = clock
+        self.events = events
+        navigator_event = partial(events.report, "navigator")
+        self.navigator = Navigator(config, saved, navigator_event, on_outcome)
+        self.injection = Injection(events.report)
+        self.sources = Sources(config, clock, self.navigator, self.injection, events.report)
+        self.operator = Operator(self.navigator, self.sources, self.injection)
+        self.solution: Solution | None = None
+        self.changed = False
+        """Whether the last tick brought another mode."""
+        self._second = Every(SECOND_NS)
+
+    def tick(self, t_ns: int) -> Solution:
+        """Run the filter on all that has come, and read the solution at `t_ns`."""
+        self.sources.release(t_ns)
+        arrived = self.sources.take_imu()
+        if arrived is not None:
+            self.navigator.add_imu(*arrived)
+        self.navigator.advance()
+        solution = self.navigator.solution(t_ns)
+        before, self.solution = self.solution, solution
+        self.changed = before is None or before.mode is not solution.mode
+        if self.changed:
+            self.events.report("navigator", f"mode_{solution.mode}", solution.reason)
+        navigating = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
+        if (self._second.due(t_ns) or self.changed) and navigating:
+            self.sources.height_hint(solution.height_m, solution.sd_ned_m[2], t_ns)
+        return solution

@@ -1,0 +1,92 @@
+"""The channels of a log, their schemas, and the messages that are made for other tools.
+
+`/fusiond/input` is what a replay needs (`fusiond.recording.records`); all other channels are
+derived from it, JSON, and there so that a log opens in Foxglove, Lichtblick and PlotJuggler as it
+is. Those named like a topic of MQTT carry the same message.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from fusiond.estimators.base import Outcome
+from fusiond.outputs.foxglove import channels as foxglove
+from fusiond.outputs.topics import TOPICS
+
+INPUT = "/fusiond/input"
+STATE = "/fusiond/state"
+INNOVATION = "/innovation"
+LOCATION = "/location"
+INPUT_ENCODING = "fusiond.records"
+
+
+@dataclass(frozen=True, slots=True)
+class InnovationMessage:
+    """How an aid ended when the filter met it, again after a rewind."""
+
+    t_ns: int
+    """Of validity, CLOCK_MONOTONIC."""
+    source: str
+    outcome: str
+    """`fused`, `gated`, `too_old`, ... as counted in `health`."""
+    nis: float | None
+    """nu^T S^-1 nu; null where there was none."""
+    degrees: int
+    whitened: tuple[float, ...]
+    """L^-1 nu with S = L L^T: each is N(0, 1) while filter and measurement agree."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel as MCAP has it."""
+
+    topic: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+
+
+def _json_channel(topic: str, name: str, schema: dict[str, Any]) -> Channel:
+    return Channel(topic, name, "jsonschema", json.dumps(schema).encode(), "json")
+
+
+OF_FOXGLOVE = tuple(c for c in foxglove.CHANNELS if c.schema_name.startswith("foxglove."))
+"""Made of the topics for Foxglove and what reads its schemas: map, attitude, log."""
+CHANNELS: dict[str, Channel] = {
+    channel.topic: channel
+    for channel in (
+        Channel(
+            INPUT,
+            "fusiond.Records",
+            "text",
+            b"little-endian records; see docs/recording.md of fusiond",
+            INPUT_ENCODING,
+        ),
+        _json_channel(STATE, "fusiond.KeptState", {"type": "object"}),
+        *(_json_channel(c.name, c.schema_name, c.schema) for c in OF_FOXGLOVE),
+        _json_channel(
+            INNOVATION, "fusiond.Innovation", TypeAdapter(InnovationMessage).json_schema()
+        ),
+        *(
+            _json_channel(
+                f"/{topic.name}",
+                f"fusiond.{topic.message.__name__}",
+                topic.message.model_json_schema(mode="serialization"),
+            )
+            for topic in TOPICS
+        ),
+    )
+}
+
+
+def innovation(source: str, t_ns: int, outcome: Outcome) -> InnovationMessage:
+    """`/innovation` of an aid valid at `t_ns` (monotonic)."""
+    nis = outcome.nis if math.isfinite(outcome.nis) else None
+    whitened = tuple(float(v) for v in outcome.whitened)
+    return InnovationMessage(t_ns, source, outcome.name, nis, outcome.degrees, whitened)

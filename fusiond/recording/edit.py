@@ -1,0 +1,125 @@
+"""Logs made of logs: a part cut out, parts joined, what can be had of a damaged one.
+
+What comes out is a log like any other, with index, metadata and attachments.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from fusiond.clock.host import SECOND_NS
+from fusiond.recording.channels import CHANNELS, INPUT, STATE
+from fusiond.recording.log_file import About, Attachment, LogFile
+from fusiond.recording.reader import About as Described
+from fusiond.recording.reader import Log, LogError, LogMessage
+from fusiond.recording.records import NO_SOURCE, Kind, Record, pack, unpack
+
+_TYPES = {".json": "application/json"}
+
+
+@dataclass(frozen=True, slots=True)
+class Edited:
+    """What was written: the file, its messages, and what was wrong with the logs it was made of."""
+
+    path: Path
+    messages: int
+    begins: str
+    problems: tuple[str, ...]
+
+
+def merge(paths: Sequence[Path], out: Path) -> Edited:
+    """All parts of one recording as one file. Raises `LogError`, OSError."""
+    recording = Log(paths)
+    written = write_log(out, recording.about, {}, recording.messages())
+    return Edited(out, written, "what the recording began with", tuple(recording.problems))
+
+
+def recover(path: Path, out: Path) -> Edited:
+    """What can be read of a log that was cut off or damaged. Raises `LogError`, OSError."""
+    return merge([path], out)
+
+
+def trim(paths: Sequence[Path], from_s: float, to_s: float, out: Path) -> Edited:
+    """The time from `from_s` to `to_s`, s after the recording's first tick, to replay by itself.
+
+    It begins with the last state before `from_s` that the log holds (every 10 s), so that a replay
+    goes on from there; with the recording itself where `from_s` is before its first state.
+    """
+    recording = Log(paths)
+    first_ns = _first_tick_ns(recording)
+    begin_ns, end_ns = (first_ns + round(s * SECOND_NS) for s in (from_s, to_s))
+    states = [m.t_log_ns for m in recording.messages(STATE) if m.t_log_ns <= begin_ns]
+    recording.problems.clear()
+    if from_s <= 0.0:
+        chosen = (m for m in recording.messages() if m.t_log_ns <= end_ns)
+        written = write_log(out, recording.about, {}, chosen)
+        return Edited(out, written, "what the recording began with", tuple(recording.problems))
+    start_ns = states[-1] if states else begin_ns
+    head = _head(recording, start_ns)
+    chosen = (m for m in recording.messages() if start_ns <= m.t_log_ns <= end_ns)
+    cut = {"cut_from_s": f"{(start_ns - first_ns) / SECOND_NS:.3f}"}
+    written = write_log(out, recording.about, cut, chain([head], chosen))
+    begins = "a state of the log" if states else "no state: a replay aligns first"
+    return Edited(out, written, begins, tuple(recording.problems))
+
+
+def _first_tick_ns(recording: Log) -> int:
+    for message in recording.messages(INPUT):
+        if any(record.kind is Kind.TICK for record in unpack(message.data)):
+            return message.t_log_ns
+    raise LogError(f"{recording.paths[0]}: no tick in it")
+
+
+def _head(recording: Log, t_log_ns: int) -> LogMessage:
+    """A start on the way: what was known of the host's clocks there."""
+    t_ns = t_log_ns - recording.about.epoch_ns
+    ahead = [recording.about.epoch_ns, 0]
+    read_ns, sequence = t_ns, 0
+    for message in recording.messages(INPUT):
+        if message.t_log_ns >= t_log_ns:
+            sequence = message.sequence - 1
+            break
+        for record in unpack(message.data):
+            if record.kind is Kind.START:
+                start = json.loads(record.payload)["system_clock"]
+                ahead = [start["offset_ns"], start["_boot_ns"]]
+            for clock, at_ns, ahead_ns in record.readings:
+                ahead[clock] = ahead_ns
+                read_ns = at_ns
+    clock_state = {
+        **dict.fromkeys(("_sampled_ns", "_queued_ns", "_stepped_ns"), read_ns),
+        **dict.fromkeys(("offset_ns", "held_ns"), ahead[0]),
+        **dict.fromkeys(("slept_ns", "changes", "last_step_ns"), 0),
+        "_boot_ns": ahead[1],
+        "before_step_ns": None,
+    }
+    payload = json.dumps({"from_start": False, "system_clock": clock_state}).encode()
+    record = Record(Kind.START, NO_SOURCE, t_ns, payload)
+    return LogMessage(INPUT, t_log_ns, pack(record), max(0, sequence))
+
+
+def write_log(
+    out: Path, about: Described, more: dict[str, str], messages: Iterable[LogMessage]
+) -> int:
+    """Messages as a log of their own, with `more` in its metadata; how many they are."""
+    attachments = tuple(
+        Attachment(name, _TYPES.get(Path(name).suffix, "text/plain"), data)
+        for name, data in about.attachments.items()
+    )
+    file: LogFile | None = None
+    for message in messages:
+        channel = CHANNELS.get(message.topic)
+        if channel is None:  # of another program
+            continue
+        if file is None:
+            described = About({**about.metadata, **more}, attachments)
+            file = LogFile(out, described, message.t_log_ns)
+        file.write(channel, message.t_log_ns, message.data, message.sequence)
+    if file is None:
+        raise LogError("there is nothing in that part of the log")
+    file.finish()
+    return file.messages

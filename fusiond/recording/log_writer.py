@@ -1,0 +1,240 @@
+"""A thread that writes logs: no tick ever waits for a disk.
+
+What is to be written is put into a bounded queue; when a disk is so slow that it fills, messages
+are lost and counted, and the log says where by their sequence. Twice a second the thread writes
+what is there, closes the chunk and syncs: a power cut loses that and what the disk itself takes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from fusiond.clock.host import SECOND_NS
+from fusiond.configuration.recording import Recording
+from fusiond.outputs.messages.base import Message
+from fusiond.recording.channels import CHANNELS, OF_FOXGLOVE, InnovationMessage
+from fusiond.recording.log_file import SUFFIX, About, LogFile
+
+log = logging.getLogger("fusiond")
+
+WRITE_S = 0.5
+"""Between two writes with sync: with the disk's own time still below the 2 s that may be lost."""
+QUEUE = 20_000
+"""Messages that may wait: over a minute of 200 a second, 15 MB; a disk that hangs longer loses."""
+KEEP_EVERY_NS = 10 * SECOND_NS
+"""Between two looks at which logs are too many: at most 10 MB come in that time."""
+MB = 1_000_000
+_INNOVATION = TypeAdapter(InnovationMessage)
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """A message for a channel, at `t_log_ns`. Models are worded by the thread."""
+
+    topic: str
+    t_log_ns: int
+    payload: bytes | Message | InnovationMessage
+    sequence: int = 0
+
+
+class LogWriter:
+    """Writes one recording into files `STEM_0000.mcap`, ... of `folder` until it is closed.
+
+    `about()` describes it; it is called in the thread, since it reads files.
+    `on_stop(why)` is called from the thread when it has to stop by itself. The other attributes may
+    be read at any time: `path` of the file under way, `dropped` messages, `free_mb` of the disk.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        stem: str,
+        vehicle: str,
+        about: Callable[[], About],
+        options: Recording,
+        t_log_ns: int,
+        on_stop: Callable[[str], None],
+    ) -> None:
+        self._folder, self._stem, self._vehicle = folder, stem, vehicle
+        self._describe = about
+        self._options = options
+        self._on_stop = on_stop
+        self._queue: deque[Item] = deque()
+        self._closing = threading.Event()
+        self._t_log_ns = t_log_ns
+        self._looked_ns = 0
+        self._file: LogFile | None = None
+        self.parts = 0
+        self.dropped = 0
+        self.free_mb: float | None = None
+        self.path = self._part_path()
+        self._thread = threading.Thread(target=self._run, name="log writer", daemon=True)
+        self._thread.start()
+
+    def put(self, item: Item) -> None:
+        """Hand a message over; it is counted and lost when too many wait."""
+        if len(self._queue) >= QUEUE:
+            self.dropped += 1
+            return
+        self._queue.append(item)
+
+    def close(self) -> None:
+        """Write what waits and finish the file, in its own time."""
+        self._closing.set()
+
+    def wait(self) -> None:
+        """Until that is done."""
+        self._thread.join()
+
+    @property
+    def busy(self) -> bool:
+        return self._thread.is_alive()
+
+    # ------------------------------------------------------------------ the thread
+
+    def _run(self) -> None:
+        try:
+            self._look_at_the_disk()
+            self._about = self._describe()
+            self._file = self._open(self._t_log_ns)
+            self._keep_newest()
+            while not self._closing.wait(WRITE_S):
+                self._write_waiting()
+                self._file.sync()
+                self._look_at_the_disk()
+                self._keep_newest()
+            self._write_waiting()
+            self._file.finish()
+        except OSError as error:
+            self._stop(error.strerror or str(error))
+        except _DiskFullError as error:
+            self._finish_full()
+            self._stop(str(error))
+
+    def _finish_full(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.finish()
+
+    def _write_waiting(self) -> None:
+        file = self._file
+        assert file is not None
+        for _ in range(len(self._queue)):
+            item = self._queue.popleft()
+            if self._is_full(file.size, item.t_log_ns):
+                file.finish()
+                file = self._file = self._open(item.t_log_ns)
+            for channel, data in _worded(item):
+                file.write(CHANNELS[channel], item.t_log_ns, data, item.sequence)
+
+    def _part_path(self) -> Path:
+        return self._folder / f"{self._stem}_{self.parts:04d}{SUFFIX}"
+
+    def _open(self, t_log_ns: int) -> LogFile:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self.path = self._part_path()
+        made = LogFile(self.path, self._about.part(self.parts), t_log_ns)
+        self._began_ns = t_log_ns
+        self.parts += 1
+        return made
+
+    def _is_full(self, size: int, t_log_ns: int) -> bool:
+        age_min = (t_log_ns - self._began_ns) / (60 * SECOND_NS)
+        o = self._options
+        return size > o.split_mb * MB or age_min > o.split_min
+
+    def _look_at_the_disk(self) -> None:
+        """Stop while there is room for the index. Raises `_DiskFullError`."""
+        free_mb, least_mb = _free_mb(self._folder), self._options.min_free_mb
+        self.free_mb = free_mb
+        if free_mb < least_mb:
+            raise _DiskFullError(
+                f"{free_mb:.0f} MB left on the disk, recording.min_free_mb is {least_mb:.0f}"
+            )
+
+    def _keep_newest(self) -> None:
+        """Remove this vehicle's oldest logs beyond `keep_mb`, now and then."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._looked_ns < KEEP_EVERY_NS:
+            return
+        self._looked_ns = now_ns
+        logs = sorted(logs_of(self._folder, self._vehicle), key=_age)
+        sizes = [_size(path) for path in logs]
+        excess = sum(sizes) - self._options.keep_mb * MB
+        for path, size in zip(logs, sizes, strict=True):
+            if excess <= 0 or path == self.path:
+                break
+            with contextlib.suppress(OSError):
+                path.unlink()
+            excess -= size
+
+    def _stop(self, why: str) -> None:
+        log.warning("recording stops: %s", why)
+        if self._file is not None:
+            self._file.abandon()
+        self._on_stop(why)
+
+
+class _DiskFullError(Exception):
+    """Not yet, but soon."""
+
+
+def _worded(item: Item) -> list[tuple[str, bytes]]:
+    """The messages of an item, as topic and bytes: some have one for other tools beside them."""
+    payload = item.payload
+    match payload:
+        case bytes():
+            return [(item.topic, payload)]
+        case InnovationMessage():
+            return [(item.topic, _INNOVATION.dump_json(payload))]
+    made = [(item.topic, payload.model_dump_json().encode())]
+    for channel in OF_FOXGLOVE:
+        beside = channel.payload(payload) if item.topic == f"/{channel.topic.name}" else None
+        if beside is not None:
+            made.append((channel.name, beside))
+    return made
+
+
+def log_stem(vehicle: str, utc_ns: int, run: str) -> str:
+    """Name of a recording without part and suffix: vehicle, when it began, a number of its own."""
+    return f"{vehicle}_{datetime.fromtimestamp(utc_ns / SECOND_NS, UTC):%Y%m%dT%H%M%SZ}_{run[:8]}"
+
+
+def logs_of(folder: Path, vehicle: str) -> list[Path]:
+    """The logs of one vehicle in a folder: those alone are ever removed."""
+    named = re.compile(rf"{re.escape(vehicle)}_\d{{8}}T\d{{6}}Z_[0-9a-f]{{8}}_\d{{4}}{SUFFIX}")
+    return [path for path in folder.iterdir() if named.fullmatch(path.name)]
+
+
+def _age(path: Path) -> tuple[int, str]:
+    try:
+        return path.stat().st_mtime_ns, path.name
+    except OSError:
+        return 0, path.name
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _free_mb(folder: Path) -> float:
+    """Of the disk on which the folder lies or will lie."""
+    while not folder.exists():
+        folder = folder.parent
+    about = os.statvfs(folder)
+    return about.f_bavail * about.f_frsize / MB

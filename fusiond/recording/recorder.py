@@ -1,0 +1,375 @@
+"""The daemon's side of a recording: what moves it is written down in the order it is handled.
+
+A record begins when its input is about to be handled, and is complete when the next begins: the
+readings of the host's clocks in between are its own. A tick closes a message, so that the log grows
+by one message of inputs a tick and a few derived ones, at whatever rate the devices send.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from pydantic import BaseModel
+
+from drivers.base import DriverStatus
+from drivers.can.bus import CanFrame
+from drivers.inputs import Inputs
+from fusiond.clock.clock import Clock
+from fusiond.clock.host import SECOND_NS, ReadClock
+from fusiond.configuration.recording import Recording
+from fusiond.configuration.schema import Config
+from fusiond.estimators.base import Outcome
+from fusiond.outputs.messages.base import Message
+from fusiond.outputs.messages.event import EventMessage
+from fusiond.outputs.messages.status import RecordingState, RecordingStatus
+from fusiond.outputs.topics import Topic
+from fusiond.recording.about import about_run
+from fusiond.recording.channels import INNOVATION, INPUT, STATE, innovation
+from fusiond.recording.log_writer import Item, LogWriter, log_stem
+from fusiond.recording.records import (
+    NO_SOURCE,
+    Kind,
+    Reading,
+    Record,
+    Tick,
+    input_record,
+    pack,
+    reading,
+    tick_payload,
+)
+
+MESSAGE_BYTES = 64 * 1024
+"""Inputs that come without a tick (it is late, or none is left) make a message of their own."""
+STATE_EVERY_NS = 10 * SECOND_NS
+"""How much earlier than asked for a cut may begin; a state has 6 kB."""
+
+
+class RecordingRefusedError(Exception):
+    """The recording cannot be started or stopped now: the text says why."""
+
+
+class Recorder:
+    """Recordings of one daemon: an output as any other (`fusiond.outputs.base`), and more.
+
+    `on_event(code, text)` hears `recording_started`, `recording_stopped` and `recording_failed`.
+    `begin` and `end` may be called whenever; `listen` connects the drivers.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        clock: Clock,
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self._config = config
+        self._options: Recording = config.recording
+        self._clock = clock
+        self._event = on_event
+        self._inputs: dict[str, Inputs] = {}
+        self._numbers: dict[str, int] = {}
+        now_ns = clock.now_ns()
+        self._epoch_ns = (clock.utc_ns(now_ns) or now_ns) - now_ns
+        self.state: RecordingState = "off"
+        """`waiting`: the last seconds are kept in memory until an event comes."""
+        self._writer: LogWriter | None = None
+        self._closing: list[LogWriter] = []
+        self._stopped_by: str | None = None
+        self._ring: deque[Item] = deque()
+        self._until_ns: int | None = None
+        self._begun: Record | None = None
+        self._readings: list[Reading] = []
+        self._after: list[Record] = []
+        self._message: list[bytes] = []
+        self._message_bytes = 0
+        self._sequence = 0
+        self._count = 0
+        self._message_ns = now_ns
+        self._state_ns: int | None = None
+        self._state_part = 0
+
+    # ------------------------------------------------------------------ what is asked of it
+
+    def listen(self, inputs: Mapping[str, Inputs]) -> None:
+        """These are the drivers' inputs by source."""
+        self._inputs = dict(inputs)
+        self._numbers = {name: number for number, name in enumerate(inputs)}
+
+    def arm(self, loaded: Mapping[str, Any]) -> None:
+        """Do from the start what the configuration says. `loaded` is what the start had loaded: it
+        is what a replay starts from."""
+        if self._options.directory is None:
+            return
+        if self._options.when == "always":
+            self.begin(loaded)
+        elif self._options.when == "event":
+            self._attach(loaded)
+            self.state = "waiting"
+
+    def begin(self, loaded: Mapping[str, Any] | None = None) -> str:
+        """Record from now on; the file's name. Raises `RecordingRefusedError`.
+
+        `loaded` is None for a recording that begins on the way.
+        """
+        if self.state == "recording":
+            raise RecordingRefusedError(f"recording already, into {self._path().name}")
+        writer = self._open()
+        if self.state != "waiting":
+            self._attach(loaded)
+        self._writer = writer
+        while self._ring:
+            writer.put(self._ring.popleft())
+        self.state = "recording"
+        self._state_ns = None
+        self._event("recording_started", str(writer.path))
+        return writer.path.name
+
+    def end(self, why: str) -> str:
+        """Stop recording and finish the file. Raises `RecordingRefusedError`."""
+        if self._writer is None:
+            raise RecordingRefusedError("nothing is being recorded")
+        path = self._path()
+        self._complete()
+        self._flush()
+        writer, self._writer = self._writer, None
+        writer.close()
+        self._closing = [w for w in (*self._closing, writer) if w.busy]
+        self._until_ns = None
+        if self._stopped_by is not None:
+            why = self._stopped_by
+            self.state = "failed"
+            self._event("recording_failed", f"{path}: {why}")
+        else:
+            self.state = "off"
+            self._event("recording_stopped", f"{path}: {why}")
+        self._detach()
+        if self._options.when == "event" and self.state == "off":
+            self._attach(None)
+            self.state = "waiting"
+        return path.name
+
+    def close(self) -> None:
+        """The daemon ends: returns when everything is on the disk. Call it from a thread."""
+        if self._writer is not None:
+            self.end("the daemon ends")
+        for writer in self._closing:
+            writer.wait()
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is to be told to it."""
+        return self.state in ("recording", "waiting")
+
+    @property
+    def recording(self) -> RecordingStatus:
+        """As `status` has it."""
+        writer = self._writer
+        if writer is None:
+            return RecordingStatus(self.state)
+        return RecordingStatus(self.state, str(writer.path), writer.dropped, writer.free_mb)
+
+    # ------------------------------------------------------------------ as an output
+
+    @property
+    def name(self) -> str:
+        return "recording"
+
+    @property
+    def nav_rate_hz(self) -> float:
+        return self._config.mqtt.nav_rate_hz
+
+    @property
+    def sets_clocks(self) -> bool:
+        return False
+
+    @property
+    def counters(self) -> Counter[str]:
+        return Counter(recording_dropped=self.recording.dropped)
+
+    @property
+    def status(self) -> DriverStatus:
+        detail = self.recording.file or self.state
+        return DriverStatus("failed" if self.state == "failed" else "running", detail)
+
+    def take(self, topic: Topic, message: Message) -> None:
+        """A message of a topic goes into the log; an event of `recording.events` starts it where
+        that is wanted."""
+        t_ns = self._clock.now_ns()
+        if self.active:
+            self._put(Item(f"/{topic.name}", t_ns + self._epoch_ns, message))
+        if isinstance(message, EventMessage):
+            self._look_at(message, t_ns)
+
+    async def run(self) -> None:
+        """Until cancelled; then everything is on the disk when this returns."""
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.to_thread(self.close)
+
+    # ------------------------------------------------------------------ what happens
+
+    def command(self, t_ns: int, name: str, command: BaseModel) -> None:
+        """An operator's command is about to be carried out."""
+        if self.active:
+            text = json.dumps({"name": name, **command.model_dump(mode="json")})
+            self._begin(Record(Kind.COMMAND, NO_SOURCE, t_ns, text.encode()))
+
+    def tick_begins(self, t_ns: int) -> None:
+        """The tick with this deadline begins."""
+        if self.active:
+            self._begin(Record(Kind.TICK, NO_SOURCE, t_ns, b""))
+
+    def tick_ended(self, t_ns: int, late_ns: int, overruns: int, digest: bytes) -> None:
+        """And has ended; what follows until the next input is still its own."""
+        if self._stopped_by is not None:
+            if self._writer is not None:
+                self.end(self._stopped_by)
+            self._stopped_by = None
+        if self._begun is None or self._begun.kind is not Kind.TICK:
+            return
+        payload = tick_payload(Tick(self._count, overruns, late_ns, digest))
+        self._begun = self._begun._replace(payload=payload)
+        if self._until_ns is not None and t_ns > self._until_ns:
+            self.end(f"{self._options.after_s:.0f} s after the last event")
+
+    def innovation(self, source: str, t_ns: int, outcome: Outcome) -> None:
+        """How an aid valid at `t_ns` ended."""
+        if self.active:
+            t_log_ns = self._clock.now_ns() + self._epoch_ns
+            self._put(Item(INNOVATION, t_log_ns, innovation(source, t_ns, outcome)))
+
+    def state_due(self, t_ns: int) -> bool:
+        """Whether `keep_state` should be called: now and then, and first of all in each file."""
+        old = self._state_ns is None or t_ns - self._state_ns >= STATE_EVERY_NS
+        parts = 0 if self._writer is None else self._writer.parts
+        return self.active and (old or parts != self._state_part)
+
+    def keep_state(self, t_ns: int, kept: bytes) -> None:
+        """A navigation state as the warm start takes it (JSON): where a cut log can begin."""
+        self._state_ns = t_ns
+        self._state_part = 0 if self._writer is None else self._writer.parts
+        self._put(Item(STATE, t_ns + self._epoch_ns, kept))
+
+    # ------------------------------------------------------------------ inside
+
+    def _look_at(self, message: EventMessage, t_ns: int) -> None:
+        if self._options.when != "event" or not self.active:
+            return
+        wanted = any(code in message.code for code in self._options.events)
+        if not wanted or message.source == "recording":
+            return
+        if self.state == "waiting":
+            try:
+                self.begin()
+            except RecordingRefusedError as error:
+                self.state = "failed"
+                self._detach()
+                self._event("recording_failed", str(error))
+                return
+            self._until_ns = t_ns
+        if self._until_ns is not None:
+            self._until_ns = t_ns + round(self._options.after_s * SECOND_NS)
+
+    def _open(self) -> LogWriter:
+        folder = self._options.directory
+        if folder is None:
+            raise RecordingRefusedError("recording.directory is not configured")
+        run = uuid4().hex
+        t_log_ns = self._clock.now_ns() + self._epoch_ns
+        vehicle = self._config.vehicle
+        about = partial(about_run, self._config, run, self._epoch_ns, list(self._numbers))
+        stem = log_stem(vehicle, t_log_ns, run)
+        return LogWriter(folder, stem, vehicle, about, self._options, t_log_ns, self._stop)
+
+    def _stop(self, why: str) -> None:
+        """From the writer's thread: the next tick notices."""
+        self._stopped_by = why
+
+    def _path(self) -> Path:
+        assert self._writer is not None
+        return self._writer.path
+
+    def _attach(self, loaded: Mapping[str, Any] | None) -> None:
+        self._count = self._sequence = 0
+        self._readings.clear()
+        for name, inputs in self._inputs.items():
+            inputs.heard = partial(self.heard, self._numbers[name])
+        self._clock.readings.heard = self._heard_reading
+        start = {
+            "from_start": loaded is not None,
+            "system_clock": self._clock.system_state(),
+            **(loaded or {}),
+        }
+        t_ns = self._clock.now_ns()
+        self._begin(Record(Kind.START, NO_SOURCE, t_ns, json.dumps(start).encode()))
+
+    def _detach(self) -> None:
+        for inputs in self._inputs.values():
+            inputs.heard = None
+        self._clock.readings.heard = None
+        self._begun = None
+        self._ring.clear()
+        self._message, self._message_bytes = [], 0
+
+    def heard(
+        self, source: int, kind: str, t_ns: int, payload: bytes | str | CanFrame | None
+    ) -> None:
+        """A driver is about to handle an input, or has sent something."""
+        record = input_record(source, kind, t_ns, payload)
+        if record.kind is Kind.SENT:
+            self._after.append(record)
+            return
+        self._count += 1
+        self._begin(record)
+
+    def _heard_reading(self, clock: ReadClock, t_ns: int, ahead_ns: int) -> None:
+        self._readings.append(reading(clock, t_ns, ahead_ns))
+
+    def _begin(self, record: Record) -> None:
+        self._complete()
+        self._begun = record
+
+    def _complete(self) -> None:
+        """The record that was begun has all its readings."""
+        record = self._begun
+        if record is None:
+            self._readings.clear()
+            return
+        self._begun = None
+        if self._readings:
+            record = record._replace(readings=self._readings)
+            self._readings = []
+        data = pack(record)
+        if self._after:
+            data += b"".join(map(pack, self._after))
+            self._after = []
+        self._message.append(data)
+        self._message_bytes += len(data)
+        self._message_ns = record.t_ns
+        if record.kind is Kind.TICK or self._message_bytes > MESSAGE_BYTES:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._message:
+            return
+        data = b"".join(self._message)
+        self._message, self._message_bytes = [], 0
+        self._sequence += 1
+        t_log_ns = self._message_ns + self._epoch_ns
+        self._put(Item(INPUT, t_log_ns, data, self._sequence))
+
+    def _put(self, item: Item) -> None:
+        if self._writer is not None:
+            self._writer.put(item)
+            return
+        self._ring.append(item)
+        oldest_ns = item.t_log_ns - round(self._options.before_s * SECOND_NS)
+        while self._ring[0].t_log_ns < oldest_ns:
+            self._ring.popleft()

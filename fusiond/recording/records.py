@@ -1,0 +1,200 @@
+"""What moves the daemon from outside, as bytes: the records of the channel `/fusiond/input`.
+
+    record  = kind u8 | source u8 | readings u16 | length u32 | t_ns i64 | payload | reading ...
+    reading = clock u8 | t_ns i64 | ahead_ns i64
+
+Little-endian; `t_ns` is CLOCK_MONOTONIC of the recording host. `source` is the place of the
+driver's name in `sources` of the metadata, 255 for none. `length` is that of the payload. The
+readings are those that the daemon made of the host's clocks (0 realtime, 1 boottime: how far that
+is ahead of the monotonic clock) from this record on until the next, in order.
+
+Records stand in the order in which the daemon handled them: a log is played by handling them again.
+
+    kind        payload
+    start       JSON: what the daemon had loaded when the recording began
+    tick        inputs u64, overruns u64, late_ns i64, digest 8 bytes; t_ns is the tick's deadline
+    read        bytes of one read
+    frame       CAN id u32, flags u8 (1 extended, 2 remote, 4 error, 8 stamped), realtime_ns i64,
+                data
+    open        nothing
+    close       why, UTF-8
+    controller  its state
+    timer       its name
+    sent        bytes that the driver gave to its device: an output, which replay compares
+    command     JSON: an operator's command, with its name
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+from drivers.can.bus import CanFrame
+from fusiond.clock.host import ReadClock
+
+NO_SOURCE = 255
+_HEAD = struct.Struct("<BBHIq")
+_READING = struct.Struct("<Bqq")
+_FRAME = struct.Struct("<IBq")
+_TICK = struct.Struct("<QQq8s")
+_EXTENDED, _REMOTE, _ERROR, _STAMPED = 1, 2, 4, 8
+_MOST_READINGS = 0xFFFF
+_CLOCKS: tuple[ReadClock, ...] = ("realtime", "boottime")
+
+Reading = tuple[int, int, int]
+"""Index of the clock in `realtime, boottime`; monotonic ns; how far it is ahead, ns."""
+
+
+class Kind(IntEnum):
+    """What a record is of."""
+
+    START = 0
+    TICK = 1
+    READ = 2
+    FRAME = 3
+    OPEN = 4
+    CLOSE = 5
+    CONTROLLER = 6
+    TIMER = 7
+    SENT = 8
+    COMMAND = 9
+
+
+class Record(NamedTuple):
+    """One record; `payload` is as in the table above."""
+
+    kind: Kind
+    source: int
+    t_ns: int
+    payload: bytes
+    readings: Sequence[Reading] = ()
+
+
+class Tick(NamedTuple):
+    """The payload of a tick: inputs handled since the recording began, ticks skipped since the
+    daemon began, how late it was (ns), and the digest of the solution and the filter after it."""
+
+    inputs: int
+    overruns: int
+    late_ns: int
+    digest: bytes
+
+
+class DamagedRecordError(ValueError):
+    """Bytes that are no records."""
+
+
+def reading(clock: ReadClock, t_ns: int, ahead_ns: int) -> Reading:
+    return _CLOCKS.index(clock), t_ns, ahead_ns
+
+
+def pack(record: Record) -> bytes:
+    """A record's bytes."""
+    readings = record.readings[:_MOST_READINGS]
+    head = _HEAD.pack(record.kind, record.source, len(readings), len(record.payload), record.t_ns)
+    if not readings:
+        return head + record.payload
+    return b"".join((head, record.payload, *(_READING.pack(*r) for r in readings)))
+
+
+def unpack(data: bytes) -> Iterator[Record]:
+    """The records of a message. Raises `DamagedRecordError`."""
+    at, end = 0, len(data)
+    try:
+        while at < end:
+            kind, source, count, length, t_ns = _HEAD.unpack_from(data, at)
+            at += _HEAD.size
+            payload = data[at : at + length]
+            if len(payload) < length:
+                raise DamagedRecordError("a record goes beyond its message")
+            at += length
+            readings = [_READING.unpack_from(data, at + k * _READING.size) for k in range(count)]
+            at += count * _READING.size
+            yield Record(Kind(kind), source, t_ns, payload, readings)
+    except (struct.error, ValueError) as error:
+        raise DamagedRecordError(str(error)) from error
+
+
+def frame_payload(frame: CanFrame) -> bytes:
+    flags = (
+        _EXTENDED * frame.extended
+        | _REMOTE * frame.remote
+        | _ERROR * frame.error
+        | _STAMPED * (frame.realtime_ns is not None)
+    )
+    return _FRAME.pack(frame.can_id, flags, frame.realtime_ns or 0) + frame.data
+
+
+def frame_of(record: Record) -> CanFrame:
+    """The frame of a record of kind FRAME. Raises `DamagedRecordError`."""
+    try:
+        can_id, flags, realtime_ns = _FRAME.unpack_from(record.payload)
+    except struct.error as error:
+        raise DamagedRecordError(str(error)) from error
+    return CanFrame(
+        can_id,
+        bool(flags & _EXTENDED),
+        record.payload[_FRAME.size :],
+        record.t_ns,
+        realtime_ns if flags & _STAMPED else None,
+        bool(flags & _REMOTE),
+        bool(flags & _ERROR),
+    )
+
+
+def tick_payload(tick: Tick) -> bytes:
+    return _TICK.pack(*tick)
+
+
+def tick_of(record: Record) -> Tick:
+    """The payload of a record of kind TICK. Raises `DamagedRecordError`."""
+    try:
+        return Tick._make(_TICK.unpack(record.payload))
+    except struct.error as error:
+        raise DamagedRecordError(str(error)) from error
+
+
+KINDS_BY_INPUT = {
+    "read": Kind.READ,
+    "frame": Kind.FRAME,
+    "open": Kind.OPEN,
+    "close": Kind.CLOSE,
+    "controller": Kind.CONTROLLER,
+    "sent": Kind.SENT,
+}
+"""Of `drivers.inputs`; a kind that is not listed is a timer of the driver's own."""
+
+
+def input_record(
+    source: int, kind: str, t_ns: int, payload: bytes | str | CanFrame | None
+) -> Record:
+    """The record of a driver's input."""
+    found = KINDS_BY_INPUT.get(kind, Kind.TIMER)
+    if isinstance(payload, CanFrame):
+        data = frame_payload(payload)
+    elif isinstance(payload, str):
+        data = payload.encode()
+    elif found is Kind.TIMER:
+        data = kind.encode()
+    else:
+        data = payload or b""
+    return Record(found, source, t_ns, data)
+
+
+def input_of(record: Record) -> tuple[str, bytes | str | CanFrame | None]:
+    """Kind and payload as the driver's `Inputs.take` has them."""
+    match record.kind:
+        case Kind.FRAME:
+            return "frame", frame_of(record)
+        case Kind.READ | Kind.SENT:
+            return record.kind.name.lower(), record.payload
+        case Kind.TIMER:
+            return record.payload.decode(), None
+        case Kind.OPEN:
+            return "open", None
+        case Kind.CLOSE | Kind.CONTROLLER:
+            return record.kind.name.lower(), record.payload.decode()
+        case _:
+            raise DamagedRecordError(f"{record.kind.name.lower()} is no input of a driver")

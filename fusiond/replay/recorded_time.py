@@ -1,0 +1,65 @@
+"""The recording host's clocks, as the log has them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+
+from fusiond.clock.host import Readings
+from fusiond.recording.records import Reading
+
+REALTIME, BOOTTIME = 0, 1
+
+
+class RecordedTime:
+    """A `HostTime` that stands at `t_ns` until it is moved."""
+
+    def __init__(self, t_ns: int) -> None:
+        self.t_ns = t_ns
+
+    def monotonic_ns(self) -> int:
+        return self.t_ns
+
+    def realtime_ns(self) -> int:
+        raise AssertionError("read by RecordedReadings")
+
+    boottime_ns = realtime_ns
+
+
+class RecordedReadings(Readings):
+    """What the daemon read of its host's clocks, in the same order.
+
+    A filter that reports other events asks another number of times: what a record does not hold is
+    answered with what was read last, and what is left over waits for nobody (`pending`).
+    """
+
+    def __init__(self, time: RecordedTime, system_clock: Mapping[str, int | None]) -> None:
+        super().__init__(time)
+        self._time = time
+        self._last = {
+            REALTIME: int(system_clock["offset_ns"] or 0),
+            BOOTTIME: int(system_clock["_boot_ns"] or 0),
+        }
+        self._readings: deque[Reading] = deque()
+
+    @property
+    def pending(self) -> bool:
+        return bool(self._readings)
+
+    def give(self, readings: Sequence[Reading]) -> None:
+        """These belong to the record that is about to be handled."""
+        self._readings = deque(readings)
+
+    def realtime(self) -> tuple[int, int]:
+        return self._next(REALTIME)
+
+    def boottime(self) -> tuple[int, int]:
+        return self._next(BOOTTIME)
+
+    def _next(self, clock: int) -> tuple[int, int]:
+        while self._readings:
+            found, t_ns, ahead_ns = self._readings.popleft()
+            self._last[found] = ahead_ns
+            if found == clock:
+                return t_ns, ahead_ns
+        return self._time.t_ns, self._last[clock]

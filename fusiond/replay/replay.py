@@ -1,0 +1,262 @@
+"""A recording through the daemon's chain: drivers, clock, navigator, tick by tick.
+
+From a recording's beginning, with its own configuration, every tick must end in the same bits: the
+log holds their digests, and the first that differs is named. From the middle of a drive (a cut log,
+a recording that was started on the way) it goes on from a state that the log holds, as a restarted
+daemon would: then nothing can be compared.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from drivers.measurements import Measurement
+from drivers.raw.messages import RawGnssEpoch
+from fusiond.clock.answers import Instant
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import Config
+from fusiond.live.chain import Chain
+from fusiond.live.events import Events
+from fusiond.live.loaded import LOADED, Loaded
+from fusiond.live.warm_keeper import KEPT_STATE
+from fusiond.navigation.solution import Solution
+from fusiond.navigator.state_file import DamagedStateError
+from fusiond.navigator.timeline import Entry
+from fusiond.outputs.commands import COMMANDS, CommandRefusedError
+from fusiond.outputs.messages.event import EventMessage
+from fusiond.recording.channels import STATE
+from fusiond.recording.digest import state_digest
+from fusiond.recording.reader import Log
+from fusiond.recording.records import Kind, Record, Tick, input_of, tick_of
+from fusiond.replay.recorded_time import RecordedReadings, RecordedTime
+
+log = logging.getLogger("fusiond")
+
+
+Arrival = Callable[[Measurement | RawGnssEpoch, Instant], None]
+
+
+class Divergence(NamedTuple):
+    """Where a replay first went another way than the daemon did."""
+
+    tick: int
+    t_ns: int
+    what: str
+
+
+@dataclass
+class Comparison:
+    """How ticks and requests of a replay compare with the recorded ones."""
+
+    ticks: int = 0
+    compared: int = 0
+    differing: int = 0
+    first: Divergence | None = None
+    lost_inputs: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+class ReplayedTick(NamedTuple):
+    """A tick of a replay beside the recorded one."""
+
+    recorded: Tick
+    solution: Solution
+
+
+class Replay:
+    """One run through a log with a configuration. `exact` says whether the log's own digests should
+    come out: it does not for another configuration, nor from the middle of a drive.
+
+    `on_event`, `on_outcome` and `on_arrival` (of each measurement, with its instant) hear what the
+    daemon's parts say. Without `navigate` the filter does not run, and there are no ticks.
+    """
+
+    def __init__(
+        self,
+        recording: Log,
+        config: Config,
+        same: bool = True,
+        on_event: Callable[[EventMessage], None] | None = None,
+        on_outcome: Callable[[Entry], None] | None = None,
+        navigate: bool = True,
+        on_arrival: Arrival | None = None,
+    ) -> None:
+        self._navigate, self._on_arrival = navigate, on_arrival
+        self._log = recording
+        self._config = config
+        self._same = same
+        self._on_event, self._on_outcome = on_event, on_outcome
+        self._sources = recording.about.sources
+        self._sent: deque[tuple[str, bytes]] = deque()
+        self._inputs = 0
+        self.exact = False
+        self.began = "nothing in the log"
+        """What the replay started from, in words."""
+        self.comparison = Comparison()
+        self.chain: Chain | None = None
+
+    def ticks(self) -> Iterator[ReplayedTick]:
+        """Run; each tick as it has ended. To be called once."""
+        after_ns = 0
+        for record in self._log.records():
+            if record.kind is Kind.START or self.chain is None:
+                if self.chain is not None:
+                    continue
+                after_ns = self._start(record)
+                if record.kind is Kind.START:
+                    continue
+            if record.t_ns <= after_ns:
+                continue
+            yield from self._handle(record)
+
+    # ------------------------------------------------------------------ start
+
+    def _start(self, record: Record) -> int:
+        """Put the chain together; inputs up to the instant that is returned (ns) come too early."""
+        start: dict[str, Any] = json.loads(record.payload) if record.kind is Kind.START else {}
+        from_start = bool(start.get("from_start"))
+        system_clock = start.get("system_clock") or _system_clock(record, self._log)
+        loaded, after_ns = Loaded(), 0
+        if from_start:
+            loaded = LOADED.validate_json(
+                json.dumps({name: start.get(name) for name in ("saved", "warm", "calibration")})
+            )
+            self.began = "the daemon's start"
+        else:
+            loaded, after_ns = self._on_the_way(start)
+        self._time = RecordedTime(max(record.t_ns, after_ns))
+        self._readings = RecordedReadings(self._time, system_clock)
+        clock = Clock(self._config.clock, self._time, self._readings)
+        clock.restore_system(system_clock)
+        events = Events(clock)
+        if self._on_event is not None:
+            events.listen(self._on_event)
+        self.chain = Chain(self._config, clock, events, loaded.saved, self._on_outcome)
+        try:
+            loaded.offer(self.chain)
+        except DamagedStateError as error:
+            self.began = f"an alignment: the log's state is of another filter ({error})"
+        self.chain.sources.on_arrival = self._on_arrival
+        self._doors = self.chain.sources.inputs
+        for name, inputs in self._doors.items():
+            inputs.heard = self._listener(name)
+        self.exact = self._same and from_start and self._log.first_part
+        self._finish(record)
+        return after_ns
+
+    def _on_the_way(self, start: dict[str, Any]) -> tuple[Loaded, int]:
+        """The first state that the log holds, and its instant."""
+        for message in self._log.messages(STATE):
+            try:
+                kept = KEPT_STATE.validate_json(message.data)
+            except ValidationError:
+                break
+            self.began = "a state on the way"
+            return Loaded(warm=kept), message.t_log_ns - self._log.about.epoch_ns
+        self.began = "an alignment: the log begins on the way and holds no state"
+        return Loaded(), 0
+
+    def _listener(self, name: str) -> Callable[[str, int, Any], None]:
+        def heard(kind: str, t_ns: int, payload: Any) -> None:
+            if kind == "sent":
+                self._sent.append((name, payload))
+
+        return heard
+
+    # ------------------------------------------------------------------ on the way
+
+    def _handle(self, record: Record) -> Iterator[ReplayedTick]:
+        assert self.chain is not None
+        self._time.t_ns = record.t_ns
+        self._readings.give(record.readings)
+        match record.kind:
+            case Kind.TICK if not self._navigate:
+                self.chain.sources.take_imu()
+            case Kind.TICK:
+                yield self._tick(record)
+            case Kind.COMMAND:
+                self._command(record)
+            case Kind.SENT:
+                self._compare_sent(record)
+            case _:
+                self._inputs += 1
+                self._take(record)
+        self._finish(record)
+
+    def _finish(self, record: Record) -> None:
+        """The daemon read its host's clocks for outputs too, which a replay need not have."""
+        assert self.chain is not None
+        while self._readings.pending:
+            self.chain.clock.look()
+
+    def _take(self, record: Record) -> None:
+        name = self._sources[record.source]
+        door = self._doors.get(name)
+        if door is None:  # another configuration, without it
+            return
+        kind, payload = input_of(record)
+        try:
+            door.take(kind, payload, record.t_ns)
+        except KeyError:
+            self._fault(f"{name}: its driver knows no input {kind!r}")
+        except Exception as error:  # the daemon restarts a driver that raises
+            self._fault(f"{name}: {error!r}")
+
+    def _fault(self, text: str) -> None:
+        if text not in self.comparison.faults:
+            log.warning("%s", text)
+            self.comparison.faults.append(text)
+
+    def _command(self, record: Record) -> None:
+        assert self.chain is not None
+        said = json.loads(record.payload)
+        model = COMMANDS[said.pop("name")]
+        try:
+            self.chain.operator.carry_out(model.model_validate(said), record.t_ns)
+        except CommandRefusedError as error:
+            log.info("%s", error)
+
+    def _tick(self, record: Record) -> ReplayedTick:
+        assert self.chain is not None
+        recorded = tick_of(record)
+        solution = self.chain.tick(record.t_ns)
+        c = self.comparison
+        c.ticks += 1
+        if self.exact:
+            c.compared += 1
+            if recorded.inputs != self._inputs:
+                c.lost_inputs = recorded.inputs - self._inputs
+                self._diverged(record, f"{c.lost_inputs} inputs are missing in the log")
+            elif state_digest(self.chain.navigator, solution) != recorded.digest:
+                c.differing += 1
+                self._diverged(record, "the solution or the filter's state")
+        return ReplayedTick(recorded, solution)
+
+    def _compare_sent(self, record: Record) -> None:
+        name = self._sources[record.source]
+        if not self.exact:
+            self._sent.clear()
+        elif not self._sent or self._sent.popleft() != (name, record.payload):
+            self._diverged(record, f"what was sent to {name}")
+
+    def _diverged(self, record: Record, what: str) -> None:
+        if self.comparison.first is None:
+            self.comparison.first = Divergence(self.comparison.ticks, record.t_ns, what)
+
+
+def _system_clock(record: Record, recording: Log) -> dict[str, int | None]:
+    """Where the log does not say it: the system clock as the log's own dates have it."""
+    t_ns, ahead_ns = record.t_ns, recording.about.epoch_ns
+    return {
+        **dict.fromkeys(("_sampled_ns", "_queued_ns", "_stepped_ns"), t_ns),
+        **dict.fromkeys(("offset_ns", "held_ns"), ahead_ns),
+        **dict.fromkeys(("_boot_ns", "slept_ns", "changes", "last_step_ns"), 0),
+        "before_step_ns": None,
+    }
