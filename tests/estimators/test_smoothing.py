@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import cast
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid, Linearised
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
@@ -107,14 +110,16 @@ def _rauch_tung_striebel(
     return np.array(errors[::-1]), np.array(covariances[::-1])
 
 
-@pytest.mark.parametrize("kind", ["fixes", "clock that jumps"])
+@pytest.mark.parametrize("kind", ["fixes", "robust", "clock that jumps"])
 def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
     """Bryson-Frazier against Rauch-Tung-Striebel, written with dense matrices."""
-    jumps = kind != "fixes"
+    jumps = kind == "clock that jumps"
     name = "ins23" if jumps else "ins21"
     _, buffer, aids, start, _ = town_drive.drive()
     if jumps:
         aids = ranges(aids, jump_at=20)
+    if kind == "robust":
+        aids = [[replace(cast("Aid", aid), robust=True) for aid in epoch] for epoch in aids]
     model = make_model(name, imu_noise(town_drive.IMU))
     estimator = Logging(model, town_drive.IMU.gap_s)
     sd = model.initial.copy()
