@@ -17,8 +17,10 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, sensor_to_body
+from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.verdicts import Verdicts
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigation.vibration import Vibration
@@ -53,7 +55,8 @@ UNKNOWN_TIME_S = 0.9
 
 
 class Navigator:
-    """Navigation of one vehicle. `on_event(code, text)` hears what an operator should know."""
+    """Navigation of one vehicle. `on_event(code, text)` hears what an operator should know;
+    `estimator` makes the filter of the configuration and its model."""
 
     def __init__(
         self,
@@ -61,6 +64,7 @@ class Navigator:
         saved: SavedState | None = None,
         on_event: Callable[[str, str], None] | None = None,
         on_outcome: Callable[[Entry], None] | None = None,
+        estimator: Callable[[Config, Model], Estimator] = estimator_of,
     ) -> None:
         self.config = config
         self._saved = saved
@@ -77,7 +81,7 @@ class Navigator:
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._event)
-        self.estimator = estimator_of(config, self.model)
+        self.estimator = estimator(config, self.model)
         self.verdicts = Verdicts(
             config.consistency.window,
             config.consistency.alpha,
