@@ -1,13 +1,15 @@
 r"""Position of an antenna: a GNSS fix, with or without height.
 
     z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + b^
-        + v^ tau^
-      = dr + (C l) x phi + tau^ dv - C dl - db - v dtau + noise
+        + v_a^ tau^ + a^ tau^2 / 2
+      = dr + (C l) x phi + tau^ dv_a - C dl - db - (v_a + a tau^) dtau + tau^2 / 2 [f x] phi + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
-ionosphere), tau how much later than its stamp the fix is valid; where the model has states for
-them they are estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is
-not shared moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis.
+ionosphere), tau how much later than its stamp the fix is valid, v_a the antenna's velocity
+(fusiond.aiding.antenna, also for the noise that products of errors are), a its acceleration; where
+the model has states for them they are estimated, true minus estimated in dl, db, dtau. A timing
+error of sigma s_t that is not shared moves the antenna by v s_t, which adds (v_i s_t)^2 to the
+variance of each axis.
 
 Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3.
 """
@@ -21,6 +23,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.antenna import antenna, antenna_velocity, force_matrix, left_out
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
@@ -61,15 +64,6 @@ def _position(
         h[2, 8] = 1.0
 
 
-def antenna(state: State, lever: Vector3, block: str) -> tuple[Vector3, list[int]]:
-    """The lever arm (m) with the estimate of its rest, and the slots of that, none without it."""
-    slots = state.model.slots_of(block)
-    if not slots:
-        return lever, slots
-    x, y, z = (a + float(state.xi[slot]) for a, slot in zip(lever, slots, strict=True))
-    return (x, y, z), slots
-
-
 @dataclass(frozen=True, slots=True)
 class PositionAid(Aid):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
@@ -95,6 +89,7 @@ class PositionAid(Aid):
         rows = 2 if self.height_m is None or state.model.hold_height else 3
         height = 0.0 if self.height_m is None else self.height_m
         z, h = np.empty(rows), np.zeros((rows, state.model.size))
+        r = np.square(self.sd[:rows])
         lever, levers = antenna(state, self.lever, self.rest)
         _position(nav, self.lat_rad, self.lon_rad, height, *lever, z, h)
         if levers:
@@ -105,11 +100,13 @@ class PositionAid(Aid):
             z[row] += state.xi[slot]
         for slot in state.model.slots_of(self.time):
             late_s = float(state.xi[slot])
-            v = nav[VN : VN + rows]
-            z += v * late_s
-            h[:, slot] = -v
-            h[:, 3 : 3 + rows] += late_s * np.eye(rows)
-        r = np.square(self.sd[:rows])
+            v, of_v = antenna_velocity(state, lever, levers, rows)
+            a = state.acceleration[:rows]
+            z += (v + 0.5 * a * late_s) * late_s
+            h[:, slot] = -(v + a * late_s)
+            h += late_s * of_v
+            h[:, :3] += 0.5 * late_s**2 * force_matrix(state)[:rows]
+            r += left_out(state, slot, of_v, a)
         if self.sd_time_s:
             r += np.square(nav[VN : VN + rows] * self.sd_time_s)
         return Innovation(z, h, r)
