@@ -4,8 +4,9 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
       = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ f x phi + noise
 
 w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s
-per 10 m. tau is how much later than its stamp the velocity is valid, a the acceleration, smoothed: with the noise of single
-samples in its Jacobian an offset would come out too small, and too sure.
+per 10 m (fusiond.aiding.antenna). tau is how much later than its stamp the velocity is valid, a the
+acceleration, smoothed: with the noise of single samples in its Jacobian an offset would come out
+too small, and too sure.
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
