@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
-from fusiond.aiding.height import HeightAid
+from fusiond.aiding.height import BarometerAid, HeightAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
@@ -28,17 +28,25 @@ from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
+    BAROMETER_AIRFLOW,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
     FIX_TIME,
     SIDE_DRIFT,
     VELOCITY_TIME,
     WHEEL_DRIFT,
     WHEEL_LATENCY,
+    WHEEL_ROUNDING,
     WHEEL_SCALE,
     antenna_lever,
     axle_lever,
+    barometer_airflow,
+    barometer_offset,
+    barometer_scale,
     drift,
     mounting,
     time_offset,
+    wheel_rounding,
     wheel_scale,
 )
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
@@ -76,11 +84,14 @@ VEHICLE = (
     time_offset(FIX_TIME, 0.1),
     time_offset(VELOCITY_TIME, 0.1),
     antenna_lever(ANTENNA_LEVER, 0.3),
+    wheel_rounding(WHEEL_ROUNDING, 0.25),
 )
 # What the filter holds of them: mounting pitch and yaw, lever, two drifts, scale, latency, two
-# offsets in time, lever of the antenna.
-ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.3, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05)
+# offsets in time, lever of the antenna, rounding.
+ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.3, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05, 0.2)
 ACCELERATION = (1.4, -0.8, 0.3)
+KM_H = 1.0 / 3.6
+AIR = (BAROMETER_OFFSET, BAROMETER_SCALE, BAROMETER_AIRFLOW)
 
 
 def _vehicle_model() -> Model:
@@ -192,6 +203,8 @@ IN_TIME: dict[str, Callable[[Array], Linearised]] = {
         drift=WHEEL_DRIFT,
         scale=WHEEL_SCALE,
         latency=WHEEL_LATENCY,
+        rounding=WHEEL_ROUNDING,
+        shared_step_m_s=KM_H,
     ),
     "position": lambda nav: replace(_position(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
     "horizontal position": lambda nav: replace(_position(nav, False), time=FIX_TIME),
@@ -218,16 +231,21 @@ def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
     xi = np.zeros(model.size)
     xi[-len(ESTIMATED) :] = ESTIMATED
     state = _state(model, nav, xi)
-    pitch, yaw, lever, _, slipping, scale, latency, late, _, *rest = ESTIMATED
+    pitch, yaw, lever, _, slipping, scale, latency, late, _, *rest, share = ESTIMATED
     to_vehicle = Rotation.from_rotvec([0.0, pitch, yaw]).as_matrix()
     dcm = Rotation.from_euler("ZYX", RPY[::-1]).as_matrix()
     at_wheel = dcm.T @ VELOCITY + np.cross(RATE_SENSED, np.add(LEVER, (lever, 0.0, 0.0)))
     before = to_vehicle @ (at_wheel - dcm.T @ ACCELERATION * latency)
-    wheel = WheelSpeedAid(*SOURCE, float((1.0 + scale) * before[0] + slipping), 0.1, LEVER)
+    reads = float((1.0 + scale) * before[0] + slipping)
+    reads -= math.copysign(share * KM_H, reads)
+    wheel = WheelSpeedAid(*SOURCE, reads, 0.1, LEVER)
     wheel = replace(wheel, drift=WHEEL_DRIFT, scale=WHEEL_SCALE, latency=WHEEL_LATENCY)
+    wheel = replace(wheel, rounding=WHEEL_ROUNDING, shared_step_m_s=KM_H)
     assert _innovation(wheel, state).z == pytest.approx([0.0], abs=1e-9)
     arm = dcm @ np.add(LEVER, rest)
-    antenna = nav[:3] + (arm + np.array(VELOCITY) * late) / runs.metres(*nav[[0, 2]])
+    moved = np.array(VELOCITY) + dcm @ np.cross(RATE_SENSED, np.add(LEVER, rest))
+    moved = moved * late + 0.5 * np.array(ACCELERATION) * late**2
+    antenna = nav[:3] + (arm + moved) / runs.metres(*nav[[0, 2]])
     lat, lon, height = (float(x) for x in antenna)
     fix = PositionAid(*SOURCE, lat, lon, height, (1.0, 1.0, 1.0), LEVER)
     fix = replace(fix, time=FIX_TIME, rest=ANTENNA_LEVER)
@@ -246,6 +264,23 @@ def test_height_jacobian_and_planar() -> None:
     model = _model("planar15")
     state = _state(model, runs.level_nav(RPY, VELOCITY), np.zeros(model.size))
     assert HeightAid(*SOURCE, 41.0, 5.0).innovation(state) == NotApplicable("height_held")
+    assert BarometerAid(*SOURCE, 41.0, 5.0, *AIR).innovation(state) == NotApplicable("height_held")
+
+
+def test_barometer_jacobian_and_what_explains_it() -> None:
+    blocks = (
+        barometer_offset(AIR[0], 100.0, 0.15),
+        barometer_scale(AIR[1], 0.04),
+        barometer_airflow(AIR[2], 0.1),
+    )
+    model = make_model("ins15", imu_noise(Imu()), *blocks)
+    aid = BarometerAid(*SOURCE, 120.0, 5.0, *AIR)
+    _check_jacobian(lambda nav: aid, "", model=model, estimated=(70.0, 0.05, 0.2))
+    nav, xi = runs.level_nav(RPY, VELOCITY), np.zeros(model.size)
+    xi[-3:] = 70.0, 0.05, 0.2
+    lift_m = 0.2 * math.hypot(*VELOCITY[:2]) ** 2 / (2.0 * 9.80665)
+    felt = replace(aid, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
+    assert _innovation(felt, _state(model, nav, xi)).z == pytest.approx([0.0], abs=1e-9)
 
 
 def test_scale_factors_are_left_out_of_lever_arms() -> None:
