@@ -4,9 +4,9 @@
 
 A frame cannot arrive before it was sent, and may arrive at any time after: a reader that stalls
 makes the next frames late, then sees them in one burst. So the wraps are those that make a frame
-least late, and a burst, a repeated or an overtaken frame is not a restart; device time that goes
-back by more than frames can overtake each other, at the pace of the arrivals, is one, and so is a
-lateness that stays.
+least late, and a burst, a repeated or an overtaken frame is not a restart. Lateness never makes
+device time go back: where it does and goes on from there at the pace of the arrivals, with no frame
+of the old time in between, the clock began anew or was set. So does one whose lateness stays.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Arrivals = tuple[int, int]
 
 @dataclass(slots=True)
 class _Doubt:
-    """A new time that may be a restart: where it began, and what went on from there."""
+    """A new time that may be a restart: its last ticks, and where what went on at the pace of the
+    arrivals began."""
 
     ticks: int
-    arrivals_ns: Arrivals
     first_ticks: int
     first_ns: Arrivals
     samples: int = 1
@@ -74,10 +74,8 @@ class DeviceTime:
         if self._ticks is None:
             return self._begin(raw, arrivals_ns)
         advance, late, elapsed = self._explain(raw, arrivals_ns)
-        if advance < -self._slack or (advance <= 0 and self._doubt is not None):
-            return self._confirm(raw, arrivals_ns)
         if advance <= 0:
-            return None
+            return self._confirm(raw, arrivals_ns)
         self._doubt = None
         if self._stays_late(late, elapsed):
             self.restarts += 1
@@ -108,7 +106,8 @@ class DeviceTime:
         return found
 
     def _confirm(self, raw: int, arrivals_ns: Arrivals) -> int | None:
-        """The device's time jumped; whether it goes on from there at the pace of the arrivals."""
+        """The device's time stood or went back; whether it goes on from there at the pace of the
+        arrivals."""
         doubt = self._doubt
         if doubt is not None:
             advance = (raw - doubt.ticks) % self._modulus
@@ -119,13 +118,15 @@ class DeviceTime:
             ]
             on_pace = any(LEAST_PACE * gone <= p <= gone + self._slack for p in passed)
             if 0 < advance < self._modulus // 2:
-                doubt.ticks, doubt.arrivals_ns = raw, arrivals_ns
+                doubt.ticks = raw
                 doubt.samples += 1
-                if on_pace and doubt.samples >= RESTART_SAMPLES:
+                if not on_pace:  # a burst says nothing; what follows it may
+                    doubt.first_ticks, doubt.first_ns, doubt.samples = raw, arrivals_ns, 1
+                elif doubt.samples >= RESTART_SAMPLES:
                     self.restarts += 1
                     return self._begin(raw, arrivals_ns)
                 return None
-        self._doubt = _Doubt(raw, arrivals_ns, raw, arrivals_ns)
+        self._doubt = _Doubt(raw, raw, arrivals_ns)
         return None
 
     def _stays_late(self, late: float, elapsed: float) -> bool:

@@ -6,6 +6,8 @@ r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 w is the rate of the body against the Earth; the Earth's own rate times the lever is under 1 mm/s
 per 10 m. tau is how much later than its stamp the velocity is valid, a the acceleration, smoothed:
 with the noise of single samples in its Jacobian an offset would come out too small, and too sure.
+A timing error of sigma s_t that is not shared changes the velocity by a s_t, which adds (a_i s_t)^2
+to the variance of each axis.
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
@@ -111,6 +113,7 @@ class VelocityAid(Aid):
     lever: Vector3
     time: str = ""
     rest: str = ""
+    sd_time_s: float = 0.0
 
     @property
     def device(self) -> str:
@@ -123,7 +126,10 @@ class VelocityAid(Aid):
         slots = model.column_of, model.slots_of_all((self.time,)), model.slots_of_all((self.rest,))
         _velocity(state.nav, state.xi, state.step, *slots, *self.lever, z, h)
         z -= self.v_ned[:rows]
-        return Innovation(z, h, np.square(self.sd[:rows]))
+        r = np.square(self.sd[:rows])
+        if self.sd_time_s:
+            r += np.square(state.acceleration[:rows] * self.sd_time_s)
+        return Innovation(z, h, r)
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever),)

@@ -21,9 +21,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from math import hypot
-from typing import NamedTuple, assert_never
+from typing import assert_never
 
 from drivers.measurements import (
     ArrivalStamp,
@@ -36,6 +35,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from fusiond.clock import dates
+from fusiond.clock.answers import ClockStatus, Instant, TimeSample
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import (
     MILLISECOND_NS,
@@ -80,38 +80,6 @@ _GUESSED_SD_S = 0.5
 """Sentences come 20 to 200 ms after their epoch, and with one receiver always alike. A filter takes
 the error of a fix for independent of the next one's and averages it: hence three times the most
 that it can be (a drive at 15 m/s with 0.15 s: 8 sigma)."""
-
-
-class Instant(NamedTuple):
-    """When a measurement was true (monotonic ns), one sigma of that (s), and the rule used."""
-
-    t_valid_ns: int
-    sd_s: float
-    how: str
-
-
-@dataclass(frozen=True, slots=True)
-class ClockStatus:
-    """What `health` and `doctor` say of the clock.
-
-    `utc_source` is a source's name, `system`, or `none` while no plausible UTC is known.
-    `system_error_s` is the system clock minus the receiver's UTC. `rdss_clock_error_s` is daemon
-    UTC minus the terminal's as learnt from fixes whose time of day fits nothing, by source.
-    """
-
-    utc_source: str
-    settled: bool
-    system_error_s: float | None
-    rdss_clock_error_s: dict[str, float] = field(default_factory=dict)
-    rdss_zone_h: dict[str, int] = field(default_factory=dict)
-    counters: dict[str, int] = field(default_factory=dict)
-
-
-class TimeSample(NamedTuple):
-    """What CLOCK_REALTIME said when a report of the reference came in, and true UTC then (ns)."""
-
-    system_ns: int
-    utc_ns: int
 
 
 class Clock:

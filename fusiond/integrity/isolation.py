@@ -14,7 +14,8 @@ Repetition    what is the same to the bit while the filter moves, more often tha
 
 A series that fails the mean test is measured against the rest: where another position, or the
 velocity of the same device, is believed, the series is excluded; where nothing is left to compare
-with, the filter's own motion and sensor errors are doubted, which widens P.
+with, the filter's own motion and sensor errors are doubted, which widens P. So they are when the
+aids that are fused correct its tilt more than its P allows (fusiond.integrity.tilt).
 
 An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
 over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
@@ -46,8 +47,9 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
-from fusiond.integrity.series import NO_TREND, PACES, Offset, Proof, Series
+from fusiond.integrity.series import DRIFTS, NO_TREND, PACES, Offset, Proof, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
+from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VE, VN
 
@@ -100,6 +102,7 @@ class Memory(NamedTuple):
 
     records: dict[str, Series]
     doubts: tuple[int, ...]
+    tilting: Tilting
 
 
 class Isolation:
@@ -108,6 +111,7 @@ class Isolation:
     def __init__(self, false_alarm: float = FALSE_ALARM) -> None:
         self._records: dict[str, Series] = {}
         self._doubts: tuple[int, ...] = ()
+        self._tilting = NOT_TILTING
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -137,17 +141,18 @@ class Isolation:
 
     def snapshot(self) -> Memory:
         """A copy of everything."""
-        return Memory({name: r.copied() for name, r in self._records.items()}, self._doubts)
+        records = {name: r.copied() for name, r in self._records.items()}
+        return Memory(records, self._doubts, self._tilting)
 
     def restore(self, memory: Memory) -> None:
         """Back to a snapshot."""
         self._records = {name: r.copied() for name, r in memory.records.items()}
-        self._doubts = memory.doubts
+        self._doubts, self._tilting = memory.doubts, memory.tilting
 
     def reset(self) -> None:
         """The filter starts anew: nobody is suspected."""
         self._records.clear()
-        self._doubts = ()
+        self._doubts, self._tilting = (), NOT_TILTING
 
     # ------------------------------------------------------------------ judgement
 
@@ -185,9 +190,17 @@ class Isolation:
             self._prove(record, t_ns, offer, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         self._average(record, outcome.whitened)
-        if not self._biased(record):
+        if not self._biased(record, t_ns):
             return Action.NONE
         return self._doubted(self._blame(record, aid), t_ns)
+
+    def corrected(self, t_ns: int, before: Attitude, after: Attitude) -> Action:
+        """A position or velocity was fused; what the filter shall do about the attitude."""
+        self._tilting = self._tilting.with_one(t_ns, before, after)
+        if not self._tilting.too_far:
+            return Action.NONE
+        self._tilting = NOT_TILTING
+        return self._doubted(Action.DOUBT_MOTION, t_ns)
 
     def _record(self, aid: Aid) -> Series:
         """The series of an aid, which is heard of now."""
@@ -217,7 +230,7 @@ class Isolation:
         z = Offset(moved.north + way[0], moved.east + way[1], moved.sd)
         trend = p.trend.with_one(z, (t_ns - p.begin_ns) * 1e-9)
         record.proof = (
-            None if trend.steady else p._replace(t_ns=t_ns, velocity=v, way=way, trend=trend)
+            None if trend.steady() else p._replace(t_ns=t_ns, velocity=v, way=way, trend=trend)
         )
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
@@ -289,8 +302,8 @@ class Isolation:
         if (
             record.passes >= READMIT_COUNT
             and t_ns - record.passing_ns >= READMIT_NS
-            and (offset is None or record.trend.steady)
-            and not self._biased(record)
+            and (offset is None or record.trend.steady(record.least_trend_sd))
+            and not self._biased(record, t_ns)
         ):
             record.excluded, record.fused_ns = "", t_ns
             record.refused, record.jumped, record.count = 0, False, 0
@@ -314,7 +327,7 @@ class Isolation:
         record.slow = tuple([m + b * (y - m) for m, y in zip(record.slow, whitened, strict=True)])
         record.count += 1
 
-    def _biased(self, record: Series) -> bool:
+    def _biased(self, record: Series, t_ns: int) -> bool:
         count = record.count
         if count < FEWEST:
             return False
@@ -325,8 +338,9 @@ class Isolation:
             slow += s * s
         limit = gate_threshold(self._pass, degrees)
         if fast > limit * record.fast_spread or slow > limit * record.slow_spread:
+            record.forget_shown()
             return True
-        record.learn(fast / degrees, slow / degrees)
+        record.learn(t_ns, fast / degrees, slow / degrees)
         return False
 
     def _blame(self, record: Series, aid: Aid) -> Action:
@@ -338,7 +352,7 @@ class Isolation:
             source = self._supported(record.device, aid.t_ns)
         if not source:
             return Action.DOUBT_FILTER
-        self._exclude(record, aid.t_ns, "drifts", jumped=record.locates)
+        self._exclude(record, aid.t_ns, DRIFTS, jumped=record.locates)
         return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
 
 

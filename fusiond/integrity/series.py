@@ -12,6 +12,10 @@ from typing import NamedTuple
 # A position comes back once its innovations are known not to run away by three times this (m/s):
 # a drift of 0.2 m/s is what a filter with an honest velocity still tells from its own.
 TREND_SD_M_S = 0.07
+# One that was left out because it drifted, by a third and less: 0.1 m/s is what a receiver's honest
+# velocity shows within twenty seconds, and five of this.
+DRIFT_SD_M_S = 0.02
+DRIFTS = "drifts"
 # Paces of the mean: some 11 and some 59 innovations deep, (2 - a) / a.
 PACES = (1.0 / 6.0, 1.0 / 30.0)
 # The variance of a mean at each pace, for white innovations of variance one; and what is assumed of
@@ -20,8 +24,11 @@ WHITE = tuple(a / (2.0 - a) for a in PACES)
 ASSUMED = tuple(white + 0.2 for white in WHITE)
 # The variance that a series' means show by themselves is averaged over so many innovations: errors
 # that last (orbits, slip of a tyre) are ordinary, and a fault is what stands out of them. What is
-# assumed at first weighs as much as some of them: the time that the slow mean looks back.
-LEARN_COUNT, ASSUMED_COUNT = 300, 30
+# assumed at first weighs as much as half the time that the slow mean looks back.
+LEARN_COUNT, ASSUMED_COUNT = 300, 15
+# What the means show lately may be the beginning of a fault: it counts once a period as long as it
+# has gone by without one. A drift of 0.1 m/s is found within twice this; longer ones hide nothing.
+LEARN_NS = 15_000_000_000
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2
@@ -77,14 +84,26 @@ class Trend(NamedTuple):
         east = (self.t_east - self.t * self.east / self.n) / spread
         return math.hypot(north, east), self.sd / math.sqrt(spread)
 
-    @property
-    def steady(self) -> bool:
-        """Whether the slope of a line through them is known to `TREND_SD_M_S`, and zero."""
+    def steady(self, least_sd: float = TREND_SD_M_S) -> bool:
+        """Whether the slope of a line through them is known to `least_sd` (m/s), and zero."""
         slope, sd = self.slope
-        return sd <= TREND_SD_M_S and slope <= 3.0 * TREND_SD_M_S
+        return sd <= least_sd and slope <= 3.0 * least_sd
 
 
 NO_TREND = Trend()
+
+
+class Shown(NamedTuple):
+    """Sums of the means' squares, by degree of freedom, over so many innovations since an
+    instant."""
+
+    since_ns: int
+    fast: float = 0.0
+    slow: float = 0.0
+    n: int = 0
+
+
+NOTHING_SHOWN = Shown(NEVER_NS)
 
 
 class Proof(NamedTuple):
@@ -134,6 +153,9 @@ class Series:
     slow_spread: float = ASSUMED[1]
     learned: int = 0
     """Innovations that the spreads have been learned from."""
+    shown: Shown = NOTHING_SHOWN
+    """What the means show now, and `waiting` what they did in the period before."""
+    waiting: Shown = NOTHING_SHOWN
     value: tuple[float, ...] | None = None
     repeats: int = 0
     repeating: float = 1.0
@@ -145,12 +167,33 @@ class Series:
         """A copy for a checkpoint."""
         return Series(*[getattr(self, name) for name in Series.__slots__])
 
-    def learn(self, fast: float, slow: float) -> None:
-        """Take in the means' squares, by degree of freedom."""
-        share = 1.0 / min(ASSUMED_COUNT + self.learned + 1, LEARN_COUNT)
-        self.fast_spread += share * (max(fast, WHITE[0]) - self.fast_spread)
-        self.slow_spread += share * (max(slow, WHITE[1]) - self.slow_spread)
-        self.learned = min(self.learned + 1, LEARN_COUNT)
+    def learn(self, t_ns: int, fast: float, slow: float) -> None:
+        """Take in the means' squares, by degree of freedom, at an instant."""
+        if t_ns - self.shown.since_ns >= LEARN_NS:
+            self._believe(self.waiting)
+            self.waiting, self.shown = self.shown, Shown(t_ns)
+        since_ns, fast_sum, slow_sum, n = self.shown
+        fast_sum += max(fast, WHITE[0])
+        slow_sum += max(slow, WHITE[1])
+        self.shown = Shown(since_ns, fast_sum, slow_sum, n + 1)
+
+    def _believe(self, shown: Shown) -> None:
+        """No fault has followed it."""
+        if not shown.n:
+            return
+        share = min(1.0, shown.n / min(ASSUMED_COUNT + self.learned + shown.n, LEARN_COUNT))
+        self.fast_spread += share * (shown.fast / shown.n - self.fast_spread)
+        self.slow_spread += share * (shown.slow / shown.n - self.slow_spread)
+        self.learned = min(self.learned + shown.n, LEARN_COUNT)
+
+    @property
+    def least_trend_sd(self) -> float:
+        """How well (m/s) it must be known that it does not run away before it comes back."""
+        return DRIFT_SD_M_S if self.excluded == DRIFTS else TREND_SD_M_S
+
+    def forget_shown(self) -> None:
+        """A fault has followed what the means have shown lately."""
+        self.shown = self.waiting = NOTHING_SHOWN
 
     def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
         """Whether a new value, of a vehicle that may be `moving`, makes so many alike to the bit

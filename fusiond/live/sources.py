@@ -10,6 +10,7 @@ import asyncio
 from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
+from math import degrees
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,15 @@ from drivers.base import Driver, Emitted
 from drivers.inputs import Inputs
 from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.clock.clock import Clock, Instant
+from fusiond.clock.answers import Instant
+from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
 from fusiond.navigator.navigator import Navigator
-from fusiond.outputs.messages.health import SkyHealth, SourceHealth
+from fusiond.navigator.raw_gnss import Seen
+from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth, SourceHealth
 
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]
@@ -234,4 +237,14 @@ class Sources:
         if sky.dops is not None:
             figures |= sky.dops._asdict()
         rounded = {k: None if v is None else round(v, 2) for k, v in figures.items()}
-        return SkyHealth(used=sky.used, refused=sky.refused, **rounded)
+        satellites = {name: _satellite(seen) for name, seen in sky.seen.items()}
+        return SkyHealth(used=sky.used, refused=sky.refused, satellites=satellites, **rounded)
+
+
+def _satellite(seen: Seen) -> SatelliteHealth:
+    azimuth, elevation, cno = seen
+    return SatelliteHealth(
+        azimuth_deg=None if azimuth is None else round(degrees(azimuth) % 360.0, 1),
+        elevation_deg=None if elevation is None else round(degrees(elevation), 1),
+        cno_db_hz=cno,
+    )

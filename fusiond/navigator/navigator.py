@@ -340,7 +340,7 @@ class Navigator:
             return Mode.COASTING, f"heading from {how}; no motion has confirmed it yet"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
-        shaken = self._standing.shaken(self.estimator.t_ns, self.timeline.isolation)
+        shaken = self._standing.shaken(self.estimator, self.timeline.isolation)
         if shaken is not None:
             return Mode.COASTING, shaken
         unaided = (t_ns - self._last_position_ns) * 1e-9

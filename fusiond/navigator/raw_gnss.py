@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,15 +34,25 @@ REASONS = {KEPT: "used", RESIDUAL: "residual"}
 """What screening calls a row in `health`; everything else is `gated`."""
 
 
+class Seen(NamedTuple):
+    """Where a satellite stands (rad; None for one that was refused before that was looked at) and
+    its strongest signal (dB-Hz; None where the receiver does not say)."""
+
+    azimuth_rad: float | None
+    elevation_rad: float | None
+    cno_db_hz: float | None
+
+
 @dataclass(frozen=True, slots=True)
 class Sky:
     """The last epoch: satellites used, refused ones by reason, DOPs, RMS of the normalised
-    innovations of the ranges that were used."""
+    innovations of the ranges that were used; where all of them stand."""
 
     used: tuple[str, ...] = ()
     refused: dict[str, str] = field(default_factory=dict)
     dops: Dops | None = None
     innovation_rms: float | None = None
+    seen: dict[str, Seen] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +130,7 @@ class RawGnss:
         self._clock = np.array(clocks, dtype=np.int64)
         self._guess: Array | None = None
         self._left_out: dict[str, str] = {}
-        self._judged: tuple[_Corrected, Sequence[int], Sequence[float]] | None = None
+        self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
         self.refused: Counter[str] = Counter()
 
@@ -179,7 +189,7 @@ class RawGnss:
         whitened: Sequence[float],
     ) -> None:
         """The filter has looked at an epoch; one that a rewind brings again counts once."""
-        self._judged = corrected, codes, whitened
+        self._judged = aid, corrected, codes, whitened
         self._guess = corrected.guess
         self._count(aid, corrected.rows)
         if not codes or aid.t_ns <= self._counted_ns:
@@ -202,7 +212,7 @@ class RawGnss:
         """What the last epoch came to."""
         if self._judged is None:
             return Sky(refused=dict(self._left_out))
-        corrected, codes, whitened = self._judged
+        epoch_aid, corrected, codes, whitened = self._judged
         used, refused, squares = [], dict(corrected.rows.refused), []
         aid = corrected.aid
         whitened = whitened or (0.0,) * len(codes)  # an epoch that failed as a whole
@@ -221,6 +231,7 @@ class RawGnss:
             refused,
             dops(sight, aid.clock[here], corrected.guess) if used else None,
             math.sqrt(float(np.mean(squares))) if squares else None,
+            _seen(epoch_aid.epoch, corrected.rows),
         )
 
     def _fix(self, found: SinglePoint, t_ns: int) -> list[Offer]:
@@ -236,3 +247,17 @@ class RawGnss:
             sd = self._section.start_velocity_sd_m_s
             offers.append(VelocityOffer(t_ns, (v_n, v_e, v_d), (sd, sd, sd), lever))
         return offers
+
+
+def _seen(epoch: RawGnssEpoch, rows: Rows) -> dict[str, Seen]:
+    """Every satellite of an epoch; rows have the direction of those that could serve."""
+    angles = zip(rows.azimuth_rad.tolist(), rows.elevation_rad.tolist(), strict=True)
+    directions = dict(zip(rows.satellites, angles, strict=True))
+    strongest: dict[str, float | None] = {}
+    for signal in epoch.signals:
+        levels = (strongest.get(signal.satellite), signal.cno_db_hz)
+        strongest[signal.satellite] = max((x for x in levels if x is not None), default=None)
+    return {
+        name: Seen(*directions.get(name, (None, None)), cno_db_hz=cno)
+        for name, cno in strongest.items()
+    }

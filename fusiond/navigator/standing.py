@@ -6,6 +6,7 @@ what follows for the operator:
     doubted    the motion was in doubt lately: the sigma was widened, and is not yet proven
     unchecked  positions come and none is believed: the IMU alone carries the solution
     contested  what was left out may be right: nobody can tell
+    askew      the IMU does not sit on the vehicle as it was configured: whose attitude is it?
     given up   the filter is wrong, or cannot be told from wrong any more: alignment begins anew
 
 A filter that was given up and aligned anew is on trial for a while: its mode stays `invalid` until
@@ -20,9 +21,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.base import Estimator
 from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.series import NEVER_NS
 from fusiond.integrity.support import Lost
+from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.strapdown import VE, VN
 
 Array = NDArray[np.float64]
@@ -47,6 +50,9 @@ MOST_DOUBTS, DOUBTS_NS = 3, 20_000_000_000
 # long after each further one. What went well for ten times as long was none of a row.
 TRIAL_NS, LONGEST_TRIAL_NS = 10_000_000_000, 320_000_000_000
 LASTED = 10
+# A mounting found so many of its configured sigmas from what was configured is not the one that was
+# configured: chance does that once in 16,000 vehicles.
+ASKEW_SIGMAS = 4.0
 
 
 class Standing:
@@ -93,15 +99,16 @@ class Standing:
             return None
         return f"on trial for {left_ns * 1e-9:.0f} s more after a failure"
 
-    def shaken(self, t_ns: int, isolation: Isolation) -> str | None:
+    def shaken(self, estimator: Estimator, isolation: Isolation) -> str | None:
         """Why a solution is coasting though aids come; None where it is not."""
+        t_ns = estimator.t_ns
         lost = isolation.lost(t_ns)
         if lost is not None and t_ns - lost.since_ns > UNCHECKED_NS:
             return f"{_told(lost)}: nothing else can check it"
         left_ns = _doubted_until(isolation.doubts) - t_ns
         if left_ns > 0:
             return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
-        return isolation.contested(t_ns)
+        return isolation.contested(t_ns) or _askew(estimator)
 
 
 def _doubted_until(doubts: Sequence[int]) -> int:
@@ -115,6 +122,17 @@ def _doubted_until(doubts: Sequence[int]) -> int:
             patience_ns = min(2 * patience_ns, LONGEST_DOUBT_NS)
         before_ns = doubt_ns
     return before_ns + patience_ns
+
+
+def _askew(estimator: Estimator) -> str | None:
+    """Attitude is that of the IMU's axes, and the vehicle's to within the mounting's sigma."""
+    model = estimator.model
+    for slot in model.slots_of(MOUNTING):
+        angle = float(estimator.xi[slot])
+        if abs(angle) > ASKEW_SIGMAS * float(model.initial[slot]):
+            turned = f"{math.degrees(angle):+.0f} deg"
+            return f"the IMU sits {turned} askew: [imu] mounting_deg is wrong, or it has turned"
+    return None
 
 
 def _told(lost: Lost) -> str:

@@ -18,7 +18,9 @@ from dataclasses import dataclass, field
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
+from fusiond.integrity.tilt import Attitude
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.strapdown import Q0
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 
 Key = tuple[int, str, int]
@@ -197,6 +199,7 @@ class Timeline:
             case "hold":
                 estimator.hold()
         believed = isolation.believes(entry.aid.source)
+        before = Attitude.of(estimator.nav[Q0:], estimator.covariance)
         try:
             aid = entry.aid.at(estimator.nav)
             outcome = estimator.update(aid) if believed else estimator.look(aid)
@@ -205,6 +208,9 @@ class Timeline:
             return Outcome("failed")
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
+            if action is Action.NONE and outcome.name == "fused" and (aid.locates or aid.moves):
+                after = Attitude.of(estimator.nav[Q0:], estimator.covariance)
+                action = isolation.corrected(aid.t_ns, before, after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome

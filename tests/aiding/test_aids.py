@@ -318,6 +318,16 @@ def test_timing_error_adds_along_the_velocity() -> None:
     assert r == pytest.approx([1.0 + 1.2**2, 4.0 + 0.7**2, 9.0 + 0.08**2])
 
 
+def test_timing_error_of_a_velocity_adds_along_the_acceleration() -> None:
+    model = _model("ins15")
+    state = _state(model, runs.level_nav(RPY, VELOCITY), np.zeros(model.size))
+    sd = (0.1, 0.1, 0.2)
+    aid = VelocityAid(*SOURCE, (12.3, -7.2, 0.7), sd, LEVER, sd_time_s=0.5)
+    assert np.abs(state.acceleration).min() > 0.01
+    expected = np.square(sd) + np.square(0.5 * state.acceleration)
+    assert _innovation(aid, state).r == pytest.approx(expected)
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     st.floats(-3.1, 3.1),

@@ -9,6 +9,7 @@ import pytest
 from fusiond.aiding.position import PositionAid
 from fusiond.estimators.base import Outcome
 from fusiond.integrity.isolation import MOTION, Action
+from fusiond.integrity.series import ASSUMED, Series
 from tests.integrity.series_bench import GATE, LEVER, NAV, SD_M, Bench, S
 
 
@@ -66,6 +67,24 @@ def test_a_drift_inside_the_gate_is_found_and_does_not_return_while_it_runs() ->
         bench.velocity(t)
         bench.fix(t, 0.2 * (t - found) - 6.0)
     assert bench.isolation.excluded == {"gnss": "drifts"}
+
+
+def test_what_a_series_shows_lately_does_not_excuse_it() -> None:
+    """Means that grow are ordinary once nothing has come of them, not while they grow."""
+    series = Series("gnss", locates=True, moves=False, heard_ns=0)
+    for t in range(30):
+        series.learn(t * S, ASSUMED[0], 4.0)
+    assert series.slow_spread == ASSUMED[1]
+    series.forget_shown()  # they were a fault's
+    for t in range(30, 60):
+        series.learn(t * S, ASSUMED[0], ASSUMED[1])
+    assert series.slow_spread == ASSUMED[1]
+    for t in range(60, 90):
+        series.learn(t * S, ASSUMED[0], 4.0)
+    assert series.slow_spread == pytest.approx(ASSUMED[1])
+    for t in range(90, 95):
+        series.learn(t * S, ASSUMED[0], 4.0)
+    assert series.slow_spread > 1.0
 
 
 def test_a_frozen_fix_while_moving_is_told_by_its_bits() -> None:

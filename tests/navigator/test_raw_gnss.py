@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import GATED, KEPT, RESIDUAL
 from fusiond.files.tables import read_solution, read_truth
+from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.catalogue import make_model
 from fusiond.navigator.intake import Intake
@@ -139,6 +141,20 @@ def test_sky_names_every_satellite() -> None:
     assert sky.innovation_rms == pytest.approx(0.5)
     assert sky.dops is not None
     assert 0.4 < sky.dops.hdop < 3.0
+    assert sky.seen.keys() == {s.satellite for s in epoch.signals}
+    strongest = max(s.cno_db_hz or 0.0 for s in epoch.signals if s.satellite == first)
+    mask_rad = math.radians(RawAiding().elevation_mask_deg)
+    azimuth, elevation, cno = sky.seen[first]
+    assert azimuth is not None
+    assert elevation is not None
+    assert mask_rad <= elevation <= 0.5 * math.pi
+    assert cno == strongest
+    # East and up of the line to it, from the receiver that was assumed.
+    sight = aid.position[0] - np.array(to_ecef(*place(0)[:3]))
+    axes = ned_axes(*place(0)[:2])
+    north, east, down = axes.T @ (sight / np.linalg.norm(sight))
+    assert math.atan2(east, north) == pytest.approx(azimuth, abs=1e-3)
+    assert -down == pytest.approx(math.sin(elevation), abs=1e-3)
     assert raw.refused[f"{first[0]}_range_gated"] == 1
     assert raw.refused[f"{second[0]}_range_residual"] == 1
     assert raw.refused[f"{third[0]}_rate_gated"] == 1

@@ -1,11 +1,19 @@
-"""How long a doubt and a failed start weigh."""
+"""How long a doubt and a failed start weigh, and a mounting that is not the configured one."""
 
 from __future__ import annotations
 
+import math
+
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.isolation import Isolation
+from fusiond.models.catalogue import make_model
+from fusiond.models.vehicle import MOUNTING, mounting
 from fusiond.navigator.standing import Standing
 
 S = 1_000_000_000
+IMU = Imu()
 
 
 class Doubted(Isolation):
@@ -16,16 +24,24 @@ class Doubted(Isolation):
         self._doubts = tuple(round(t * S) for t in at_s)
 
 
+def at(t_s: float) -> KalmanEstimator:
+    """A filter at an instant; its IMU is mounted to within 5 deg."""
+    model = make_model("ins15", imu_noise(IMU), mounting(math.radians(5.0)))
+    estimator = KalmanEstimator(model, IMU.gap_s)
+    estimator.t_ns = round(t_s * S)
+    return estimator
+
+
 def coasts_until_s(isolation: Isolation, last_s: int) -> int:
     """The first second from the last doubt on at which nothing is doubted any more."""
     standing = Standing(150.0)
     return next(
-        t for t in range(last_s, last_s + 1000) if standing.shaken(t * S, isolation) is None
+        t for t in range(last_s, last_s + 1000) if standing.shaken(at(t), isolation) is None
     )
 
 
 def test_each_doubt_in_a_row_takes_twice_as_long_to_prove() -> None:
-    assert Standing(150.0).shaken(0, Isolation()) is None
+    assert Standing(150.0).shaken(at(0.0), Isolation()) is None
     assert coasts_until_s(Doubted(100), 100) == 110
     assert coasts_until_s(Doubted(100, 130), 130) == 150
     assert coasts_until_s(Doubted(100, 130, 200), 200) == 240
@@ -51,3 +67,15 @@ def test_a_start_after_failures_in_a_row_is_longer_on_trial() -> None:
     standing.started(401 * S)
     assert standing.unproven(410 * S) is not None
     assert standing.unproven(411 * S) is None
+
+
+def test_an_imu_that_sits_askew_beyond_its_sigma_is_told() -> None:
+    """Attitude is the IMU's: by then it is not the vehicle's that was configured."""
+    estimator = at(100.0)
+    yaw = estimator.model.slots_of(MOUNTING)[1]
+    estimator.xi[yaw] = math.radians(-19.0)
+    assert Standing(150.0).shaken(estimator, Isolation()) is None
+    estimator.xi[yaw] = math.radians(-30.0)
+    why = Standing(150.0).shaken(estimator, Isolation())
+    assert why is not None
+    assert "-30 deg askew" in why

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import radians
 from typing import Any
 
-from fusiond.clock.clock import ClockStatus
+from fusiond.clock.answers import ClockStatus
 from fusiond.integrity.consistency import judge
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.navigator.calibration import CalibrationState, Parameter

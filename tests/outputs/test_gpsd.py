@@ -24,7 +24,7 @@ from fusiond.outputs import tcp
 from fusiond.outputs.gpsd import reports
 from fusiond.outputs.gpsd.requests import MOST_BYTES, Malformed, Request, RequestReader
 from fusiond.outputs.gpsd.server import GpsdServer
-from fusiond.outputs.messages.health import SkyHealth
+from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.nmea import NmeaServer
 from fusiond.outputs.tcp import MOST_CLIENTS, MOST_SKIPPED
@@ -151,9 +151,12 @@ def test_a_vehicle_at_rest_has_no_course() -> None:
 
 
 def test_satellites_by_gpsds_numbers() -> None:
-    said = reports.sky(
-        "d", None, SkyHealth(used=("C21", "G07"), refused={"E30": "gated"}, hdop=0.9)
-    )
+    seen = {"C21": SatelliteHealth(azimuth_deg=12.5, elevation_deg=60.0, cno_db_hz=44.0)}
+    sky = SkyHealth(used=("C21", "G07"), refused={"E30": "gated"}, hdop=0.9, satellites=seen)
+    said = reports.sky("d", None, sky)
+    first = said["satellites"][0]
+    assert (first["az"], first["el"], first["ss"]) == (12.5, 60.0, 44.0)
+    assert "az" not in said["satellites"][1]
     assert (said["nSat"], said["uSat"], said["hdop"]) == (3, 2, 0.9)
     assert [s["PRN"] for s in said["satellites"]] == [421, 7, 330]
     assert [s["used"] for s in said["satellites"]] == [True, True, False]

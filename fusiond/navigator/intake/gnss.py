@@ -120,6 +120,7 @@ def _velocity(
         o.lever_arm_m,
         sections.own(VELOCITY_TIME, m.source, o),
         rest=sections.own(ANTENNA_LEVER, m.source, o),
+        sd_time_s=math.hypot(when.sd_time_s, o.time_sd_s),
     )
 
 

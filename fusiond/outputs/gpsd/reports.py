@@ -15,7 +15,7 @@ from typing import Any
 
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.figures import TWO_SIDED_95, horizontal_rms_m, known, motion, usable
-from fusiond.outputs.messages.health import SkyHealth
+from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage
 
 PROTOCOL = (3, 14)
@@ -140,8 +140,7 @@ def gst(path: str, nav: NavMessage) -> Report | None:
 
 def sky(path: str, t_utc: str | None, seen: SkyHealth) -> Report:
     """Satellites of the last epoch of a receiver's raw data, those that were refused as unused."""
-    satellites = [_satellite(name, True) for name in seen.used]
-    satellites += [_satellite(name, False) for name in seen.refused]
+    satellites = [_satellite(name, seen) for name in (*seen.used, *seen.refused)]
     return {
         "class": "SKY",
         "device": path,
@@ -157,10 +156,20 @@ def sky(path: str, t_utc: str | None, seen: SkyHealth) -> Report:
     }
 
 
-def _satellite(name: str, used: bool) -> Report:
-    system, number = name[0], int(name[1:])
-    gnssid, first = _SYSTEMS[system]
-    return {"PRN": first + number, "gnssid": gnssid, "svid": number, "used": used}
+def _satellite(name: str, sky: SkyHealth) -> Report:
+    number = int(name[1:])
+    gnssid, first = _SYSTEMS[name[0]]
+    seen = sky.satellites.get(name, SatelliteHealth())
+    report = {
+        "PRN": first + number,
+        "el": seen.elevation_deg,
+        "az": seen.azimuth_deg,
+        "ss": seen.cno_db_hz,
+        "used": name in sky.used,
+        "gnssid": gnssid,
+        "svid": number,
+    }
+    return known_only(report)
 
 
 def _at_95(sd: float | None) -> float | None:

@@ -8,9 +8,19 @@ from dataclasses import dataclass
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.base import State
-from fusiond.clock.clock import ClockStatus
+from fusiond.clock.answers import ClockStatus
 from fusiond.integrity.consistency import Verdict
 from fusiond.outputs.messages.base import Count, Message, Number, stamp
+
+
+class SatelliteHealth(BaseModel):
+    """One satellite of that epoch."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    azimuth_deg: Number = Field(default=None, description="clockwise from true north")
+    elevation_deg: Number = None
+    cno_db_hz: Number = Field(default=None, description="of its strongest signal")
 
 
 class SkyHealth(BaseModel):
@@ -27,6 +37,9 @@ class SkyHealth(BaseModel):
     tdop: Number = None
     innovation_rms: Number = Field(
         default=None, description="of the ranges used, normalised; 1 is expected"
+    )
+    satellites: dict[str, SatelliteHealth] = Field(
+        default_factory=dict, description="all of the epoch; no direction for what had no ephemeris"
     )
 
 

@@ -139,6 +139,8 @@ FAULTS: dict[str, Fault] = {
     "position_0n_0e": Fault(aid.null_island, 20.0),
     "fix_frozen": Fault(aid.frozen, 20.0),
     "velocity_reversed": Fault(aid.velocity_reversed, 20.0),
+    "drift_0.1_m_s": Fault(partial(aid.drift, north_m_s=0.1), 60.0, phases=UNDER_WAY),
+    "drift_0.2_m_s": Fault(partial(aid.drift, north_m_s=0.2), 60.0, phases=UNDER_WAY),
     "drift_0.5_m_s": Fault(aid.drift, 60.0),
     "step_500m_to_the_end": Fault(aid.step, phases=UNDER_WAY),
     "velocity_ramp_0.1_m_s2": Fault(aid.velocity_ramp, 60.0),

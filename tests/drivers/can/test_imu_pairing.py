@@ -122,6 +122,32 @@ def test_a_restart_to_a_later_time_is_told_by_lateness_that_stays() -> None:
     assert line.samples[-1].stamp == DeviceStamp("imu/1", (900_000_000 + 5000 * 3199) * 1000)
 
 
+@pytest.mark.parametrize("back_ms", [20, 500, 900])
+def test_a_clock_that_is_set_back_is_no_lateness(back_ms: int) -> None:
+    """Two samples show it, and from the third on the new time holds: none is taken for late."""
+    line = Line(SBG)
+    for k in range(400):
+        us = 900_000_000 + 5000 * k - (1000 * back_ms if k >= 200 else 0)
+        line.burst(T0 + 5 * MS * k, sbg_time(us), sbg_accel(k), sbg_gyro(k))
+    assert line.counters["device_restarts"] == 1
+    assert line.counters["time_backward"] == 2
+    after = [s.stamp for s in line.samples[200:]]
+    first = 900_000_000 + 5000 * 202 - 1000 * back_ms
+    assert after == [DeviceStamp("imu/1", (first + 5000 * k) * 1000) for k in range(198)]
+
+
+def test_a_stall_while_the_clock_is_set_back_is_over_with_it() -> None:
+    """Half a second of frames in one burst hides the set clock; what comes on time shows it."""
+    line = Line(SBG, kernel=False)
+    for k in range(400):
+        us = 900_000_000 + 5000 * k - (500_000 if k >= 200 else 0)
+        due = 290 if 190 <= k < 290 else k
+        line.burst(T0 + 5 * MS * due, sbg_time(us), sbg_accel(k), sbg_gyro(k))
+    assert line.counters["device_restarts"] == 1
+    stamp = line.samples[-1].stamp
+    assert stamp == DeviceStamp("imu/1", (900_000_000 + 5000 * 399 - 500_000) * 1000)
+
+
 def test_device_time_that_goes_back_is_refused() -> None:
     line = Line(SBG)
     for k, us in enumerate([0, 5000, 10_000, 15_000, 20_000, 12_000, 30_000]):
