@@ -206,6 +206,8 @@ class WheelSpeed:
     """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given.
 
     Not `signed`: the device does not know forward from backward, and the speed is its amount.
+    `shared_step_m_s`: the step of a rounding whose manner is not known; `drivers.rounding` says
+    what part of `rounding_sd_m_s` all readings share.
     """
 
     source: str
@@ -215,6 +217,7 @@ class WheelSpeed:
     sd_m_s: float | None = None
     rounding_sd_m_s: float = 0.0
     signed: bool = True
+    shared_step_m_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,35 +5,49 @@ r"""What is known of a quantity that a device has rounded to its steps.
     not known which  one as likely as the other    mean value + q / 4     sd q sqrt(1/12 + 1/16)
 
 q the step, x the quantity, uniform within: Bennett, Spectra of quantized signals, BSTJ 27 (1948).
+Of the last, q / 4 is shared by all readings: whichever way it is, it is always the same.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Rounding = Literal["nearest", "down", "unknown"]
 
 NEAREST_SD = 1.0 / math.sqrt(12.0)
 """One sigma of rounding to the nearest, in steps."""
+SHARED_SD = 0.25
+"""One sigma, in steps, of what all readings share where it is not known how they are rounded."""
 _MEAN_SD: dict[Rounding, tuple[float, float]] = {
     "nearest": (0.0, NEAREST_SD),
     "down": (0.5, NEAREST_SD),
-    "unknown": (0.25, math.sqrt(1.0 / 12.0 + 1.0 / 16.0)),
+    "unknown": (0.25, math.hypot(NEAREST_SD, SHARED_SD)),
 }
 ZERO_SD = 1.0 / math.sqrt(3.0)
 """One sigma of a speed that reads 0, in steps: it is below one step, forward or backward."""
 
 
+class RoundedSpeed(NamedTuple):
+    """Mean and one sigma (m/s) of a speed, and the step (m/s) of readings that share an error of
+    sigma `SHARED_SD` steps, which is a part of that; 0 where they share none."""
+
+    mean_m_s: float
+    sd_m_s: float
+    shared_step_m_s: float
+
+
 def rounded_speed(
     value_m_s: float, step_m_s: float, rounding: Rounding = "nearest"
-) -> tuple[float, float]:
-    """Mean and one sigma (m/s) of the speed behind what a device with steps of `step_m_s` says.
+) -> RoundedSpeed:
+    """The speed behind what a device with steps of `step_m_s` says.
 
     A 0 is no standstill: it says that the speed is below one step, whichever way it is rounded,
     for sensors of wheels give no pulses below a least speed.
     """
     if abs(value_m_s) < 0.5 * step_m_s:
-        return 0.0, ZERO_SD * step_m_s
+        return RoundedSpeed(0.0, ZERO_SD * step_m_s, 0.0)
     mean, sd = _MEAN_SD[rounding]
-    return value_m_s + math.copysign(mean * step_m_s, value_m_s), sd * step_m_s
+    shared = step_m_s if rounding == "unknown" else 0.0
+    mean_m_s = value_m_s + math.copysign(mean * step_m_s, value_m_s)
+    return RoundedSpeed(mean_m_s, sd * step_m_s, shared)

@@ -129,12 +129,19 @@ class ObdSpeedDecoder:
             return ()
         self.counters["samples"] += 1
         o = self._options
-        speed, rounding_sd = rounded_speed(value_km_h * STEP_M_S, STEP_M_S, o.rounding)
-        stamp = o.stamp(frame.realtime_ns)
-        stated = o.accuracy_m_s or None
-        signed = speed == 0.0
-        t_ns = frame.t_seen_ns
-        return (WheelSpeed(self.name, t_ns, stamp, speed, stated, rounding_sd, signed),)
+        r = rounded_speed(value_km_h * STEP_M_S, STEP_M_S, o.rounding)
+        return (
+            WheelSpeed(
+                self.name,
+                frame.t_seen_ns,
+                o.stamp(frame.realtime_ns),
+                r.mean_m_s,
+                sd_m_s=o.accuracy_m_s or None,
+                rounding_sd_m_s=r.sd_m_s,
+                signed=r.mean_m_s == 0.0,
+                shared_step_m_s=r.shared_step_m_s,
+            ),
+        )
 
     @staticmethod
     def _speed(data: bytes) -> int | str:

@@ -136,7 +136,7 @@ class CanWheelDecoder(CanDecoder[CanWheelOptions]):
                 self.counters["no_steering"] += 1
                 return ()
             total += math.fsum(values[straight:count]) * math.cos(angle)
-        speed, rounding_sd = rounded_speed(total / count, self._step_m_s)
+        speed, rounding_sd, _ = rounded_speed(total / count, self._step_m_s)
         # Near zero there is nothing to be wrong about.
         signed = o.signed or speed == 0.0
         if values[_DIRECTION] in o.backward:

@@ -6,16 +6,17 @@ vehicle's by the mounting m:
     u = exp[m x] (C^T v + w x l),     l = l_0 + (l_x, 0, 0)
 
     no slip:      0 = u_right - s,   0 = u_down
-    wheel speed:  y = (1 + k) (u_forward - a_forward tau) + s_w
+    wheel speed:  y = (1 + k) (u_forward - a_forward tau) + s_w - q sign(y) p
 
 m (pitch, yaw), the lever's rest l_x, the side drift s (tyres, a road's crown, wind: it lasts for
-seconds), the wheel's drift s_w (slip, quantised steps), scale k and latency tau are estimated where
-the model has their blocks (fusiond.models.vehicle). With z = h(x^) - y, navigation errors computed
-minus true, parameters true minus estimated, and e_i the axis's unit vector:
+seconds), the wheel's drift s_w (slip, quantised steps), scale k, latency tau and the share p of a
+step q that its rounding takes off are estimated where the model has their blocks
+(fusiond.models.vehicle). With z = h(x^) - y, navigation errors computed minus true, parameters true
+minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
-        + tau e_i exp[m x] C^T [g x] phi) - ds_w + v                                      (wheel)
+        + tau e_i exp[m x] C^T [g x] phi) - ds_w + q sign(y) dp + v                       (wheel)
 
 a_forward = f + C^T g is smoothed: one sample of a shaken sensor would make the latency look smaller
 than it is.
@@ -197,7 +198,8 @@ class NonHolonomicAid(Aid):
 @dataclass(frozen=True, slots=True)
 class WheelSpeedAid(Aid):
     """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
-    `scale` and `latency` name the blocks of the wheel's own errors.
+    `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; what the last says
+    of steps of `shared_step_m_s` is in `sd_m_s` where the model has it not.
 
     Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
     is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
@@ -211,6 +213,8 @@ class WheelSpeedAid(Aid):
     drift: str = ""
     scale: str = ""
     latency: str = ""
+    rounding: str = ""
+    shared_step_m_s: float = 0.0
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         slots = _slots(state.model, self.drift, self.scale, self.latency)
@@ -222,7 +226,16 @@ class WheelSpeedAid(Aid):
             if abs(forward) <= SIGN_SIGMAS * sd:
                 return NotApplicable("direction_unknown")
             speed = math.copysign(speed, forward)
-        return Innovation(z - speed, h, np.array([self.sd_m_s**2]))
+        z -= speed
+        variance = self.sd_m_s**2
+        rounding = state.model.slots_of(self.rounding)
+        if rounding and self.shared_step_m_s:
+            (slot,) = rounding
+            step = math.copysign(self.shared_step_m_s, speed)
+            z -= step * state.xi[slot]
+            h[0, slot] = step
+            variance -= (step * state.model.initial[slot]) ** 2
+        return Innovation(z, h, np.array([variance]))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
         return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)

@@ -14,6 +14,7 @@ SIDE_DRIFT = "side_drift"
 WHEEL_DRIFT = "wheel_drift"
 WHEEL_SCALE = "wheel_scale"
 WHEEL_LATENCY = "wheel_latency"
+WHEEL_ROUNDING = "wheel_rounding"
 FIX_TIME = "gnss_time"
 VELOCITY_TIME = "gnss_velocity_time"
 ANTENNA_LEVER = "antenna_lever"
@@ -43,6 +44,12 @@ def drift(name: str, sd_m_s: float, lasts_s: float) -> Block:
 def wheel_scale(name: str, sd: float) -> Block:
     """By what share a wheel's speed is too high: a tyre's radius, worn or under pressure."""
     return _constant(name, "1", ("scale",), sd)
+
+
+def wheel_rounding(name: str, sd: float) -> Block:
+    """By what share of its step a wheel's speed is too low, beside what rounding is taken to be: no
+    standard says which way whole km/h are made."""
+    return _constant(name, "1", ("share",), sd)
 
 
 def time_offset(name: str, sd_s: float) -> Block:

@@ -33,12 +33,14 @@ from fusiond.models.vehicle import (
     VELOCITY_TIME,
     WHEEL_DRIFT,
     WHEEL_LATENCY,
+    WHEEL_ROUNDING,
     WHEEL_SCALE,
     antenna_lever,
     axle_lever,
     drift,
     mounting,
     time_offset,
+    wheel_rounding,
     wheel_scale,
 )
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
@@ -76,11 +78,13 @@ VEHICLE = (
     time_offset(FIX_TIME, 0.1),
     time_offset(VELOCITY_TIME, 0.1),
     antenna_lever(ANTENNA_LEVER, 0.3),
+    wheel_rounding(WHEEL_ROUNDING, 0.25),
 )
 # What the filter holds of them: mounting pitch and yaw, lever, two drifts, scale, latency, two
-# offsets in time, lever of the antenna.
-ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.3, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05)
+# offsets in time, lever of the antenna, rounding.
+ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.3, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05, 0.2)
 ACCELERATION = (1.4, -0.8, 0.3)
+KM_H = 1.0 / 3.6
 
 
 def _vehicle_model() -> Model:
@@ -192,6 +196,8 @@ IN_TIME: dict[str, Callable[[Array], Linearised]] = {
         drift=WHEEL_DRIFT,
         scale=WHEEL_SCALE,
         latency=WHEEL_LATENCY,
+        rounding=WHEEL_ROUNDING,
+        shared_step_m_s=KM_H,
     ),
     "position": lambda nav: replace(_position(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
     "horizontal position": lambda nav: replace(_position(nav, False), time=FIX_TIME),
@@ -218,13 +224,16 @@ def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
     xi = np.zeros(model.size)
     xi[-len(ESTIMATED) :] = ESTIMATED
     state = _state(model, nav, xi)
-    pitch, yaw, lever, _, slipping, scale, latency, late, _, *rest = ESTIMATED
+    pitch, yaw, lever, _, slipping, scale, latency, late, _, *rest, share = ESTIMATED
     to_vehicle = Rotation.from_rotvec([0.0, pitch, yaw]).as_matrix()
     dcm = Rotation.from_euler("ZYX", RPY[::-1]).as_matrix()
     at_wheel = dcm.T @ VELOCITY + np.cross(RATE_SENSED, np.add(LEVER, (lever, 0.0, 0.0)))
     before = to_vehicle @ (at_wheel - dcm.T @ ACCELERATION * latency)
-    wheel = WheelSpeedAid(*SOURCE, float((1.0 + scale) * before[0] + slipping), 0.1, LEVER)
+    reads = float((1.0 + scale) * before[0] + slipping)
+    reads -= math.copysign(share * KM_H, reads)
+    wheel = WheelSpeedAid(*SOURCE, reads, 0.1, LEVER)
     wheel = replace(wheel, drift=WHEEL_DRIFT, scale=WHEEL_SCALE, latency=WHEEL_LATENCY)
+    wheel = replace(wheel, rounding=WHEEL_ROUNDING, shared_step_m_s=KM_H)
     assert _innovation(wheel, state).z == pytest.approx([0.0], abs=1e-9)
     arm = dcm @ np.add(LEVER, rest)
     antenna = nav[:3] + (arm + np.array(VELOCITY) * late) / runs.metres(*nav[[0, 2]])

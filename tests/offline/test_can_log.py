@@ -17,7 +17,7 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
 from fusiond.files.tables import read_gnss, read_imu, read_wheel
-from fusiond.offline.aid_files import Arrival
+from fusiond.offline.aid_files import READERS, Arrival
 from fusiond.offline.can_log import CanLog, MissingPackageError, read_can_log
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.places import DATA, REPOSITORY
@@ -247,9 +247,14 @@ def test_the_drives_speeds_are_those_of_its_table(drive: CanLog) -> None:
     for row, speed_m_s in zip(rows, table.speed_m_s, strict=True):
         m = speeds[row]
         assert isinstance(m, WheelSpeed)
-        mean, rounding_sd = rounded_speed(float(speed_m_s), KM_H, "unknown")
-        assert m.speed_m_s == pytest.approx(mean, abs=1e-3)
-        assert m.rounding_sd_m_s == pytest.approx(rounding_sd)
+        r = rounded_speed(float(speed_m_s), KM_H, "unknown")
+        assert m.speed_m_s == pytest.approx(r.mean_m_s, abs=1e-3)
+        assert (m.rounding_sd_m_s, m.shared_step_m_s) == pytest.approx(r[1:])
+    # The table does not say that its speeds are whole km/h: they show it.
+    tabled, _ = READERS["wheel"](DRIVE / "wheel.csv", drive.imu, "wheel")
+    moving = [m for m in (row.measurement for row in tabled) if getattr(m, "speed_m_s", 0.0)]
+    (seen,) = {getattr(m, "shared_step_m_s", 0.0) for m in moving}
+    assert seen == pytest.approx(KM_H, abs=1e-3)
 
 
 def test_the_drives_fixes_are_those_of_its_table(drive: CanLog) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from drivers.measurements import WheelSpeed
+from drivers.rounding import SHARED_SD
 from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import WheelSpeedAid
 from fusiond.configuration.aiding import WheelAiding
@@ -12,9 +13,11 @@ from fusiond.models.blocks import Block
 from fusiond.models.vehicle import (
     WHEEL_DRIFT,
     WHEEL_LATENCY,
+    WHEEL_ROUNDING,
     WHEEL_SCALE,
     drift,
     time_offset,
+    wheel_rounding,
     wheel_scale,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
@@ -37,13 +40,15 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
             sections.own(WHEEL_DRIFT, m.source, o),
             sections.own(WHEEL_SCALE, m.source, o),
             sections.own(WHEEL_LATENCY, m.source, o),
+            sections.own(WHEEL_ROUNDING, m.source, o),
+            m.shared_step_m_s,
         )
     ]
 
 
 def blocks(source: str, section: WheelAiding, sections: Sections) -> list[Block]:
-    """Drift, scale and latency of the wheel's speed."""
-    found = []
+    """Drift, scale, latency and rounding of the wheel's speed."""
+    found = [wheel_rounding(sections.own(WHEEL_ROUNDING, source, section), SHARED_SD)]
     if section.drift_sd_m_s:
         name = sections.own(WHEEL_DRIFT, source, section)
         found.append(drift(name, section.drift_sd_m_s, section.drift_s))
