@@ -1,10 +1,6 @@
 """Driver `can_height`: a height, or the pressure that stands for one, out of a CAN bus by any DBC.
 
-    H = (T0 / L) (1 - (p / p0)^(R L / g0))
-
-T0 = 288.15 K, L = 6.5 K/km, p0 = 1013.25 hPa, g0 = 9.80665 m/s^2, R = 287.05287 J/(kg K).
-
-Source: Manual of the ICAO Standard Atmosphere, Doc 7488, 3rd ed. (1993), up to 11 km.
+A pressure becomes a height of the standard atmosphere (drivers.standard_atmosphere).
 """
 
 from __future__ import annotations
@@ -22,12 +18,8 @@ from drivers.can.driver import CanDriver, Codec
 from drivers.measurements import Height, Stamp
 from drivers.plausible import HEIGHT_M, SIGMA_M
 from drivers.rounding import NEAREST_SD
+from drivers.standard_atmosphere import PRESSURE_PA, metres_a_pascal, pressure_height_m
 
-T0_K, LAPSE_K_M, P0_PA, G0_M_S2, R_J_KG_K = 288.15, 6.5e-3, 101_325.0, 9.80665, 287.05287
-SCALE_M = T0_K / LAPSE_K_M
-EXPONENT = R_J_KG_K * LAPSE_K_M / G0_M_S2
-PRESSURE_PA = (22_632.0, 120_000.0)
-"""From the tropopause at 11 km, where the formula ends, to beyond the highest at any shore."""
 _ACCURACY, _FLAGS = 1, 2
 
 
@@ -51,18 +43,6 @@ class CanHeightOptions(CanOptions):
         if (self.height is None) == (self.pressure is None):
             raise ValueError("height or pressure: one of the two")
         return self
-
-
-def pressure_height_m(pressure_pa: float) -> float:
-    """Height (m) in the standard atmosphere at which this is the pressure."""
-    height: float = SCALE_M * (1.0 - (pressure_pa / P0_PA) ** EXPONENT)
-    return height
-
-
-def metres_a_pascal(pressure_pa: float) -> float:
-    """How much of height a step of pressure is: -dH/dp."""
-    ratio: float = (pressure_pa / P0_PA) ** EXPONENT
-    return SCALE_M * EXPONENT * ratio / pressure_pa
 
 
 class CanHeightDecoder(CanDecoder[CanHeightOptions]):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from drivers.raw.messages import System
     from fusiond.offline.outages import Outage
 
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "nmea", "raw")
+AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "barometer", "nmea", "raw")
 # What was recorded, as `process` and `calibrate` take it.
 ImuFile = Annotated[Path | None, typer.Option("--imu", metavar="F.csv", help="IMU samples.")]
 CanLog = Annotated[
@@ -135,7 +135,7 @@ def simulate(
         typer.Option(metavar="KIND:START:LENGTH", help="canyon, canyon2 to canyon4, tunnel; s."),
     ] = None,
 ) -> None:
-    """Write imu.csv, gnss.csv, rdss.csv, truth.csv, gnss.ubx of a simulated vehicle."""
+    """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle."""
     from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
     from fusiond.simulation.gnss.masks import parse_mask  # noqa: PLC0415
     from fusiond.simulation.scenarios import SCENARIOS  # noqa: PLC0415

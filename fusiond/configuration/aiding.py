@@ -176,6 +176,23 @@ class HeightAiding(Aiding):
     sd_m: PositiveFloat = 5.0
 
 
+class BarometerAiding(Aiding):
+    """Height by the pressure of the air, with what is wrong with it as states; see
+    `docs/can-height.md`."""
+
+    kind: Literal["barometer"] = "barometer"
+    sd_m: PositiveFloat = 5.0
+    """Where the device states none: gusts of 0.5 m that last for 5 s, told ten times a second."""
+    weather_sd_m: PositiveFloat = 100.0
+    """One sigma of the offset at first: 10 hPa of weather (80 m) and the geoid (30 m)."""
+    weather_walk_m_sqrt_s: PositiveFloat = 0.15
+    """Its random walk: 9 m in an hour, the weather's 0.7 hPa and as much by driving through it."""
+    temperature_sd: PositiveFloat = 0.04
+    """By what share its metres are too many: 4 % in air 10 K colder than the standard."""
+    airflow_sd: PositiveFloat = 0.1
+    """What share of the dynamic pressure the sensor's place lacks: 2 m at 20 m/s."""
+
+
 class WheelAiding(Aiding):
     """Speed of the vehicle from its wheels; see `docs/vehicle.md`."""
 
@@ -207,6 +224,7 @@ AnyAiding = Annotated[
     | SarAiding
     | HeadingAiding
     | HeightAiding
+    | BarometerAiding
     | WheelAiding,
     Field(discriminator="kind"),
 ]

@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from drivers.base import PermanentDriverError, monotonic_ns
 from fusiond.configuration.aiding import (
     AnyAiding,
+    BarometerAiding,
     GnssAiding,
     HeightAiding,
     RawAiding,
@@ -27,7 +28,7 @@ from fusiond.configuration.aiding import (
     WheelAiding,
 )
 from fusiond.configuration.mistakes import Location, did_you_mean, mistake, validate
-from fusiond.configuration.schema import Config
+from fusiond.configuration.schema import Config, Source
 
 EXIT_CONFIG = 78
 """EX_CONFIG of sysexits.h; systemd's RestartPreventExitStatus knows it."""
@@ -78,12 +79,20 @@ def load_config(path: Path | str) -> Config:
         name: source.model_copy(update=options[name]) for name, source in config.sources.items()
     }
     defaults = {
-        name: _DEFAULT_AIDING[source.driver]
+        name: _default_aiding(source)
         for name, source in sources.items()
         if name not in config.aiding and source.driver in _DEFAULT_AIDING
     }
     aiding = {**config.aiding, **defaults}
     return config.model_copy(update={"sources": sources, "aiding": aiding})
+
+
+def _default_aiding(source: Source) -> AnyAiding:
+    """The section of a source that has none of its own."""
+    o = source.options
+    if source.driver == "can_height" and ("pressure" in o or o.get("barometric")):
+        return BarometerAiding()
+    return _DEFAULT_AIDING[source.driver]
 
 
 def config_digest(config: Config) -> str:

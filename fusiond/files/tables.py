@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.standard_atmosphere import PRESSURE_PA
 from fusiond.files.csv_tables import (
     TIME,
     Column,
@@ -302,6 +303,26 @@ def read_wheel(path: Path | str) -> WheelTable:
         c["unsigned"],
         raw.rejected,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class BarometerTable:
+    """Pressure of the air (Pa) and one sigma of the height that it stands for (m), (n,)."""
+
+    t_s: Floats
+    t_arrival_s: Floats
+    pressure_pa: Floats
+    sd_m: Floats
+    rejected: list[Rejection]
+
+
+def read_barometer(path: Path | str) -> BarometerTable:
+    """Read `barometer.csv`: t_s, pressure_pa and, where known, sd_m. Raises `TableError`."""
+    low, high = PRESSURE_PA
+    columns = [TIME, _ARRIVAL, Column("pressure_pa", low=low, high=high), *_sigma(("sd_m",))]
+    raw = read_table(path, columns, [_EARLY])
+    c = raw.columns
+    return BarometerTable(c["t_s"], c["t_arrival_s"], c["pressure_pa"], c["sd_m"], raw.rejected)
 
 
 # --------------------------------------------------------------------------- trajectories

@@ -18,6 +18,9 @@ WHEEL_ROUNDING = "wheel_rounding"
 FIX_TIME = "gnss_time"
 VELOCITY_TIME = "gnss_velocity_time"
 ANTENNA_LEVER = "antenna_lever"
+BAROMETER_OFFSET = "barometer_offset"
+BAROMETER_SCALE = "barometer_scale"
+BAROMETER_AIRFLOW = "barometer_airflow"
 
 # Random walk (s per root second) of a time offset: a serial line's load and two clocks that differ
 # by some 10 ppm move it by milliseconds in minutes.
@@ -60,6 +63,23 @@ def time_offset(name: str, sd_s: float) -> Block:
 def antenna_lever(name: str, sd_m: float) -> Block:
     """What is left of the lever arm (m) from the IMU to an antenna, body axes."""
     return _constant(name, "m", ("x", "y", "z"), sd_m)
+
+
+def barometer_offset(name: str, sd_m: float, walk_m_sqrt_s: float) -> Block:
+    """How much too high (m) a barometer's height is, at the sea and at rest: the weather, and the
+    geoid above the ellipsoid."""
+    return Block(name, "m", ("m",), (-1,), initial=sd_m, white=walk_m_sqrt_s**2)
+
+
+def barometer_scale(name: str, sd: float) -> Block:
+    """By what share a barometer's metres are too many: how much colder than the standard the air
+    is."""
+    return _constant(name, "1", ("scale",), sd)
+
+
+def barometer_airflow(name: str, sd: float) -> Block:
+    """What share of the dynamic pressure a barometer on a vehicle that drives lacks."""
+    return _constant(name, "1", ("share",), sd)
 
 
 def _constant(name: str, unit: str, states: tuple[str, ...], sd: float) -> Block:

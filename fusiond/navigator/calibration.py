@@ -28,6 +28,9 @@ from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,
+    BAROMETER_AIRFLOW,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
     FIX_TIME,
     MOUNTING,
     VELOCITY_TIME,
@@ -45,10 +48,13 @@ CALIBRATED = (
     FIX_TIME,
     VELOCITY_TIME,
     ANTENNA_LEVER,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
+    BAROMETER_AIRFLOW,
 )
 """Blocks that are a calibration; a source's own has its name behind it (`wheel_scale_rear`)."""
-WANDERING = (WHEEL_LATENCY, FIX_TIME, VELOCITY_TIME)
-"""Those that are no constants: two clocks drift."""
+WANDERING = (WHEEL_LATENCY, FIX_TIME, VELOCITY_TIME, BAROMETER_OFFSET, BAROMETER_SCALE)
+"""Those that are no constants: two clocks drift, and so does the weather."""
 UNIT_SUFFIX = {"rad": "_deg", "m": "_m", "s": "_s", "1": ""}
 
 NOT_OBSERVED_SHARE = 0.9

@@ -24,6 +24,9 @@ from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,
+    BAROMETER_AIRFLOW,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
     FIX_TIME,
     MOUNTING,
     VELOCITY_TIME,
@@ -61,6 +64,11 @@ CHANGES = {
     VELOCITY_TIME: 0.02,
     # An antenna stays where it is screwed.
     ANTENNA_LEVER: 0.01,
+    # Other weather (10 hPa) at another place (the geoid), other air (10 K).
+    BAROMETER_OFFSET: 100.0,
+    BAROMETER_SCALE: 0.04,
+    # A window that is open or not.
+    BAROMETER_AIRFLOW: 0.05,
 }
 # A value this many configured sigmas off belongs to no vehicle of that configuration.
 MOST_SIGMAS = 6.0

@@ -16,6 +16,7 @@ from drivers.measurements import (
     Attitude,
     Bearing,
     DelayedFix,
+    Height,
     Measurement,
     MonotonicStamp,
     PositionFix,
@@ -26,12 +27,14 @@ from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import RawEvent, RawGnssEpoch
 from drivers.rounding import rounded_speed
+from drivers.standard_atmosphere import pressure_height_m
 from fusiond.configuration.aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError
 from fusiond.files.tables import (
     ImuTable,
     read_attitude,
+    read_barometer,
     read_bearing,
     read_gnss,
     read_rdss,
@@ -209,6 +212,17 @@ def _read_wheel(path: Path, _: ImuTable, source: str) -> _Read:
     return _arrivals(table.t_s, table.t_arrival_s, speed), table.rejected
 
 
+def _read_barometer(path: Path, _: ImuTable, source: str) -> _Read:
+    table = read_barometer(path)
+
+    def height(i: int, t_ns: int, seen: int) -> Measurement:
+        height_m = pressure_height_m(float(table.pressure_pa[i]))
+        sd_m = _or_none(float(table.sd_m[i]))
+        return Height(source, seen, MonotonicStamp(t_ns), height_m, sd_m, barometric=True)
+
+    return _arrivals(table.t_s, table.t_arrival_s, height), table.rejected
+
+
 def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
     """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
     maps to: GPS second of week (below 604800) or POSIX seconds."""
@@ -266,6 +280,7 @@ READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
     "attitude": _read_attitude,
     "bearing": _read_bearing,
     "wheel": _read_wheel,
+    "barometer": _read_barometer,
     "nmea": _read_nmea,
     "raw": _read_raw,
 }

@@ -26,6 +26,9 @@ from fusiond.configuration.settings import DEG, PER_ROOT_HOUR, imu_noise
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,
+    BAROMETER_AIRFLOW,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
     FIX_TIME,
     MOUNTING,
     VELOCITY_TIME,
@@ -74,6 +77,9 @@ SHOWN_BY = {
     FIX_TIME: ("driving", "changes of speed"),
     VELOCITY_TIME: ("changes of speed",),
     ANTENNA_LEVER: ("bends",),
+    BAROMETER_OFFSET: ("driving",),
+    BAROMETER_SCALE: ("driving",),
+    BAROMETER_AIRFLOW: ("changes of speed",),
 }
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusiond.files.fixed_decimal import MAX_CELL, format_rows
 from fusiond.simulation.aid_sensors import aid_tables
+from fusiond.simulation.barometer import BAROMETER_COLUMNS, Barometer, barometer_stream
 from fusiond.simulation.gnss.raw import GnssRaw
 from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
 from fusiond.simulation.gnss.receiver import GnssReceiver
@@ -68,7 +69,8 @@ def simulate(
     gnss_raw: RawFormat | None = None,
 ) -> Simulated:
     """Write imu.csv, gnss.csv, rdss.csv and truth.csv into `out_dir`, which is made if need be;
-    attitude.csv and bearing.csv where star tracker and radar are on board.
+    attitude.csv, bearing.csv and barometer.csv where star tracker, radar and barometer are on
+    board.
 
     With `gnss_raw` also the receiver's raw stream, gnss.ubx or gnss.rtcm3. The same scenario, seed
     and duration write the same bytes. `t_s` counts from the start of the trajectory, which is the
@@ -87,6 +89,9 @@ def simulate(
         "truth": (_TRUTH, truth_rows(truth)),
         **aid_tables(truth, scenario.star_tracker, scenario.sar, seed),
     }
+    if scenario.barometer is not None:
+        barometer = Barometer(truth, scenario.barometer, barometer_stream(seed))
+        tables["barometer"] = (BAROMETER_COLUMNS, barometer.rows)
     files = {name: out_dir / f"{name}.csv" for name in tables}
     for name, (columns, rows) in tables.items():
         _write(files[name], columns, rows)

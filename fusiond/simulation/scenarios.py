@@ -10,6 +10,7 @@ import numpy as np
 from fusiond.configuration.aiding import GnssAiding, RawAiding, RdssAiding, SarAiding
 from fusiond.configuration.schema import Config, Imu
 from fusiond.simulation.aid_sensors import FLIGHT_POINTS, SarOptions, StarTrackerOptions
+from fusiond.simulation.barometer import BarometerOptions
 from fusiond.simulation.gnss.masks import Mask
 from fusiond.simulation.gnss.raw import GnssRawOptions
 from fusiond.simulation.gnss.receiver import GnssOptions
@@ -55,6 +56,7 @@ class Scenario:
     """From the IMU to the point that follows the path without side slip, body axes."""
     star_tracker: StarTrackerOptions | None = None
     sar: SarOptions | None = None
+    barometer: BarometerOptions | None = None
 
     def truth(self, duration_s: float | None = None) -> Truth:
         """The trajectory, sampled at the IMU's rate."""
@@ -119,7 +121,7 @@ SCENARIOS = {
     scenario.name: scenario
     for scenario in (
         Scenario("static", static, 600.0),
-        Scenario("drive", drive, 1560.0),
+        Scenario("drive", drive, 1560.0, barometer=BarometerOptions()),
         FLIGHT,
         replace(
             FLIGHT,

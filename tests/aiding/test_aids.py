@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
-from fusiond.aiding.height import HeightAid
+from fusiond.aiding.height import BarometerAid, HeightAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import BIAS_BLOCK, RdssPositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
@@ -28,6 +28,9 @@ from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
+    BAROMETER_AIRFLOW,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
     FIX_TIME,
     SIDE_DRIFT,
     VELOCITY_TIME,
@@ -37,6 +40,9 @@ from fusiond.models.vehicle import (
     WHEEL_SCALE,
     antenna_lever,
     axle_lever,
+    barometer_airflow,
+    barometer_offset,
+    barometer_scale,
     drift,
     mounting,
     time_offset,
@@ -85,6 +91,7 @@ VEHICLE = (
 ESTIMATED = (-0.12, 0.09, 0.7, -0.2, 0.3, 0.013, 0.15, 0.12, -0.08, 0.2, -0.1, 0.05, 0.2)
 ACCELERATION = (1.4, -0.8, 0.3)
 KM_H = 1.0 / 3.6
+AIR = (BAROMETER_OFFSET, BAROMETER_SCALE, BAROMETER_AIRFLOW)
 
 
 def _vehicle_model() -> Model:
@@ -255,6 +262,23 @@ def test_height_jacobian_and_planar() -> None:
     model = _model("planar15")
     state = _state(model, runs.level_nav(RPY, VELOCITY), np.zeros(model.size))
     assert HeightAid(*SOURCE, 41.0, 5.0).innovation(state) == NotApplicable("height_held")
+    assert BarometerAid(*SOURCE, 41.0, 5.0, *AIR).innovation(state) == NotApplicable("height_held")
+
+
+def test_barometer_jacobian_and_what_explains_it() -> None:
+    blocks = (
+        barometer_offset(AIR[0], 100.0, 0.15),
+        barometer_scale(AIR[1], 0.04),
+        barometer_airflow(AIR[2], 0.1),
+    )
+    model = make_model("ins15", imu_noise(Imu()), *blocks)
+    aid = BarometerAid(*SOURCE, 120.0, 5.0, *AIR)
+    _check_jacobian(lambda nav: aid, "", model=model, estimated=(70.0, 0.05, 0.2))
+    nav, xi = runs.level_nav(RPY, VELOCITY), np.zeros(model.size)
+    xi[-3:] = 70.0, 0.05, 0.2
+    lift_m = 0.2 * math.hypot(*VELOCITY[:2]) ** 2 / (2.0 * 9.80665)
+    felt = replace(aid, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
+    assert _innovation(felt, _state(model, nav, xi)).z == pytest.approx([0.0], abs=1e-9)
 
 
 def test_scale_factors_are_left_out_of_lever_arms() -> None:

@@ -11,9 +11,11 @@ import pytest
 from drivers.measurements import Heading, Height, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import SIGN_SIGMAS, WheelSpeedAid
+from fusiond.aiding.height import BarometerAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.aiding.witnesses import Witnesses
+from fusiond.configuration.aiding import BarometerAiding, HeightAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.catalogue import make_model
@@ -107,6 +109,16 @@ def test_rounding_enters_the_noise_of_every_kind() -> None:
     assert getattr(height, "sd_m", None) == pytest.approx(5.0)
 
 
-def test_a_barometer_is_refused_by_name_while_no_state_knows_the_weather() -> None:
-    height = Height("baro", SECOND, STAMP, 100.0, 3.0, barometric=True)
+def test_a_barometer_is_refused_by_name_where_no_state_knows_the_weather() -> None:
+    height = Height("baro", SECOND, STAMP, 100.0, 3.0, 4.0, barometric=True)
     assert Intake({}).aids(height, SECOND, 0.0) == "weather_unknown"
+    assert Intake({"baro": HeightAiding()}).aids(height, SECOND, 0.0) == "weather_unknown"
+    for name in ("baro", "barometer"):
+        intake = Intake({name: BarometerAiding()})
+        (aid,) = intake.aids(height, SECOND, 0.0)
+        assert isinstance(aid, BarometerAid)
+        assert aid.sd_m == pytest.approx(5.0)
+        assert not aid.offers()
+        blocks = [block.name for block in intake.extra_blocks()]
+        assert blocks == [aid.offset, aid.scale, aid.airflow]
+        assert aid.offset == "barometer_offset" + ("_baro" if name == "baro" else "")

@@ -24,6 +24,7 @@ SECTIONS = {
     "[aiding.sar]": config_aiding.SarAiding,
     "[aiding.heading]": config_aiding.HeadingAiding,
     "[aiding.height]": config_aiding.HeightAiding,
+    "[aiding.barometer]": config_aiding.BarometerAiding,
     "[aiding.wheel]": config_aiding.WheelAiding,
     "[constraints.zero_velocity]": config.ZeroVelocity,
     "[constraints.non_holonomic]": config.NonHolonomic,

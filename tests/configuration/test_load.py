@@ -93,12 +93,14 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             '[aiding.roof]\nkind = "gns"',
             "aiding.roof.kind = \"gns\": did you mean 'gnss'? "
-            "allowed: attitude, gnss, heading, height, raw, rdss, sar, star_tracker, wheel",
+            "allowed: attitude, barometer, gnss, heading, height, raw, rdss, sar, star_tracker, "
+            "wheel",
         ),
         (
             "[aiding.roof]",
             "aiding.roof: lacks the key kind; "
-            "allowed: gnss, raw, rdss, attitude, star_tracker, sar, heading, height, wheel",
+            "allowed: gnss, raw, rdss, attitude, star_tracker, sar, heading, height, barometer, "
+            "wheel",
         ),
         ("[sources.rx]", "sources.rx.driver: missing; expected text in quotes"),
         (

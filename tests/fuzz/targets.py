@@ -305,6 +305,7 @@ _READERS: tuple[Callable[[Path], Any], ...] = (
     tables.read_bearing,
     tables.read_wheel,
     tables.read_truth,
+    tables.read_barometer,
 )
 _SCRATCH = tempfile.TemporaryDirectory(prefix="fuzz-")
 

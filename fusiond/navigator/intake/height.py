@@ -1,4 +1,4 @@
-"""Ellipsoidal height."""
+"""Height above the ellipsoid, or by the pressure of the air."""
 
 from __future__ import annotations
 
@@ -6,8 +6,17 @@ import math
 
 from drivers.measurements import Height
 from fusiond.aiding.base import Aid
-from fusiond.aiding.height import HeightAid
-from fusiond.configuration.aiding import HeightAiding
+from fusiond.aiding.height import BarometerAid, HeightAid
+from fusiond.configuration.aiding import BarometerAiding, HeightAiding
+from fusiond.models.blocks import Block
+from fusiond.models.vehicle import (
+    BAROMETER_AIRFLOW,
+    BAROMETER_OFFSET,
+    BAROMETER_SCALE,
+    barometer_airflow,
+    barometer_offset,
+    barometer_scale,
+)
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
 
@@ -15,13 +24,40 @@ def aids(m: Height, sections: Sections, when: Instants) -> list[Aid] | str:
     """The height, with the section's sigma where the device states none, and what rounding adds.
 
     `weather_unknown`: a barometer's height is off by the weather, 100 m and more, for hours alike;
-    without a state for that error its sigma would be a lie.
+    without a section of kind `barometer`, whose states know that error, its sigma would be a lie.
     """
-    if m.barometric:
+    if not m.barometric:
+        o = sections.of(m.source, HeightAiding)
+        return [HeightAid(m.source, when.t_ns, o.gate_probability, m.height_m, _sd_m(m, o))]
+    b = sections.of(m.source, BarometerAiding)
+    if not any(b is section for section in sections.aiding.values()):
         return "weather_unknown"
-    o = sections.of(m.source, HeightAiding)
-    sd_m = math.hypot((m.sd_m or o.sd_m) * o.sigma_scale, m.rounding_sd_m)
-    return [HeightAid(m.source, when.t_ns, o.gate_probability, m.height_m, sd_m)]
+    names = _names(m.source, b, sections)
+    sd_m = _sd_m(m, b)
+    return [BarometerAid(m.source, when.t_ns, b.gate_probability, m.height_m, sd_m, *names)]
 
 
-KIND = Kind(Height, aids, {})
+def _sd_m(m: Height, o: HeightAiding | BarometerAiding) -> float:
+    return math.hypot((m.sd_m or o.sd_m) * o.sigma_scale, m.rounding_sd_m)
+
+
+def blocks(source: str, section: BarometerAiding, sections: Sections) -> list[Block]:
+    """Offset, scale and airflow of a barometer's height."""
+    offset, scale, airflow = _names(source, section, sections)
+    return [
+        barometer_offset(offset, section.weather_sd_m, section.weather_walk_m_sqrt_s),
+        barometer_scale(scale, section.temperature_sd),
+        barometer_airflow(airflow, section.airflow_sd),
+    ]
+
+
+def _names(source: str, section: BarometerAiding, sections: Sections) -> tuple[str, str, str]:
+    """Its blocks, in that order."""
+    return (
+        sections.own(BAROMETER_OFFSET, source, section),
+        sections.own(BAROMETER_SCALE, source, section),
+        sections.own(BAROMETER_AIRFLOW, source, section),
+    )
+
+
+KIND = Kind(Height, aids, {BarometerAiding: blocks})

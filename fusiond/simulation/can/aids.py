@@ -14,6 +14,7 @@ from drivers.can.aids import (
     CanBearingOptions,
 )
 from drivers.can.decoder import CanDecoder
+from drivers.can.height import CanHeightOptions
 from fusiond.simulation.aid_sensors import (
     SarOptions,
     SarRadar,
@@ -21,6 +22,7 @@ from fusiond.simulation.aid_sensors import (
     StarTrackerOptions,
     aid_streams,
 )
+from fusiond.simulation.barometer import BarometerOptions
 from fusiond.simulation.can.encoder import CanEncoder
 from fusiond.simulation.imu_truth import Truth
 
@@ -46,6 +48,15 @@ SIM_SAR = CanBearingOptions(
     valid="SAR_SIGMA.VALID",
     counter=("SAR_BEARING.BEARING_COUNTER", "SAR_SIGMA.SIGMA_COUNTER"),
     latency_s=SarOptions().latency_s,
+)
+SIM_BAROMETER = CanHeightOptions(
+    interface="virtual",
+    channel="fusiond-sim",
+    dbc="fusiond_sim_aids",
+    pressure="BAROMETER.PRESSURE",
+    accuracy="BAROMETER.SIGMA",
+    counter="BAROMETER.BAROMETER_COUNTER",
+    latency_s=BarometerOptions().latency_s,
 )
 """The simulation's own devices: `config/dbc/fusiond_sim_aids.dbc`, 1.3 arcsec a step."""
 

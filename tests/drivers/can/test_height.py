@@ -13,14 +13,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.base import PermanentDriverError
-from drivers.can.height import (
-    CanHeightDecoder,
-    CanHeightDriver,
-    CanHeightOptions,
-    metres_a_pascal,
-    pressure_height_m,
-)
+from drivers.can.height import CanHeightDecoder, CanHeightDriver, CanHeightOptions
 from drivers.measurements import Height
+from drivers.standard_atmosphere import metres_a_pascal, pressure_height_m, standard_pressure_pa
 from tests.drivers.can.served import Served, fed, sent
 from tests.patience import until
 
@@ -58,6 +53,7 @@ def test_the_standard_atmosphere(height_m: float, pressure_pa: float) -> None:
     assert pressure_height_m(pressure_pa) == pytest.approx(height_m, abs=0.3)
     slope = pressure_height_m(pressure_pa) - pressure_height_m(pressure_pa + 1.0)
     assert metres_a_pascal(pressure_pa) == pytest.approx(slope, rel=1e-4)
+    assert standard_pressure_pa(pressure_height_m(pressure_pa)) == pytest.approx(pressure_pa)
 
 
 def test_a_pressure_is_a_height_that_is_off_by_the_weather(dbc: str) -> None:
