@@ -1,0 +1,1 @@
+"""Study: whether what the filter finds of a vehicle is as good as it says."""
