@@ -91,6 +91,9 @@ class Imu(Section):
     """One sigma of the scale factors' errors."""
     accel_scale_ppm: PositiveFloat = 2000.0
     """One sigma of the scale factors' errors."""
+    misalignment_deg: NonNegativeFloat = 0.0
+    """One sigma of each small angle by which an axis is out of square: cross-axis sensitivity, 1 %
+    of it is 0.57 deg. It is noise while the vehicle turns."""
     gap_s: PositiveFloat = 0.5
     """A pause longer than this is a gap: the solution says so. The covariance grows for any that is
     longer than 3.5 samples."""

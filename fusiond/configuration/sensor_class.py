@@ -5,9 +5,10 @@ minutes in a vehicle that warms up. Noise is the chip's: what the vehicle shakes
 the samples (fusiond.navigation.vibration).
 
 `consumer`: phones, OBD dongles, navigation modules (Bosch BMI160, ST LSM6DS3: zero-rate level 3 to
-10 deg/s, zero-g level 40 mg). `mems`: industrial units, calibrated at the factory (Xsens MTi-600,
-Analog Devices ADIS16470: 0.2 deg/s, 10 to 16 mg over temperature). `tactical`: 1 deg/h units
-(Sensonor STIM300, Honeywell HG4930).
+10 deg/s, zero-g level 40 mg, cross-axis sensitivity 1 %). `mems`: industrial units, calibrated at
+the factory (Xsens MTi-600, Analog Devices ADIS16470: 0.2 deg/s, 10 to 16 mg over temperature, axes
+to the package 0.25 deg). `tactical`: 1 deg/h units (Sensonor STIM300: axes 1 mrad; Honeywell
+HG4930).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ CLASSES: dict[SensorClass, dict[str, float]] = {
         "accel_bias_initial_mg": 50.0,
         "gyro_scale_ppm": 10000.0,
         "accel_scale_ppm": 10000.0,
+        "misalignment_deg": 0.5,
     },
     "mems": {
         "gyro_noise_deg_sqrt_h": 0.3,
@@ -36,6 +38,7 @@ CLASSES: dict[SensorClass, dict[str, float]] = {
         "accel_bias_initial_mg": 20.0,
         "gyro_scale_ppm": 5000.0,
         "accel_scale_ppm": 5000.0,
+        "misalignment_deg": 0.2,
     },
     "tactical": {
         "gyro_noise_deg_sqrt_h": 0.1,
@@ -46,6 +49,7 @@ CLASSES: dict[SensorClass, dict[str, float]] = {
         "accel_bias_initial_mg": 2.0,
         "gyro_scale_ppm": 500.0,
         "accel_scale_ppm": 500.0,
+        "misalignment_deg": 0.05,
     },
 }
 """Values of `[imu]` that a class stands for, by key."""

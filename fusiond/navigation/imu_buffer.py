@@ -12,6 +12,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.strapdown import NAV_SIZE
 from fusiond.navigation.vibration import Vibration
 
@@ -53,12 +54,13 @@ class ImuBuffer:
         time_offset_s: float,
         gap_s: float,
         vibration: Vibration | None = None,
+        crosstalk: Crosstalk | None = None,
     ) -> None:
         capacity = int(rate_hz * keep_s * 2.5) + 1000
         self.times: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)
         self.samples: Array = np.zeros((capacity, 6))
         self.densities: Array = np.zeros((capacity, 6))
-        self._vibration = vibration
+        self._vibration, self._crosstalk = vibration, crosstalk
         self.nav: Array = np.full((capacity, NAV_SIZE), np.nan)
         self.sigmas: Array = np.full((capacity, 9), np.nan)
         self.start = 0
@@ -184,6 +186,10 @@ class ImuBuffer:
         np.matmul(samples, self._turn, out=self.samples[rows])
         if self._vibration is not None:
             self.densities[rows] = self._vibration.follow(self.samples[rows])
+        else:
+            self.densities[rows] = 0.0
+        if self._crosstalk is not None:
+            self._crosstalk.follow(self.samples[rows], self.densities[rows])
         self.nav[rows] = np.nan
         self.end += count
 

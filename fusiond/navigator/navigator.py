@@ -16,8 +16,9 @@ from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise, sensor_to_body
+from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.integrity.verdicts import Verdicts
+from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigation.vibration import Vibration
@@ -71,8 +72,15 @@ class Navigator:
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
         self.model = model_of(config, *of_vehicle, *self._intake.extra_blocks())
         vibration = Vibration(1.0 / imu.rate_hz, self._noise.rate_noise, self._noise.force_noise)
+        askew = imu.misalignment_deg * DEG
         self.imu = ImuBuffer(
-            imu.rate_hz, e.buffer_s, sensor_to_body(imu), imu.time_offset_s, imu.gap_s, vibration
+            imu.rate_hz,
+            e.buffer_s,
+            sensor_to_body(imu),
+            imu.time_offset_s,
+            imu.gap_s,
+            vibration,
+            Crosstalk(1.0 / imu.rate_hz, askew) if askew else None,
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._event)

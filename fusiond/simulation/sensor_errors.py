@@ -74,16 +74,18 @@ def imu_output(
     rng: np.random.Generator,
     *,
     vibration: Vibration | None = None,
-    misalignment_deg: float = 0.0,
+    misalignment_deg: float | None = None,
     gyro_step_rad_s: float = 0.0,
     accel_step_m_s2: float = 0.0,
 ) -> ImuOutput:
     """Turn ideal means in body axes (n, 3) at `imu.rate_hz` into what this IMU would send.
 
     `misalignment_deg` is one sigma of each small angle between a sensor's axes and its nominal
-    ones, `*_step_*` the resolution of its output (0: none). The same `rng` state, the same bytes.
+    ones, None for that of `imu`, `*_step_*` the resolution of its output (0: none). The same `rng`
+    state, the same bytes.
     """
     n, dt = len(gyro), 1.0 / imu.rate_hz
+    askew = (imu.misalignment_deg if misalignment_deg is None else misalignment_deg) * DEG
     vibration = vibration or Vibration()
     phase = rng.uniform(0.0, 2.0 * math.pi, 6)
     omega = 2.0 * math.pi * vibration.frequency_hz
@@ -115,7 +117,7 @@ def imu_output(
         ),
     ):
         misaligned = np.eye(3)
-        misaligned[~np.eye(3, dtype=bool)] = rng.standard_normal(6) * misalignment_deg * DEG
+        misaligned[~np.eye(3, dtype=bool)] = rng.standard_normal(6) * askew
         value = truth @ (misaligned @ matrix).T
         if amplitude > 0.0:
             value += amplitude * average * np.sin(omega * middle + phases)

@@ -18,5 +18,6 @@ STUDIES = {
     "consistency": "fusiond.studies.consistency",
     "reduced-order": "fusiond.studies.reduced_order.study",
     "protection": "fusiond.studies.protection",
+    "vehicle": "fusiond.studies.vehicle.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
 }

@@ -73,7 +73,13 @@ STANDS_M_S = 0.5
 """Below it wheels give no pulses: the speed reads 0, without noise."""
 WHEEL_HZ, SLIP_HZ, AIR_HZ, AIR_SD_M = 2.0, 5.0, 1.0, 2.0
 VEHICLE: dict[str, Any] = {
-    "imu": {"sensor_class": "mems", "rate_hz": RATE_HZ},
+    # What a rest before the drive leaves of a `mems` unit's biases.
+    "imu": {
+        "sensor_class": "mems",
+        "rate_hz": RATE_HZ,
+        "gyro_bias_initial_deg_h": 36.0,
+        "accel_bias_initial_mg": 5.0,
+    },
     "aiding": {
         "gnss": {"lever_arm_m": [0.2, 0.1, -1.2], "lever_arm_sd_m": 0.3, "bias_sd_m": 0.0},
         "wheel": {},

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
+from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.constraints import vehicle_blocks
 from fusiond.navigator.intake import Intake
@@ -23,7 +24,7 @@ from fusiond.studies.vehicle.car import RATE_HZ, Car, draw_car
 
 Array = NDArray[np.float64]
 
-START_SD = np.array([*np.radians([1.0, 1.0, 3.0]), 0.2, 0.2, 0.2, 1.0, 1.0, 2.0])
+START_SD = np.array([*np.radians([0.3, 0.3, 1.0]), 0.1, 0.1, 0.1, 0.5, 0.5, 1.0])
 """One sigma of attitude, velocity and position at the start."""
 SHOWN_S, HIDDEN_S = 300.0, 60.0
 CRUISE_M_S = 15.0
@@ -63,8 +64,9 @@ class Run:
     outcomes: Counter[str]
 
 
-def run_once(config: Config, path: str, seed: int) -> Run:
-    """Draw a car and drive it, from an error of `START_SD` on."""
+def run_once(config: Config, path: str, seed: int, known: bool = True) -> Run:
+    """Draw a car and drive it, from an error of `START_SD` on; `known`: whether the filter has the
+    noise of axes that are out of square."""
     rng = np.random.default_rng([seed, sorted(PATHS).index(path)])
     make, seconds = PATHS[path]
     model = model_of(config)
@@ -74,7 +76,7 @@ def run_once(config: Config, path: str, seed: int) -> Run:
     estimator = KalmanEstimator(model, config.imu.gap_s)
     start = with_error(car.nav(0.0), rng.standard_normal(9) * START_SD)
     estimator.initialise(0, 0, start, np.zeros(model.size), np.diag(sd**2))
-    outcomes = _drive(config, car, estimator, seconds)
+    outcomes = _drive(config, car, estimator, seconds, known)
     errors, sigmas, priors, nees = {}, {}, {}, {}
     of_nav = nav_error(estimator.nav, car.nav(seconds))
     p, xi = estimator.covariance, estimator.xi
@@ -87,9 +89,15 @@ def run_once(config: Config, path: str, seed: int) -> Run:
     return Run(errors, sigmas, priors, nees, outcomes)
 
 
-def _drive(config: Config, car: Car, estimator: KalmanEstimator, seconds: float) -> Counter[str]:
+def _drive(
+    config: Config, car: Car, estimator: KalmanEstimator, seconds: float, known: bool
+) -> Counter[str]:
     times = np.rint(np.arange(1, len(car.samples) + 1) * 1e9 / RATE_HZ).astype(np.int64)
-    buffer = ImuBuffer(RATE_HZ, seconds + 1.0, np.eye(3), 0.0, config.imu.gap_s)
+    askew = config.imu.misalignment_deg * DEG
+    crosstalk = Crosstalk(1.0 / RATE_HZ, askew) if askew and known else None
+    buffer = ImuBuffer(
+        RATE_HZ, seconds + 1.0, np.eye(3), 0.0, config.imu.gap_s, crosstalk=crosstalk
+    )
     buffer.append(times, car.samples)
     outcomes = Counter[str]()
     for aid in car.aids:
