@@ -17,6 +17,7 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, sensor_to_body
+from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
@@ -141,8 +142,7 @@ class Navigator:
         felt = self._constraints.feed(self.imu, new)
         self._units.samples(self.imu, new)
         if self.started is None:
-            for window in felt.windows:
-                self._aligner.known.window(window)
+            self._aligner.felt(felt.windows, felt.aids)
         for aid in felt.aids:
             self.timeline.insert(aid)
 
@@ -167,7 +167,7 @@ class Navigator:
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
-            self._aligner.known.aids(aids)
+            self._aligner.aids(aids)
         if isinstance(m, PositionFix):
             self._units.fix(m, t_ns, self.imu)
         self._constraints.witnesses.hear(aids)
@@ -197,7 +197,7 @@ class Navigator:
             (0.0, 0.0, 0.0),
         )
         if self.started is None:
-            self._aligner.known.aids([aid])
+            self._aligner.aids([aid])
         entry = self.timeline.insert(aid)
         self.advance()
         return "aligning" if entry.outcome is None else entry.outcome.name
@@ -215,6 +215,8 @@ class Navigator:
             self.calibrating.restart()
             first = self.imu.index_after(start.t_ns) + self.imu.start
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
+            if isinstance(self.estimator, InvariantFilter):
+                self.estimator.origin = start.origin
             self.timeline.start()
             self.verdicts.reset()
             self.started = start
