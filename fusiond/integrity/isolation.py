@@ -279,7 +279,7 @@ class Isolation:
     @staticmethod
     def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
         record.excluded, record.refused_ns, record.jumped = reason, since_ns, jumped
-        record.passes = record.count = 0
+        record.passes, record.count, record.ran = 0, 0, False
 
     def _look(
         self,
@@ -299,6 +299,7 @@ class Isolation:
         self._average(record, whitened)
         if offset is not None:
             record.trend = record.trend.with_one(offset, (t_ns - record.passing_ns) * 1e-9)
+            record.ran = record.ran or record.trend.runs_away
         if (
             record.passes >= READMIT_COUNT
             and t_ns - record.passing_ns >= READMIT_NS

@@ -13,8 +13,10 @@ from typing import NamedTuple
 # a drift of 0.2 m/s is what a filter with an honest velocity still tells from its own.
 TREND_SD_M_S = 0.07
 # One that was left out because it drifted, by a third and less: 0.1 m/s is what a receiver's honest
-# velocity shows within twenty seconds, and five of this.
+# velocity shows within twenty seconds, and five of this. Not so one that was seen to run away by
+# five times the above: a drift as slow as that is not what has to be over.
 DRIFT_SD_M_S = 0.02
+RUNS_SD_M_S, RUNS_M_S = 0.5 * TREND_SD_M_S, 5.0 * TREND_SD_M_S
 DRIFTS = "drifts"
 # Paces of the mean: some 11 and some 59 innovations deep, (2 - a) / a.
 PACES = (1.0 / 6.0, 1.0 / 30.0)
@@ -89,6 +91,12 @@ class Trend(NamedTuple):
         slope, sd = self.slope
         return sd <= least_sd and slope <= 3.0 * least_sd
 
+    @property
+    def runs_away(self) -> bool:
+        """Whether the slope is known to be that of no slow drift."""
+        slope, sd = self.slope
+        return sd <= RUNS_SD_M_S and slope > RUNS_M_S
+
 
 NO_TREND = Trend()
 
@@ -146,6 +154,8 @@ class Series:
     """While excluded: innovations in a row that passed, the first at `passing_ns`."""
     passing_ns: int = 0
     trend: Trend = NO_TREND
+    ran: bool = False
+    """While excluded: it was seen to run away, faster than any slow drift."""
     count: int = 0
     fast: tuple[float, ...] = ()
     slow: tuple[float, ...] = ()
@@ -189,7 +199,7 @@ class Series:
     @property
     def least_trend_sd(self) -> float:
         """How well (m/s) it must be known that it does not run away before it comes back."""
-        return DRIFT_SD_M_S if self.excluded == DRIFTS else TREND_SD_M_S
+        return DRIFT_SD_M_S if self.excluded == DRIFTS and not self.ran else TREND_SD_M_S
 
     def forget_shown(self) -> None:
         """A fault has followed what the means have shown lately."""
