@@ -22,7 +22,7 @@ MOST_WAITING_BYTES = 16384
 MOST_SKIPPED = 30
 """Epochs in a row: 3 s at 10 Hz, half a minute at 1 Hz, the time that gpsd's clients wait."""
 _TURN = 16
-"""Clients written to before the loop may run a tick: some 0.3 ms."""
+"""Clients written to before the loop may run a tick."""
 
 
 class Client:
