@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -104,6 +104,8 @@ class Aid:
     source: str
     t_ns: int
     gate: float
+    robust: bool = field(default=False, kw_only=True)
+    """Rows with large residuals weigh less (fusiond.estimators.robust)."""
 
     @property
     def device(self) -> str:
@@ -154,6 +156,8 @@ class Linearised(Protocol):
     def t_ns(self) -> int: ...
     @property
     def gate(self) -> float: ...
+    @property
+    def robust(self) -> bool: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
 

@@ -74,6 +74,8 @@ def check(
     for name, source in loaded.sources.items():
         aid = loaded.aiding.get(name)
         typer.echo(f"  {name}: driver {source.driver}" + (f", aids as {aid.kind}" if aid else ""))
+    for name in loaded.outputs.served:
+        typer.echo(f"  output {name}")
     for name, aid in loaded.aiding.items():
         if name not in loaded.sources:
             typer.echo(f"  {name}: aids as {aid.kind}, no source (for `process`)")

@@ -55,6 +55,10 @@ def process(
     out: Annotated[
         Path | None, typer.Option(metavar="F.csv", help="Write the solution; - is standard output.")
     ] = None,
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="Write what all measurements say, later ones too."),
+    ] = False,
     systems: Annotated[
         str | None,
         typer.Option(metavar="C,G,E", help="Satellite systems of raw data to use."),
@@ -68,6 +72,8 @@ def process(
         raise typer.BadParameter("--out and --json cannot both be standard output")
     if (imu is None) == (can is None):
         raise typer.BadParameter("--imu or --can: the samples come of one of the two")
+    if smooth and out is None:
+        raise typer.BadParameter("--smooth: name a file to write with --out")
     loaded = load(config)
     from fusiond.offline.can_log import MissingPackageError  # noqa: PLC0415
     from fusiond.offline.process import process as run_process  # noqa: PLC0415
@@ -75,7 +81,7 @@ def process(
     wanted = _systems_argument(systems)
     try:
         with config_errors(), data_errors(), spinner("processing"):
-            result = run_process(loaded, imu, aids, outages, out, wanted, can)
+            result = run_process(loaded, imu, aids, outages, out, wanted, can, smooth=smooth)
     except MissingPackageError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
@@ -236,6 +242,10 @@ def _print_summary(result: dict[str, Any], err: bool) -> None:
     used = samples["rows"] - sum(samples["rejected"].values())
     modes = ", ".join(f"{n} {mode}" for mode, n in result["solution_modes"].items())
     typer.echo(f"solution: {rows} of {used} samples: {modes}", err=err)
+    if "smoothed" in result:
+        smoothed = result["smoothed"]
+        starts = f", by {smoothed['starts']} starts" if smoothed["starts"] > 1 else ""
+        typer.echo(f"smoothed: {smoothed['rows']} of them{starts}", err=err)
 
 
 def _print_file(name: str, report: dict[str, Any], err: bool) -> None:

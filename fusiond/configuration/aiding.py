@@ -37,6 +37,9 @@ class Aiding(Section):
     """A consistent innovation fails the gate with one minus this probability."""
     sigma_scale: PositiveFloat = 1.0
     """Multiplies every sigma the device states, where experience says it is too optimistic."""
+    robust: bool = False
+    """Measurements far off weigh less instead of being refused, by Student's t: where fixes come
+    among houses. See `docs/estimators.md`."""
 
 
 class GnssAiding(Aiding):

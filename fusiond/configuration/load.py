@@ -146,5 +146,10 @@ def _absolute(section: BaseModel, base: Path) -> dict[str, Path]:
 def _resolve_paths(config: Config, base: Path) -> Config:
     mqtt = config.mqtt.model_copy(update=_absolute(config.mqtt, base))
     recording = config.recording.model_copy(update=_absolute(config.recording, base))
-    of_sections = {"mqtt": mqtt, "recording": recording}
+    served = {
+        name: section.model_copy(update=_absolute(section, base))
+        for name, section in config.outputs.served.items()
+    }
+    outputs = config.outputs.model_copy(update=served)
+    of_sections = {"mqtt": mqtt, "outputs": outputs, "recording": recording}
     return config.model_copy(update={**_absolute(config, base), **of_sections})

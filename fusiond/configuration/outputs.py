@@ -106,6 +106,12 @@ class Outputs(Section):
     chrony: Chrony | None = None
 
     @property
+    def served(self) -> dict[str, Section]:
+        """The sections that stand there, by name."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: value for name, value in values.items() if isinstance(value, Section)}
+
+    @property
     def through_the_broker(self) -> tuple[str, ...]:
         """Those that are configured and go out by MQTT."""
-        return tuple(n for n in ("home_assistant", "owntracks") if getattr(self, n) is not None)
+        return tuple(name for name in ("home_assistant", "owntracks") if name in self.served)

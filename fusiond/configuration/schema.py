@@ -163,8 +163,8 @@ class Alignment(Section):
     """
 
     heading: tuple[
-        Literal["saved", "config", "dual_antenna", "gyrocompass", "gnss_course"], ...
-    ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course")
+        Literal["saved", "config", "dual_antenna", "gyrocompass", "gnss_course", "positions"], ...
+    ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course", "positions")
     """Allowed sources of the first heading, in order of preference."""
     heading_deg: float | None = None
     """For `config`: true heading at the start."""

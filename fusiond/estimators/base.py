@@ -24,6 +24,7 @@ from scipy.special import chdtri
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates
 from fusiond.estimators.reading import sigmas
+from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
@@ -322,7 +323,15 @@ class ErrorStateFilter:
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
-        return aid.innovation(self.state)
+        return self._weighed(aid, aid.innovation(self.state))
+
+    def _weighed(
+        self, aid: Linearised, rows: Innovation | NotApplicable
+    ) -> Innovation | NotApplicable:
+        """The rows as a robust aid wants them; others as they are."""
+        if not aid.robust or isinstance(rows, NotApplicable):
+            return rows
+        return reweighted(rows, self.model, self.covariance, self._dxs[0])
 
     def _doubt(self, rows: Innovation, motion: bool) -> None:
         """Widen what is kept between updates by an innovation."""

@@ -14,7 +14,9 @@ from fusiond.files.csv_tables import Floats
 from fusiond.files.fixed_decimal import MAX_CELL, format_rows
 from fusiond.navigation.solution import Mode
 
-STATUS: tuple[str, ...] = tuple(Mode)
+SMOOTHED = "smoothed"
+"""Instead of a mode: the row is of all measurements, not of those until then."""
+STATUS: tuple[str, ...] = (*Mode, SMOOTHED)
 """The words of the column `status`; a row's status code is an index into them."""
 
 # Decimals resolve 1 us, 0.1 mm (1e-9 deg), 0.1 mm/s and 0.04 arc seconds.

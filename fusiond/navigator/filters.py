@@ -13,7 +13,7 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
@@ -44,7 +44,7 @@ def estimator_of(config: Config, model: Model) -> Estimator:
         case "kalman":
             if config.integrity.watched:
                 return SeparatedEstimator(model, config.imu.gap_s, config.positioning)
-            return KalmanEstimator(model, config.imu.gap_s)
+            return InvariantFilter(model, config.imu.gap_s)
         case "multiscale":
             from fusiond.estimators.multiscale.filter import MultiscaleEstimator  # noqa: PLC0415
 

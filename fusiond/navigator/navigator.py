@@ -17,7 +17,10 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, sensor_to_body
+from fusiond.estimators.base import Estimator
+from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.verdicts import Verdicts
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigation.vibration import Vibration
@@ -52,7 +55,8 @@ UNKNOWN_TIME_S = 0.9
 
 
 class Navigator:
-    """Navigation of one vehicle. `on_event(code, text)` hears what an operator should know."""
+    """Navigation of one vehicle. `on_event(code, text)` hears what an operator should know;
+    `estimator` makes the filter of the configuration and its model."""
 
     def __init__(
         self,
@@ -60,6 +64,7 @@ class Navigator:
         saved: SavedState | None = None,
         on_event: Callable[[str, str], None] | None = None,
         on_outcome: Callable[[Entry], None] | None = None,
+        estimator: Callable[[Config, Model], Estimator] = estimator_of,
     ) -> None:
         self.config = config
         self._saved = saved
@@ -76,7 +81,7 @@ class Navigator:
         )
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._event)
-        self.estimator = estimator_of(config, self.model)
+        self.estimator = estimator(config, self.model)
         self.verdicts = Verdicts(
             config.consistency.window,
             config.consistency.alpha,
@@ -141,8 +146,7 @@ class Navigator:
         felt = self._constraints.feed(self.imu, new)
         self._units.samples(self.imu, new)
         if self.started is None:
-            for window in felt.windows:
-                self._aligner.known.window(window)
+            self._aligner.felt(felt.windows, felt.aids)
         for aid in felt.aids:
             self.timeline.insert(aid)
 
@@ -167,7 +171,7 @@ class Navigator:
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         if self.started is None:
-            self._aligner.known.aids(aids)
+            self._aligner.aids(aids)
         if isinstance(m, PositionFix):
             self._units.fix(m, t_ns, self.imu)
         self._constraints.witnesses.hear(aids)
@@ -197,7 +201,7 @@ class Navigator:
             (0.0, 0.0, 0.0),
         )
         if self.started is None:
-            self._aligner.known.aids([aid])
+            self._aligner.aids([aid])
         entry = self.timeline.insert(aid)
         self.advance()
         return "aligning" if entry.outcome is None else entry.outcome.name
@@ -215,6 +219,8 @@ class Navigator:
             self.calibrating.restart()
             first = self.imu.index_after(start.t_ns) + self.imu.start
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
+            if isinstance(self.estimator, InvariantFilter):
+                self.estimator.origin = start.origin
             self.timeline.start()
             self.verdicts.reset()
             self.started = start

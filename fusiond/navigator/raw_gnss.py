@@ -179,6 +179,7 @@ class RawGnss:
             self._clock[rows.system],
             self._section.lever_arm_m,
             aid.epoch.clock_reset,
+            robust=aid.robust,
         )
 
     def judged(

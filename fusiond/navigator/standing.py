@@ -10,7 +10,8 @@ what follows for the operator:
     given up   the filter is wrong, or cannot be told from wrong any more: alignment begins anew
 
 A filter that was given up and aligned anew is on trial for a while: its mode stays `invalid` until
-it has gone on without a doubt.
+it has gone on without a doubt. What made it fail may be there still, and driving straight on at one
+speed shows neither a wrong IMU nor stamps that are late: it coasts until its velocity has changed.
 """
 
 from __future__ import annotations
@@ -50,6 +51,9 @@ MOST_DOUBTS, DOUBTS_NS = 3, 20_000_000_000
 # long after each further one. What went well for ten times as long was none of a row.
 TRIAL_NS, LONGEST_TRIAL_NS = 10_000_000_000, 320_000_000_000
 LASTED = 10
+# By so much (m/s) since the last doubt: at 1 m/s^2 stamps that are half a second late are off by
+# ten sigma of a receiver's velocity meanwhile.
+PROVING_M_S = 5.0
 # A mounting found so many of its configured sigmas from what was configured is not the one that was
 # configured: chance does that once in 16,000 vehicles.
 ASKEW_SIGMAS = 4.0
@@ -62,6 +66,9 @@ class Standing:
         self._max_speed = max_speed_m_s
         self._trial_ns = 0
         self._started_ns = 0
+        self._since_ns = 0
+        self._from = 0.0, 0.0
+        self._changed = 0.0
 
     def started(self, t_ns: int) -> None:
         """A navigation has begun."""
@@ -78,6 +85,7 @@ class Standing:
 
         `nav` (10,) at `t_ns`, the filter's instant.
         """
+        self._watch(isolation, nav)
         speed = math.hypot(nav[VN], nav[VE])
         if speed > self._max_speed:
             return f"{speed:.0f} m/s is faster than this vehicle can be"
@@ -91,6 +99,14 @@ class Standing:
         if waited_ns <= patience_ns:
             return None
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
+
+    def _watch(self, isolation: Isolation, nav: Array) -> None:
+        """How far the velocity has changed since the start or the last doubt."""
+        since_ns = max((self._started_ns, *isolation.doubts))
+        velocity = float(nav[VN]), float(nav[VE])
+        if since_ns != self._since_ns:
+            self._since_ns, self._from, self._changed = since_ns, velocity, 0.0
+        self._changed = max(self._changed, math.dist(velocity, self._from))
 
     def unproven(self, t_ns: int) -> str | None:
         """Why a solution is not to be called valid yet: it is on trial."""
@@ -108,6 +124,8 @@ class Standing:
         left_ns = _doubted_until(isolation.doubts) - t_ns
         if left_ns > 0:
             return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
+        if self._trial_ns and self._changed < PROVING_M_S:
+            return "after a failure, and no bend or change of speed has proven it since"
         return isolation.contested(t_ns) or _askew(estimator)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +25,21 @@ from drivers.measurements import (
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, RawAiding, WheelAiding
 from fusiond.configuration.schema import Config
+from fusiond.estimators.base import Estimator
 from fusiond.files.csv_tables import TableError, counts
-from fusiond.files.solution_csv import STATUS, SolutionWriter
+from fusiond.files.solution_csv import STATUS
 from fusiond.files.tables import ImuTable, read_imu
+from fusiond.models.model import Model
+from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import READERS, Arrival, source_of
 from fusiond.offline.can_log import read_can_log
 from fusiond.offline.outages import Outage, named, withheld
 from fusiond.offline.reasons import FileRead, nothing_navigated, wrong_units
+from fusiond.offline.rows import Rows, RowsWriter
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from fusiond.offline.smooth import SmoothedRows
 
 # Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
 # this spacing, and memory stays bounded.
@@ -51,6 +56,7 @@ def process(
     systems: tuple[System, ...] | None = None,
     can_log: Path | None = None,
     watch: Callable[[Navigator], None] = lambda navigator: None,
+    smooth: bool = False,
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
@@ -58,13 +64,15 @@ def process(
     Samples whose units cannot be what the columns say are not navigated, and no `out` is written.
     `systems` are the satellite systems of raw data to use, instead of the configuration's.
     `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` sees the navigator
-    each time it has advanced. Raises `TableError` for a
-    file that cannot be read as what it is said to be, and for an outage of a source that there is
-    not; `MissingPackageError` for a format whose package is not installed.
+    each time it has advanced. With `smooth` the solution written at each sample is of all
+    measurements, not of those until then. Raises `TableError` for a file that cannot be read as
+    what it is said to be, and for an outage of a source that there is not; `ConfigError` for a
+    filter that cannot be smoothed; `MissingPackageError` for a format whose package is not
+    installed.
     """
     with _imports_left_alone():
         read = _read(config, imu_path, aids, outages or (), systems, can_log)
-        return _process(read, out, watch)
+        return _process(read, out, watch, smooth)
 
 
 @contextmanager
@@ -141,20 +149,26 @@ def _imu_read(imu: ImuTable) -> FileRead:
     return FileRead(span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)
 
 
-def _process(read: _Read, out: Path | None, watch: Callable[[Navigator], None]) -> dict[str, Any]:
+def _process(
+    read: _Read, out: Path | None, watch: Callable[[Navigator], None], smooth: bool
+) -> dict[str, Any]:
     config, imu, arrivals, events = read.config, read.imu, read.arrivals, read.events
     navigator = Navigator(
-        config, on_event=lambda code, text: events.append({"code": code, "text": text})
+        config,
+        on_event=lambda code, text: events.append({"code": code, "text": text}),
+        estimator=_taped if smooth else estimator_of,
     )
     why = wrong_units(imu, config.imu, arrivals)
-    writer = SolutionWriter(out) if out and why is None else None
-    recorder = _Recorder(navigator, writer, watch)
+    writer = RowsWriter(out, navigator.model.stated) if out and why is None else None
+    smoothed = _smoothed(navigator, writer) if smooth and writer is not None else None
+    recorder = _Recorder(navigator, writer, smoothed, watch)
     if why is None:
         _run(navigator, imu, arrivals, recorder)
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     if why is None and not recorder.rows:
         why = nothing_navigated(read.files, navigator.refused, reason)
     return {
+        **({} if smoothed is None else {"smoothed": smoothed.counts()}),
         "files": {name: _account(file) for name, file in read.files.items()},
         "sources": _outcomes(navigator, read.withheld),
         "events": events,
@@ -170,6 +184,21 @@ def _process(read: _Read, out: Path | None, watch: Callable[[Navigator], None]) 
         },
         "rewinds": navigator.timeline.counters.rewinds,
     }
+
+
+# The smoother's kernels are loaded where it is asked for.
+
+
+def _taped(config: Config, model: Model) -> Estimator:
+    from fusiond.offline.smooth import taped  # noqa: PLC0415
+
+    return taped(config, model)
+
+
+def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
+    from fusiond.offline.smooth import SmoothedRows  # noqa: PLC0415
+
+    return SmoothedRows(navigator, writer)
 
 
 def _outcomes(navigator: Navigator, withheld: Counter[str]) -> dict[str, dict[str, int]]:
@@ -294,11 +323,13 @@ class _Recorder:
     def __init__(
         self,
         navigator: Navigator,
-        writer: SolutionWriter | None,
+        writer: RowsWriter | None,
+        smoothed: SmoothedRows | None,
         watch: Callable[[Navigator], None],
     ) -> None:
         self._navigator = navigator
         self._writer = writer
+        self.smoothed = smoothed
         self._watch = watch
         self._next = 0
         self.rows = 0
@@ -308,6 +339,8 @@ class _Recorder:
     def take(self) -> None:
         navigator = self._navigator
         self._watch(navigator)
+        if self.smoothed is not None:
+            self.smoothed.follow()
         if navigator.started is None:
             return
         imu, passed = navigator.imu, navigator.estimator.sample
@@ -315,7 +348,7 @@ class _Recorder:
         if passed <= first:
             return
         rows = slice(first - imu.start, passed - imu.start)
-        nav, count = imu.nav[rows], passed - first
+        count = passed - first
         self._next = passed
         mode, _ = navigator.mode(int(imu.times[rows.stop - 1]))
         self.rows += count
@@ -324,27 +357,16 @@ class _Recorder:
             self.first_s = float(imu.times[rows.start] * 1e-9)
         if self._writer is None:
             return
-        self._writer.rows(
-            np.asarray(imu.times[rows] * 1e-9, dtype=np.float64),
-            nav[:, 0],
-            (nav[:, 1] + np.pi) % (2.0 * np.pi) - np.pi,
-            nav[:, 2],
-            nav[:, 3:6],
-            _rpy(nav[:, 6:]),
-            np.where(navigator.model.stated, imu.sigmas[rows], np.nan),
-            np.full(count, STATUS.index(mode), dtype=np.int64),
-        )
+        status = np.full(count, STATUS.index(mode), dtype=np.int64)
+        taken = Rows(imu.times[rows], imu.nav[rows], imu.sigmas[rows], status)
+        if self.smoothed is None:
+            self._writer.write(taken)
+        else:
+            self.smoothed.take(first, taken)
 
     def close(self) -> None:
         """Write out what is left."""
+        if self.smoothed is not None:
+            self.smoothed.close()
         if self._writer is not None:
             self._writer.close()
-
-
-def _rpy(q: Array) -> Array:
-    """Roll, pitch, yaw (n, 3) of quaternions (n, 4)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
-    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z)
-    return np.column_stack([roll, pitch, yaw])

@@ -52,16 +52,14 @@ def make_outputs(
             on_command=on_command,
             utc_now=lambda: clock.utc_ns(clock.now_ns()),
         )
-    for name, make in MAKERS.items():
-        section = getattr(config.outputs, name)
-        if section is not None:
-            around = Surroundings(
-                config.vehicle,
-                partial(on_event, name),
-                config.outputs.geoid_separation_m,
-                tuple(config.sources),
-                mqtt,
-                clock,
-            )
-            made[name] = make(section, around)
+    for name, section in config.outputs.served.items():
+        around = Surroundings(
+            config.vehicle,
+            partial(on_event, name),
+            config.outputs.geoid_separation_m,
+            tuple(config.sources),
+            mqtt,
+            clock,
+        )
+        made[name] = MAKERS[name](section, around)
     return made

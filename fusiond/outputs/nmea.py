@@ -56,7 +56,7 @@ class NmeaServer:
 
     @property
     def status(self) -> DriverStatus:
-        return self.server.status
+        return self.server.port.status
 
     def take(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):

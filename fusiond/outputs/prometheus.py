@@ -64,7 +64,7 @@ class PrometheusEndpoint:
 
     @property
     def status(self) -> DriverStatus:
-        return self.server.status
+        return self.server.port.status
 
     def take(self, topic: Topic, message: Message) -> None:
         if isinstance(message, EventMessage):

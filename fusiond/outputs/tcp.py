@@ -12,8 +12,8 @@ import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable
 
-from drivers.base import Backoff, DriverStatus
 from fusiond.outputs.activation import activated
+from fusiond.outputs.port import Port
 
 MOST_CLIENTS = 256
 """A quarter of the descriptors that a process has by default (1024, RLIMIT_NOFILE)."""
@@ -71,8 +71,7 @@ class TcpServer:
 
     `serve(client)` is called for each connection, which ends with it. `counters`: `clients` (since
     the start), `clients_refused` (too many at once), `clients_dropped` (did not read), `sent`,
-    `skipped` (epochs that a client was too slow for). `on_event` hears `<name>_absent` when the
-    port cannot be had, once; `status` says how it stands.
+    `skipped` (epochs that a client was too slow for). `port` says how it stands.
     """
 
     def __init__(
@@ -84,35 +83,20 @@ class TcpServer:
         on_event: Callable[[str, str], None],
     ) -> None:
         self._name = name
-        self._host, self._port = host, port
         self._serve = serve
-        self._on_event = on_event
         self.counters: Counter[str] = Counter()
-        self.status = DriverStatus()
-        self.address: tuple[str, int] = (host, port)
-        """Where it listens, once it is `running`."""
+        self.port = Port(name, host, port, on_event)
         self.clients: set[Client] = set()
 
     async def run(self) -> None:
         """Listen until cancelled; a port that is taken is tried again."""
-        backoff = Backoff()
-        while True:
-            try:
-                server = await self._listening()
-            except OSError as error:
-                text = f"{self._host}:{self._port}: {error.strerror or error}"
-                if self.status.state != "absent":
-                    self._on_event(f"{self._name}_absent", text)
-                self.status = DriverStatus("absent", text)
-                await asyncio.sleep(backoff.next())
-                continue
-            self._say_running()
-            try:
-                await asyncio.get_running_loop().create_future()
-            finally:
-                server.close()
-                for client in tuple(self.clients):
-                    client.drop()
+        server = await self.port.open(self._listening)
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:
+            server.close()
+            for client in tuple(self.clients):
+                client.drop()
 
     async def send(self, data: Callable[[Client], bytes]) -> None:
         """Send each client what `data` makes for it, if anything."""
@@ -123,24 +107,17 @@ class TcpServer:
             if payload:
                 client.send(payload)
 
-    async def _listening(self) -> asyncio.Server:
+    async def _listening(self, host: str, port: int) -> asyncio.Server:
         held = activated(self._name)
         server = (
-            await asyncio.start_server(self._connected, self._host, self._port)
+            await asyncio.start_server(self._connected, host, port)
             if held is None
             else await asyncio.start_server(self._connected, sock=held)
         )
         for sock in server.sockets:
             # Inherited by each connection: the kernel would keep megabytes for who does not read.
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_WAITING_BYTES // 2)
-        bound = server.sockets[0].getsockname()
-        self.address = (bound[0], bound[1])
         return server
-
-    def _say_running(self) -> None:
-        host, port = self.address
-        count = len(self.clients)
-        self.status = DriverStatus("running", f"{host}:{port}, {count} connected")
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         client = Client(reader, writer, self.counters)
@@ -150,11 +127,11 @@ class TcpServer:
             return
         self.counters["clients"] += 1
         self.clients.add(client)
-        self._say_running()
+        self.port.serves(len(self.clients))
         try:
             with contextlib.suppress(OSError, asyncio.IncompleteReadError):
                 await self._serve(client)
         finally:
             self.clients.discard(client)
-            self._say_running()
+            self.port.serves(len(self.clients))
             writer.close()

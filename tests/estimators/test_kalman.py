@@ -133,6 +133,7 @@ class Row:
     source: str = "row"
     t_ns: int = 0
     screened: bool = False
+    robust: bool = False
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return Innovation(self.z, self.h, self.r)

@@ -11,7 +11,7 @@ import random
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from functools import partial
@@ -456,43 +456,53 @@ async def test_an_output_that_raises_is_restarted(
     assert len(bench.events("output_fault")) == 1
 
 
-async def test_configured_outputs_are_served_and_stand_in_health(
+async def test_configured_outputs_are_served_and_nothing_is_time_before_utc_is_settled(
     bench: Bench, tmp_path: Path
 ) -> None:
-    """The receiver settles UTC; before it nothing goes out as time."""
     vehicle = bench.vehicle(gnss_link=bench.folder / "gnss")
     ports = free_port(), free_port()
     with Broker(tmp_path) as broker:
-        sections = (
+        daemon = bench.daemon(
             f'[mqtt]\nhost = "127.0.0.1"\nport = {broker.port}',
             f"[outputs.gpsd]\nport = {ports[0]}\nrate_hz = 10.0",
             f"[outputs.nmea]\nport = {ports[1]}\nrate_hz = 10.0",
         )
-        daemon = bench.daemon(*sections)
-        async with listening(broker) as (listener, _), running(daemon, vehicle):
+        async with listening(broker) as (listener, _), running(daemon):
             await until(lambda: daemon.outputs["gpsd"].status.state == "running")
             reader, writer = await asyncio.open_connection("127.0.0.1", ports[0])
             writer.write(b'?WATCH={"enable":true,"json":true};')
-            said: list[dict[str, Any]] = []
-            async with asyncio.timeout(PATIENCE_S):
-                while not (said and said[-1].get("mode") == 3 and "time" in said[-1]):
-                    report = json.loads(await reader.readline())
-                    if report["class"] == "TPV":
-                        said.append(report)
-            writer.close()
-            health = json.loads(
-                await listener.until(
-                    lambda heard: next(
-                        (p for p in heard.payloads("fusiond/test/health") if b'"requests":1' in p),
-                        None,
+            # The system clock has a date, but no receiver has confirmed it.
+            undated = await _report(reader, lambda tpv: True)
+            assert (undated["mode"], "time" in undated) == (1, False)
+            nav = (await listener.until(lambda heard: heard.payloads("fusiond/test/nav")))[0]
+            assert json.loads(nav)["t_utc"] is not None
+            async with _driving(vehicle):
+                fix = await _report(reader, lambda tpv: tpv["mode"] == 3 and "time" in tpv)
+                health = json.loads(
+                    await listener.until(
+                        lambda heard: next(
+                            (p for p in heard.payloads("fusiond/test/health")
+                             if b'"requests":1' in p and b'"utc_source":"gnss"' in p),
+                            None,
+                        )
                     )
-                )
-            )
+                )  # fmt: skip
+            writer.close()
+    assert fix["device"] == "fusiond://test"
     assert {o["state"] for o in health["outputs"].values()} == {"running"}
     assert list(health["outputs"]) == ["mqtt", "gpsd", "nmea"]
     assert health["utc_settled"]
-    dated = [x for x in said if "time" in x]
-    assert dated[0]["time"][:4] == str(1970 + vehicle.utc_start_ns // (31_556_952 * 10**9))
+
+
+async def _report(
+    reader: asyncio.StreamReader, wanted: Callable[[dict[str, Any]], bool]
+) -> dict[str, Any]:
+    """The first TPV of gpsd's protocol that is as wanted."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            report: dict[str, Any] = json.loads(await reader.readline())
+            if report["class"] == "TPV" and wanted(report):
+                return report
 
 
 # --------------------------------------------------------------------------- the state on disk

@@ -199,7 +199,9 @@ def test_a_gyro_that_is_too_poor_never_gyrocompasses() -> None:
     truth = _parked(150.0)
     story = _tell(truth, MEMS, _fixes(truth, 5), heading=("gyrocompass",))
     assert story.navigator.started is None
-    assert story.modes[-1][1:] == (Mode.ALIGNING, "no heading yet (allowed: gyrocompass)")
+    mode, reason = story.modes[-1][1:]
+    assert mode is Mode.ALIGNING
+    assert "too poor to gyrocompass: 5 deg take 1.1 deg/h" in reason
 
 
 FORWARD = [Leg(15), Leg(8, speed_m_s=12.0), Leg(20), Leg(6, turn_deg=60.0)]
@@ -265,6 +267,30 @@ def test_saved_heading_is_void_once_the_vehicle_has_moved() -> None:
     assert {mode for _, mode, _ in story.modes} == {Mode.ALIGNING}
 
 
+def test_after_a_ferry_the_saved_heading_is_void() -> None:
+    """Parked 5 km away: who moved the vehicle while it was off has turned it, too."""
+    truth = _parked(10.0)
+    lat, lon, height = runs.ORIGIN
+    elsewhere = replace(SAVED, position=(lat + 5000.0 / 6.37e6, lon, height))
+    story = _tell(truth, MEMS, _fixes(truth, 2), saved=elsewhere, heading=("saved", "gnss_course"))
+    assert story.navigator.started is None
+    assert "m from where the vehicle was parked: moved while it was off" in story.modes[-1][2]
+
+
+def test_a_claim_that_is_poor_is_no_start_where_driving_tells_the_heading() -> None:
+    """A filter is linear in the heading: with 60 deg it would be sure of what it cannot know."""
+    truth = _truth(FORWARD, 40.0)
+    claim = {"heading_deg": YAW_DEG + 70.0, "heading_sd_deg": 60.0}
+    story = _tell(truth, MEMS, _fixes(truth, 2), heading=("config", "gnss_course"), **claim)
+    waiting = [reason for _, mode, reason in story.modes if mode is Mode.ALIGNING]
+    assert any("known to 60 deg: drive off, and the way will tell it" in why for why in waiting)
+    start = story.navigator.started
+    assert start is not None
+    assert start.how.startswith("GNSS course")
+    error, p = _start_error(story, truth)
+    assert error @ np.linalg.solve(p, error) < float(chi2.ppf(0.9999, 3))
+
+
 def test_never_navigating_without_heading_and_reasons() -> None:
     """Half a minute of driving with everything but an allowed source of heading."""
     truth = _truth(FORWARD, 50.0)
@@ -273,7 +299,9 @@ def test_never_navigating_without_heading_and_reasons() -> None:
     assert {mode for _, mode, _ in story.modes} == {Mode.ALIGNING}
     reasons = list(dict.fromkeys(reason for _, _, reason in story.modes))
     assert reasons[0] == "no position yet: no fix, none configured"
-    assert reasons[-1] == "no heading yet (allowed: dual_antenna)"
+    assert reasons[-1] == (
+        "no heading yet (allowed: dual_antenna); no heading of two antennas has come"
+    )
     navigator = Navigator(Config())
     assert navigator.solution(0).mode is Mode.WAITING
     navigator.advance()

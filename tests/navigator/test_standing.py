@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.isolation import Isolation
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import MOUNTING, mounting
+from fusiond.navigation.strapdown import VE, VN
 from fusiond.navigator.standing import Standing
 
 S = 1_000_000_000
@@ -79,3 +82,26 @@ def test_an_imu_that_sits_askew_beyond_its_sigma_is_told() -> None:
     why = Standing(150.0).shaken(estimator, Isolation())
     assert why is not None
     assert "-30 deg askew" in why
+
+
+def test_after_a_failure_driving_straight_on_proves_nothing() -> None:
+    standing, isolation = Standing(150.0), Isolation()
+    nav = np.zeros(10)
+    nav[VN] = 20.0
+    standing.started(0)
+    assert standing.failure(S, isolation, nav) is None
+    assert standing.shaken(at(30.0), isolation) is None  # there was no failure
+    standing.given_up(30 * S)
+    standing.started(31 * S)
+    for t in range(31, 90):
+        assert standing.failure(t * S, isolation, nav) is None
+    assert standing.unproven(90 * S) is None
+    why = standing.shaken(at(90.0), isolation)
+    assert why is not None
+    assert "no bend" in why
+    nav[VN], nav[VE] = 19.0, 6.0
+    assert standing.failure(91 * S, isolation, nav) is None
+    assert standing.shaken(at(91.0), isolation) is None
+    again = Doubted(92)  # what was proven before a doubt is not after it
+    assert standing.failure(93 * S, again, nav) is None
+    assert standing.shaken(at(110.0), again) is not None

@@ -64,7 +64,7 @@ def test_the_attitude_turns_forward_to_where_the_vehicle_looks(
 async def serving() -> AsyncIterator[tuple[FoxgloveServer, str]]:
     server = FoxgloveServer(Foxglove(port=free_port()), Around().surroundings)
     async with at_work(server):
-        yield server, f"ws://127.0.0.1:{server.address[1]}"
+        yield server, f"ws://127.0.0.1:{server.port.address[1]}"
 
 
 async def received(connection: ClientConnection) -> tuple[int, int, dict[str, Any]]:

@@ -33,6 +33,7 @@ from tests.broker import free_port
 from tests.outputs.messages_examples import EXAMPLES
 from tests.outputs.serving import Around, TcpClient, at_work, connected, feed, nav
 from tests.patience import until
+from tests.places import REPOSITORY
 
 WATCH = b'?WATCH={"enable":true,"json":true}'
 
@@ -166,7 +167,7 @@ def test_satellites_by_gpsds_numbers() -> None:
 
 
 async def test_a_client_watches_and_polls() -> None:
-    async with serving() as server, connected(server.server.address) as client:
+    async with serving() as server, connected(server.server.port.address) as client:
         server.take(HEALTH, EXAMPLES["health"])
         lines = [json.loads(x) for x in await watching(server, client, WATCH)]
         assert [x["class"] for x in lines] == ["VERSION", "DEVICES", "WATCH"]
@@ -193,27 +194,27 @@ async def test_a_client_watches_and_polls() -> None:
 
 async def test_a_client_without_semicolon_and_one_that_wants_nmea() -> None:
     async with serving() as server:
-        async with connected(server.server.address) as gps3:
+        async with connected(server.server.port.address) as gps3:
             await watching(server, gps3, b'?WATCH={"enable":true,"json":true}')
             server.take(NAV, nav())
             assert json.loads(await gps3.line())["class"] == "TPV"
-        async with connected(server.server.address) as gpspipe:
+        async with connected(server.server.port.address) as gpspipe:
             await watching(server, gpspipe, b'?WATCH={"enable":true,"nmea":true};\n')
             server.take(NAV, nav())
             assert (await gpspipe.line()).startswith(b"$GNRMC,233307.12,A,3101.5263323,N,")
-        async with connected(server.server.address) as kismet:
+        async with connected(server.server.port.address) as kismet:
             await watching(server, kismet, b'?WATCH={"json":true};\n')
             server.take(NAV, nav())
             assert json.loads(await kismet.line())["class"] == "TPV"
 
 
 async def test_clients_that_leave_at_once_or_ask_nonsense_harm_nobody() -> None:
-    async with serving() as server, connected(server.server.address) as patient:
+    async with serving() as server, connected(server.server.port.address) as patient:
         await watching(server, patient, WATCH)
         for _ in range(20):
-            async with connected(server.server.address) as hasty:
+            async with connected(server.server.port.address) as hasty:
                 hasty.writer.write(b"?WATCH=" + b"{" * 100)
-        async with connected(server.server.address) as rude:
+        async with connected(server.server.port.address) as rude:
             rude.writer.write(b"\x00\xff" * 20_000 + b'?WATCH={"enable":7};')
             await rude.line()
             assert json.loads(await rude.line())["class"] == "ERROR"
@@ -223,12 +224,12 @@ async def test_clients_that_leave_at_once_or_ask_nonsense_harm_nobody() -> None:
 
 
 async def test_a_client_that_does_not_read_is_skipped_then_dropped_alone() -> None:
-    async with serving() as server, connected(server.server.address) as quick:
+    async with serving() as server, connected(server.server.port.address) as quick:
         await watching(server, quick, WATCH)
         with socket.socket() as stuck:
             stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             stuck.setblocking(False)
-            await asyncio.get_running_loop().sock_connect(stuck, server.server.address)
+            await asyncio.get_running_loop().sock_connect(stuck, server.server.port.address)
             await asyncio.get_running_loop().sock_sendall(stuck, WATCH)
             reading = asyncio.create_task(quick.ended())
             await feed(server, lambda: server.counters["clients_dropped"] > 0)
@@ -240,9 +241,11 @@ async def test_a_client_that_does_not_read_is_skipped_then_dropped_alone() -> No
 
 async def test_more_clients_than_there_may_be_are_sent_away() -> None:
     async with serving() as server:
-        socks = [await asyncio.open_connection(*server.server.address) for _ in range(MOST_CLIENTS)]
+        socks = [
+            await asyncio.open_connection(*server.server.port.address) for _ in range(MOST_CLIENTS)
+        ]
         await until(lambda: len(server.server.clients) == MOST_CLIENTS)
-        async with connected(server.server.address) as surplus:
+        async with connected(server.server.port.address) as surplus:
             await surplus.ended()
         assert server.counters["clients_refused"] == 1
         assert server.status.detail.endswith(f"{MOST_CLIENTS} connected")
@@ -290,11 +293,18 @@ async def test_the_service_managers_socket_is_ours() -> None:
         assert await process.wait() == 0
 
 
+def test_the_shipped_socket_has_our_name_and_port() -> None:
+    unit = (REPOSITORY / "systemd" / "fusiond-gpsd.socket").read_text()
+    options = Gpsd()
+    assert f"\nListenStream={options.host}:{options.port}\n" in unit
+    assert f"\nFileDescriptorName={GpsdServer.name}\n" in unit
+
+
 async def test_the_service_managers_socket_is_served(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as held:
         monkeypatch.setattr(tcp, "activated", lambda name: held.dup() if name == "gpsd" else None)
         async with serving() as server:
-            assert server.server.address == held.getsockname()
+            assert server.server.port.address == held.getsockname()
             async with connected(held.getsockname()) as client:
                 assert json.loads(await client.line())["class"] == "VERSION"
 

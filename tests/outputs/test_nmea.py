@@ -78,6 +78,10 @@ def test_no_time_while_utc_is_not_settled() -> None:
     assert said["RMC"].lat == pytest.approx(31.025438871, abs=2e-9)
 
 
+def test_time_is_cut_off_not_rounded() -> None:
+    assert sentences(nav(t_ms=1_795_217_579_999), ("GGA",), None).startswith(b"$GNGGA,233259.99,")
+
+
 def test_pashr_comes_first_and_has_roll_and_pitch() -> None:
     epoch = sentences(nav(), ALL, GEOID_M)
     assert epoch.startswith(b"$PASHR,233307.12,346.09,T,+0.41,-1.21,,0.080,0.080,0.600,1,1*")
@@ -126,7 +130,7 @@ def test_every_solution_can_be_read_back(
 async def test_everyone_gets_whole_epochs() -> None:
     server = NmeaServer(NmeaServed(port=free_port()), Around().surroundings)
     async with at_work(server):
-        address = server.server.address
+        address = server.server.port.address
         async with connected(address) as one, connected(address) as two:
             two.writer.write(b"whatever a plotter says\r\n")
             await until(lambda: len(server.server.clients) == 2)

@@ -97,7 +97,7 @@ def test_text_in_labels_is_escaped() -> None:
 
 async def ask(output: PrometheusEndpoint, request: bytes) -> tuple[bytes, bytes]:
     """Head and body of the answer, up to the end that the server makes."""
-    async with connected(output.server.address) as client:
+    async with connected(output.server.port.address) as client:
         client.writer.write(request)
         async with asyncio.timeout(PATIENCE_S):
             head, _, body = (await client.reader.read()).partition(b"\r\n\r\n")

@@ -133,7 +133,7 @@ class FederatedFilter(ErrorStateFilter):
         NIS and whitened innovation of the outcome are those of what is published; those of a
         screened aid are of the filter that judges its rows.
         """
-        i = aid.innovation(self.state)
+        i = self._linearise(aid)
         if isinstance(i, NotApplicable):
             return Outcome(i.outcome)
         if aid.source not in self._local_of:

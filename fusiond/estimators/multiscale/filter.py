@@ -138,7 +138,7 @@ class MultiscaleEstimator(ErrorStateFilter):
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
-        innovation = aid.innovation(self.state)
+        innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         if aid.screened:

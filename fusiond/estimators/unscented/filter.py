@@ -103,7 +103,7 @@ class UnscentedEstimator(KalmanEstimator):
         linear_form(
             points, central.h, central.r, dx, slots, root, self.spread, aid.screened, z, h, r
         )
-        return Innovation(z, h, r)
+        return self._weighed(aid, Innovation(z, h, r))
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""

@@ -7,11 +7,13 @@ No heading, no navigation: `reason` says what is missing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from fusiond.aiding.base import Aid
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.standstill import Window
 from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.collected import Collected
 from fusiond.navigator.alignment.course import from_course
@@ -22,7 +24,9 @@ from fusiond.navigator.alignment.headings import (
     from_saved,
 )
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.positions import Track, from_positions
 from fusiond.navigator.alignment.start import Place, Start
+from fusiond.navigator.alignment.why import Journal, why_not
 from fusiond.navigator.saved_state import SavedState
 
 HeadingSource = Callable[[Basis, ImuBuffer, Place], Start | None]
@@ -32,6 +36,7 @@ HEADING_SOURCES: dict[str, HeadingSource] = {
     "dual_antenna": from_dual_antenna,
     "gyrocompass": from_gyrocompass,
     "gnss_course": from_course,
+    "positions": from_positions,
 }
 
 
@@ -48,29 +53,36 @@ class Aligner:
     ) -> None:
         self.reason = "waiting for IMU data"
         self.known = Collected(options, noise, saved, on_event)
-        self._basis = Basis(options, noise, model, saved, self.known)
+        self._track = Track(options, model)
+        self._journal = Journal(on_event)
+        self._basis = Basis(options, noise, model, saved, self.known, self._track)
+
+    def aids(self, aids: Sequence[Aid]) -> None:
+        """A measurement has arrived, as the aids it stands for."""
+        self.known.aids(aids)
+        self._track.hear(aids)
+
+    def felt(self, windows: Sequence[Window], aids: Sequence[Aid]) -> None:
+        """Windows of the standstill detector have ended; constraints that hold."""
+        for window in windows:
+            self.known.window(window)
+        self._track.hear(aids)
 
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""
         if not imu.end:
             self.reason = "waiting for IMU data"
             return None
-        if self.known.upside_down:
-            self.reason = self.known.why
-            return None
-        place = self.known.place()
-        if place is None:
-            self.reason = "no position yet: no fix, none configured"
-            return None
-        allowed = self._basis.options.heading
-        for source in allowed:
-            start = HEADING_SOURCES[source](self._basis, imu, place)
-            if start is not None:
-                return start
-        if not self.known.levelled() and not self.known.fixes:
-            self.reason = "not at rest: no level yet"
-        else:
-            self.reason = f"no heading yet (allowed: {', '.join(allowed)})"
-        if self.known.why:
-            self.reason += f"; {self.known.why}"
-        return None
+        start = None
+        place = None if self.known.upside_down else self.known.place()
+        if place is not None:
+            sources = (HEADING_SOURCES[name] for name in self._basis.options.heading)
+            found = (source(self._basis, imu, place) for source in sources)
+            start = next((s for s in found if s is not None), None)
+        if start is None:
+            latitude = None if place is None else float(place[1][0])
+            upside_down = self.known.upside_down
+            self.reason = self.known.why if upside_down else why_not(self._basis, imu, latitude)
+            if not upside_down:  # that has been told
+                self._journal.keep(self.reason, imu.latest_ns)
+        return start

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigator.alignment.collected import Collected, Standing
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.saved_state import SavedState
+
+if TYPE_CHECKING:
+    from fusiond.navigator.alignment.positions import Track
 
 Array = NDArray[np.float64]
 
@@ -26,6 +29,7 @@ class Basis(NamedTuple):
     model: Model
     saved: SavedState | None
     known: Collected
+    track: Track
 
 
 def rest_bias(noise: ImuNoise, standing: Standing, dcm: Array, lat: float) -> tuple[Array, float]:

@@ -28,6 +28,10 @@ ANY_TIME_NS = 1 << 62
 # Fixes that a course may be taken from: of the last twenty seconds, the longest that changes of
 # velocity are taken over, of a receiver of 20 Hz.
 MOST_FIXES, FIXES_NS = 400, 20_000_000_000
+# Positions that may contradict a standstill: a minute's, of a receiver of 1 Hz.
+MOST_POSITIONS = 60
+# A vehicle that drives for long drives faster (m/s).
+SLOWEST_M_S = 3.0
 # Sigmas at which a rate is no bias of the gyro's data sheet, and at which position and velocity of
 # a receiver contradict each other.
 BIAS_SIGMAS = 3.0
@@ -80,6 +84,8 @@ class Collected:
         self._event = on_event
         self.why = ""
         """What the start waits for, beyond what the aligner sees itself."""
+        self.poor_claims: dict[str, str] = {}
+        """Why a claimed heading, by its origin, is no start."""
         self.told: set[str] = set()
         """Events that the operator has heard."""
         self.upside_down = False
@@ -90,6 +96,8 @@ class Collected:
         self.witnesses = Witnesses()
         self.standing: Standing | None = None
         """The last standstill, also when the vehicle has moved off since."""
+        self.left: Standing | None = None
+        """The last standstill that one could level by and that has ended."""
         self.ever_moved = False
         self.unexplained = np.zeros(3)
         """The largest rates (3,) of quiet windows that no bias of the data sheet explains: a turn,
@@ -101,6 +109,7 @@ class Collected:
         self._pending: Window | None = None
         self._speed = 0.0
         self._position: PositionOffer | None = None
+        self._positions: list[PositionOffer] = []
 
     def window(self, latest: Window) -> None:
         """A window of the standstill detector has ended.
@@ -118,6 +127,9 @@ class Collected:
         if turning:
             self.unexplained = np.maximum(self.unexplained, np.abs(latest.mean_rate))
         if not latest.quiet or turning or self._speed > self._options.rest_speed_m_s:
+            s = self.levelled()
+            if s is not None:
+                self.left = s
             self._at_rest = False
             self.ever_moved = True
             self._pending = None
@@ -153,6 +165,9 @@ class Collected:
                     velocity = offer
                 case HeadingOffer():
                     self.heading = offer
+        if position is not None:
+            insort(self._positions, position, key=lambda p: p.t_ns)
+            del self._positions[:-MOST_POSITIONS]
         if position is not None and (
             self._position is None or position.t_ns >= self._position.t_ns
         ):
@@ -162,6 +177,11 @@ class Collected:
             if position is not None:
                 self._keep(Fix(velocity, position))
 
+    @property
+    def resting(self) -> bool:
+        """Whether the last windows were quiet."""
+        return self._at_rest
+
     def levelled(self) -> Standing | None:
         """The standstill that the vehicle is in, once it is long enough to level by."""
         s = self.standing
@@ -170,8 +190,32 @@ class Collected:
         return s if self.rested(s, ANY_TIME_NS) else None
 
     def rested(self, s: Standing, until_ns: int = 0) -> bool:
-        """Whether no measured speed contradicts a standstill, up to its end or later."""
-        return not self.witnesses.measured(s.start_ns, max(s.end_ns, until_ns)).contradicts
+        """Whether no measured speed contradicts a standstill, up to its end or later; nor the way
+        between positions, where no speed was measured."""
+        end_ns = max(s.end_ns, until_ns)
+        seen = self.witnesses.measured(s.start_ns, end_ns)
+        if math.isfinite(seen.sd):
+            return not seen.contradicts
+        slope, sd = self._way(s.start_ns, end_ns)
+        return slope <= max(self._options.rest_speed_m_s, CONTRADICTION_SIGMAS * sd)
+
+    def confirmed_rest(self, s: Standing) -> bool:
+        """Whether a standstill that nothing contradicts was measured to be one."""
+        if self.seen_at_rest(s):
+            return True
+        return CONTRADICTION_SIGMAS * self._way(s.start_ns, s.end_ns)[1] < SLOWEST_M_S
+
+    def _way(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
+        """Slope (m/s) of a line through the positions of a span, and its sigma."""
+        trend, first = NO_TREND, None
+        for p in self._positions:
+            if begin_ns <= p.t_ns <= end_ns:
+                first = first or p
+                metres = 1.0 / as_geodetic(np.ones(3), first.lat_rad)[:2]
+                east = math.remainder(p.lon_rad - first.lon_rad, 2.0 * math.pi)
+                n, e = (np.array([p.lat_rad - first.lat_rad, east]) * metres).tolist()
+                trend = trend.with_one(Offset(n, e, max(p.sd[:2])), (p.t_ns - begin_ns) * 1e-9)
+        return trend.slope
 
     def seen_at_rest(self, s: Standing) -> bool:
         """Whether speeds were measured in a standstill, and were zero."""

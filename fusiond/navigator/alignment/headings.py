@@ -11,13 +11,19 @@ from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.start import Place, Start, build_start
+from fusiond.navigator.alignment.collected import CONTRADICTION_SIGMAS
+from fusiond.navigator.alignment.start import Place, Start, as_geodetic, build_start
 
 # A heading that came this long ago no longer describes a body at rest that may have been moved.
 HEADING_AGE_NS = 2_000_000_000
 SAVED, CONFIGURED = "saved state", "configured heading"
 CLAIMS = (SAVED, CONFIGURED)
 """Headings that nothing measured at the start."""
+# A claim that is poorer than this is no start where driving tells the heading: a filter that is
+# linear in the heading is honest to 10 deg, and at 20 to 30 its NEES is 14 to 22 of 3.
+POOR_SD_RAD = math.radians(15.0)
+ON_THE_WAY = frozenset({"gnss_course", "positions"})
+"""Sources that give a heading as the vehicle drives."""
 # One sigma of velocity (m/s) of a vehicle that stands.
 REST_VELOCITY_SD = np.full(3, 0.1)
 
@@ -25,6 +31,11 @@ REST_VELOCITY_SD = np.full(3, 0.1)
 def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> Start | None:
     standing = by.known.levelled()
     if standing is None:
+        return None
+    if sd > POOR_SD_RAD and ON_THE_WAY.intersection(by.options.heading):
+        by.known.poor_claims[how] = (
+            f"the {how} is known to {math.degrees(sd):.0f} deg: drive off, and the way will tell it"
+        )
         return None
     roll, pitch = level(standing.mean_force)
     dcm = dcm_from_rpy(roll, pitch, yaw)
@@ -43,9 +54,24 @@ def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> 
 
 
 def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """What the vehicle knew when it was parked, while it has not moved since."""
+    """What the vehicle knew when it was parked, while it has not moved since: neither by itself nor
+    on a ferry, which the first fix tells."""
     if by.saved is None or by.known.ever_moved:
         return None
+    fix, where, sd = place
+    if fix is not None:
+        apart = where - np.array(by.saved.position)
+        apart[1] = math.remainder(float(apart[1]), 2.0 * math.pi)
+        metres = apart[:2] / as_geodetic(np.ones(3), float(where[0]))[:2]
+        away = math.hypot(*metres.tolist())
+        if away > CONTRADICTION_SIGMAS * math.hypot(sd, by.saved.sd_position_m):
+            text = (
+                f"the fix is {away:.0f} m from where the vehicle was parked: moved while it was "
+                "off, so the saved heading counts no more"
+            )
+            by.known.poor_claims[SAVED] = text
+            by.known.tell("saved_elsewhere", text)
+            return None
     return _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, SAVED)
 
 

@@ -17,7 +17,8 @@ MAX_REVERSE_M_S = 8.0
 class AlignmentOptions:
     """SI units; `heading` the allowed sources in order of preference, `window_s` the length of the
     standstill detector's windows, `rate_sd_rad_s` what a vehicle at rest may turn, `no_slip_m` from
-    the IMU to the point that does not slide, where it is known."""
+    the IMU to the point that does not slide, where it is known, `quiet_rad_s` and `quiet_m_s2` the
+    standard deviations below which the sensor is quiet."""
 
     heading: tuple[str, ...]
     heading_rad: float | None
@@ -34,6 +35,10 @@ class AlignmentOptions:
     rate_sd_rad_s: float
     no_slip_m: tuple[float, float, float] | None
     max_reverse_m_s: float
+    gap_s: float
+    rate_hz: float
+    quiet_rad_s: float
+    quiet_m_s2: float
 
 
 def alignment_options(config: Config) -> AlignmentOptions:
@@ -56,5 +61,9 @@ def alignment_options(config: Config) -> AlignmentOptions:
         window_s=rest.window_s,
         rate_sd_rad_s=rest.rate_sd_deg_s * DEG,
         no_slip_m=no_slip.lever_arm_m if no_slip.enabled else None,
+        gap_s=config.imu.gap_s,
+        rate_hz=config.imu.rate_hz,
+        quiet_rad_s=rest.gyro_sd_deg_s * DEG,
+        quiet_m_s2=rest.accel_sd_m_s2,
         max_reverse_m_s=math.inf if config.vehicle_class == "rail" else MAX_REVERSE_M_S,
     )

@@ -48,13 +48,18 @@ def velocity_of(offer: VelocityOffer) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found."""
+    """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
+
+    `origin` (rad, rad, m), where the heading is known so poorly that the filter should update in
+    the coordinates of `fusiond.estimators.invariant`, about that place.
+    """
 
     t_ns: int
     nav: Array
     xi: Array
     covariance: Array
     how: str
+    origin: Array | None = None
 
 
 def build_start(

@@ -9,6 +9,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import RawGnssEpoch
@@ -61,7 +62,10 @@ class Intake:
                 refused = refusal(m, self._limits) or self._pace.refusal(m, t_ns)
                 if refused is not None:
                     return refused
-                return kind.aids(m, self._sections, when)
+                found = kind.aids(m, self._sections, when)
+                if isinstance(found, str) or not self._sections.robust(m.source):
+                    return found
+                return [replace(aid, robust=True) for aid in found]
         return "not_an_aid"
 
     def extra_blocks(self) -> list[Block]:

@@ -45,6 +45,15 @@ class Sections:
             self._found[source, kind] = section
         return section
 
+    def robust(self, source: str) -> bool:
+        """Whether the section that a measurement of the source was made with, as `of` found it,
+        wants large residuals to weigh less."""
+        section: Aiding | None = self.aiding.get(source)
+        if section is None:
+            used = (found for (name, _), found in self._found.items() if name == source)
+            section = next(used, None)
+        return section is not None and section.robust
+
     def own(self, block: str, source: str, section: Aiding) -> str:
         """The block's name: with the source's, where that has a section of its own that is not
         simply named after its kind."""

@@ -19,17 +19,18 @@ import time
 from collections import Counter, deque
 from typing import Any
 
-from drivers.base import Backoff, DriverStatus
+from drivers.base import DriverStatus
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.outputs import Foxglove
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.foxglove.channels import CHANNELS, Channel
 from fusiond.outputs.messages.base import Message
+from fusiond.outputs.port import Port
 from fusiond.outputs.topics import Topic
 
 try:
     from websockets import Subprotocol
-    from websockets.asyncio.server import ServerConnection, serve
+    from websockets.asyncio.server import Server, ServerConnection, serve
     from websockets.exceptions import ConnectionClosed
 except ImportError as error:  # the extra is not installed
     _MISSING: ImportError | None = error
@@ -70,17 +71,14 @@ class FoxgloveServer:
         if _MISSING is not None:
             raise ConfigError(f"outputs.foxglove: {_MISSING}: pip install 'fusiond[foxglove]'")
         self.nav_rate_hz = section.rate_hz
-        self._host, self._port = section.host, section.port
         self._vehicle = around.vehicle
-        self._on_event = around.on_event
         self._session = str(time.time_ns())
         self._queue: deque[tuple[Topic, Message]] = deque(maxlen=_WAITING)
         self._queued = asyncio.Event()
         self._latest: dict[Topic, Message] = {}
         self._viewers: set[_Viewer] = set()
         self.counters: Counter[str] = Counter()
-        self.status = DriverStatus()
-        self.address: tuple[str, int] = (self._host, self._port)
+        self.port = Port(self.name, section.host, section.port, around.on_event)
 
     def take(self, topic: Topic, message: Message) -> None:
         self._latest[topic] = message
@@ -88,35 +86,24 @@ class FoxgloveServer:
             self._queue.append((topic, message))
             self._queued.set()
 
-    async def run(self) -> None:
-        backoff = Backoff()
-        while True:
-            try:
-                server = await serve(
-                    self._serve,
-                    self._host,
-                    self._port,
-                    subprotocols=[Subprotocol(name) for name in PROTOCOLS],
-                    max_size=_MOST_REQUEST_BYTES,
-                    logger=_LOG,
-                    compression=None,  # a core's worth of it, for a local network
-                )
-            except OSError as error:
-                text = f"{self._host}:{self._port}: {error.strerror or error}"
-                if self.status.state != "absent":
-                    self._on_event("foxglove_absent", text)
-                self.status = DriverStatus("absent", text)
-                await asyncio.sleep(backoff.next())
-                continue
-            bound = next(iter(server.sockets)).getsockname()
-            self.address = (bound[0], bound[1])
-            self._say_running()
-            async with server:
-                await self._distribute()
+    @property
+    def status(self) -> DriverStatus:
+        return self.port.status
 
-    def _say_running(self) -> None:
-        where = f"{self.address[0]}:{self.address[1]}"
-        self.status = DriverStatus("running", f"{where}, {len(self._viewers)} connected")
+    async def run(self) -> None:
+        async with await self.port.open(self._listening):
+            await self._distribute()
+
+    async def _listening(self, host: str, port: int) -> Server:
+        return await serve(
+            self._serve,
+            host,
+            port,
+            subprotocols=[Subprotocol(name) for name in PROTOCOLS],
+            max_size=_MOST_REQUEST_BYTES,
+            logger=_LOG,
+            compression=None,  # a core's worth of it, for a local network
+        )
 
     async def _distribute(self) -> None:
         """From the queue of the tick to the places of those who have subscribed."""
@@ -158,7 +145,7 @@ class FoxgloveServer:
         viewer = _Viewer()
         self._viewers.add(viewer)
         self.counters["clients"] += 1
-        self._say_running()
+        self.port.serves(len(self._viewers))
         sending = asyncio.create_task(self._send(connection, viewer))
         try:
             async for request in connection:
@@ -169,7 +156,7 @@ class FoxgloveServer:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
             self._viewers.discard(viewer)
-            self._say_running()
+            self.port.serves(len(self._viewers))
 
     async def _send(self, connection: ServerConnection, viewer: _Viewer) -> None:
         await connection.send(json.dumps(self._greeting()))

@@ -89,7 +89,7 @@ class GpsdServer:
 
     @property
     def status(self) -> DriverStatus:
-        return self.server.status
+        return self.server.port.status
 
     def take(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):

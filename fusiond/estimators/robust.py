@@ -1,0 +1,60 @@
+r"""Robust update: rows whose residuals are large are taken to have more noise than they state.
+
+Noise is not Gaussian but Student's, with m degrees of freedom: what an update minimises is, instead
+of the sum of squares,
+
+    (x - dx)^T P^-1 (x - dx) / 2 + sum_i (m + 1) / 2 ln(1 + t_i^2 / m)
+    t_i = (z_i - h_i x) / sqrt(r_i)
+
+by weights in turn: with r / w for r the residuals follow from
+
+    e = z - H x = R_w (H P H^T + R_w)^-1 (z - H dx),   R_w = diag(r / w)
+
+and new weights w = (m + 1) / (m + t^2) from them, until they stay. That is expectation and
+maximisation: every turn lowers the sum. It may have several minima; the one sought is reached from
+w = 1. The update is then the ordinary one with R_w, its covariance too.
+
+A receiver's clock jumps, with all ranges at once, without one of them being wrong: for the weights
+its offset is unknown.
+
+Source: Lange, Little, Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989),
+881.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Innovation
+from fusiond.models.blocks import CLOCK_OFFSET
+from fusiond.models.model import Model
+
+Array = NDArray[np.float64]
+
+# Degrees of freedom that Lange, Little and Taylor recommend where the data do not tell better.
+DEGREES = 4.0
+# Weights that change by less in a turn are found.
+SETTLED, MOST_TURNS = 1e-6, 100
+
+
+def reweighted(rows: Innovation, model: Model, p: Array, dx: Array) -> Innovation:
+    """The rows with r / w for r, for P (n, n) and the error estimate `dx` (n,) before the update.
+
+    As they are where one has no finite innovation: the filter names that itself.
+    """
+    z, h, r = rows
+    innovation = z - h @ dx
+    if not np.isfinite(innovation).all():
+        return rows
+    spread = h @ p @ h.T
+    for offset in model.slots_of(CLOCK_OFFSET):
+        spread += np.outer(h[:, offset], h[:, offset]) * model.initial[offset] ** 2
+    weight = np.ones(len(z))
+    for _ in range(MOST_TURNS):
+        noise = r / weight
+        residual = noise * np.linalg.solve(spread + np.diag(noise), innovation)
+        before, weight = weight, (DEGREES + 1.0) / (DEGREES + residual * residual / r)
+        if np.abs(weight - before).max() < SETTLED:
+            break
+    return Innovation(z, h, r / weight)

@@ -1,0 +1,148 @@
+r"""What a filter leaves behind of an instant, so that a smoother can come back to it.
+
+A node is an instant t_j at which aids were fused, or one between them where they are far apart:
+
+    Phi_j   transition of the error state from node j - 1 to node j
+    rows    of each scalar measurement at t_j in their order: h, k, s, nu
+            u = P h^T,  s = h u + r,  k = u / s,  nu = z - h dx
+    P_j     after them, of what is published: the navigation errors and the receiver's offset in
+            time; all columns
+    dx_j    the error estimate that is kept (zero unless feedback is held back)
+    f_j     what was fed back into the navigation state at t_j
+
+and the navigation state, offset and last step, by which it is published. Process noise, and what
+widens P for whatever other reason, are in P alone. Of Phi the nine rows of the navigation errors
+are kept, the diagonal of the parameters' rows, and what an offset takes from its rate; the rest is
+zero, exactly.
+
+All lies in one row of doubles, `body`; the measurements in rows of 2 n + 2, `ops`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import CORE_SIZE
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+# The navigation errors and the offset in time.
+PUBLISHED = CORE_SIZE + 1
+
+
+class Nodes(NamedTuple):
+    """Successive nodes (m): `t_ns` (m,), `bodies` (m, body_size), `counts` (m,) of their rows in
+    `ops` (sum of counts, 2 n + 2)."""
+
+    t_ns: Indices
+    bodies: Array
+    counts: Indices
+    ops: Array
+
+    def first(self, count: int) -> Nodes:
+        """The first `count` of them."""
+        rows = int(self.counts[:count].sum())
+        return Nodes(self.t_ns[:count], self.bodies[:count], self.counts[:count], self.ops[:rows])
+
+
+def body_size(size: int, rates: int) -> int:
+    """Doubles of a body, for `size` states of which `rates` are rates of others."""
+    of_covariance, of_transition = PUBLISHED * size, CORE_SIZE * size + size + rates
+    return of_covariance + of_transition + 2 * PUBLISHED + NAV_SIZE + 1 + STEP_SIZE
+
+
+@compiled(
+    "void(f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[:, ::1], i8,"
+    "f8[::1])"
+)
+def write_body(
+    cov: Array,
+    phi: Array,
+    dx: Array,
+    fed_back: Array,
+    nav: Array,
+    xi: Array,
+    step: Array,
+    rate_terms: Indices,
+    time_slot: int,
+    body: Array,
+) -> None:
+    """Write `body` of P and Phi (width, width), dx and what was fed back (n,), nav (10,),
+    parameters (n,), step (21,); Phi is then the identity again, and nothing was fed back."""
+    n = xi.shape[0]
+    at = 0
+    for i in range(PUBLISHED):
+        slot = i if i < CORE_SIZE else time_slot
+        for j in range(n):
+            body[at + j] = cov[slot, j] if slot >= 0 else 0.0
+        at += n
+    for i in range(CORE_SIZE):
+        for j in range(n):
+            body[at + j] = phi[i, j]
+        at += n
+    for i in range(n):
+        body[at + i] = phi[i, i]
+    at += n
+    for k in range(rate_terms.shape[1]):
+        body[at + k] = phi[rate_terms[0, k], rate_terms[1, k]]
+    at += rate_terms.shape[1]
+    for i in range(PUBLISHED):
+        slot = i if i < CORE_SIZE else time_slot
+        body[at + i] = dx[slot] if slot >= 0 else 0.0
+        body[at + PUBLISHED + i] = fed_back[slot] if slot >= 0 else 0.0
+    at += 2 * PUBLISHED
+    for i in range(NAV_SIZE):
+        body[at + i] = nav[i]
+    at += NAV_SIZE
+    body[at] = xi[time_slot] if time_slot >= 0 else 0.0
+    for i in range(STEP_SIZE):
+        body[at + 1 + i] = step[i]
+    for i in range(phi.shape[0]):
+        for j in range(phi.shape[0]):
+            phi[i, j] = 0.0
+        phi[i, i] = 1.0
+    for i in range(n):
+        fed_back[i] = 0.0
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])")
+def write_rows(cov: Array, dx: Array, z: Array, h: Array, r: Array, ops: Array) -> None:
+    """Write `ops` (m, 2 n + 2) of an update of P (width, width) by rows z = h dx + noise, and move
+    `dx` (n,) as the update does: h (m, n), z, r (m,).
+
+    Gains without P of each row: with P_a = P - sum_b k_b u_b^T,  P_a h_a^T = P h_a^T
+    - sum_b k_b (u_b h_a^T), and u_b = s_b k_b.
+    """
+    n = dx.shape[0]
+    for a in range(z.shape[0]):
+        gain = ops[a, n : 2 * n]
+        for i in range(n):
+            gain[i] = 0.0
+        nu = z[a]
+        for i in range(n):
+            c = h[a, i]
+            ops[a, i] = c
+            if c != 0.0:
+                nu -= c * dx[i]
+                for j in range(n):
+                    gain[j] += c * cov[i, j]
+        for b in range(a):
+            c = 0.0
+            for i in range(n):
+                c += ops[b, n + i] * h[a, i]
+            c *= ops[b, 2 * n]
+            for j in range(n):
+                gain[j] -= c * ops[b, n + j]
+        s = r[a]
+        for i in range(n):
+            s += h[a, i] * gain[i]
+        for j in range(n):
+            gain[j] /= s
+            dx[j] += gain[j] * nu
+        ops[a, 2 * n], ops[a, 2 * n + 1] = s, nu

@@ -1,0 +1,171 @@
+r"""A bank of headings: filters that start with the heading in cells around the circle.
+
+    p(x) = sum_i w_i N(x; x_i, P_i),   w_i <- w_i N(nu_i; 0, S_i) / sum
+
+Each is a filter of the vehicle's own model (`InvariantFilter`), which is Gaussian where the heading
+alone is not; the weights say which cell the measurements fit. The mixture's mean and covariance,
+taken in the error xi that all cells share, are the start once they are one hump and narrow:
+
+    m = sum w_i xi_i,   C = sum w_i (P_i + (xi_i - m)(xi_i - m)^T)
+
+Source: Alspach and Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE
+TAC 17 (1972), eq. 14 to 20; Bar-Shalom, Li, Kirubarajan (2001), eq. 1.4.16-7 and -8 for the
+moments. PX4's estimator of yaw (EKFGSF_yaw) is such a bank of five, on GNSS velocity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.estimators.invariant import InvariantFilter
+from fusiond.navigation.error_model import DV, PHI
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigation.strapdown import Q0, VN
+
+Array = NDArray[np.float64]
+
+CELLS = 24
+YAWS_RAD = tuple(2.0 * math.pi * k / CELLS for k in range(CELLS))
+# One sigma of the heading in a cell: half the way to the next, so that their sum is flat to 2 %.
+CELL_SD_RAD = 0.5 * 2.0 * math.pi / CELLS
+# A cell that is as unlikely as this is given up.
+UNLIKELY = 1e-5
+# A source is heard twice a second at most: what it says oftener is alike, and costs every cell.
+INTERVAL_NS = 500_000_000
+# So many positions in a row that no cell can explain: what the bank began with was wrong.
+MOST_REFUSED = 3
+
+
+class Mixture(NamedTuple):
+    """Mean state (10,), parameters (n,) and P (n, n) of all cells."""
+
+    nav: Array
+    xi: Array
+    covariance: Array
+
+    @property
+    def sd_yaw(self) -> float:
+        """One sigma of the heading (rad)."""
+        return math.sqrt(float(self.covariance[PHI + 2, PHI + 2]))
+
+    @property
+    def sd_speed(self) -> float:
+        """One sigma of the velocity along the forward axis (m/s)."""
+        ahead = dcm_from_quaternion(self.nav[Q0:])[:, 0]
+        return math.sqrt(float(ahead @ self.covariance[DV : DV + 3, DV : DV + 3] @ ahead))
+
+
+@dataclass(slots=True)
+class Cell:
+    """A filter that has started, and how likely it is."""
+
+    filter: InvariantFilter
+    weight: float
+
+
+class HeadingBank:
+    """Runs cells that have started at `t_ns`, with so many `positions` fused."""
+
+    def __init__(
+        self, cells: list[Cell], t_ns: int, positions: int, max_reverse_m_s: float
+    ) -> None:
+        self._cells, self.t_ns = cells, t_ns
+        self.positions = positions
+        """Fixes that some cell has taken."""
+        self._max_reverse_m_s = max_reverse_m_s
+        self._heard_ns: dict[str, int] = {}
+        self._refused = 0
+        self.backwards = False
+        """The likeliest cell drove backward, faster than the vehicle can."""
+        self._prune()
+
+    @property
+    def lost(self) -> bool:
+        """No cell explains what is measured."""
+        return not self._cells or self._refused >= MOST_REFUSED
+
+    @property
+    def _best(self) -> Cell:
+        return max(self._cells, key=lambda cell: cell.weight)
+
+    def run(self, imu: ImuBuffer, aids: Sequence[Aid], until_ns: int) -> None:
+        """To `until_ns`, with `aids` that are valid until then, in their order."""
+        for aid in aids:
+            if aid.t_ns < self._heard_ns.get(aid.source, 0) + INTERVAL_NS:
+                continue
+            self._heard_ns[aid.source] = aid.t_ns
+            self._propagate(imu, aid.t_ns)
+            self._hear(aid)
+            if self.lost:
+                return
+        self._propagate(imu, until_ns)
+
+    def mixture(self) -> Mixture:
+        """Mean and covariance of all cells, about the likeliest."""
+        best = self._best.filter
+        back = best.transform(best.nav, best.xi, -1.0)
+        means, spread = [], np.zeros((best.model.size, best.model.size))
+        for cell in self._cells:
+            f = cell.filter
+            means.append(best.between(f.nav, f.xi))
+            own = back if f is best else f.transform(f.nav, f.xi, -1.0)
+            spread += cell.weight * own @ f.covariance @ own.T
+        weights = np.array([cell.weight for cell in self._cells])
+        apart = np.array(means)
+        mean = weights @ apart
+        apart -= mean
+        spread += (apart * weights[:, None]).T @ apart
+        nav, xi = best.without(best.nav, best.xi, mean)
+        t = best.transform(nav, xi)
+        covariance = t @ spread @ t.T
+        return Mixture(nav, xi, 0.5 * (covariance + covariance.T))
+
+    def _propagate(self, imu: ImuBuffer, t_ns: int) -> None:
+        if t_ns <= self.t_ns:
+            return
+        for cell in self._cells:
+            cell.filter.propagate(imu, t_ns)
+        self.t_ns = t_ns
+
+    def _hear(self, aid: Aid) -> None:
+        outcomes = [cell.filter.update(aid.at(cell.filter.nav)).name for cell in self._cells]
+        fused = "fused" in outcomes
+        if aid.locates:
+            self.positions += fused
+            self._refused = 0 if fused else self._refused + 1
+        # Cells are compared by what all of them were measured with; what none takes is an outlier.
+        if not fused or set(outcomes) - {"fused", "gated"}:
+            return
+        logs = np.array([cell.filter.log_likelihood for cell in self._cells])
+        for cell, factor in zip(self._cells, np.exp(logs - logs.max()), strict=True):
+            cell.weight *= float(factor)
+        if aid.locates:
+            self._drop_backward()
+        self._prune()
+
+    def _drop_backward(self) -> None:
+        """Nothing drives backward so fast."""
+        for cell in self._cells:
+            f = cell.filter
+            ahead = dcm_from_quaternion(f.nav[Q0:])[:, 0]
+            forward = float(ahead @ f.nav[VN : VN + 3])
+            sd = math.sqrt(float(ahead @ f.covariance[DV : DV + 3, DV : DV + 3] @ ahead))
+            if -forward - 3.0 * sd > self._max_reverse_m_s:
+                self.backwards |= cell is self._best
+                cell.weight = 0.0
+
+    def _prune(self) -> None:
+        total = sum(cell.weight for cell in self._cells)
+        kept = [cell for cell in self._cells if cell.weight > UNLIKELY * total]
+        total = sum(cell.weight for cell in kept)
+        for cell in kept:
+            cell.weight /= total
+        self._cells = kept

@@ -1,0 +1,290 @@
+r"""Heading from positions alone: a vehicle that drives, and fixes without velocity, late ones too.
+
+A bank of headings (fusiond.navigator.alignment.bank) starts where the vehicle is last known to
+have stood, level, at rest and with the gyro's bias seen; or, of a vehicle that has been driving all
+the time, at its first fix, with a road's slope and a road's speed. All that is measured from then
+on is weighed at its own instant: the bank runs `LATE_NS` behind the samples, so that what comes
+late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
+heading:
+
+    sd_yaw ~ sqrt(2) sd_fix / way,   6 deg after 280 m with fixes of 20 m
+
+That the vehicle drives the way it faces, to within a mounting angle, is measured too: at constant
+speed nothing else tells the heading.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import insort
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.offers import PositionOffer
+from fusiond.estimators.invariant import InvariantFilter
+from fusiond.models.model import Model, TooManyStatesError
+from fusiond.models.vehicle import MOUNTING, mounting
+from fusiond.navigation.alignment import level
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import dcm_from_rpy
+from fusiond.navigator.alignment.bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
+from fusiond.navigator.alignment.basis import Basis, rest_bias
+from fusiond.navigator.alignment.collected import FIXES_NS, Standing
+from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
+from fusiond.navigator.alignment.motion import TILT_SD_RAD
+from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.start import Place, Start, build_start
+
+Array = NDArray[np.float64]
+
+# An RDSS fix comes 0.6 to 5 s after its instant (two hops up and down, the centre's queue).
+LATE_NS = 6_000_000_000
+# The bank is run in pieces of this length: a tick has little to do, and each piece enough.
+PIECE_NS = 100_000_000
+# One sigma (rad) of the heading at which the filter takes over: its sine is then wrong by 1.5 %
+# and its covariance by as much.
+KNOWN_SD_RAD = math.radians(10.0)
+# The same of the speed (m/s).
+KNOWN_SD_M_S = 2.0
+# Fixes that a start needs: place, heading and speed are four numbers, and one fix may be wrong.
+FEWEST_FIXES = 3
+# Aids that may wait: more than the bank's delay holds of all that a vehicle sends.
+MOST_WAITING = 4096
+# Fixes at rest that are used for the place at its end.
+MOST_AT_REST = 20
+# The first fix is taken by all cells; until then the place is known to this (m).
+ANYWHERE_M = 10_000.0
+# How likely a sensor that was quiet for `levelling_s` was not at rest, before any fix says so.
+QUIET_AT_SPEED = 0.1
+# Speed (m/s) of a road vehicle that is met on the move, and one sigma: town to motorway.
+ROAD_SPEED_M_S, ROAD_SPEED_SD_M_S = 12.5, 10.0
+# One sigma (m/s) across, of the IMU ahead of the axle in a bend, and up or down.
+ACROSS_SD_M_S = 1.0
+# No slip (m/s) sideways and down, as `[constraints.non_holonomic]` has it, where that is off.
+SLIP_SD_M_S, HEAVE_SD_M_S, LEAST_SPEED_M_S = 0.2, 0.5, 2.0
+SLIP_NS = 500_000_000
+# Gate probability, as the measured aids' default.
+GATE = 0.9999
+HOW = "positions on the way"
+
+
+def bank_model(model: Model, options: AlignmentOptions) -> Model:
+    """The vehicle's model, with the angle between driving and facing where it has none."""
+    if model.slots_of(MOUNTING):
+        return model
+    try:
+        return Model(
+            model.name, (*model.blocks, mounting(options.course_sd_rad)), model.hold_height
+        )
+    except TooManyStatesError:
+        return model
+
+
+class Track:
+    """What a vehicle without heading has been measured with, and the bank that it leads to."""
+
+    def __init__(self, options: AlignmentOptions, model: Model) -> None:
+        self._options = options
+        self._model = bank_model(model, options)
+        self._size = model.size
+        # Where the vehicle's own constraint is off, the bank has one of its own.
+        self._own_slip = not model.slots_of(MOUNTING) and bool(self._model.slots_of(MOUNTING))
+        self._aids: list[Aid] = []
+        self._bank: HeadingBank | None = None
+        self._left: Standing | None = None
+        self._begun_ns = 0
+
+    def hear(self, aids: Sequence[Aid]) -> None:
+        """Measurements and constraints have come."""
+        if "positions" not in self._options.heading:
+            return
+        for aid in aids:
+            if not aid.screened:
+                insort(self._aids, aid, key=lambda a: (a.t_ns, a.source))
+        del self._aids[:-MOST_WAITING]
+
+    def give_up(self) -> None:
+        """Forget all: something else tells the heading."""
+        self._aids.clear()
+        self._bank = self._left = None
+
+    @property
+    def running(self) -> bool:
+        """Whether a bank seeks the heading."""
+        return self._bank is not None
+
+    def start(self, by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+        """A start, once the heading is known."""
+        until_ns = imu.latest_ns - LATE_NS
+        if self._bank is None:
+            self._bank = self._begin(by, imu, place[1], until_ns)
+        bank = self._bank
+        if bank is None:
+            self._forget(imu, by.known.standing)
+            return None
+        if until_ns < bank.t_ns + PIECE_NS:
+            return None
+        due = [aid for aid in self._aids if aid.t_ns <= until_ns]
+        del self._aids[: len(due)]
+        if self._own_slip:
+            due = self._with_slip(due, bank.t_ns, until_ns)
+        bank.run(imu, due, until_ns)
+        if bank.lost:
+            self._bank = None
+            if bank.backwards:
+                by.known.tell(
+                    "imu_backwards",
+                    "the fixes show a vehicle that drives backward, faster than it can: is the IMU "
+                    "mounted backwards? Correct [imu] axes",
+                )
+                return None
+            by.known.doubted("the fixes fit no heading: beginning anew")
+            return None
+        found = bank.mixture()
+        if bank.positions < FEWEST_FIXES or found.sd_yaw > KNOWN_SD_RAD:
+            by.known.doubted(
+                f"finding the heading: known to {math.degrees(found.sd_yaw):.0f} deg from "
+                f"{bank.positions} fixes, {math.degrees(KNOWN_SD_RAD):.0f} deg and {FEWEST_FIXES} "
+                "fixes are needed; drive on"
+            )
+            return None
+        if found.sd_speed > KNOWN_SD_M_S:
+            by.known.doubted(
+                f"heading found, speed known to {found.sd_speed:.1f} m/s, {KNOWN_SD_M_S:.1f} are "
+                "needed; drive on"
+            )
+            return None
+        n = self._size
+        origin = found.nav[:3].copy()
+        return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, origin)
+
+    def _begin(self, by: Basis, imu: ImuBuffer, where: Array, until_ns: int) -> HeadingBank | None:
+        """A bank, where there is something to begin with: the end of a rest, or the first fix."""
+        known = by.known
+        left = self._left or known.left
+        if left is not None and left.end_ns < max(imu.oldest_ns, self._begun_ns):
+            left = None
+        if left is not None and known.rested(left):
+            self._left = left
+            if left.end_ns > until_ns:
+                return None
+            there = [a for a in self._aids if a.locates and left.start_ns <= a.t_ns <= left.end_ns]
+            begin_ns, fixes = left.end_ns, len(there)
+            cells = self._from_rest(by, imu, where, left, there[-MOST_AT_REST:])
+            if not known.confirmed_rest(left):
+                cells += self._on_the_move(imu, where, begin_ns, QUIET_AT_SPEED)
+        else:
+            first = next((a for a in self._aids if a.locates and a.t_ns >= imu.oldest_ns), None)
+            if known.levelled() is not None or first is None or first.t_ns > until_ns:
+                return None
+            begin_ns, fixes = first.t_ns - 1, 0
+            cells = self._on_the_move(imu, where, begin_ns, 1.0)
+        self._left, self._begun_ns = None, begin_ns + 1
+        self._aids = [aid for aid in self._aids if aid.t_ns > begin_ns]
+        return HeadingBank(cells, begin_ns, fixes, self._options.max_reverse_m_s)
+
+    def _from_rest(
+        self, by: Basis, imu: ImuBuffer, where: Array, left: Standing, there: Sequence[Aid]
+    ) -> list[Cell]:
+        """Cells of a vehicle that has stood until `left` ended; fixes `there` tell the place."""
+        roll, pitch = level(left.mean_force)
+        there = [replace(aid, t_ns=left.end_ns) for aid in there]
+        cells = []
+        for yaw in YAWS_RAD:
+            dcm = dcm_from_rpy(roll, pitch, yaw)
+            start = build_start(
+                self._model,
+                left.end_ns,
+                (None, where, ANYWHERE_M),
+                dcm,
+                CELL_SD_RAD,
+                np.zeros(3),
+                REST_VELOCITY_SD,
+                HOW,
+                bias=rest_bias(by.noise, left, dcm, float(where[0])),
+                levelled=True,
+            )
+            cell = self._cell(imu, start, 1.0)
+            for aid in there:
+                cell.filter.update(aid)
+            cells.append(cell)
+        return cells
+
+    def _on_the_move(self, imu: ImuBuffer, where: Array, t_ns: int, weight: float) -> list[Cell]:
+        """Cells of a vehicle of unknown speed on a road of unknown slope."""
+        where, sd = self._place(where, t_ns)
+        cells = []
+        for yaw in YAWS_RAD:
+            dcm = dcm_from_rpy(0.0, 0.0, yaw)
+            velocity, zero = ROAD_SPEED_M_S * dcm[:, 0], np.zeros(3)
+            place: Place = (None, where, sd)
+            start = build_start(self._model, t_ns, place, dcm, CELL_SD_RAD, velocity, zero, HOW)
+            p = start.covariance
+            p[0, 0] = p[1, 1] = TILT_SD_RAD**2
+            p[8, 8] = ANYWHERE_M**2
+            p[3:6, 3:6] = (
+                dcm * np.square((ROAD_SPEED_SD_M_S, ACROSS_SD_M_S, ACROSS_SD_M_S))
+            ) @ dcm.T
+            cell = self._cell(imu, start, weight)
+            # The speed is one along the body, whatever the heading: T P_xi T^T.
+            turn = cell.filter.transform(start.nav, start.xi)
+            cell.filter.covariance[:] = turn @ cell.filter.covariance @ turn.T
+            cells.append(cell)
+        return cells
+
+    def _cell(self, imu: ImuBuffer, start: Start, weight: float) -> Cell:
+        """A filter that has started, about the place of its start."""
+        found = InvariantFilter(self._model, self._options.gap_s, settles=False)
+        first = imu.index_after(start.t_ns) + imu.start
+        found.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
+        found.origin = start.nav[:3].copy()
+        return Cell(found, weight)
+
+    def _place(self, where: Array, t_ns: int) -> tuple[Array, float]:
+        """Where (rad, rad, m) a moving vehicle is at an instant, and one sigma (m): where it was at
+        the fix before, as far as it may have driven since, or about `where` it is now."""
+        fixes = [o for a in self._aids for o in a.offers() if isinstance(o, PositionOffer)]
+        before = [o for o in fixes if o.t_ns <= t_ns]
+        if not before:
+            return where, ANYWHERE_M
+        o = before[-1]
+        way = math.hypot(ROAD_SPEED_M_S, ROAD_SPEED_SD_M_S) * (t_ns - o.t_ns) * 1e-9
+        return np.array([o.lat_rad, o.lon_rad, where[2]]), math.hypot(max(o.sd[:2]), way)
+
+    def _with_slip(self, due: list[Aid], begin_ns: int, until_ns: int) -> list[Aid]:
+        """What is due, and that the vehicle does not slide, twice a second."""
+        lever = self._options.no_slip_m or (0.0, 0.0, 0.0)
+        first = (begin_ns // SLIP_NS + 1) * SLIP_NS
+        own: list[Aid] = [
+            NonHolonomicAid(
+                "no_slip", t_ns, GATE, SLIP_SD_M_S, HEAVE_SD_M_S, LEAST_SPEED_M_S, lever
+            )
+            for t_ns in range(first, until_ns + 1, SLIP_NS)
+        ]
+        return sorted([*due, *own], key=lambda a: (a.t_ns, a.source))
+
+    def _forget(self, imu: ImuBuffer, standing: Standing | None) -> None:
+        """What no bank can begin with any more."""
+        since = imu.latest_ns - 2 * LATE_NS
+        begin = since if standing is None else min(since, standing.start_ns)
+        old = [a for a in self._aids if a.t_ns < since]
+        kept = [a for a in old if a.locates and a.t_ns >= begin][-MOST_AT_REST:]
+        self._aids = kept + self._aids[len(old) :]
+
+
+def from_positions(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """Heading of positions alone; a velocity, where there is one, tells it sooner and better."""
+    fixes = by.known.fixes
+    if (
+        fixes
+        and "gnss_course" in by.options.heading
+        and imu.latest_ns - fixes[-1].velocity.t_ns < FIXES_NS
+    ):
+        by.track.give_up()
+        return None
+    return by.track.start(by, imu, place)

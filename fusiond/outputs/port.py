@@ -1,0 +1,56 @@
+"""Where a server listens: tried again while it cannot be had, and how it stands."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Protocol, TypeVar
+
+from drivers.base import Backoff, DriverStatus
+
+
+class Listening(Protocol):
+    """A server of asyncio's or of a library's."""
+
+    @property
+    def sockets(self) -> Iterable[socket.socket]: ...
+
+
+S = TypeVar("S", bound=Listening)
+
+
+class Port:
+    """`on_event` hears `<name>_absent` when the port cannot be had, once; `status` says how it
+    stands and `address` where it is, once it is `running`."""
+
+    def __init__(
+        self, name: str, host: str, port: int, on_event: Callable[[str, str], None]
+    ) -> None:
+        self._name = name
+        self._on_event = on_event
+        self.address: tuple[str, int] = (host, port)
+        self.status = DriverStatus()
+
+    async def open(self, listen: Callable[[str, int], Awaitable[S]]) -> S:
+        """What `listen(host, port)` gives; waits while it raises `OSError`."""
+        backoff = Backoff()
+        while True:
+            try:
+                server = await listen(*self.address)
+            except OSError as error:
+                text = f"{self.address[0]}:{self.address[1]}: {error.strerror or error}"
+                if self.status.state != "absent":
+                    self._on_event(f"{self._name}_absent", text)
+                self.status = DriverStatus("absent", text)
+                await asyncio.sleep(backoff.next())
+                continue
+            bound = next(iter(server.sockets)).getsockname()
+            self.address = (bound[0], bound[1])
+            self.serves(0)
+            return server
+
+    def serves(self, clients: int) -> None:
+        """So many are connected."""
+        host, port = self.address
+        self.status = DriverStatus("running", f"{host}:{port}, {clients} connected")
