@@ -14,6 +14,7 @@ A truth's own error is not taken off: an RTK track adds its centimetres to every
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -33,11 +34,29 @@ class NothingToCompareError(Exception):
     """Solution and truth have no epoch in common; the text says which times each covers."""
 
 
-def compare(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 0.0) -> Report:
-    """Error statistics, flat, units in the names; None where a file does not hold the quantity.
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Solution minus truth at the n epochs `t_s` that both have, and the solution's sigma there.
 
-    `after_s` leaves out what lies less than this after the solution's first epoch. `*_p95_*` is the
-    95th percentile of the absolute error. Raises `NothingToCompareError`.
+    All (n, 3): `position` (m) and `velocity` (m/s) north, east, down, `attitude` (rad) roll, pitch,
+    yaw; `sd_*` alike; NaN where a file does not say. `not_covered` epochs of the truth have no
+    solution.
+    """
+
+    t_s: Floats
+    position: Floats
+    velocity: Floats
+    attitude: Floats
+    sd_position: Floats
+    sd_velocity: Floats
+    sd_attitude: Floats
+    not_covered: int
+
+
+def errors_of(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 0.0) -> Errors:
+    """The errors at the truth's epochs that are later than `after_s` after the solution's first.
+
+    Raises `NothingToCompareError`.
     """
     usable = np.isfinite(solution.lat_rad) & np.isfinite(solution.lon_rad)
     usable &= np.isfinite(solution.height_m)
@@ -63,20 +82,39 @@ def compare(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 
             height - at.linear(solution.height_m),
         ],
         axis=1,
-    )[chosen]
-    sigma = np.stack([at.linear(solution.sd_position[:, k]) for k in range(3)], axis=1)[chosen]
-    velocity = np.stack([at.linear(solution.v[:, k]) - truth.v[:, k] for k in range(3)], axis=1)
-    velocity = velocity[chosen]
+    )
     attitude = np.stack(
         [_wrapped(at.angle(solution.rpy[:, k]) - truth.rpy[:, k]) for k in range(3)], axis=1
-    )[chosen]
+    )
+    return Errors(
+        t_s=truth.t_s[chosen],
+        position=position[chosen],
+        velocity=(at.columns(solution.v) - truth.v)[chosen],
+        attitude=attitude[chosen],
+        sd_position=at.columns(solution.sd_position)[chosen],
+        sd_velocity=at.columns(solution.sd_v)[chosen],
+        sd_attitude=at.columns(solution.sd_rpy)[chosen],
+        not_covered=int((~at.bridged & (truth.t_s >= start)).sum()),
+    )
 
-    times = truth.t_s[chosen]
+
+def compare(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 0.0) -> Report:
+    """Error statistics, flat, units in the names; None where a file does not hold the quantity.
+
+    `after_s` leaves out what lies less than this after the solution's first epoch. `*_p95_*` is the
+    95th percentile of the absolute error. Raises `NothingToCompareError`.
+    """
+    return report_of(errors_of(solution, truth, after_s))
+
+
+def report_of(errors: Errors) -> Report:
+    """The statistics of errors, as `compare` gives them."""
+    position, velocity = errors.position, errors.velocity
     report: Report = {
-        "epochs": len(times),
-        "epochs_not_covered": int((~at.bridged & (truth.t_s >= start)).sum()),
-        "t_first_s": float(times[0]),
-        "t_last_s": float(times[-1]),
+        "epochs": len(errors.t_s),
+        "epochs_not_covered": errors.not_covered,
+        "t_first_s": float(errors.t_s[0]),
+        "t_last_s": float(errors.t_s[-1]),
     }
     horizontal = np.hypot(position[:, 0], position[:, 1])
     report |= _statistics("horizontal", "m", horizontal)
@@ -85,9 +123,9 @@ def compare(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float = 
     report |= _statistics("v_horizontal", "m_s", np.hypot(velocity[:, 0], velocity[:, 1]))
     for name, error in zip(("v_n", "v_e", "v_d"), velocity.T, strict=True):
         report |= _statistics(name, "m_s", error)
-    for name, error in zip(("roll", "pitch", "yaw"), np.degrees(attitude).T, strict=True):
+    for name, error in zip(("roll", "pitch", "yaw"), np.degrees(errors.attitude).T, strict=True):
         report |= _statistics(name, "deg", error)
-    return report | _consistency(position, sigma)
+    return report | _consistency(position, errors.sd_position)
 
 
 class _Epochs:
@@ -112,6 +150,10 @@ class _Epochs:
         if not len(self._t):
             return np.full(len(self._wanted), np.nan)
         return np.interp(self._wanted, self._t, column[self._rows])
+
+    def columns(self, table: Floats) -> Floats:
+        """The columns of a table (n, k) at the wanted epochs, each as `linear`."""
+        return np.stack([self.linear(column) for column in table.T], axis=1)
 
     def angle(self, column: Floats) -> Floats:
         """A column of angles (rad), through the shorter arc between rows."""
