@@ -15,6 +15,7 @@ import pytest
 from tests.places import REPOSITORY
 
 CONFIG = REPOSITORY / "config"
+PAGE = "fusiond/report/assets"
 
 
 def _run(*command: str | Path, folder: Path) -> str:
@@ -64,16 +65,18 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
+    folders = {"drivers/config": CONFIG, PAGE: REPOSITORY / PAGE}
     shipped = {
-        f"drivers/config/{path.relative_to(CONFIG)}": path.read_bytes()
-        for path in CONFIG.rglob("*")
+        f"{name}/{path.relative_to(folder)}": path.read_bytes()
+        for name, folder in folders.items()
+        for path in folder.rglob("*")
         if path.is_file()
     }
     with zipfile.ZipFile(wheel) as archive:
         held = {
             name: archive.read(name)
             for name in archive.namelist()
-            if name.startswith("drivers/config/")
+            if name.startswith(tuple(f"{folder}/" for folder in folders))
         }
     assert held == shipped
     assert {"drivers/config/vehicle.toml", "drivers/config/dbc/xsens_mti600.dbc"} < set(held)

@@ -1,0 +1,181 @@
+"""What the channels of a log say, as arrays. Values that are no numbers become NaN."""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import isfinite, isnan, nan
+from typing import Any
+
+import numpy as np
+
+from fusiond.clock.host import SECOND_NS
+from fusiond.files.csv_tables import Floats
+from fusiond.report.run import Estimated, Innovations, Sky, Verdicts
+
+
+def number(value: object) -> float:
+    """A JSON value as a float; NaN for null and for what is no number."""
+    return float(value) if isinstance(value, int | float) and isfinite(value) else nan
+
+
+def _objects(said: dict[str, Any], key: str) -> dict[str, dict[str, Any]]:
+    """The objects in the object `key`."""
+    found = said.get(key)
+    if not isinstance(found, dict):
+        return {}
+    return {name: value for name, value in found.items() if isinstance(value, dict)}
+
+
+def _rows(rows: list[tuple[float, ...]], width: int) -> Floats:
+    table: Floats = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    return table
+
+
+class InnovationLists:
+    """`/innovation`: a late measurement rewinds the filter and brings later aids again; the last
+    word on each counts, and the first says when it came."""
+
+    def __init__(self, epoch_ns: int) -> None:
+        self._epoch_ns = epoch_ns
+        self._aids: dict[str, dict[int, tuple[float, str, float, float, list[float]]]] = {}
+
+    def take(self, t_s: float, said: dict[str, Any]) -> None:
+        t_ns, source = said.get("t_ns"), said.get("source")
+        if not isinstance(t_ns, int) or not isinstance(source, str):
+            return
+        aids = self._aids.setdefault(source, {})
+        valid_s = (t_ns + self._epoch_ns) / SECOND_NS
+        delay_s = aids[t_ns][0] if t_ns in aids else t_s - valid_s
+        whitened = said.get("whitened")
+        values = [number(v) for v in whitened] if isinstance(whitened, list) else []
+        nis, degrees = number(said.get("nis")), number(said.get("degrees"))
+        aids[t_ns] = delay_s, str(said.get("outcome", "")), nis, degrees, values
+
+    def by_source(self) -> dict[str, Innovations]:
+        return {source: self._of(aids) for source, aids in self._aids.items()}
+
+    def _of(self, aids: dict[int, tuple[float, str, float, float, list[float]]]) -> Innovations:
+        times = sorted(aids)
+        rows = [aids[t] for t in times]
+        width = max(len(row[4]) for row in rows)
+        whitened = np.full((len(rows), width), nan)
+        for k, row in enumerate(rows):
+            whitened[k, : len(row[4])] = row[4]
+        return Innovations(
+            t_s=np.array([(t + self._epoch_ns) / SECOND_NS for t in times]),
+            delay_s=np.array([row[0] for row in rows]),
+            nis=np.array([row[2] for row in rows]),
+            degrees=np.array([row[3] for row in rows]),
+            whitened=whitened,
+            outcome=[row[1] for row in rows],
+        )
+
+
+class VerdictLists:
+    """`/consistency`."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, list[tuple[float, ...]]] = {}
+        self._verdicts: dict[str, list[str]] = {}
+
+    def take(self, t_s: float, said: dict[str, Any]) -> None:
+        for source, one in _objects(said, "sources").items():
+            rho = one.get("rho")
+            first = rho[0] if isinstance(rho, list) and rho else None
+            figures = (*(one.get(f"nis_{k}") for k in ("average", "low", "high")), first)
+            row = (t_s, *map(number, (*figures, one.get("rho_high"))))
+            self._rows.setdefault(source, []).append(row)
+            self._verdicts.setdefault(source, []).append(str(one.get("verdict", "")))
+
+    def by_source(self) -> dict[str, Verdicts]:
+        found = {}
+        for source, rows in self._rows.items():
+            t_s, average, low, high, rho_1, rho_high = _rows(rows, 6).T
+            words = self._verdicts[source]
+            found[source] = Verdicts(t_s, average, low, high, rho_1, rho_high, words)
+        return found
+
+
+class Calibrations:
+    """`/calibration`; the unit ends a parameter's name, none is a ratio."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, list[tuple[float, ...]]] = {}
+        self._states: dict[str, str] = {}
+
+    def take(self, t_s: float, said: dict[str, Any]) -> None:
+        for name, one in _objects(said, "parameters").items():
+            row = (t_s, number(one.get("value")), number(one.get("sd")))
+            self._rows.setdefault(name, []).append(row)
+            self._states[name] = str(one.get("state", ""))
+
+    def by_name(self) -> dict[str, Estimated]:
+        found = {}
+        for name, rows in self._rows.items():
+            unit = name.rpartition("_")[2]
+            known = unit if unit in ("m", "s", "deg") else "1"
+            t_s, value, sd = _rows(rows, 3).T
+            found[name] = Estimated(known, t_s, value, sd, self._states[name])
+        return found
+
+
+class Healths:
+    """`/health`: outcomes and counters as the last message has them; satellites, delays, CPU and
+    memory over time."""
+
+    def __init__(self) -> None:
+        self.outcomes: dict[str, dict[str, int]] = {}
+        self.counters: dict[str, dict[str, int]] = {}
+        self._usage: list[tuple[float, ...]] = []
+        self._latency: dict[str, list[tuple[float, ...]]] = {}
+        self._sky: dict[str, list[tuple[float, ...]]] = {}
+        self._reasons: dict[str, Counter[str]] = {}
+
+    def take(self, t_s: float, said: dict[str, Any]) -> None:
+        self._usage.append((t_s, number(said.get("cpu_percent")), number(said.get("memory_mb"))))
+        for source, one in _objects(said, "sources").items():
+            rejected = _counts(one.get("rejected"))
+            self.outcomes[source] = {"fused": _count(one.get("fused")), **rejected}
+            self.counters[source] = _counts(one.get("counters"))
+            latency = number(one.get("latency_s"))
+            if not isnan(latency):
+                self._latency.setdefault(source, []).append((t_s, latency))
+            sky = one.get("sky")
+            if isinstance(sky, dict):
+                self._sky_of(source, t_s, sky)
+
+    def _sky_of(self, source: str, t_s: float, sky: dict[str, Any]) -> None:
+        used, refused = sky.get("used"), sky.get("refused")
+        used = used if isinstance(used, list) else []
+        refused = refused if isinstance(refused, dict) else {}
+        row = (t_s, float(len(used)), float(len(refused)), number(sky.get("pdop")))
+        self._sky.setdefault(source, []).append(row)
+        self._reasons.setdefault(source, Counter()).update(map(str, refused.values()))
+
+    def usage(self) -> tuple[Floats, Floats, Floats] | None:
+        if not self._usage:
+            return None
+        t_s, cpu, memory = _rows(self._usage, 3).T
+        return t_s, cpu, memory
+
+    def latency(self) -> dict[str, tuple[Floats, Floats]]:
+        tables = {source: _rows(rows, 2) for source, rows in self._latency.items()}
+        return {source: (table[:, 0], table[:, 1]) for source, table in tables.items()}
+
+    def sky(self) -> dict[str, Sky]:
+        found = {}
+        for source, rows in self._sky.items():
+            t_s, used, refused, pdop = _rows(rows, 4).T
+            found[source] = Sky(t_s, used, refused, pdop, dict(self._reasons[source]))
+        return found
+
+
+def _count(value: object) -> int:
+    found = number(value)
+    return 0 if isnan(found) else int(found)
+
+
+def _counts(value: object) -> dict[str, int]:
+    if not isinstance(value, dict):
+        return {}
+    return {str(name): _count(count) for name, count in value.items()}

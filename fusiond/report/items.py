@@ -1,0 +1,143 @@
+"""What a page is made of: plots, tables, the track, sentences. `as_json(zero_s)` is what the page
+reads, with times counted from there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from fusiond.files.csv_tables import Floats
+from fusiond.report.arrays import packed, thinned
+
+Role = Literal["line", "points", "refused", "bound", "steps", "bars"]
+"""How a series is drawn. `bound`: thin and dashed, such as two sigma around zero; `refused`: the
+measurements that were not used."""
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One curve (n,)."""
+
+    label: str
+    values: Floats
+    role: Role = "line"
+    like: int | None = None
+    """Which series of the plot it shares its colour with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Curves over one abscissa (n,): time in s of the page's axis, or what `x_label` says.
+
+    `good`: one sentence on what it looks like when all is well. `levels` are horizontal lines.
+    """
+
+    title: str
+    unit: str
+    x: Floats
+    series: Sequence[Series]
+    good: str
+    x_label: str | None = None
+    log: bool = False
+    levels: Sequence[float] = ()
+
+    def as_json(self, zero_s: float) -> dict[str, Any]:
+        x, columns = self.x, np.stack([s.values for s in self.series], axis=1)
+        if self.x_label is None:
+            x, columns = thinned(x - zero_s, columns)
+        return {
+            "kind": "plot",
+            "title": self.title,
+            "unit": self.unit,
+            "good": self.good,
+            "x_label": self.x_label,
+            "log": self.log,
+            "levels": list(self.levels),
+            "x": packed(x),
+            "series": [
+                {"label": s.label, "role": s.role, "like": s.like, "y": packed(columns[:, k])}
+                for k, s in enumerate(self.series)
+            ],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    good: str = ""
+    wrong: frozenset[int] = frozenset()
+    """The rows that a reader should see first."""
+
+    def as_json(self, zero_s: float) -> dict[str, Any]:
+        return {
+            "kind": "table",
+            "title": self.title,
+            "head": list(self.head),
+            "rows": [list(row) for row in self.rows],
+            "good": self.good,
+            "wrong": sorted(self.wrong),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The way from above: metres north and east of its beginning, (n,) each.
+
+    `mode` are indices into the modes' names, `sigma` the horizontal one (m), `sd_n` and `sd_e` its
+    parts. `truth` (m, 2) is north and east of another track, if there is one.
+    """
+
+    t_s: Floats
+    north: Floats
+    east: Floats
+    sd_n: Floats
+    sd_e: Floats
+    mode: Floats
+    good: str
+    truth: Floats | None = None
+
+    def as_json(self, zero_s: float) -> dict[str, Any]:
+        arrays = {
+            "t": self.t_s - zero_s,
+            "north": self.north,
+            "east": self.east,
+            "sd_n": self.sd_n,
+            "sd_e": self.sd_e,
+            "mode": self.mode,
+        }
+        truth = self.truth if self.truth is not None else np.empty((0, 2))
+        return {
+            "kind": "track",
+            "title": "Track",
+            "good": self.good,
+            "truth": [packed(truth[:, 0]), packed(truth[:, 1])],
+            **{name: packed(values) for name, values in arrays.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Sentence:
+    """What is not there, and why."""
+
+    text: str
+
+    def as_json(self, zero_s: float) -> dict[str, Any]:
+        return {"kind": "sentence", "text": self.text}
+
+
+Item = Plot | Table | Track | Sentence
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Items under one heading; what has the same `key` in two runs stands side by side."""
+
+    title: str
+    items: Sequence[tuple[str, Item]] = field(default_factory=tuple)

@@ -1,0 +1,161 @@
+"""One run as a report sees it, whatever it was read from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from fusiond.files.csv_tables import Floats
+from fusiond.files.tables import TrajectoryTable
+
+
+class Problem(NamedTuple):
+    """Something that is wrong with the file, or that a reader must know before he believes it."""
+
+    level: Literal["warning", "error"]
+    text: str
+
+
+class Event(NamedTuple):
+    """At `t_s` of the run."""
+
+    t_s: float
+    level: str
+    code: str
+    source: str
+    text: str
+
+
+class Difference(NamedTuple):
+    """A setting that is not at its default, dotted; None: it has no default."""
+
+    key: str
+    value: str
+    default: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Innovations:
+    """The aids of one source, a row each, by instant of validity.
+
+    `delay_s` is from validity until the filter first met it. `whitened` (n, k) is NaN where there
+    was no innovation.
+    """
+
+    t_s: Floats
+    delay_s: Floats
+    nis: Floats
+    degrees: Floats
+    whitened: Floats
+    outcome: Sequence[str]
+
+    @property
+    def fused(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        return np.array([name == "fused" for name in self.outcome], dtype=np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdicts:
+    """The consistency tests of one source over time (n,)."""
+
+    t_s: Floats
+    nis_average: Floats
+    nis_low: Floats
+    nis_high: Floats
+    rho_1: Floats
+    rho_high: Floats
+    verdict: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """A parameter over time with one sigma, in the unit named."""
+
+    unit: str
+    t_s: Floats
+    value: Floats
+    sd: Floats
+    state: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """Satellites of one receiver: counts over time, and refusals by reason over all epochs."""
+
+    t_s: Floats
+    used: Floats
+    refused: Floats
+    pdop: Floats
+    reasons: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuLook:
+    """What the inertial samples look like before the filter, in the stretches looked at.
+
+    Intervals (ms) between samples by their own stamps and by their arrival; the amplitude spectrum
+    of the three axes of rate (deg/s per root Hz) and specific force (m/s^2 per root Hz), (n, 3).
+    """
+
+    source: str
+    t_s: Floats
+    stamped_ms: Floats
+    arrived_ms: Floats
+    samples: int
+    seconds: float
+    frequency_hz: Floats
+    gyro: Floats
+    accel: Floats
+
+
+@dataclass(slots=True)
+class LogParts:
+    """What a log holds beyond the solution; empty where it does not."""
+
+    outcomes: dict[str, dict[str, int]] = field(default_factory=dict)
+    counters: dict[str, dict[str, int]] = field(default_factory=dict)
+    innovations: dict[str, Innovations] = field(default_factory=dict)
+    verdicts: dict[str, Verdicts] = field(default_factory=dict)
+    biases: dict[str, Estimated] = field(default_factory=dict)
+    calibration: dict[str, Estimated] = field(default_factory=dict)
+    sky: dict[str, Sky] = field(default_factory=dict)
+    latency: dict[str, tuple[Floats, Floats]] = field(default_factory=dict)
+    late_ms: tuple[Floats, Floats] | None = None
+    usage: tuple[Floats, Floats, Floats] | None = None
+    """Times, CPU in percent of a core, resident memory in MB."""
+    imu: ImuLook | None = None
+    sources: Sequence[str] = ()
+
+
+@dataclass(slots=True)
+class Run:
+    """A run. `t_s` of the solution is the axis of everything; `posix` says whether it is seconds of
+    POSIX time. `truth_offset_s` is what a truth's times are ahead of it."""
+
+    name: str
+    solution: TrajectoryTable
+    posix: bool
+    facts: list[tuple[str, str]] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+    differs: list[Difference] | None = None
+    events: list[Event] = field(default_factory=list)
+    truth_offset_s: float = 0.0
+    log: LogParts | None = None
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last instant of the solution, or of the events where there is none."""
+        times = self.solution.t_s if len(self.solution.t_s) else [e.t_s for e in self.events]
+        return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
+
+    def modes(self) -> Iterator[tuple[float, float, str]]:
+        """Stretches of one mode: from, to, which."""
+        status, t_s = self.solution.status, self.solution.t_s
+        begun = 0
+        for k in range(1, len(status) + 1):
+            if k == len(status) or status[k] != status[begun]:
+                yield float(t_s[begun]), float(t_s[min(k, len(status) - 1)]), status[begun]
+                begun = k

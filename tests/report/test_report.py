@@ -1,0 +1,396 @@
+"""Pages of a drive that was recorded, of solution files, of two runs, of files that are broken."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fusiond.commands.app import app
+from fusiond.files.solution_csv import STATUS, SolutionWriter
+from fusiond.files.tables import read_truth
+from fusiond.offline.compare import compare
+from fusiond.recording.reader import Log
+from fusiond.report.local import metres_from, origin_of
+from fusiond.report.report import report
+from fusiond.report.run import Run
+from tests.patience import PATIENCE_S
+from tests.recording.driven import Drive
+from tests.report.pages import (
+    EPOCH_NS,
+    item,
+    items,
+    numbers,
+    read_page,
+    series,
+    solution,
+    written,
+)
+
+ASSETS = Path(__file__).parents[2] / "fusiond" / "report" / "assets"
+HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)"><!--'
+
+
+@dataclass
+class Recorded:
+    log: Path
+    truth: Path
+    page: Path
+    run: Run
+    document: dict[str, Any]
+    health: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """The demo's car for 16 s, 4 s of them navigating, and its page with the truth."""
+    folder = tmp_path_factory.mktemp("drive")
+    drive = Drive(folder, 20.0)
+    drive.run(16.0)
+    (log,) = drive.close()
+    states = drive.vehicle.truth.at(np.arange(0.0, 18.0, 0.1))
+    path = folder / "truth.csv"
+    n = len(states.t_s)
+    with SolutionWriter(path) as file:
+        file.rows(
+            states.t_s + drive.vehicle.utc_start_ns * 1e-9,
+            *states.position.T,
+            states.v_ned,
+            states.rpy,
+            np.full((n, 9), np.nan),
+            np.full(n, STATUS.index("navigating"), dtype=np.int64),
+        )
+    page = folder / "report.html"
+    (run,) = report([log], page, path)
+    health = [m.json() for m in Log([log]).messages("/health")]
+    return Recorded(log, path, page, run, read_page(page), health[-1])
+
+
+def fusiond(*args: str | Path) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["report", *map(str, args)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.output
+
+
+# --------------------------------------------------------------------------- a log
+
+
+def test_a_page_has_every_section_and_a_sentence_under_every_plot(recorded: Recorded) -> None:
+    titles = [s["title"] for s in recorded.document["sections"]]
+    assert titles == [
+        "Summary",
+        "Track",
+        "Position, velocity, attitude",
+        "Errors against the truth",
+        "Innovations",
+        "Biases and calibration",
+        "Verdicts",
+        "Delays",
+        "Satellites",
+        "Inertial unit",
+        "Computer",
+    ]
+    drawn = [i for t in titles for i in items(recorded.document, t) if i["kind"] != "sentence"]
+    plots = [i for i in drawn if i["kind"] in ("plot", "track")]
+    assert len(plots) > 20
+    assert all(i["good"].startswith("Good: ") for i in plots)
+    assert not recorded.document["runs"][0]["problems"]
+
+
+def test_the_page_asks_for_nothing(recorded: Recorded) -> None:
+    text = recorded.page.read_text()
+    assert "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'" in text
+    program = re.sub(r'type="application/json">.*?</script>', "></script>", text, flags=re.DOTALL)
+    asks = r"<link|<img|<iframe|<script[^>]*src|@import|url\(|fetch\(|XMLHttp|import\(|WebSocket"
+    assert not re.findall(asks, program)
+    assert set(re.findall(r"https?://[^\s\"')]*", program)) == {"https://github.com/leeoniya/uPlot"}
+
+
+def test_the_states_are_those_of_the_log(recorded: Recorded) -> None:
+    s = recorded.run.solution
+    origin = origin_of(s)
+    assert origin is not None
+    north = metres_from(origin, s)[:, 0]
+    plot = item(recorded.document, "Position, velocity, attitude", "Position from")
+    drawn = series(plot, "north")
+    assert np.nanmax(drawn) == pytest.approx(np.nanmax(north), abs=1e-3)
+    assert numbers(plot["x"])[-1] == pytest.approx(s.t_s[-1] - s.t_s[0], abs=1e-3)
+    track = items(recorded.document, "Track")[0]
+    assert len(numbers(track["north"])) == np.isfinite(s.lat_rad).sum()
+    assert numbers(track["north"])[-1] == pytest.approx(north[-1], abs=1e-3)
+    modes = recorded.document["runs"][0]["modes"]
+    assert [mode for *_, mode in modes] == ["waiting", "aligning", "navigating"]
+    codes = [code for *_, code, _ in recorded.document["runs"][0]["events"]]
+    assert "aligned" in codes
+
+
+def test_errors_are_those_of_compare(recorded: Recorded) -> None:
+    truth = read_truth(recorded.truth)
+    s = recorded.run.solution
+    utc = replace(s, t_s=s.t_s + recorded.run.truth_offset_s)
+    expected = compare(utc, truth)
+    table = item(recorded.document, "Errors against the truth", f"{expected['epochs']} epochs")
+    horizontal = expected["horizontal_rms_m"]
+    assert horizontal is not None
+    assert 0.05 < horizontal < 5.0
+    assert table["rows"][0][:2] == ["horizontal", f"{horizontal:.4f}"]
+    coverage = item(recorded.document, "Errors against the truth", "Coverage")
+    share = expected["horizontal_inside_2_sigma"]
+    assert share is not None
+    assert coverage["rows"][1] == ["inside 2 sigma horizontally", f"{100 * share:.1f} %", "86.5 %"]
+
+
+def test_each_measurement_is_counted_once(recorded: Recorded) -> None:
+    """A late fix rewinds the filter, which meets later aids again: the log holds them twice."""
+    found = recorded.run.log
+    assert found is not None
+    gnss = found.innovations["gnss"]
+    assert np.count_nonzero(gnss.fused) == pytest.approx(
+        recorded.health["sources"]["gnss"]["fused"], abs=10
+    )
+    assert len(set(gnss.t_s)) == len(gnss.t_s)
+    plot = item(recorded.document, "Innovations", "NIS a degree of freedom, gnss")
+    assert np.isfinite(series(plot, "accepted")).sum() == np.count_nonzero(gnss.fused)
+    assert plot["good"].startswith("Good: around 1")
+    constraint = item(recorded.document, "Innovations", "NIS a degree of freedom, non_holonomic")
+    assert "no verdict" in constraint["good"]
+    outcomes = item(recorded.document, "Summary", "What became")
+    row = dict(zip(outcomes["head"], outcomes["rows"][1], strict=True))
+    assert row["source"] == "gnss"
+    assert int(row["fused"]) == recorded.health["sources"]["gnss"]["fused"]
+
+
+def test_delays_and_lateness_are_those_of_the_drive(recorded: Recorded) -> None:
+    rdss = recorded.run.log.innovations["rdss"]  # type: ignore[union-attr]
+    fused = rdss.delay_s[rdss.fused]
+    assert len(fused) >= 1
+    assert np.all((fused > 0.5) & (fused < 5.0))  # the simulated terminal's request cycle
+    late = item(recorded.document, "Computer", "Lateness of the ticks")
+    assert np.nanmedian(series(late, "after its deadline")) == pytest.approx(0.3, abs=0.2)
+
+
+def test_the_inertial_unit_is_looked_at(recorded: Recorded) -> None:
+    look = recorded.run.log.imu  # type: ignore[union-attr]
+    assert look is not None
+    assert look.source == "imu"
+    assert np.nanmedian(look.stamped_ms) == pytest.approx(10.0, abs=0.01)
+    assert look.frequency_hz[-1] == pytest.approx(50.0)
+    # The demo's unit: 0.3 deg/sqrt(h), one-sided sqrt(2) times as much, far from the motion.
+    noise = 0.3 / 60.0 * np.sqrt(2.0)
+    high = look.gyro[look.frequency_hz > 25.0]
+    assert float(np.sqrt(np.mean(high**2))) == pytest.approx(noise, rel=0.1)
+
+
+def test_biases_come_with_sigma(recorded: Recorded) -> None:
+    biases = recorded.run.log.biases  # type: ignore[union-attr]
+    assert list(biases) == [f"{what} {axis}" for what in ("gyro", "accel") for axis in "xyz"]
+    assert biases["gyro x"].unit == "deg/h"
+    assert all(np.all(b.sd > 0.0) for b in biases.values())
+    assert items(recorded.document, "Biases and calibration")
+
+
+def test_satellites_verdicts_and_calibration_over_time(tmp_path: Path) -> None:
+    messages: list[tuple[str, float, bytes]] = []
+    for k in range(5):
+        sky = {"used": ["C21"] * (6 + k), "refused": {"C05": "low", "C06": "low"}, "pdop": 2.0 + k}
+        health = {"sources": {"gnss": {"sky": sky}}, "cpu_percent": 10.0 * k, "memory_mb": 80.0}
+        judged = {
+            "verdict": "optimistic",
+            "nis_average": 1.0 + k,
+            "rho": [0.1 * k],
+            "rho_high": 0.2,
+        }
+        bounds = {"nis_low": 0.8, "nis_high": 1.2}
+        scale = {"value": 0.01, "sd": 0.1 / (k + 1), "prior_sd": 0.1, "state": "observed"}
+        messages += [
+            ("/health", 1.0 + k, json.dumps(health).encode()),
+            ("/consistency", 1.1 + k, json.dumps({"sources": {"gnss": judged | bounds}}).encode()),
+            ("/calibration", 1.2 + k, json.dumps({"parameters": {"wheel_scale": scale}}).encode()),
+        ]
+    report([written(tmp_path / "a.mcap", messages)], tmp_path / "a.html")
+    document = read_page(tmp_path / "a.html")
+    assert series(item(document, "Satellites", "Satellites"), "used").tolist() == [6, 7, 8, 9, 10]
+    assert series(item(document, "Satellites", "PDOP"), "PDOP").tolist() == [2, 3, 4, 5, 6]
+    assert item(document, "Satellites", "Why refused")["rows"] == [["low", "10"]]
+    end = item(document, "Verdicts", "At the end")
+    assert end["rows"] == [["gnss", "optimistic", "5.000", "0.400"]]
+    assert end["wrong"] == [0]
+    nis = item(document, "Verdicts", "NIS average")
+    assert series(nis, "95 % to") == pytest.approx([1.2] * 5)
+    scale_plot = item(document, "Biases and calibration", "wheel_scale")
+    assert scale_plot["unit"] == "ratio"
+    assert series(scale_plot, "+2 sigma")[-1] == pytest.approx(0.05)
+    assert series(item(document, "Computer", "CPU"), "CPU").tolist() == [0, 10, 20, 30, 40]
+
+
+# --------------------------------------------------------------------------- broken files
+
+
+def test_a_log_that_is_cut_off_is_shown_as_far_as_it_goes(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(recorded.log.read_bytes()[: recorded.log.stat().st_size // 2])
+    code, text = fusiond(cut, "--out", tmp_path / "cut.html")
+    assert code == 0
+    assert "cut off" in text
+    document = read_page(tmp_path / "cut.html")
+    ((level, problem),) = document["runs"][0]["problems"]
+    assert level == "error"
+    assert "cut off" in problem
+    assert 1.0 < document["span"][1] < recorded.document["span"][1]
+
+
+def test_a_part_that_is_missing_is_named(recorded: Recorded, tmp_path: Path) -> None:
+    nav = json.dumps({"mode": "aligning"}).encode()
+    first = written(tmp_path / "a.mcap", [("/nav", 1.0, nav)])
+    third = written(tmp_path / "c.mcap", [("/nav", 2.0, nav)], metadata={"part": "2"})
+    (run,) = report([first, third], tmp_path / "r.html")
+    assert any("missing" in p.text for p in run.problems)
+
+
+@pytest.mark.parametrize("content", [b"", b"t_s,lat\n" * 20, b"\x89MCAP0\r\n"])
+def test_what_is_no_log_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    code, text = fusiond(path, "--out", tmp_path / "x.html")
+    assert code == 65
+    assert text.startswith(f"fusiond: {path}: no ")
+    assert text.count("\n") == 1
+    assert not (tmp_path / "x.html").exists()
+
+
+def test_values_of_the_wrong_kind_cost_themselves_alone(tmp_path: Path) -> None:
+    good = {"mode": "navigating", "lat_deg": 30.5, "lon_deg": 114.3, "height_m": 40.0}
+    messages = [
+        ("/nav", 1.0, json.dumps(good).encode()),
+        ("/nav", 1.1, json.dumps({**good, "lat_deg": "north", "v_n_m_s": True}).encode()),
+        ("/nav", 1.2, b"[1, 2]"),
+        ("/health", 1.3, b'{"sources": {"gnss": 3, "imu": {"rejected": [], "sky": 1}}}'),
+        ("/consistency", 1.4, b'{"sources": {"gnss": {"rho": "x"}}}'),
+        ("/calibration", 1.5, b'{"parameters": null}'),
+        ("/innovation", 1.6, b'{"t_ns": "soon", "source": 1}'),
+        ("/fusiond/state", 1.7, b'{"navigation": {"xi": [1], "covariance": [1, 2]}}'),
+        ("/nav", 1.8, json.dumps(good).encode()),
+    ]
+    log = written(tmp_path / "odd.mcap", messages)
+    (run,) = report([log], tmp_path / "odd.html")
+    assert np.isfinite(run.solution.lat_rad).tolist() == [True, False, True]
+    assert any("1 messages are no JSON objects" in p.text for p in run.problems)
+    assert read_page(tmp_path / "odd.html")["sections"]
+
+
+def test_names_and_texts_from_a_file_stay_text(tmp_path: Path) -> None:
+    nav = json.dumps({"mode": HOSTILE, "lat_deg": 30.5, "lon_deg": 114.3, "height_m": 1.0}).encode()
+    event = {"level": HOSTILE, "code": HOSTILE, "source": HOSTILE, "text": HOSTILE}
+    health = {"sources": {HOSTILE: {"fused": 1, "rejected": {HOSTILE: 2}}}}
+    messages = [
+        ("/nav", 1.0, nav),
+        ("/event", 1.1, json.dumps(event).encode()),
+        ("/health", 1.2, json.dumps(health).encode()),
+        ("/nav", 2.0, nav),
+    ]
+    named = tmp_path / "<img src=x onerror=alert(3)>.mcap"
+    log = written(named, messages, metadata={"vehicle": HOSTILE})
+    report([log], tmp_path / "hostile.html")
+    text = (tmp_path / "hostile.html").read_text()
+    assert "alert(1)" in text
+    assert not re.findall("<script>alert|<img|<!--", text)
+    document = read_page(tmp_path / "hostile.html")
+    assert ["vehicle", HOSTILE] in item(document, "Summary", "Run")["rows"]
+    assert document["runs"][0]["events"][0][1:] == [HOSTILE] * 4
+    # ... and what the page's own scripts write is text too.
+    own = "".join(p.read_text() for p in ASSETS.glob("*.js"))
+    assert not re.findall(
+        r"innerHTML|outerHTML|insertAdjacent|document\.write|eval\(|Function\(", own
+    )
+
+
+# --------------------------------------------------------------------------- solutions, two runs
+
+
+def test_a_solution_file_says_what_it_does_not_hold(tmp_path: Path) -> None:
+    path = solution(tmp_path / "s.csv", 1000.0)
+    code, _ = fusiond(path, "--out", tmp_path / "s.html")
+    assert code == 0
+    document = read_page(tmp_path / "s.html")
+    titles = [s["title"] for s in document["sections"]]
+    assert titles == ["Summary", "Track", "Position, velocity, attitude"]
+    told = " ".join(i["text"] for i in items(document, "Summary") if i["kind"] == "sentence")
+    assert "outcomes, innovations, biases, verdicts, delays, satellites" in told
+    run = item(document, "Summary", "Run")
+    assert ["distance", "399.0 m"] in run["rows"]
+    modes = item(document, "Summary", "Modes")
+    assert [row[:2] for row in modes["rows"]] == [["navigating", "87.7 %"], ["coasting", "12.3 %"]]
+
+
+def test_two_runs_stand_side_by_side_and_their_difference_is_drawn(tmp_path: Path) -> None:
+    first = solution(tmp_path / "a.csv", 1000.0)
+    second = solution(tmp_path / "b.csv", 1000.0, east_m=2.0)
+    report([first], tmp_path / "two.html", beside=[second])
+    document = read_page(tmp_path / "two.html")
+    assert [run["name"] for run in document["runs"]] == ["a.csv", "b.csv"]
+    apart = item(document, "The second run against the first", "Distance")
+    assert np.nanmedian(series(apart, "horizontal")) == pytest.approx(2.0, rel=0.01)
+    sigmas = item(document, "The second run against the first", "The same in sigmas")
+    assert np.nanmedian(series(sigmas, "east")) == pytest.approx(4.0, rel=0.01)
+    rows = next(s["rows"] for s in document["sections"] if s["title"].startswith("Position"))
+    assert all(len(row) == 2 for row in rows)
+
+
+def test_a_run_beside_itself_is_the_same(tmp_path: Path) -> None:
+    path = solution(tmp_path / "a.csv", 1000.0)
+    report([path], tmp_path / "two.html", beside=[path])
+    (same,) = items(read_page(tmp_path / "two.html"), "The second run against the first")
+    assert same["text"] == "The same positions at all 400 instants that both have."
+
+
+def test_runs_without_common_time_begin_together(tmp_path: Path) -> None:
+    first = solution(tmp_path / "a.csv", 1000.0)
+    second = solution(tmp_path / "b.csv", 9000.0)
+    report([first], tmp_path / "two.html", beside=[second])
+    document = read_page(tmp_path / "two.html")
+    assert "no time in common" in document["note"]
+    assert document["span"] == pytest.approx([0.0, 39.9])
+
+
+def test_a_log_beside_a_solution(recorded: Recorded, tmp_path: Path) -> None:
+    other = solution(tmp_path / "b.csv", EPOCH_NS * 1e-9)
+    report([other], tmp_path / "two.html", beside=[recorded.log])
+    document = read_page(tmp_path / "two.html")
+    rows = next(s["rows"] for s in document["sections"] if s["title"] == "Computer")
+    assert all(row[0] is None and row[1] is not None for row in rows)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="Debian's chromium is not installed")
+def test_a_browser_draws_every_plot(recorded: Recorded, tmp_path: Path) -> None:
+    told = tmp_path / "told.html"
+    watch = (
+        "<script>addEventListener('load', () => setTimeout(() => { document.title ="
+        " `drawn ${document.querySelectorAll('.uplot').length}"
+        " track ${document.querySelectorAll('.track canvas').length}`; }, 0));</script>"
+    )
+    told.write_text(recorded.page.read_text().replace("</body>", watch + "</body>"))
+    done = subprocess.run(
+        [
+            *("chromium", "--headless", "--no-sandbox", "--disable-gpu"),
+            *("--disable-background-networking", "--disable-component-update"),
+            *(f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000"),
+            *("--dump-dom", told.as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+    )
+    titles = [s["title"] for s in recorded.document["sections"]]
+    plots = sum(i["kind"] == "plot" for t in titles for i in items(recorded.document, t))
+    assert f"<title>drawn {plots} track 1</title>" in done.stdout
