@@ -344,9 +344,9 @@ class ErrorStateFilter:
             doubted = DOUBTED_ATTITUDE_RAD, DOUBTED_RATE_RAD_S, DOUBTED_FORCE_M_S2
             for first, sd in zip((0, 9, 12), doubted, strict=True):
                 for axis in range(first, first + 3):
-                    slot = axis if first == 0 else self.model.parameters(axis)[0]
-                    if self.model.active[slot]:
-                        cov[slot, slot] += sd**2
+                    slots = [axis] if first == 0 else self.model.parameters(axis)
+                    for slot in slots[:1]:  # a model may know no such error
+                        cov[slot, slot] += sd**2 * self.model.active[slot]
         for row, value in zip(h, z, strict=True):
             # Position or velocity before the attitude that turns a lever arm.
             group = next(g for g in (slice(3, 9), slice(0, 3), slice(0, len(row))) if row[g].any())

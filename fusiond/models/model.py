@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fusiond.models.blocks import Block
 from fusiond.models.vehicle import FIX_TIME
-from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR, RATE_SCALE, WIDTHS
+from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR, RATE_SCALE, WIDTHS
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -124,6 +124,11 @@ class Model:
             if block.name.startswith(FIX_TIME):
                 return self.slots_of(block.name)[0]
         return -1
+
+    @cached_property
+    def sensor_errors(self) -> bool:
+        """Whether it has states for what each gyro and each accelerometer errs by."""
+        return all(self.parameters(axis) for axis in range(RATE_ERROR, FORCE_ERROR + 3))
 
     def parameters(self, column: int) -> list[int]:
         """Slots of the parameters of one column (constant and Markov gyro drift share one)."""

@@ -242,14 +242,14 @@ class Navigator:
             self._event("filter_not_finite", f"{what}: aligning anew")
             self.reset(what)
             return
+        if self._refuted():  # before it is a failure, of which it would be the reason
+            return
         e = self.estimator
         failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav)
         if failure is not None:
             self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
-            return
-        if self._refuted():
             return
         self._left_out.tell()
         if self.warm is not None and self.warm.refused_by is not None:

@@ -199,7 +199,9 @@ class Timeline:
             case "hold":
                 estimator.hold()
         believed = isolation.believes(entry.aid.source)
-        before = Attitude.of(estimator.nav[Q0:], estimator.covariance)
+        # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
+        tilts = (entry.aid.locates or entry.aid.moves) and estimator.model.sensor_errors
+        before = Attitude.of(estimator.nav[Q0:], estimator.covariance) if tilts else None
         try:
             aid = entry.aid.at(estimator.nav)
             outcome = estimator.update(aid) if believed else estimator.look(aid)
@@ -208,7 +210,7 @@ class Timeline:
             return Outcome("failed")
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
-            if action is Action.NONE and outcome.name == "fused" and (aid.locates or aid.moves):
+            if action is Action.NONE and outcome.name == "fused" and before is not None:
                 after = Attitude.of(estimator.nav[Q0:], estimator.covariance)
                 action = isolation.corrected(aid.t_ns, before, after)
             if action is not Action.NONE:

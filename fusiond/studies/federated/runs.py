@@ -22,14 +22,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
-from fusiond.estimators.base import Estimator, Outcome
+from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.integrity.isolation import Action, Isolation
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -41,6 +39,7 @@ from fusiond.simulation.trajectories import drive
 from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
 from fusiond.studies.monte_carlo import on_processes
 from fusiond.studies.navigation_error import nav_error, true_nav, with_error
+from fusiond.studies.trusting import Trusting
 
 Array = NDArray[np.float64]
 FaultKind = Literal["", "step", "drift", "frozen"]
@@ -78,14 +77,6 @@ class Filter:
     name: str
     options: FederatedOptions | None = None
     isolates: bool = False
-
-
-class _Trusting(Isolation):
-    """Leaves all to the filter: its gate, and what detects faults in a federated one."""
-
-    def judge(self, aid: Aid, outcome: Outcome, nav: Array) -> Action:
-        """Nobody is ever suspected."""
-        return Action.NONE
 
 
 @dataclass(slots=True)
@@ -195,7 +186,7 @@ def _run(
     imu = ImuBuffer(rate, HISTORY_S, np.eye(3), 0.0, STUDY_IMU.gap_s)
     timeline = Timeline(estimator, imu, HISTORY_S, CHECKPOINT_S)
     if not filter_.isolates:
-        timeline.isolation = _Trusting()
+        timeline.isolation = Trusting()
     p = np.diag(initial_sd(model) ** 2)
     estimator.initialise(0, 0, start, np.zeros(model.size), p)
     timeline.start()

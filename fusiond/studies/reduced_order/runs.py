@@ -29,6 +29,7 @@ from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
 from fusiond.studies.monte_carlo import on_processes
 from fusiond.studies.navigation_error import nav_error, with_error
 from fusiond.studies.reduced_order import flight
+from fusiond.studies.trusting import Trusting
 
 Array = NDArray[np.float64]
 
@@ -122,6 +123,7 @@ def live(
     for estimator in filters:
         buffer = ImuBuffer(rate_hz, HISTORY_S, np.eye(3), 0.0, flight.IMU.gap_s)
         timelines.append(Timeline(estimator, buffer, HISTORY_S, CHECKPOINT_S))
+        timelines[-1].isolation = Trusting()
         timelines[-1].start()
     for k, aids in enumerate(given):
         second = slice(k * count, (k + 1) * count)

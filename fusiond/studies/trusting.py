@@ -1,0 +1,25 @@
+"""A timeline without isolation, for experiments on filters that are wrong by design."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.estimators.base import Outcome
+from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.tilt import Attitude
+
+Array = NDArray[np.float64]
+
+
+class Trusting(Isolation):
+    """Leaves all to the filter: its gate, and what detects faults in a federated one."""
+
+    def judge(self, aid: Aid, outcome: Outcome, nav: Array) -> Action:
+        """Nobody is ever suspected."""
+        return Action.NONE
+
+    def corrected(self, t_ns: int, before: Attitude, after: Attitude) -> Action:
+        """Nor is the IMU."""
+        return Action.NONE
