@@ -142,10 +142,17 @@ def _published(block: Block, state: str) -> str:
 
 class CalibrationWatch:
     """Follows the calibration of a filter of `model`; `on_event(code, text)` hears `calibrated`
-    when a parameter has settled, once for each, and when the last one has."""
+    when a parameter has settled, once for each, and when the last one has.
 
-    def __init__(self, model: Model, on_event: Callable[[str, str], None]) -> None:
+    `askew_rad` is one sigma of what the IMU's axes are out of square by: to no more than that can
+    anybody say how it is mounted.
+    """
+
+    def __init__(
+        self, model: Model, on_event: Callable[[str, str], None], askew_rad: float = 0.0
+    ) -> None:
         self._slots = calibration_slots(model)
+        self._least_sd = np.array([askew_rad * (s.kind == MOUNTING) for s in self._slots])
         self._indices = np.array([s.index for s in self._slots], dtype=np.int64)
         self._event = on_event
         self._told: set[str] = set()
@@ -178,7 +185,7 @@ class CalibrationWatch:
         before = None
         if self._past and t_ns - self._past[0][0] >= STAYS_S * 1e9:
             before = self._past[0][1]
-        sd = np.sqrt(covariance[self._indices, self._indices])
+        sd = np.maximum(np.sqrt(covariance[self._indices, self._indices]), self._least_sd)
         self._past.append((t_ns, now))
         self.parameters = tuple(
             _parameter(s, float(now[i]), float(sd[i]), None if before is None else before[i])

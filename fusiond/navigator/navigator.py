@@ -114,7 +114,7 @@ class Navigator:
         """A start to be tried before any alignment, and its trial."""
         self.calibration: SavedCalibration | None = None
         """What an earlier drive has shown, taken up by each alignment until it is refuted."""
-        self.calibrating = CalibrationWatch(self.model, self._event)
+        self.calibrating = CalibrationWatch(self.model, self._event, askew)
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:

@@ -99,6 +99,7 @@ class OneRow:
     screened: ClassVar[bool] = True
     source: str = "raw"
     gate: float = 1 - 1e-9
+    robust: bool = False
 
     @property
     def t_ns(self) -> int:

@@ -14,8 +14,8 @@ from tests.hil.uml import HarnessError, Result, run_in_uml, run_with_vcan
 
 INSIDE = Path(__file__).parent / "inside"
 GROUPS = (
-    ("test_bench.py", "test_daemon.py", "test_daemon_can_log.py", "test_daemon_estimators.py"),
-    ("test_daemon_drive.py", "test_daemon_raw.py", "test_daemon_rdss.py"),
+    ("test_bench.py", "test_daemon.py", "test_daemon_estimators.py"),
+    ("test_daemon_can_log.py", "test_daemon_drive.py", "test_daemon_raw.py", "test_daemon_rdss.py"),
 )
 """Each group has a guest of its own, side by side on two cores; about equally long."""
 TIMEOUT_S = 3600.0
