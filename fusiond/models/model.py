@@ -106,6 +106,18 @@ class Model:
         """The slots of a block; empty if the model has no such block."""
         return self._slots_by_name.get(block, [])
 
+    def slots_of_all(self, blocks: tuple[str, ...]) -> Indices:
+        """The slots of blocks one after another (k,), as kernels take them; not to be written."""
+        found = self._joined.get(blocks)
+        if found is None:
+            slots = [slot for block in blocks for slot in self.slots_of(block)]
+            found = self._joined[blocks] = np.array(slots, dtype=np.int64)
+        return found
+
+    @cached_property
+    def _joined(self) -> dict[tuple[str, ...], Indices]:
+        return {}
+
     @cached_property
     def stated(self) -> NDArray[np.bool_]:
         """(9,): whether position, velocity (n, e, d), roll, pitch, yaw are estimated at all, and

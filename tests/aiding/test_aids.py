@@ -243,9 +243,7 @@ def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
     wheel = replace(wheel, rounding=WHEEL_ROUNDING, shared_step_m_s=KM_H)
     assert _innovation(wheel, state).z == pytest.approx([0.0], abs=1e-9)
     arm = dcm @ np.add(LEVER, rest)
-    moved = np.array(VELOCITY) + dcm @ np.cross(RATE_SENSED, np.add(LEVER, rest))
-    moved = moved * late + 0.5 * np.array(ACCELERATION) * late**2
-    antenna = nav[:3] + (arm + moved) / runs.metres(*nav[[0, 2]])
+    antenna = nav[:3] + (arm + np.array(VELOCITY) * late) / runs.metres(*nav[[0, 2]])
     lat, lon, height = (float(x) for x in antenna)
     fix = PositionAid(*SOURCE, lat, lon, height, (1.0, 1.0, 1.0), LEVER)
     fix = replace(fix, time=FIX_TIME, rest=ANTENNA_LEVER)
