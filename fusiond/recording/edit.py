@@ -53,7 +53,6 @@ def trim(paths: Sequence[Path], from_s: float, to_s: float, out: Path) -> Edited
     first_ns = _first_tick_ns(recording)
     begin_ns, end_ns = (first_ns + round(s * SECOND_NS) for s in (from_s, to_s))
     states = [m.t_log_ns for m in recording.messages(STATE) if m.t_log_ns <= begin_ns]
-    recording.problems.clear()
     if from_s <= 0.0:
         chosen = (m for m in recording.messages() if m.t_log_ns <= end_ns)
         written = write_log(out, recording.about, {}, chosen)

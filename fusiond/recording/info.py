@@ -23,7 +23,6 @@ def info(recording: Log) -> dict[str, Any]:
     `gaps` are pauses between ticks of more than a second; `clock_steps` of the system clock.
     """
     channels = Counter(message.topic for message in recording.messages() if message.topic != INPUT)
-    recording.problems.clear()  # they come again with the input
     inputs = _Inputs(recording)
     for record in recording.records():
         inputs.take(record)

@@ -67,7 +67,7 @@ class Log:
     """A recording in one or several files, in order. Raises `LogError`, and OSError for what cannot
     be read.
 
-    `problems` fills while messages are read: what is wrong with the files, one sentence each.
+    `problems` fills while messages are read: what is wrong with the files, each sentence once.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -84,13 +84,13 @@ class Log:
         first = int(self.about.metadata["part"])
         for place, (path, about) in enumerate(described):
             if int(about.metadata["part"]) != first + place:
-                self.problems.append(f"{path.name}: a part before it is missing")
+                self._problem(f"{path.name}: a part before it is missing")
 
     def messages(self, *topics: str) -> Iterator[LogMessage]:
         """The messages of these channels, of all by default, as they were written."""
         wanted = frozenset(topics)
         for path in self.paths:
-            for found in _messages(path, self.problems.append):
+            for found in _messages(path, self._problem):
                 if not wanted or found.topic in wanted:
                     yield found
 
@@ -100,12 +100,16 @@ class Log:
         for message in self.messages(INPUT):
             if last and message.sequence != last + 1:
                 lost = message.sequence - last - 1
-                self.problems.append(f"{lost} messages of input are missing after message {last}")
+                self._problem(f"{lost} messages of input are missing after message {last}")
             last = message.sequence
             try:
                 yield from unpack(message.data)
             except DamagedRecordError as error:
-                self.problems.append(f"message {message.sequence} of input: {error}")
+                self._problem(f"message {message.sequence} of input: {error}")
+
+    def _problem(self, text: str) -> None:
+        if text not in self.problems:
+            self.problems.append(text)
 
     @property
     def first_part(self) -> bool:

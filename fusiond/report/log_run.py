@@ -59,14 +59,13 @@ class _Heard(Log):
 def run_from_log(paths: Sequence[Path]) -> Run:
     """Raises `LogError`, OSError."""
     log = _Heard(paths)
-    at_first = list(log.problems)
     reader = _Channels(log)
     log.on_message = reader.take
     with TemporaryDirectory(prefix="fusiond-report-") as folder:
         look = InputLook(log.about, Path(folder))
         log.on_record = look.take
         known = info(log)  # reads all messages, then all records
-    problems = [Problem("error", text) for text in dict.fromkeys((*at_first, *known["problems"]))]
+    problems = [Problem("error", text) for text in known["problems"]]
     problems += _told_by(known)
     parts = reader.parts()
     parts.late_ms, parts.imu = look.late_ms(), look.imu()

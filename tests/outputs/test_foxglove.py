@@ -78,7 +78,7 @@ async def received(connection: ClientConnection) -> tuple[int, int, dict[str, An
 
 
 async def subscribe(connection: ClientConnection, **channels: int) -> None:
-    wanted = [{"id": n, "channelId": IDS["/" + c.replace("__", "/")]} for c, n in channels.items()]
+    wanted = [{"id": n, "channelId": IDS[f"/{c}"]} for c, n in channels.items()]
     await connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
 
@@ -98,8 +98,8 @@ async def test_a_viewer_sees_what_it_has_subscribed_to(protocol: str) -> None:
             assert json.loads(channel["schema"])["type"] == "object"
         names = {c["topic"]: c["schemaName"] for c in advertised["channels"]}
         assert names["/location"] == "foxglove.LocationFix"
-        assert names["/fusiond/health"] == "fusiond.HealthMessage"
-        await subscribe(viewer, location=7, fusiond__health=2**32 - 1)
+        assert names["/health"] == "fusiond.HealthMessage"
+        await subscribe(viewer, location=7, health=2**32 - 1)
         subscription, t_ns, fix = await received(viewer)  # the last one, at once
         assert (subscription, t_ns) == (7, 1_795_217_587_123_000_000)
         assert fix["latitude"] == 31.025438871
@@ -129,8 +129,8 @@ async def test_one_who_does_not_read_costs_the_others_nothing() -> None:
         for viewer in (quick, stuck):
             await viewer.recv()
             await viewer.recv()
-        await subscribe(stuck, fusiond__health=1)
-        await subscribe(quick, fusiond__nav=2)
+        await subscribe(stuck, health=1)
+        await subscribe(quick, nav=2)
         async with asyncio.timeout(PATIENCE_S):
             while not server.counters["skipped"]:
                 server.take(HEALTH, EXAMPLES["health"])

@@ -18,6 +18,7 @@ from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.outputs.messages.event import event_message
 from fusiond.outputs.topics import EVENT
 from fusiond.recording import log_writer
+from fusiond.recording.info import info
 from fusiond.recording.log_file import LogFile
 from fusiond.recording.log_writer import logs_of
 from fusiond.recording.reader import Log
@@ -161,6 +162,8 @@ def test_a_recording_is_split_and_the_oldest_goes(make: Callable[..., Bench]) ->
         about = Log([path]).about
         assert {"version", "host", "run", "part", "epoch_ns"} <= about.metadata.keys()
         assert "config.json" in about.attachments
+    missing = f"{parts[2].name}: a part before it is missing"
+    assert info(Log([parts[0], parts[2]]))["problems"][0] == missing
     second = make(keep_mb=2.5)
     second.recorder.arm({})
     second.recorder.close()

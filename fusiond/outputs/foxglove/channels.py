@@ -156,7 +156,7 @@ def _channels() -> Iterator[Channel]:
         model = topic.message
         name = f"fusiond.{model.__name__}"
         schema = model.model_json_schema(mode="serialization")
-        yield Channel(number, f"/fusiond/{topic.name}", name, schema, topic, _as_it_is)
+        yield Channel(number, f"/{topic.name}", name, schema, topic, _as_it_is)
 
 
 CHANNELS = tuple(_channels())
