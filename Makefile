@@ -15,7 +15,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load lock clean \
-	kernels test-packages
+	kernels systemd test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -68,6 +68,9 @@ fuzz: $(STAMP) ## every parser with atheris; RUNS=1000000 ARGS=nmea for one of t
 
 hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
 	$(BIN)/pytest tests/hil/test_hil.py
+
+systemd: $(STAMP) test-packages ## the unit as its README installs it, systemd as process 1 of a guest
+	$(BIN)/python -m tests.hil.unit_guest
 
 test-packages:
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh test

@@ -13,11 +13,6 @@ mount -t tmpfs shm /dev/shm
 mount -t tmpfs run /run
 mount -t tmpfs tmp "$HIL_JOB/tmp"
 
-modules=/usr/lib/uml/modules/$(uname -r)/kernel
-for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/net/can/vcan; do
-    insmod "$modules/$module.ko" || echo "guest: cannot load $module.ko" >&2
-done
-
 sh "$HIL_JOB/job" 2>&1
 status=$?
 

@@ -67,23 +67,35 @@ def host_has_vcan() -> bool:
     return probe.returncode == 0
 
 
-def run_in_uml(command: Sequence[str], timeout_s: float, output: TextIO) -> int:
-    """Boot a guest, run `command` in it, power it off; the command's exit status."""
+def run_in_uml(
+    command: Sequence[str],
+    timeout_s: float,
+    output: TextIO,
+    systemd_keeps: Sequence[Path] | None = None,
+) -> int:
+    """Boot a guest, run `command` in it, power it off; the command's exit status.
+
+    With `systemd_keeps` process 1 is systemd, on a root in memory: of the host it sees /usr, these
+    folders and a copy of /etc, and can write nothing (`guest_systemd.sh`).
+    """
     kernel = shutil.which("linux.uml")
     if kernel is None:
         raise HarnessError("no vcan in this kernel and no linux.uml: apt install user-mode-linux")
     job = Path(tempfile.mkdtemp(prefix="fusiond-hil-"))
     try:
-        _write_job(job, command)
+        init = "guest_init.sh" if systemd_keeps is None else "guest_systemd.sh"
+        _write_job(job, command, HERE / init)
         environment = _environment() | _preload(job)
         environment |= {"TMPDIR": str(_memory_folder(job)), "HOME": str(job)}  # HOME: for ~/.uml
         boot = [
             *_one_processor(),
             kernel,
             f"mem={GUEST_MEMORY_MIB}M",
-            *("root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw"),
+            *("root=/dev/root", "rootfstype=hostfs", "rootflags=/"),
+            "rw" if systemd_keeps is None else "ro",
             f"init={job / 'init'}",
             f"HIL_JOB={job}",
+            f"HIL_KEEP={':'.join(map(str, systemd_keeps or ()))}",
             *("con=null", "con0=fd:0,fd:1", "quiet"),
         ]
         _stream(boot, timeout_s, output, environment)
@@ -106,13 +118,14 @@ def _one_processor() -> list[str]:
     return ["taskset", "--cpu-list", str(ours[next(_turns) % len(ours)])]
 
 
-def _write_job(job: Path, command: Sequence[str]) -> None:
+def _write_job(job: Path, command: Sequence[str], init: Path) -> None:
     (job / "tmp").mkdir()
-    shutil.copy(HERE / "guest_init.sh", job / "init")
+    shutil.copy(init, job / "init")
     passed = {k: v for k, v in os.environ.items() if k.startswith(PASSED_ON)}
     passed |= {"TMPDIR": str(job / "tmp"), "PYTHONUNBUFFERED": "1"}
     lines = [f"export {key}={shlex.quote(value)}" for key, value in sorted(passed.items())]
     lines += [f"cd {shlex.quote(str(REPOSITORY))} || exit 125"]
+    lines += [shlex.quote(str(HERE / "guest_modules.sh"))]
     lines += [shlex.join([str(NETWORK), *command])]
     (job / "job").write_text("\n".join(lines) + "\n")
 
