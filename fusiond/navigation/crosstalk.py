@@ -56,4 +56,4 @@ class Crosstalk:
     def follow(self, samples: Array, densities: Array) -> None:
         """Add the density, (rad/s)^2/Hz, after each of samples (m, 6) to the first three columns of
         `densities` (m, 6)."""
-        _follow(np.ascontiguousarray(samples), self._gain, self._times, self._mean, densities)
+        _follow(samples, self._gain, self._times, self._mean, densities)

@@ -12,11 +12,13 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.strapdown import NAV_SIZE
 from fusiond.navigation.vibration import Vibration
 
 Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
 
 # Beyond any vehicle and any sensor sold for one: such a row is damage, not motion.
 MAX_RATE_RAD_S = 100.0
@@ -38,6 +40,38 @@ def sound(samples: Array) -> NDArray[np.bool_]:
     return found
 
 
+@compiled("b1(f8[:, :])")
+def all_sound(samples: Array) -> bool:
+    """Whether `sound` holds for each of samples (m, 6): what a tick asks, of a sample or two."""
+    for i in range(samples.shape[0]):
+        for j in range(6):
+            most = MAX_RATE_RAD_S if j < 3 else MAX_FORCE_M_S2
+            if not abs(samples[i, j]) <= most:
+                return False
+    return True
+
+
+@compiled("UniTuple(i8, 2)(i8[:], i8, i8[::1])")
+def _steps(times: Stamps, before_ns: int, intervals: Stamps) -> tuple[int, int]:
+    """Write the intervals (m,) between `before_ns` and times (m,), m > 0; shortest and longest."""
+    shortest = longest = times[0] - before_ns
+    for i in range(len(times)):
+        intervals[i] = times[i] - before_ns
+        before_ns = times[i]
+        shortest, longest = min(shortest, intervals[i]), max(longest, intervals[i])
+    return shortest, longest
+
+
+@compiled("UniTuple(i8, 2)(i8[:], i8)")
+def longest_step(times: Stamps, before_ns: int) -> tuple[int, int]:
+    """The longest interval between `before_ns` and times (m,), m > 0, and the latest of them."""
+    longest, latest = times[0] - before_ns, before_ns
+    for i in range(len(times)):
+        longest, latest = max(longest, times[i] - before_ns), max(latest, times[i])
+        before_ns = times[i]
+    return longest, latest
+
+
 class ImuBuffer:
     """IMU samples of the last `keep_s` seconds and the solution recorded at each.
 
@@ -57,7 +91,7 @@ class ImuBuffer:
         crosstalk: Crosstalk | None = None,
     ) -> None:
         capacity = int(rate_hz * keep_s * 2.5) + 1000
-        self.times: NDArray[np.int64] = np.zeros(capacity, dtype=np.int64)
+        self.times: Stamps = np.zeros(capacity, dtype=np.int64)
         self.samples: Array = np.zeros((capacity, 6))
         self.densities: Array = np.zeros((capacity, 6))
         self._vibration, self._crosstalk = vibration, crosstalk
@@ -73,7 +107,8 @@ class ImuBuffer:
         self._keep_ns = round(keep_s * 1e9)
         self._gap_ns = round(gap_s * 1e9)
         self._configured_ns = self._period_ns = 1e9 / rate_hz
-        self._intervals: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._intervals: list[Stamps] = []
+        self._unjudged = 0
         self._offset_ns = round(time_offset_s * 1e9)
         self._turn = np.zeros((6, 6))
         self._turn[:3, :3] = self._turn[3:, 3:] = sensor_to_body.T
@@ -119,22 +154,24 @@ class ImuBuffer:
         self.counters.update(names)
         return {name: count for name, count in names.items() if count}
 
-    def append(self, times: NDArray[np.int64], samples: Array) -> int:
+    def append(self, times: Stamps, samples: Array) -> int:
         """Append samples (m,) ns and (m, 6) in sensor axes; return how many were taken.
 
         Refused and counted: `not_finite`, `out_of_range`, `duplicate_stamp`, `backward_stamp`.
         Counted and taken: `gap`.
         """
-        good = sound(samples)
-        if not good.all():
+        if not all_sound(samples):
+            good = sound(samples)
             self.refuse(samples[~good])
             times, samples = times[good], samples[good]
         if not len(times):
             return 0
         times = times + self._offset_ns
-        before = np.concatenate(([self.latest_ns if self.end else times[0] - 1], times))
-        if (np.diff(before) <= 0).any():
-            highest = np.maximum.accumulate(before)[:-1]
+        before_ns = self.latest_ns if self.end else int(times[0]) - 1
+        intervals = np.empty(len(times), dtype=np.int64)
+        shortest, longest = _steps(times, before_ns, intervals)
+        if shortest <= 0:
+            highest = np.maximum.accumulate(np.concatenate(([before_ns], times)))[:-1]
             self.counters["duplicate_stamp"] += int((times == highest).sum())
             backward = int((times < highest).sum())
             self.counters["backward_stamp"] += backward
@@ -143,12 +180,11 @@ class ImuBuffer:
             times, samples = times[forward], samples[forward]
             if not len(times):
                 return 0
-            before = np.concatenate(([before[0]], times))
-        intervals = np.diff(before)
+            intervals = np.empty(len(times), dtype=np.int64)
+            _, longest = _steps(times, before_ns, intervals)
         self._learn_period(intervals)
-        gaps = int((intervals > self._gap_ns).sum())
-        if gaps:
-            self.counters["gap"] += gaps
+        if longest > self._gap_ns:
+            self.counters["gap"] += int((intervals > self._gap_ns).sum())
         taken = len(times)
         self.backward_in_a_row = 0
         room = len(self.times) // 4  # at a time: a long chunk before the start needs no more
@@ -157,17 +193,21 @@ class ImuBuffer:
             self._store(times[part], samples[part])
         return taken
 
-    def _learn_period(self, intervals: NDArray[np.int64]) -> None:
+    def _learn_period(self, intervals: Stamps) -> None:
         """Intervals (m,) ns of samples taken; judged by whole windows, however they come."""
-        intervals = np.concatenate((self._intervals, intervals))
+        self._intervals.append(intervals)
+        self._unjudged += len(intervals)
+        if self._unjudged < PERIOD_WINDOW:
+            return
+        intervals = np.concatenate(self._intervals)
         while len(intervals) >= PERIOD_WINDOW:
             seen = float(np.median(intervals[:PERIOD_WINDOW]))
             if abs(seen - self._period_ns) > PERIOD_CHANGE * self._period_ns:
                 self._period_ns = seen
             intervals = intervals[PERIOD_WINDOW:]
-        self._intervals = intervals
+        self._intervals, self._unjudged = [intervals], len(intervals)
 
-    def _store(self, times: NDArray[np.int64], samples: Array) -> None:
+    def _store(self, times: Stamps, samples: Array) -> None:
         count = len(times)
         if self.end + count > len(self.times):
             needed = int(times[-1]) - self._keep_ns
@@ -185,7 +225,7 @@ class ImuBuffer:
         self.times[rows] = times
         np.matmul(samples, self._turn, out=self.samples[rows])
         if self._vibration is not None:
-            self.densities[rows] = self._vibration.follow(self.samples[rows])
+            self._vibration.follow(self.samples[rows], self.densities[rows])
         else:
             self.densities[rows] = 0.0
         if self._crosstalk is not None:

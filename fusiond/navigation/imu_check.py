@@ -204,7 +204,7 @@ def _take(memory: Array, samples: Array, i: int) -> None:
     memory[_REFUSED] = 0.0
 
 
-@compiled("i8(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1], i8[::1])")
+@compiled("UniTuple(i8, 2)(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1], i8[::1])")
 def _check(
     times: Stamps,
     samples: Array,
@@ -213,8 +213,9 @@ def _check(
     limits: Array,
     memory: Array,
     codes: Stamps,
-) -> int:
-    """Write `codes` (m,); return how many samples are judged: the rest waits for more.
+) -> tuple[int, int]:
+    """Write `codes` (m,); return how many samples are judged, the rest waits for more, and the
+    stamp that the next must be later than.
 
     `limits`: rate in Hz, full scale of rate and force. Samples whose stamps do not go forward are
     left to whoever orders them.
@@ -237,7 +238,7 @@ def _check(
             while k < m and times[k] <= last_ns:
                 k += 1
             if k == m:
-                return i
+                return i, last_ns
         # A gap is real if the next sample goes on from here; else this stamp was wrong.
         if gap and times[k] <= times[i]:
             codes[i] = STAMP_AHEAD
@@ -256,7 +257,7 @@ def _check(
             memory[_REFUSED] += 1.0
         last_ns = times[i]
         i += 1
-    return i
+    return i, last_ns
 
 
 class Checked(NamedTuple):
@@ -279,24 +280,26 @@ class ImuCheck:
         self._limits = np.array([rate_hz, rate_range, force_range])
         self._memory = np.zeros(_MEMORY)
         self._last_ns = _NEVER_NS
-        self._waiting: tuple[Stamps, Array] = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+        self._waiting: tuple[Stamps, Array] | None = None
 
     def restart(self) -> None:
         """Forget all: the next sample may have any stamp."""
         self._memory[:] = 0.0
         self._last_ns = _NEVER_NS
-        self._waiting = self._waiting[0][:0], self._waiting[1][:0]
+        self._waiting = None
 
     def feed(self, times: Stamps, samples: Array, hold_ns: int) -> Checked:
         """Samples (m,) ns and (m, 6), finite; a pause beyond `hold_ns` is a gap."""
-        if len(self._waiting[0]):
+        if self._waiting is not None:
             times = np.concatenate((self._waiting[0], times))
             samples = np.concatenate((self._waiting[1], samples))
         times, samples = np.ascontiguousarray(times), np.ascontiguousarray(samples)
         codes = np.zeros(len(times), dtype=np.int64)
-        done = _check(times, samples, self._last_ns, hold_ns, self._limits, self._memory, codes)
+        done, self._last_ns = _check(
+            times, samples, self._last_ns, hold_ns, self._limits, self._memory, codes
+        )
+        if done == len(times):
+            self._waiting = None
+            return Checked(times, samples, codes)
         self._waiting = times[done:].copy(), samples[done:].copy()
-        good = times[:done][codes[:done] != STAMP_AHEAD]
-        if len(good):
-            self._last_ns = max(int(good.max()), self._last_ns)
         return Checked(times[:done], samples[:done], codes[:done])

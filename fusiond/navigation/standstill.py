@@ -72,6 +72,16 @@ def _moments(samples: Array, first: int, end: int, mean: Array, sd: Array) -> No
         sd[j] = np.sqrt(total / count)
 
 
+@compiled("i8(i8[::1], i8, i8, i8, i8)")
+def next_cell(times: NDArray[np.int64], first: int, end: int, width_ns: int, cell: int) -> int:
+    """The first of rows first ... end-1 that lies in another cell of the grid of time than `cell`;
+    -1 where none does."""
+    for i in range(first, end):
+        if times[i] // width_ns != cell:
+            return i
+    return -1
+
+
 def judge(
     times: NDArray[np.int64], samples: Array, first: int, end: int, limits: QuietLimits
 ) -> Window:
@@ -109,13 +119,11 @@ class StandstillDetector:
         """
         windows: list[Window] = []
         width = self.limits.window_ns
-        cells = times[new:end] // width
         if self._first is None:
             self._first = start + new
-        previous = times[new - 1] // width if new else cells[0]
-        changes = np.flatnonzero(np.diff(np.concatenate(([previous], cells))))
-        for change in changes:
-            stop = new + int(change)
+        row = max(new - 1, 0)
+        while (stop := next_cell(times, row, end, width, int(times[row]) // width)) >= 0:
+            row = stop
             first = self._first - start
             if 0 <= first < stop:
                 window = judge(times, samples, first, stop, self.limits)

@@ -36,9 +36,12 @@ EXCESS = 1.5
 _SUM, _COUNT, _LAST, _BEFORE, _MEANS, _DENSITY = range(6)
 
 
-@compiled("void(f8[:, ::1], f8, f8, f8[:, :, ::1], f8[:, ::1])")
-def _follow(samples: Array, period_s: float, memory_s: float, memory: Array, out: Array) -> None:
-    """Write `out` (m, 6), the smallest density so far after each of `samples` (m, 6).
+@compiled("void(f8[:, ::1], f8, f8, f8[::1], f8[:, :, ::1], f8[:, ::1])")
+def _follow(
+    samples: Array, period_s: float, memory_s: float, sheet: Array, memory: Array, out: Array
+) -> None:
+    """Write `out` (m, 6), the smallest density so far after each of `samples` (m, 6) beyond that of
+    `sheet` (6,), 0 where it is not above it by EXCESS.
 
     `memory` (LEVELS, 6, 6) goes on from call to call.
     """
@@ -63,7 +66,8 @@ def _follow(samples: Array, period_s: float, memory_s: float, memory: Array, out
                 if m[_MEANS] >= FEWEST:
                     smallest = min(smallest, m[_DENSITY])
                 wanted *= RATIO
-            out[i, axis] = smallest if smallest < np.inf else 0.0
+            above = smallest < np.inf and smallest > EXCESS * sheet[axis]
+            out[i, axis] = smallest - sheet[axis] if above else 0.0
 
 
 class Vibration:
@@ -75,9 +79,7 @@ class Vibration:
         self._sheet = np.repeat([rate_noise**2, force_noise**2], 3)
         self._memory = np.zeros((LEVELS, 6, 6))
 
-    def follow(self, samples: Array) -> Array:
-        """Density (m, 6) beyond the sheet's, (rad/s)^2/Hz and (m/s^2)^2/Hz, after each of samples
-        (m, 6), rate and force of the same axes."""
-        seen = np.empty((len(samples), 6))
-        _follow(np.ascontiguousarray(samples), self._period_s, MEMORY_S, self._memory, seen)
-        return np.where(seen > EXCESS * self._sheet, seen - self._sheet, 0.0)
+    def follow(self, samples: Array, densities: Array) -> None:
+        """Write to `densities` (m, 6) that beyond the sheet's, (rad/s)^2/Hz and (m/s^2)^2/Hz, after
+        each of samples (m, 6), rate and force of the same axes."""
+        _follow(samples, self._period_s, MEMORY_S, self._sheet, self._memory, densities)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from fusiond.aiding.base import Aid
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
@@ -16,7 +14,7 @@ from fusiond.configuration.settings import DEG, quiet_limits
 from fusiond.models.blocks import Block
 from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.standstill import StandstillDetector, Window
+from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
 
 GATE = 0.9999
 """Gate probability, as the measured aids' default."""
@@ -86,13 +84,14 @@ class ConstraintMaker:
     def _no_sliding(self, imu: ImuBuffer, new: int) -> list[Aid]:
         """One at the first sample of each interval."""
         o = self._options.non_holonomic
-        cells = imu.times[new : imu.end] // round(o.interval_s * 1e9)
-        rows = np.flatnonzero(np.diff(cells, prepend=self._last_cell))
-        self._last_cell = int(cells[-1])
+        width, rows, row = round(o.interval_s * 1e9), [], new
+        while (row := next_cell(imu.times, row, imu.end, width, self._last_cell)) >= 0:
+            self._last_cell = int(imu.times[row]) // width
+            rows.append(row)
         return [
             NonHolonomicAid(
                 "non_holonomic",
-                int(imu.times[new + row]),
+                int(imu.times[row]),
                 GATE,
                 o.sd_m_s,
                 o.sd_down_m_s,

@@ -6,13 +6,12 @@ gets them back: it is started anew.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
-import numpy as np
-
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.finite import first_not_finite
 
+_STATE = "the navigation state is", "the estimated parameters are", "the covariance is"
 RAISED_BY_NUMBERS = (ArithmeticError, ValueError)
 """What numerics raise: division by zero and overflow; domain errors and numpy's LinAlgError."""
 
@@ -20,16 +19,10 @@ RAISED_BY_NUMBERS = (ArithmeticError, ValueError)
 def broken(estimator: Estimator) -> str | None:
     """What of the filter's state is not finite; None where all is.
 
-    A sum is finite only if every number is, and an update carries a covariance that is none to its
-    diagonal: at each tick this costs some microseconds.
+    An update carries a covariance that is none to its diagonal.
     """
-    if not math.isfinite(estimator.nav.sum()):
-        return "the navigation state is not finite"
-    if not math.isfinite(estimator.xi.sum()):
-        return "the estimated parameters are not finite"
-    if not math.isfinite(np.trace(estimator.covariance)):
-        return "the covariance is not finite"
-    return None
+    what = first_not_finite(estimator.nav, estimator.xi, estimator.covariance)
+    return None if what < 0 else f"{_STATE[what]} not finite"
 
 
 class FailedAids:

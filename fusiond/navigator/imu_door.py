@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_range
-from fusiond.navigation.imu_buffer import ImuBuffer, sound
+from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
 from fusiond.navigator.imu_units import other_unit
 
@@ -106,28 +106,38 @@ class ImuDoor:
         """
         if len(times):
             self._newest = times[-1:]
-        good = sound(samples)
-        if not good.all():
+        if not all_sound(samples):
+            good = sound(samples)
             unit = _unit(samples[~good])
             for name, count in imu.refuse(samples[~good]).items():
                 self._trouble(name, times[~good], count, TEXTS[name] + unit)
             times, samples = times[good], samples[good]
         checked = self._check.feed(times, samples, imu.hold_ns)
-        ends = ""
+        times, samples = checked.times, checked.samples
         if checked.codes.any():
             ends = self._refuse(checked, imu)
-        taken = checked.codes == TAKEN
-        times, samples = checked.times[taken], checked.samples[taken]
-        if ends:
-            yield Run(times[:0], samples[:0], ends)
-            navigating = False
+            taken = checked.codes == TAKEN
+            times, samples = times[taken], samples[taken]
+            if ends:
+                yield Run(times[:0], samples[:0], ends)
+                navigating = False
         if not len(times):
             return
-        before = times[0] - 1 if self._latest_ns is None else self._latest_ns
-        intervals = np.diff(times, prepend=before) * 1e-9
+        before = int(times[0]) - 1 if self._latest_ns is None else self._latest_ns
         most_s = self._most_s if navigating else max(self._config.gap_s, imu.hold_ns * 1e-9)
+        longest, self._latest_ns = longest_step(times, before)
+        if longest * 1e-9 > most_s:
+            yield from self._parted(times, samples, before, most_s, imu)
+        else:
+            yield Run(times, samples)
+        self._recover(self._latest_ns)
+
+    def _parted(
+        self, times: Stamps, samples: Array, before: int, most_s: float, imu: ImuBuffer
+    ) -> Iterator[Run]:
+        """Samples with gaps that cannot be borne between them, or before them."""
+        intervals = np.diff(times, prepend=before) * 1e-9
         breaks = np.flatnonzero(intervals > most_s).tolist()
-        self._latest_ns = max(before, int(times.max()))
         for begin, end in pairwise(sorted({0, *breaks, len(times)})):
             ends = ""
             if begin in breaks:
@@ -136,7 +146,6 @@ class ImuDoor:
                 silent = f"IMU silent for {intervals[begin]:.1f} s"
                 self._event("imu_gap", f"{silent}: aligning anew")
             yield Run(times[begin:end], samples[begin:end], ends)
-        self._recover(self._latest_ns)
 
     def _refuse(self, checked: Checked, imu: ImuBuffer) -> str:
         """Count what is not taken; why navigation ends, if it does."""

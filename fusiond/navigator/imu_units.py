@@ -135,7 +135,7 @@ class RateUnits:
         newest_ns = imu.latest_ns
         if not self._count:
             self._since_ns = int(imu.times[new])
-        self._squares += float(np.sum(rates**2))
+        self._squares += float(np.einsum("ij,ij->", rates, rates))
         self._count += len(rates)
         if newest_ns - self._since_ns >= RMS_S * 1e9:
             self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)

@@ -344,9 +344,9 @@ class Navigator:
             return Mode.ALIGNING, self._aligner.reason
         if silent > self.config.imu.gap_s:
             return Mode.INVALID, self._door.silence(silent)
-        horizontal = float(np.hypot(*np.sqrt(np.diag(self.estimator.covariance)[6:8])))
-        if not horizontal <= e.invalid_sd_m:
-            return Mode.INVALID, f"horizontal sigma {horizontal:.0f} m"
+        p = self.estimator.covariance
+        if not 0.0 <= (variance := p[6, 6] + p[7, 7]) <= e.invalid_sd_m**2:
+            return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
         if self.on_trial:
             return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"
         if self._afterwards is not None and self._afterwards.unconfirmed:

@@ -44,13 +44,15 @@ class Afterwards:
         """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
         the start was wrong."""
         axes = dcm_from_quaternion(nav[Q0:])
-        forward = float(axes[:, 0] @ nav[VN : VN + 3])
-        sd = math.sqrt(max(float(axes[:, 0] @ covariance[3:6, 3:6] @ axes[:, 0]), 0.0))
-        if -forward - 3.0 * sd > self._options.max_reverse_m_s:
-            return "imu_backwards", (
-                f"driving backward at {-forward:.0f} m/s, faster than the vehicle can: is the IMU "
-                "mounted backwards? Correct [imu] axes"
-            )
+        ahead = axes[:, 0]
+        backward = -float(ahead @ nav[VN : VN + 3])
+        if backward > self._options.max_reverse_m_s:
+            sd = math.sqrt(max(float(ahead @ covariance[3:6, 3:6] @ ahead), 0.0))
+            if backward - 3.0 * sd > self._options.max_reverse_m_s:
+                return "imu_backwards", (
+                    f"driving backward at {backward:.0f} m/s, faster than the vehicle can: is the "
+                    "IMU mounted backwards? Correct [imu] axes"
+                )
         if not self._claim:
             return None
         if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw:
