@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 
 import pytest
 
-from tests.golden.golden import FOLDER, LOGS, kept, solution
+from tests.golden.golden import FOLDER, LOGS, VEHICLES, driven, kept, solution
+from tests.places import DATA
 
 TOLERANCE = 1.5
 """Of the last printed digit: compiled code may differ in the last bit between processors."""
 
 
-@pytest.mark.parametrize("name", LOGS)
-def test_the_solution_is_the_one_that_was_approved(name: str) -> None:
-    with kept(FOLDER / name).open(newline="") as file:
+@pytest.mark.parametrize("name", [*LOGS, *VEHICLES])
+def test_the_solution_is_the_one_that_was_approved(name: str, tmp_path: Path) -> None:
+    if name in VEHICLES and not (DATA / name).is_dir():
+        pytest.skip(f"recorded data is absent: {DATA / name} (set FUSIOND_DATA)")
+    with kept(name).open(newline="") as file:
         approved = list(csv.DictReader(file))
-    found = solution(FOLDER / name)
+    found = solution([FOLDER / name] if name in LOGS else driven(name, tmp_path))
     assert len(found) == len(approved)
     for now, before in zip(found, approved, strict=True):
         changed = [f"{c} {v} -> {now[c]}" for c, v in before.items() if not _same(now[c], v)]
