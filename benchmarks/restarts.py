@@ -132,7 +132,8 @@ class Process:
         if said.mode not in (Mode.NAVIGATING, Mode.COASTING):
             return np.zeros(len(QUANTITIES))
         at = replace(said, t_ns=said.t_ns - BEGIN_NS)
-        return np.array(compared(at, self._data.truth).ratios)
+        true = self._data.truth.at(np.array([at.t_ns * 1e-9]))
+        return np.array(compared(at, true).ratios)
 
 
 def restarted(old: Process, data: Received, row: int, gap_s: float) -> tuple[Array, Array]:

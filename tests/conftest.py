@@ -13,6 +13,7 @@ settings.register_profile("fusiond", deadline=None, suppress_health_check=[Healt
 settings.load_profile("fusiond")
 
 LONG = (
+    "studies/test_bds_tight",
     "studies/test_studies",
     "commands/test_kernel_cache",
     "studies/",
@@ -20,8 +21,13 @@ LONG = (
     "live/",
     "offline/",
     "commands/",
+    "estimators/",
+    "navigator/",
+    "navigation/test_compiled",
+    "demo/",
 )
-"""Files that take minutes come first, so that all cores end at about the same time."""
+"""Files that take ten seconds or more come first, the longest at the head, so that all cores end at
+about the same time."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,27 +77,33 @@ def sample_times(truth: Truth, start_ns: int = 0) -> NDArray[np.int64]:
     return start_ns + np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ImuRun:
     """One IMU on one trajectory: samples (n, 6), and its errors, biases (n, 6), scales (6,)."""
 
     samples: Array
     biases: Array
-    scales: Array
+    _imu: Imu
+    _seed: int
+
+    @cached_property
+    def scales(self) -> Array:
+        """Told by the same seed with unit and with no motion."""
+        zero, one = np.zeros((len(self.samples), 3)), np.ones((len(self.samples), 3))
+        still, unit = (
+            imu_output(self._imu, motion, motion, np.random.default_rng(self._seed))
+            for motion in (zero, one)
+        )
+        return np.concatenate(
+            [(unit.gyro - still.gyro)[0] - 1.0, (unit.accel - still.accel)[0] - 1.0]
+        )
 
 
 def imu_run(imu: Imu, truth: Truth, seed: int) -> ImuRun:
-    """What that IMU says; the same seed with unit and no motion tells its scale factors."""
+    """What that IMU says."""
     out = imu_output(imu, truth.gyro, truth.accel, np.random.default_rng(seed))
-    zero, one = np.zeros_like(truth.gyro), np.ones_like(truth.gyro)
-    still = imu_output(imu, zero, zero, np.random.default_rng(seed))
-    unit = imu_output(imu, one, one, np.random.default_rng(seed))
-    scales = [(unit.gyro - still.gyro)[0] - 1.0, (unit.accel - still.accel)[0] - 1.0]
-    return ImuRun(
-        np.hstack([out.gyro, out.accel]),
-        np.hstack([out.gyro_bias, out.accel_bias]),
-        np.concatenate(scales),
-    )
+    biases = np.hstack([out.gyro_bias, out.accel_bias])
+    return ImuRun(np.hstack([out.gyro, out.accel]), biases, imu, seed)
 
 
 def filled_buffer(imu: Imu, times: NDArray[np.int64], samples: Array) -> ImuBuffer:

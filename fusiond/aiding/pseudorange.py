@@ -187,6 +187,7 @@ class PseudorangeAid(Aid):
     lever: Vector3 = (0.0, 0.0, 0.0)
     clock_reset: bool = False
     _r: Array = field(init=False, repr=False)
+    _ranges: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         n = len(self.satellites)
@@ -195,16 +196,15 @@ class PseudorangeAid(Aid):
         for name in ("rates", "range_variance", "rate_variance"):
             _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), (n,))
         _keep(self, "clock", np.ascontiguousarray(self.clock, dtype=np.int64), (n,))
-        rates = np.isfinite(self.rates)
-        r = np.concatenate(
-            [self.range_variance[np.isfinite(self.ranges)], self.rate_variance[rates]]
-        )
+        ranges, rates = np.isfinite(self.ranges), np.isfinite(self.rates)
+        r = np.concatenate([self.range_variance[ranges], self.rate_variance[rates]])
         if not bool(np.all((r > 0.0) & np.isfinite(r))):
             raise ValueError("variances must be positive and finite")
         timed = self.clock[rates] >= 0
         if timed.any() and not timed.all():
             raise ValueError("rates of satellites with and without a clock in one epoch")
         object.__setattr__(self, "_r", r)
+        object.__setattr__(self, "_ranges", int(ranges.sum()))
 
     @property
     def labels(self) -> list[tuple[str, str]]:
@@ -260,12 +260,13 @@ class PseudorangeAid(Aid):
         model = state.model
         if not self._r.size:
             return NotApplicable("no_satellites")
-        offsets = np.array(model.slots_of(CLOCK_OFFSET) or [-1])
+        offsets = model.slots_of(CLOCK_OFFSET) or [NO_CLOCK]
         drifts = model.slots_of(CLOCK_DRIFT)
-        greatest = int(self.clock.max())
+        clocks = self.clock.tolist()
+        greatest = max(clocks)
         if greatest >= len(offsets) or (greatest >= 0 and not drifts):
             return NotApplicable("no_clock_state")
-        slots = np.where(self.clock >= 0, offsets[self.clock], NO_CLOCK)
+        slots = np.array([offsets[k] if k >= 0 else NO_CLOCK for k in clocks], dtype=np.int64)
         rows = self._r.size
         z, h = np.empty(rows), np.zeros((rows, model.size))
         _rows(
@@ -290,10 +291,9 @@ class PseudorangeAid(Aid):
     def _shared(self, state: State, z: Array, h: Array) -> None:
         """The displacement that the ranges share, where the model has states for it."""
         model = state.model
-        slots = [slot for block in RANGE_BIAS for slot in model.slots_of(block)]
+        slots, count = model.slots_of_all(RANGE_BIAS), self._ranges
         if len(slots) != 3:
             return
-        count = int(np.isfinite(self.ranges).sum())
         toward = -h[:count, 6:9]
         h[:count, slots] = toward
         z[:count] -= toward @ state.xi[slots]

@@ -151,7 +151,7 @@ class _Replay:
         A log of one channel is everybody's bus. In one of several each source has the channel of
         its name, or `canN` of number N.
         """
-        channels = sorted({m.channel for m in messages(self._path, lambda text: None)}, key=str)
+        channels = sorted(_channels(self._path), key=str)
         if not channels:
             raise TableError(f"{self._path}: no CAN frame")
         if len(channels) == 1:
@@ -213,11 +213,7 @@ def messages(path: Path, damaged: Callable[[str], None]) -> Iterator[can.Message
     Raises `TableError` where there is no message to be read, `MissingPackageError` for MF4 without
     asammdf, OSError for a file that cannot be opened.
     """
-    suffixes = [s.lower() for s in path.suffixes]
-    zipped = suffixes[-1:] == [".gz"]
-    suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
-    if suffix not in FORMATS or (zipped and suffix == ".mf4"):
-        raise TableError(f"{path}: no CAN log by its name: {', '.join(FORMATS)} are read")
+    suffix, zipped = _format(path)
     count = 0
     with contextlib.ExitStack() as stack:
         try:
@@ -228,6 +224,33 @@ def messages(path: Path, damaged: Callable[[str], None]) -> Iterator[can.Message
             if not count:
                 raise TableError(f"{path}: cannot be read as {suffix}: {error}") from error
             damaged(f"{type(error).__name__} after {count} frames: {error}")
+
+
+def _format(path: Path) -> tuple[str, bool]:
+    """One of `FORMATS`, and whether it is zipped; by the name. Raises `TableError`."""
+    suffixes = [s.lower() for s in path.suffixes]
+    zipped = suffixes[-1:] == [".gz"]
+    suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
+    if suffix not in FORMATS or (zipped and suffix == ".mf4"):
+        raise TableError(f"{path}: no CAN log by its name: {', '.join(FORMATS)} are read")
+    return suffix, zipped
+
+
+def _channels(path: Path) -> set[Any]:
+    """The channels of a log, up to where it is damaged. Raises as `messages` does.
+
+    What candump wrote says them in the second word of its lines: to parse every frame for that
+    takes as long as to parse it for the drivers.
+    """
+    suffix, zipped = _format(path)
+    found: set[Any] = set()
+    if suffix == ".log":
+        with contextlib.suppress(*_DAMAGE), (gzip.open if zipped else open)(path, "rt") as lines:
+            for words in filter(None, map(str.split, lines)):
+                if not words[2].partition("#")[1]:
+                    break
+                found.add(int(words[1]) if words[1].isdigit() else words[1])
+    return found or {m.channel for m in messages(path, lambda text: None)}
 
 
 _DAMAGE = (ValueError, LookupError, EOFError, struct.error, zlib.error, can.CanError)

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fusiond.configuration.settings import ARCSEC
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
@@ -127,6 +126,9 @@ class StarTracker:
         self.t_s = np.arange(1, n + 1) / o.rate_hz
         self.t_arrival_s = self.t_s + o.latency_s
         self.misalignment = _misalignment(o, n, rng)
+        # Loaded where there is such a sensor on board: it takes a third of a second.
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
         body = dcm_from_rpy(truth.at(self.t_s).rpy)
         turned = Rotation.from_matrix(body) * Rotation.from_rotvec(self.misalignment)
         self.sd_rad = np.array(o.sd_arcsec) * ARCSEC
@@ -160,6 +162,8 @@ class SarRadar:
         places = np.array([o.targets_deg_m[name] for name in names]).reshape(-1, 3)
         points = _earth_fixed(np.radians(places[:, 0]), np.radians(places[:, 1]), places[:, 2])
         here = _earth_fixed(*states.position.T)
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
         # north-east-down axes as columns in Earth-fixed axes, then body, then the sensor's own
         ned = Rotation.from_euler(
             "ZY", np.column_stack((states.position[:, 1], -states.position[:, 0] - math.pi / 2.0))

@@ -20,12 +20,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
+
+
+@compiled("void(f8[:, ::1], f8)")
+def _decaying(process: Array, decay: float) -> None:
+    """Row by row add to what drives the processes (n, columns) what is left of the row before.
+
+    As scipy's `lfilter`, to the bit; its package takes a second to load."""
+    for k in range(1, process.shape[0]):
+        for j in range(process.shape[1]):
+            process[k, j] += decay * process[k - 1, j]
 
 
 def gauss_markov(
@@ -42,9 +52,9 @@ def gauss_markov(
     """
     n, columns = shape
     decay = math.exp(-step_s / correlation_s) if correlation_s > 0.0 else 0.0
-    drive = rng.standard_normal((n, columns)) * (sigma * math.sqrt(1.0 - decay * decay))
-    drive[0] = rng.standard_normal(columns) * sigma
-    process: Array = lfilter([1.0], [1.0, -decay], drive, axis=0)
+    process: Array = rng.standard_normal((n, columns)) * (sigma * math.sqrt(1.0 - decay * decay))
+    process[0] = rng.standard_normal(columns) * sigma
+    _decaying(process, decay)
     return process
 
 

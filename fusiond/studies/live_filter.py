@@ -71,8 +71,9 @@ class LiveFilter:
     def advance(self, t_s: float, aids: Iterable[Aid] = ()) -> None:
         """IMU samples up to `t_s` and then `aids` arrive."""
         end = round(t_s * RATE_HZ)
-        self._buffer.append(self._times[self._given : end], self._samples[self._given : end])
-        self._given = end
+        if end > self._given:
+            self._buffer.append(self._times[self._given : end], self._samples[self._given : end])
+            self._given = end
         for aid in aids:
             self._timeline.insert(aid)
         self._timeline.run()

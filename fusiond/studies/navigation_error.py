@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.rotation import (
-    dcm_from_quaternion,
-    quaternion_from_rpy,
-    rotate_quaternion,
-    rotation_vector_from_dcm,
-)
+from fusiond.navigation.rotation import quaternion_from_rpy, rotate_quaternion
 from fusiond.simulation.imu_truth import Truth
 
 Array = NDArray[np.float64]
@@ -38,9 +33,26 @@ def metres(lat: float, height: float) -> Array:
 
 def nav_error(computed: Array, true: Array) -> Array:
     """Error (9,) of the state `computed` (10,)."""
-    turn = dcm_from_quaternion(computed[6:]) @ dcm_from_quaternion(true[6:]).T
-    dr = (computed[:3] - true[:3]) * metres(float(true[0]), float(true[2]))
-    return np.concatenate([-rotation_vector_from_dcm(turn), computed[3:6] - true[3:6], dr])
+    lat, lon, height, vn, ve, vd, w, x, y, z = computed.tolist()
+    lat_0, lon_0, height_0, vn_0, ve_0, vd_0, w_0, x_0, y_0, z_0 = true.tolist()
+    # The quaternion of the turn from the true to the computed attitude: q times the conjugate of
+    # the true one. In plain numbers: a study asks a hundred thousand times.
+    turn = w * w_0 + x * x_0 + y * y_0 + z * z_0
+    north = w_0 * x - w * x_0 - y * z_0 + z * y_0
+    east = w_0 * y - w * y_0 - z * x_0 + x * z_0
+    down = w_0 * z - w * z_0 - x * y_0 + y * x_0
+    s = math.sqrt(north * north + east * east + down * down)
+    angle = 2.0 * math.atan2(s, abs(turn))
+    per = math.copysign(angle / s if s > 1e-12 else 2.0, turn)
+    return np.array(
+        [
+            *(-per * north, -per * east, -per * down),
+            *(vn - vn_0, ve - ve_0, vd - vd_0),
+            (lat - lat_0) * (meridian_radius(lat_0) + height_0),
+            (lon - lon_0) * (transverse_radius(lat_0) + height_0) * math.cos(lat_0),
+            height_0 - height,
+        ]
+    )
 
 
 def with_error(true: Array, error: Array) -> Array:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+
+from typer.testing import CliRunner
+
+from fusiond.commands.app import app
 
 CONFIG = """
 [imu]
@@ -47,14 +52,13 @@ RESULTS = {
 }
 
 
-def start(command: str, folder: Path, cache: Path | None) -> list[str]:
-    """Run a command in `folder`, with the tests' own cache if none; the lines that it wrote."""
+def start(command: str, folder: Path, cache: Path) -> list[str]:
+    """Run a command in `folder` with the kernels of `cache`; the lines that it wrote."""
     folder.mkdir(exist_ok=True)
     (folder / "C.toml").write_text(CONFIG)
-    own = {} if cache is None else {"NUMBA_CACHE_DIR": str(cache)}
     done = subprocess.run(
         [sys.executable, "-m", "fusiond", *COMMANDS[command]],
-        env=os.environ | own,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
         cwd=folder,
         capture_output=True,
         text=True,
@@ -63,5 +67,19 @@ def start(command: str, folder: Path, cache: Path | None) -> list[str]:
     )
     assert done.returncode == 0, f"{command}: {done.returncode} {done.stderr}"
     assert "compiled anew" not in done.stderr
+    return written(command, folder)
+
+
+def run_here(command: str, folder: Path) -> list[str]:
+    """The same in this process, which keeps what it has loaded for the next command."""
+    (folder / "C.toml").write_text(CONFIG)
+    with contextlib.chdir(folder):
+        done = CliRunner().invoke(app, COMMANDS[command])
+    assert done.exit_code == 0, f"{command}: {done.exit_code} {done.stderr} {done.exception!r}"
+    return written(command, folder)
+
+
+def written(command: str, folder: Path) -> list[str]:
+    """The lines of a command's results."""
     lines = [line for name in RESULTS[command] for line in (folder / name).read_text().splitlines()]
     return [line for line in lines if "time_per_step_us" not in line]  # what a study took

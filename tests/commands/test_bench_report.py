@@ -31,6 +31,7 @@ FIGURES = (
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """The real benchmark, short, and run once."""
     whole = timing.bench
+    monkeypatch.setattr(timing, "STEP_SECONDS", 10)
     monkeypatch.setattr(timing, "bench", cache(lambda: whole(repetitions=2, process_s=90.0)))
 
 

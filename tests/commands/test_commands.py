@@ -1,4 +1,7 @@
-"""The console script as a person calls it: output, exit codes, no traceback."""
+"""The command line as a person calls it: output, exit codes, no traceback.
+
+Each exit code comes from a process of its own once; the other mistakes are made in this process,
+where all is loaded: `main` adds nothing to the app but the exit code of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -36,12 +40,15 @@ def fusiond(*args: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def in_this_process(*args: str | Path) -> subprocess.CompletedProcess[str]:
-    """The same where navigation is loaded already: 3 s of CPU less than a process of its own.
+    """The same where navigation is loaded already: 1 to 3 s of CPU less than a process of its own.
 
     That these commands work as processes, too, is shown by `test_kernel_cache`."""
     done = CliRunner().invoke(app, list(map(str, args)))
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return subprocess.CompletedProcess(args, done.exit_code, done.stdout, done.stderr)
+
+
+Call = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def test_version_and_help() -> None:
@@ -62,8 +69,9 @@ def test_help_imports_nothing_heavy() -> None:
     )
 
 
-def test_check() -> None:
-    done = fusiond("check", "config/vehicle.toml")
+def test_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    done = in_this_process("check", "config/vehicle.toml")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines() == [
         "config/vehicle.toml: ok, vehicle vehicle",
@@ -73,17 +81,20 @@ def test_check() -> None:
     ]
 
 
-@pytest.mark.parametrize("command", ["run", "check", "doctor"])
-def test_configuration_mistake_exits_78(tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize(
+    ("call", "command"),
+    [(fusiond, "run"), (in_this_process, "check"), (in_this_process, "doctor")],
+)
+def test_configuration_mistake_exits_78(tmp_path: Path, call: Call, command: str) -> None:
     path = tmp_path / "bad.toml"
     path.write_text("[imu]\nrate_hz = -5\n")
-    done = fusiond(command, path)
+    done = call(command, path)
     assert (done.returncode, done.stdout) == (78, "")
     assert done.stderr == f"{path}: imu.rate_hz = -5: expected a number above 0\n"
 
 
 def test_missing_configuration_exits_78(tmp_path: Path) -> None:
-    done = fusiond("run", tmp_path / "none.toml")
+    done = in_this_process("run", tmp_path / "none.toml")
     assert done.returncode == 78
     assert "none.toml: No such file or directory" in done.stderr
 
@@ -99,7 +110,8 @@ def test_missing_configuration_exits_78(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_command_line_exits_2(option: str, word: str) -> None:
-    done = fusiond("process", "config/drive_0708.toml", "--imu", "imu.csv", option)
+    command = "process", REPOSITORY / "config" / "drive_0708.toml", "--imu", "imu.csv", option
+    done = in_this_process(*command)
     assert done.returncode == 2
     assert word in done.stderr
 
@@ -128,7 +140,7 @@ def test_compare_prints_text_and_writes_json(tmp_path: Path) -> None:
     figures = json.loads(report.read_text())
     assert figures["down_max_m"] == pytest.approx(3.0)
     assert figures["yaw_rms_deg"] is None
-    piped = fusiond("compare", solution, truth, "--json", "-", "--after", "2")
+    piped = in_this_process("compare", solution, truth, "--json", "-", "--after", "2")
     assert json.loads(piped.stdout)["epochs"] == 1
 
 
@@ -138,7 +150,7 @@ def test_compare_with_unusable_files_exits_65(tmp_path: Path) -> None:
     done = fusiond("compare", solution, truth)
     assert done.returncode == 65
     assert "no common epoch" in done.stderr
-    done = fusiond("compare", solution, tmp_path / "none.csv")
+    done = in_this_process("compare", solution, tmp_path / "none.csv")
     assert done.returncode == 65
     assert "none.csv: No such file or directory" in done.stderr
 
@@ -151,7 +163,7 @@ def test_output_that_cannot_be_written_exits_74(tmp_path: Path) -> None:
 
 
 def test_simulate_writes_what_the_readers_read(tmp_path: Path) -> None:
-    done = fusiond(
+    done = in_this_process(
         "simulate", "static", "--out", tmp_path / "sim", "--seed", "3", "--duration", "5"
     )
     assert done.returncode == 0, done.stderr
@@ -159,7 +171,7 @@ def test_simulate_writes_what_the_readers_read(tmp_path: Path) -> None:
     rows = len(truth.read_text().splitlines()) - 1
     assert rows > 1
     assert f"{truth}: {rows} rows" in done.stdout.splitlines()
-    same = fusiond("compare", truth, truth, "--json", "-")
+    same = in_this_process("compare", truth, truth, "--json", "-")
     assert json.loads(same.stdout)["horizontal_max_m"] == pytest.approx(0.0, abs=1e-6)
     assert fusiond("simulate", "boat", "--out", tmp_path).returncode == 2
 

@@ -29,7 +29,9 @@ from tests.estimators.monte_carlo import (
 
 Array = NDArray[np.float64]
 
-SECONDS, RUNS = 240.0, 100
+SECONDS, RUNS = 240.0, 60
+"""A sigma of 15 states that is 12 % too small or 11 % too large is noticed at one instant with 90 %
+probability; of three states alone, 28 % too small or 23 % too large."""
 INSTANTS_S = (20.0, 90.0, 160.0, 239.0)
 
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fusiond.navigation.earth import meridian_radius, transverse_radius
 from tests.broker import Broker, Listener, listening
 from tests.hil.processes import PATIENCE_S, VehicleProcess
-from tests.runs import metres
 
 
 class Heard:
@@ -45,14 +45,19 @@ class Heard:
         patience_s: float = PATIENCE_S,
     ) -> dict[str, Any]:
         """The first message of a topic from now on that fulfils `condition`."""
-        since = self.count
+        seen = self.count
+
+        def found(listener: Listener) -> list[dict[str, Any]]:
+            """Each message is looked at once: there are a dozen a second, for minutes."""
+            nonlocal seen
+            new = self.all(name, seen)
+            seen = len(listener.messages)
+            return [message for message in new if condition(message)]
+
         try:
-            found = await self._listener.until(
-                lambda _: [m for m in self.all(name, since) if condition(m)], patience_s
-            )
+            message: dict[str, Any] = (await self._listener.until(found, patience_s))[0]
         except TimeoutError:
             raise AssertionError(f"{name} never came so; last: {self.all(name)[-1:]}") from None
-        message: dict[str, Any] = found[0]
         return message
 
     async def online(self, word: bytes) -> None:
@@ -101,10 +106,9 @@ def _payload(message: aiomqtt.Message) -> bytes:
 def nav_errors(nav: dict[str, Any], truth: NDArray[np.float64]) -> dict[str, tuple[float, float]]:
     """Error and stated sigma of each figure of a `nav` message; m, m/s and degrees."""
     lat, lon, height, v_n, v_e, v_d, roll, pitch, yaw = (float(x) for x in truth)
-    north, east, _ = metres(lat, height)
     errors = {
-        "n_m": (radians(nav["lat_deg"]) - lat) * north,
-        "e_m": (radians(nav["lon_deg"]) - lon) * east,
+        "n_m": (radians(nav["lat_deg"]) - lat) * (meridian_radius(lat) + height),
+        "e_m": (radians(nav["lon_deg"]) - lon) * (transverse_radius(lat) + height) * math.cos(lat),
         "d_m": height - nav["height_m"],
         "vn_m_s": nav["v_n_m_s"] - v_n,
         "ve_m_s": nav["v_e_m_s"] - v_e,

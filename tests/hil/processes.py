@@ -187,8 +187,11 @@ class VehicleProcess:
 
     def truth(self, utc_ms: float) -> NDArray[np.float64]:
         """True latitude, longitude (rad), height (m), v_ned (m/s), roll, pitch, yaw (rad): (9,)."""
-        t_s = self.t_s(utc_ms)
-        return np.array([np.interp(t_s, self._times, column) for column in self._states.T])
+        t_s = float(np.clip(self.t_s(utc_ms), self._times[0], self._times[-1]))
+        k = max(1, int(np.searchsorted(self._times, t_s)))
+        (t0, t1), (before, after) = self._times[k - 1 : k + 1], self._states[k - 1 : k + 1]
+        state: NDArray[np.float64] = before + (after - before) * ((t_s - t0) / (t1 - t0))
+        return state
 
     async def __aenter__(self) -> VehicleProcess:
         return self

@@ -10,19 +10,24 @@ from pathlib import Path
 
 import pytest
 
+from tests.hil.logs import HANDED_OVER, check
 from tests.hil.uml import HarnessError, Result, run_in_uml, run_with_vcan
 
 INSIDE = Path(__file__).parent / "inside"
 GROUPS = (
-    ("test_bench.py", "test_daemon.py", "test_daemon_estimators.py"),
-    ("test_daemon_can_log.py", "test_daemon_drive.py", "test_daemon_raw.py", "test_daemon_rdss.py"),
+    ("test_bench.py", "test_daemon.py", "test_daemon_can_log.py", "test_daemon_estimators.py"),
+    ("test_daemon_drive.py", "test_daemon_raw.py", "test_daemon_rdss.py"),
 )
 """Each group has a guest of its own, side by side on two cores; about equally long."""
 TIMEOUT_S = 3600.0
-"""A guest that hangs must not hold the build; the suite takes six minutes on two quiet cores."""
+"""A guest that hangs must not hold the build; the suite takes some minutes on two quiet cores."""
 
 
-def test_hardware_in_the_loop(capfd: pytest.CaptureFixture[str]) -> None:
+def test_hardware_in_the_loop(
+    capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = tmp_path / "logs"
+    monkeypatch.setenv(HANDED_OVER, str(logs))
     # What numba compiles is shared with the guests, where it takes three times as long.
     filters = ("federated.standing", "multiscale.filter", "unscented.filter")
     modules = ["fusiond.live.daemon", *(f"fusiond.estimators.{name}" for name in filters)]
@@ -38,6 +43,7 @@ def test_hardware_in_the_loop(capfd: pytest.CaptureFixture[str]) -> None:
         results = [run.result() for run in runs]
     for result in results:
         assert result.status == 0, f"failures in the report above (ran on: {result.where})"
+    check(logs)
 
 
 def _run(mark: str, group: tuple[str, ...]) -> Result:

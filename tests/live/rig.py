@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 
 import can
+import numpy as np
 
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
@@ -215,7 +216,8 @@ class Rig:
         # The least lever of a drive that has not begun has no truth.
         if t_s < 0.0 or (self.samples and t_s < self.samples[-1].t_s + 1.0):
             return
-        found = compared(replace(said, t_ns=round(t_s * 1e9)), self.vehicle.truth)
+        true = self.vehicle.truth.at(np.array([t_s]))
+        found = compared(replace(said, t_ns=round(t_s * 1e9)), true)
         self.samples.append(replace(found, t_s=float(int(t_s))))
 
     @property

@@ -26,7 +26,7 @@ from fusiond.simulation.can.imu import SIM_IMU
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
-from tests.live.test_daemon import running
+from tests.live.daemon_bench import running
 from tests.patience import until
 from tests.places import REPOSITORY
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,14 +18,15 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
-from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.trajectories import Leg, dcm_from_rpy, follow
+from fusiond.simulation.imu_truth import States, Truth
+from fusiond.simulation.trajectories import Leg, follow
 from tests import runs
 from tests.navigator.vehicle import CONFIG, START_NS, drive
 
 Array = NDArray[np.float64]
 
-RATE_HZ, FIXES_HZ = 50.0, 5.0
+RATE_HZ, EVERY = 50.0, 10
+"""A fix after so many samples."""
 SD_M, SD_M_S = 1.5, 0.05
 RUNS = 24
 HIGH = float(chi2.ppf(0.999, 3 * RUNS)) / RUNS
@@ -64,51 +66,59 @@ CASES = {
 }  # fmt: skip
 
 
+@lru_cache(maxsize=2)
 def _truth(case: Case, seconds: float = 60.0) -> Truth:
     return Truth(follow(case.legs, seconds, course_deg=40.0), runs.ORIGIN, RATE_HZ, seconds)
 
 
-def _fix(truth: Truth, t_s: float, lever: Sequence[float], rng: np.random.Generator) -> PositionFix:
-    s = truth.at(np.array([t_s]))
-    dcm = dcm_from_rpy(s.rpy)[0]
-    near = truth.at(np.array([t_s - 0.005, t_s + 0.005]))
-    turn = dcm_from_rpy(near.rpy)
-    w = (turn[0].T @ turn[1] - np.eye(3)) / 0.01
-    rate = np.array([w[2, 1], w[0, 2], w[1, 0]])
-    away = dcm @ np.array(lever) * [1.0, 1.0, -1.0] + SD_M * rng.standard_normal(3)
-    p = s.position[0] + away / np.abs(runs.metres(s.position[0, 0], s.position[0, 2]))
-    v = s.v_ned[0] + dcm @ np.cross(rate, lever) + SD_M_S * rng.standard_normal(3)
-    t_ns = round(t_s * 1e9)
-    lat, lon, height = (float(x) for x in p)
+@lru_cache(maxsize=2)
+def _antenna(case: Case) -> States:
+    """Where the antenna is at each fix, and how fast."""
+    truth = _truth(case)
+    return truth.at(truth.t_s[EVERY::EVERY], case.lever)
+
+
+def _fix(case: Case, row: int, rng: np.random.Generator) -> PositionFix:
+    """What the receiver says at the end of the samples `row` to `row` + `EVERY`."""
+    antenna, k = _antenna(case), row // EVERY
+    p = antenna.position[k]
+    away = SD_M * rng.standard_normal(3) / np.abs(runs.metres(float(p[0]), float(p[2])))
+    lat, lon, height = (p + away).tolist()
+    north, east, down = (antenna.v_ned[k] + SD_M_S * rng.standard_normal(3)).tolist()
+    t_ns = round(float(antenna.t_s[k]) * 1e9)
     fix = PositionFix("gnss", t_ns, MonotonicStamp(t_ns), lat, lon, height)
-    north, east, down = (float(x) for x in v)
     sd: Any = {"sd_ned_m": (SD_M,) * 3, "sd_v_ned_m_s": (SD_M_S,) * 3}
     return replace(fix, v_ned_m_s=(north, east, down), **sd)
 
 
-def _started(case: Case, seed: int, until_s: float = 60.0, **imu: Any) -> Navigator:
+def _feed(
+    navigator: Navigator, case: Case, samples: Array, rows: range, rng: np.random.Generator
+) -> Iterator[None]:
+    """Samples and a fix at a time; the fixes begin at `fixes_from_s`. Yields after each."""
+    times = runs.sample_times(_truth(case))
+    for row in rows:
+        part = slice(row, row + EVERY)
+        navigator.add_imu(times[part], samples[part])
+        if times[part][-1] >= case.fixes_from_s * 1e9:
+            fix = _fix(case, row, rng)
+            navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+        yield
+
+
+def _started(case: Case, seed: int, until_s: float = 60.0) -> Navigator:
     """Run until the start, or to `until_s`."""
     config = Config.model_validate(
         {
-            "imu": {"rate_hz": RATE_HZ, **imu},
+            "imu": {"rate_hz": RATE_HZ},
             "aiding": {"gnss": {"lever_arm_m": case.lever}},
             "alignment": {"heading": ["gnss_course"]},
         }
     )
-    truth, rng = _truth(case), np.random.default_rng(seed)
-    samples = runs.imu_run(config.imu, truth, seed).samples
-    times = runs.sample_times(truth)
-    events: list[str] = []
-    navigator = Navigator(config, on_event=lambda code, text: events.append(code))
-    step = round(RATE_HZ / FIXES_HZ)
-    for row in range(round(case.from_s * RATE_HZ), round(until_s * RATE_HZ), step):
-        rows = slice(row, row + step)
-        navigator.add_imu(times[rows], samples[rows])
-        t_s = float(times[rows][-1]) * 1e-9
-        if t_s >= case.fixes_from_s:
-            fix = _fix(truth, t_s, case.lever, rng)
-            navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
-        navigator.advance()
+    samples = runs.imu_run(config.imu, _truth(case), seed).samples
+    navigator = Navigator(config)
+    rows = range(round(case.from_s * RATE_HZ), round(until_s * RATE_HZ), EVERY)
+    for _ in _feed(navigator, case, samples, rows, np.random.default_rng(seed)):
         if navigator.started is not None:
             break
     return navigator
@@ -156,13 +166,8 @@ def test_an_imu_that_is_upside_down_is_refused() -> None:
     config = Config.model_validate({"imu": {"rate_hz": RATE_HZ}})
     navigator = Navigator(config, on_event=lambda code, text: events.append(code))
     samples = runs.imu_run(config.imu, truth, 1).samples * np.tile([1.0, -1.0, -1.0], 2)
-    rng = np.random.default_rng(1)
-    times = runs.sample_times(truth)
-    for row in range(0, 1500, 10):
-        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
-        fix = _fix(truth, float(times[row + 9]) * 1e-9, case.lever, rng)
-        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
-        navigator.advance()
+    for _ in _feed(navigator, case, samples, range(0, 1500, EVERY), np.random.default_rng(1)):
+        pass
     assert navigator.started is None
     assert events == ["imu_upside_down"]
     assert "upside down" in navigator.mode(navigator.imu.latest_ns)[1]
@@ -175,13 +180,7 @@ def test_an_imu_that_is_mounted_backwards_is_told_and_never_navigates() -> None:
     config = Config.model_validate({"imu": {"rate_hz": RATE_HZ}})
     navigator = Navigator(config, on_event=lambda code, text: events.append(code))
     samples = runs.imu_run(config.imu, truth, 1).samples * np.tile([-1.0, -1.0, 1.0], 2)
-    rng = np.random.default_rng(1)
-    times = runs.sample_times(truth)
-    for row in range(0, 1800, 10):
-        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
-        fix = _fix(truth, float(times[row + 9]) * 1e-9, case.lever, rng)
-        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
-        navigator.advance()
+    for _ in _feed(navigator, case, samples, range(0, 1800, EVERY), np.random.default_rng(1)):
         assert navigator.started is None
     assert [code for code in events if code != "not_aligned"] == ["imu_backwards"]
 
@@ -189,8 +188,7 @@ def test_an_imu_that_is_mounted_backwards_is_told_and_never_navigates() -> None:
 def test_a_turning_deck_is_no_rest() -> None:
     """0.6 deg/s is six sigma of the bias at switch-on; the start says so, and waits."""
     legs = (Leg(60, turn_deg=36.0 * 1.875),)  # the profile's largest rate, in its middle
-    case = Case(legs, "", from_s=20.0)
-    truth = _truth(case)
+    case = Case(legs, "", lever=(0.0, 0.0, 0.0))
     config = Config.model_validate(
         {
             "imu": {"rate_hz": RATE_HZ},
@@ -198,13 +196,9 @@ def test_a_turning_deck_is_no_rest() -> None:
         }
     )
     navigator = Navigator(config)
-    samples, times = runs.imu_run(config.imu, truth, 2).samples, runs.sample_times(truth)
-    rng = np.random.default_rng(2)
-    for row in range(1000, 2000, 10):
-        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
-        fix = _fix(truth, float(times[row + 9]) * 1e-9, (0.0, 0.0, 0.0), rng)
-        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
-        navigator.advance()
+    samples = runs.imu_run(config.imu, _truth(case), 2).samples
+    for _ in _feed(navigator, case, samples, range(1000, 2000, EVERY), np.random.default_rng(2)):
+        pass
     assert navigator.started is None
     assert "turning at" in navigator.mode(navigator.imu.latest_ns)[1]
 
@@ -221,12 +215,8 @@ def test_a_configured_heading_is_compared_with_the_course(
     config = Config.model_validate({"imu": {"rate_hz": RATE_HZ}, "alignment": heading})
     navigator = Navigator(config, on_event=lambda code, text: told.append(code))
     samples, times = runs.imu_run(config.imu, truth, 4).samples, runs.sample_times(truth)
-    rng = np.random.default_rng(4)
-    for row in range(0, 1500, 10):
-        navigator.add_imu(times[row : row + 10], samples[row : row + 10])
-        fix = _fix(truth, float(times[row + 9]) * 1e-9, case.lever, rng)
-        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
-        navigator.advance()
+    for _ in _feed(navigator, case, samples, range(0, 1500, EVERY), np.random.default_rng(4)):
+        pass
     assert [code for code in told if code == "heading_contradicted"] == events
     start, yaw = navigator.started, navigator.solution(int(times[1499])).rpy_rad[2]
     assert start is not None

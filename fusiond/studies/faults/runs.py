@@ -115,6 +115,8 @@ def navigate(config: Config, recording: Recording, truth: Truth) -> Course:
     navigator = Navigator(config, on_event=hear)
     given = taken = 0
     received = recording.received
+    # Of all seconds at once: one by one it takes as long as the navigation.
+    track = truth.at(np.arange(1.0, truth.duration_s + 0.5))
     for tick in range(1, round(truth.duration_s * TICKS_PER_S) + 1):
         now_s = tick / TICKS_PER_S
         now_ns = round(now_s * 1e9)
@@ -129,21 +131,21 @@ def navigate(config: Config, recording: Recording, truth: Truth) -> Course:
                 navigator.add(item.measurement, item.t_ns, 0.0, item.seen_ns)
             navigator.advance()
             if tick % TICKS_PER_S == 0:
-                samples.append(compared(navigator.solution(now_ns), truth))
+                samples.append(compared(navigator.solution(now_ns), track, tick // TICKS_PER_S - 1))
         except Exception as error:  # whatever leaves the navigator ends the daemon: a finding
             return Course(samples, events, f"{type(error).__name__} at {now_s:g} s: {error}")
     return Course(samples, events)
 
 
-def compared(solution: Solution, truth: Truth) -> Sample:
-    """A solution against the truth at its instant."""
+def compared(solution: Solution, true: States, row: int = 0) -> Sample:
+    """A solution against that row of true states."""
     t_s = solution.t_ns * 1e-9
     if solution.mode in (Mode.WAITING, Mode.ALIGNING):
         return Sample(t_s, str(solution.mode))
-    true = truth.at(np.array([t_s]))
-    place = _position_error_m(solution, true)
-    velocity = [v - w for v, w in zip(solution.v_ned_m_s, true.v_ned[0].tolist(), strict=True)]
-    turn = [_wrapped(a - b) for a, b in zip(solution.rpy_rad, true.rpy[0].tolist(), strict=True)]
+    v_ned, rpy = true.v_ned[row].tolist(), true.rpy[row].tolist()
+    place = _position_error_m(solution, true.position[row])
+    velocity = [v - w for v, w in zip(solution.v_ned_m_s, v_ned, strict=True)]
+    turn = [_wrapped(a - b) for a, b in zip(solution.rpy_rad, rpy, strict=True)]
     ratios = (
         _ratio(place[:2], solution.sd_ned_m[:2]),
         _ratio(place[2:], solution.sd_ned_m[2:]),
@@ -164,9 +166,9 @@ def _wrapped(angle_rad: float) -> float:
     return math.remainder(angle_rad, 2.0 * math.pi) if math.isfinite(angle_rad) else math.nan
 
 
-def _position_error_m(solution: Solution, true: States) -> list[float]:
-    """North, east, down."""
-    unit = metres_to_geodetic(true.position[:, 0], true.position[:, 2], np.ones((1, 3)))[0]
-    lat, lon, height = true.position[0].tolist()
+def _position_error_m(solution: Solution, true: Array) -> list[float]:
+    """North, east, down; from the true latitude, longitude (rad) and height (m)."""
+    unit = metres_to_geodetic(true[0:1], true[2:3], np.ones((1, 3)))[0]
+    lat, lon, height = true.tolist()
     apart = solution.lat_rad - lat, _wrapped(solution.lon_rad - lon), solution.height_m - height
     return [a / u for a, u in zip(apart, unit.tolist(), strict=True)]

@@ -14,17 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.recording.info import info
-from fusiond.recording.reader import Log
-from fusiond.replay.run import Wish, replay
 from tests.broker import Broker
 from tests.hil.drives import configuration, drive, section
 from tests.hil.heard import Heard, hearing, judge
+from tests.hil.logs import STEP_S, hand_over
 from tests.hil.processes import FUSIOND, PATIENCE_S, DaemonProcess, VehicleProcess
 
 VEHICLE = "bench"
 RATE_HZ = 50.0
-STEP_S = 3.0
 # What no error may exceed whatever the stated sigma: the receiver's white noise is 0.8 m and 1.5 m
 # (fusiond.simulation.gnss.receiver).
 
@@ -99,23 +96,6 @@ async def _step_the_system_clock(heard: Heard, vehicle: VehicleProcess) -> None:
     time.clock_settime(time.CLOCK_REALTIME, time.time() + STEP_S)
     await heard.until("event", lambda m: m["code"] == "system_clock_stepped")
     await _check_against_truth(heard, vehicle)
-
-
-def _replay(folder: Path) -> None:
-    """What both runs of the daemon recorded, once more: the same bits at every tick."""
-    parts = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime)
-    assert len(parts) == 2, parts
-    for path in parts:
-        found = replay([path], Wish())
-        assert found["identical"] is True, found["first_difference"]
-        assert found["problems"] == found["driver_faults"] == []
-        ticks, speed = found["compared"], found["times_real_time"]
-        print(f"{ticks} ticks the same, from {found['started_from']}, {speed} times real time")
-    first = info(Log(parts[:1]))
-    assert first["sources"]["gnss"]["close"] >= 1
-    assert first["sources"]["rdss"]["sent"] >= 1
-    assert any(abs(step["step_s"] - STEP_S) < 0.1 for step in first["clock_steps"])
-    print(f"overruns {first['overruns']}, {first['mb_per_hour']} MB an hour")
 
 
 async def _lose_imu(heard: Heard, vehicle: VehicleProcess) -> None:
@@ -210,7 +190,7 @@ async def test_a_drive_through_every_fault(tmp_path: Path) -> None:
     finally:
         broker.stop()
         _link("up")
-    _replay(tmp_path / "logs")
+    hand_over(tmp_path / "logs")
 
 
 def test_a_config_mistake_exits_78(tmp_path: Path) -> None:

@@ -21,11 +21,11 @@ from drivers.measurements import PositionFix
 from fusiond.configuration.load import load_config
 from fusiond.offline.can_log import CanLog, messages, read_can_log
 from fusiond.offline.process import process
+from fusiond.studies.navigation_error import metres
 from tests.broker import Broker
 from tests.hil.heard import hearing
 from tests.hil.processes import DaemonProcess
 from tests.places import DATA, REPOSITORY
-from tests.runs import metres
 
 LOG = DATA / "css_164" / "can.log.gz"
 FROM_S, UNTIL_S = 1_627_210_600.0, 1_627_210_660.0

@@ -31,12 +31,12 @@ from fusiond.offline.process import process
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.gnss.receiver import KNOT_M_S, latitude, longitude, sentence
 from fusiond.simulation.pty_line import PtyLine
+from fusiond.studies.navigation_error import metres
 from tests.broker import Broker
 from tests.hil.drives import imu_section
 from tests.hil.heard import hearing
 from tests.hil.processes import DaemonProcess
 from tests.places import DATA, REPOSITORY
-from tests.runs import metres
 
 DRIVE = DATA / "drive_0708"
 FROM_S, UNTIL_S = 243288.0, 243333.0

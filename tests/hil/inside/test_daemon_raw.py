@@ -14,8 +14,8 @@ from tests.hil.processes import DaemonProcess
 
 VEHICLE = "raw"
 RATE_HZ = 100.0
-CANYON_S = (50.0, 40.0)
-"""Start and length on the trajectory, the drive's motion from 4 s on."""
+CANYON_S = (35.0, 30.0)
+"""Start and length on the trajectory, which begins when the daemon is up; it moves from 4 s on."""
 BOUNDS = {"m": 15.0, "m_s": 1.0}
 """What no error may exceed whatever the sigma: ranges with errors of metres, downwards more."""
 
@@ -23,7 +23,7 @@ BOUNDS = {"m": 15.0, "m_s": 1.0}
 async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: Broker) -> None:
     start_s, length_s = CANYON_S
     vehicle = drive(
-        *(tmp_path, 4, 200, 5),
+        *(tmp_path, 4, 120, 5),
         *("--gnss-raw", "ubx", "--gnss-mask", f"canyon2:{start_s}:{length_s}"),
     )
     config = tmp_path / "raw.toml"
@@ -32,9 +32,10 @@ async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: 
         configuration(VEHICLE, vehicle, broker.port, RATE_HZ, receiver, {"kind": "raw"})
     )
     async with vehicle, DaemonProcess(config) as daemon:
-        await vehicle.start()
         await daemon.start()
         async with hearing(broker, VEHICLE) as heard:
+            await heard.online(b"online")
+            await vehicle.start()
             await heard.until("status", lambda m: m["mode"] == "navigating")
             health = await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
             sky = health["sources"]["gnss"]["sky"]

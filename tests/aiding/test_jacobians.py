@@ -1,0 +1,193 @@
+"""Every aid's Jacobian, numerically, for full, planar and scale-factor models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.aiding.base import Linearised, NotApplicable
+from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
+from fusiond.aiding.height import BarometerAid, HeightAid
+from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
+from fusiond.models.vehicle import (
+    ANTENNA_LEVER,
+    FIX_TIME,
+    VELOCITY_TIME,
+    WHEEL_DRIFT,
+    WHEEL_LATENCY,
+    WHEEL_ROUNDING,
+    WHEEL_SCALE,
+    barometer_airflow,
+    barometer_offset,
+    barometer_scale,
+)
+from tests import runs
+from tests.aiding.aid_bench import (
+    AIR,
+    ESTIMATED,
+    FIX_BIAS,
+    KM_H,
+    LEVER,
+    RPY,
+    SOURCE,
+    VELOCITY,
+    Array,
+    aid_model,
+    innovation_of,
+    position_aid,
+    rdss_aid,
+    state_of,
+    vehicle_model,
+)
+
+MODELS = ("ins15", "ins21", "planar15")
+
+
+def _check_jacobian(
+    make: Callable[[Array], Linearised],
+    name: str,
+    rpy: tuple[float, float, float] = RPY,
+    tolerance: float = 1e-6,
+    model: Model | None = None,
+    estimated: tuple[float, ...] = (),
+) -> None:
+    """H against the change of z when the *computed* state is off by one state at a time.
+
+    Parameters in error by +d are estimates short by d. `tolerance` covers the curvature over the
+    step of the central difference and latitude's rounding.
+    """
+    model = model or aid_model(name)
+    v = (*VELOCITY[:2], 0.0) if model.hold_height else VELOCITY
+    nav = runs.level_nav(rpy, v)
+    xi = np.zeros(model.size)
+    for axis in range(3):
+        xi[model.parameters(9 + axis)[0]] = 1e-3 * (axis + 1)
+    if estimated:
+        xi[-len(estimated) :] = estimated
+    aid = make(nav)
+    z, h, r = innovation_of(aid, state_of(model, nav, xi))
+    assert h.shape == (len(z), model.size)
+    assert r.shape == z.shape
+    assert (r > 0.0).all()
+    for k in range(model.size):
+        if not model.active[k]:
+            assert (h[:, k] == 0.0).all()
+            continue
+        if model.column_of[k] in range(15, 18):
+            continue  # see test_scale_factors_are_left_out_of_lever_arms
+        size = 1.0 if 6 <= k < 9 else 1e-4
+        ends = []
+        for sign in (1.0, -1.0):
+            error = np.zeros(model.size)
+            error[k] = sign * size
+            off = runs.with_error(nav, error[:9])
+            ends.append(
+                innovation_of(aid, state_of(model, off, xi - np.r_[np.zeros(9), error[9:]])).z
+            )
+        numeric = (ends[0] - ends[1]) / (2.0 * size)
+        assert numeric == pytest.approx(h[:, k], abs=tolerance), (k, numeric, h[:, k])
+
+
+AIDS: dict[str, Callable[[Array], Linearised]] = {
+    "position": position_aid,
+    "horizontal position": lambda nav: position_aid(nav, False),
+    "position with a shared error": lambda nav: replace(position_aid(nav), bias=FIX_BIAS),
+    "horizontal, shared error": lambda nav: replace(position_aid(nav, False), bias=FIX_BIAS),
+    "rdss": rdss_aid,
+    "rdss, moved by the delay": lambda nav: rdss_aid(nav, 1.5),
+    "velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
+    "horizontal velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2), (0.1, 0.1), LEVER),
+    "heading": lambda nav: HeadingAid(*SOURCE, 2.25, 0.01),
+    "non-holonomic": lambda nav: NonHolonomicAid(*SOURCE, 0.1, 0.2, 2.0, LEVER),
+    "wheel speed": lambda nav: WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
+    "zero velocity": lambda nav: ZeroVelocityAid(*SOURCE, 0.05, runs.rest(100.0)),
+    "zero rate": lambda nav: ZeroRateAid(*SOURCE, (2e-3, 1e-3, 3e-3), 1e-3, runs.rest(100.0)),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("kind", sorted(AIDS))
+def test_jacobian(kind: str, model: str) -> None:
+    # Position: a metre north turns east's scale by cos' / R; zero rate: the Earth's own rate in H.
+    tolerance = {"zero rate": 1e-4, "heading": 2e-6}.get(kind, 2e-6)
+    _check_jacobian(AIDS[kind], model, tolerance=tolerance)
+
+
+IN_TIME: dict[str, Callable[[Array], Linearised]] = {
+    "no slip": AIDS["non-holonomic"],
+    "wheel": lambda nav: replace(
+        WheelSpeedAid(*SOURCE, 14.0, 0.1, LEVER),
+        drift=WHEEL_DRIFT,
+        scale=WHEEL_SCALE,
+        latency=WHEEL_LATENCY,
+        rounding=WHEEL_ROUNDING,
+        shared_step_m_s=KM_H,
+    ),
+    "position": lambda nav: replace(position_aid(nav), time=FIX_TIME, rest=ANTENNA_LEVER),
+    "horizontal position": lambda nav: replace(position_aid(nav, False), time=FIX_TIME),
+    "velocity": lambda nav: replace(
+        VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),
+        time=VELOCITY_TIME,
+        rest=ANTENNA_LEVER,
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", sorted(IN_TIME))
+def test_jacobian_of_what_an_owner_cannot_measure(kind: str) -> None:
+    """With estimates of 5 to 7 deg, decimetres and tenths of seconds."""
+    model = vehicle_model()
+    # Third order of the mounting.
+    _check_jacobian(IN_TIME[kind], "", tolerance=1e-3, model=model, estimated=ESTIMATED)
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.5, 1.1, -3.0), (-2.0, -0.9, 1.0)])
+def test_jacobian_at_steep_attitudes(rpy: tuple[float, float, float]) -> None:
+    _check_jacobian(lambda nav: HeadingAid(*SOURCE, rpy[2], 0.01), "ins15", rpy, 1e-5)
+    _check_jacobian(lambda nav: AttitudeAid(*SOURCE, rpy, (0.01, 0.02, 0.03)), "ins15", rpy)
+    _check_jacobian(AIDS["velocity"], "ins15", rpy, 2e-6)
+
+
+def test_height_jacobian_and_planar() -> None:
+    _check_jacobian(lambda nav: HeightAid(*SOURCE, 41.0, 5.0), "ins15")
+    model = aid_model("planar15")
+    state = state_of(model, runs.level_nav(RPY, VELOCITY), np.zeros(model.size))
+    assert HeightAid(*SOURCE, 41.0, 5.0).innovation(state) == NotApplicable("height_held")
+    assert BarometerAid(*SOURCE, 41.0, 5.0, *AIR).innovation(state) == NotApplicable("height_held")
+
+
+def test_barometer_jacobian_and_what_explains_it() -> None:
+    blocks = (
+        barometer_offset(AIR[0], 100.0, 0.15),
+        barometer_scale(AIR[1], 0.04),
+        barometer_airflow(AIR[2], 0.1),
+    )
+    model = make_model("ins15", imu_noise(Imu()), *blocks)
+    aid = BarometerAid(*SOURCE, 120.0, 5.0, *AIR)
+    _check_jacobian(lambda nav: aid, "", model=model, estimated=(70.0, 0.05, 0.2))
+    nav, xi = runs.level_nav(RPY, VELOCITY), np.zeros(model.size)
+    xi[-3:] = 70.0, 0.05, 0.2
+    lift_m = 0.2 * math.hypot(*VELOCITY[:2]) ** 2 / (2.0 * 9.80665)
+    felt = replace(aid, height_m=1.05 * float(nav[2]) + 70.0 + lift_m)
+    assert innovation_of(felt, state_of(model, nav, xi)).z == pytest.approx([0.0], abs=1e-9)
+
+
+def test_scale_factors_are_left_out_of_lever_arms() -> None:
+    """What a scale factor does over a lever arm: 2000 ppm of 0.5 rad/s over 2 m is 2 mm/s."""
+    model = aid_model("ins21")
+    nav = runs.level_nav(RPY, VELOCITY)
+    aid = AIDS["velocity"](nav)
+    xi = np.zeros(model.size)
+    base = innovation_of(aid, state_of(model, nav, xi)).z
+    xi[model.parameters(17)] = 2e-3
+    assert np.abs(innovation_of(aid, state_of(model, nav, xi)).z - base).max() < 2e-3

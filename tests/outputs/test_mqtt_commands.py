@@ -1,0 +1,177 @@
+"""Commands over a real Mosquitto: checked, carried out, answered, limited."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fusiond.outputs.command_intake import BURST, CommandIntake
+from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
+from fusiond.outputs.topics import EVENT, NAV
+from tests.broker import Broker, Listener, listening
+from tests.outputs.publisher import BASE, UTC_NS, event, heard, nav, options, running
+
+
+def handler(taken: list[Command]) -> Callable[[Command], str]:
+    def handle(command: Command) -> str:
+        if command.id == "no":
+            raise CommandRefusedError("not while moving")
+        if command.id == "bug":
+            raise ZeroDivisionError("oops")
+        taken.append(command)
+        return "done"
+
+    return handle
+
+
+async def test_commands_are_checked_carried_out_and_answered(tmp_path: Path) -> None:
+    taken: list[Command] = []
+    position = {"id": "a1", "lat_deg": 31.0, "lon_deg": 121, "height_m": 12.5, "sd_m": 5.0}
+    cases: list[tuple[str, bytes, str | None, bool, str]] = [
+        ("set_position", json.dumps(position).encode(), "a1", True, "done"),
+        ("set_position", json.dumps(position | {"lat_deg": 91}).encode(), "a1", False, "lat_deg"),
+        ("set_position", json.dumps(position | {"lat_deg": "31"}).encode(), "a1", False, "lat_deg"),
+        ("set_position", json.dumps(position | {"alt": 1}).encode(), "a1", False, "alt"),
+        ("set_position", b'{"id":"a2","lat_deg":NaN}', "a2", False, "lat_deg"),
+        ("reset_filter", b"\xff\xfe{", None, False, "payload"),
+        ("reset_filter", b"", None, False, "payload"),
+        ("reset_filter", b'{"id":"' + b"x" * 5000 + b'"}', None, False, "5009 bytes"),
+        ("reset_filter", b'{"id":"no"}', "no", False, "not while moving"),
+        ("reset_filter", b'{"id":"bug"}', "bug", False, "failed"),
+        ("reset_filter", b'{"id":"r1"}', "r1", True, "done"),
+    ]
+    with Broker(tmp_path) as broker:
+        enabled = options(broker, commands=("set_position", "reset_filter"))
+        async with listening(broker) as (listener, client):
+            await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"old"}', qos=1, retain=True)
+            async with running(enabled, on_command=handler(taken)) as it:
+                first = json.loads((await listener.until(heard("reply")))[0])
+                assert (first["id"], first["ok"]) == ("old", False)
+                assert "retained" in first["text"]
+                for name, payload, *_ in cases:
+                    await client.publish(f"{BASE}/cmd/{name}", payload, qos=1)
+                replies = await listener.until(
+                    lambda li: len(r := heard("reply")(li)) == len(cases) + 1 and r[1:]
+                )
+                for (name, _, request_id, ok, words), raw in zip(cases, replies, strict=True):
+                    reply = json.loads(raw)
+                    assert (reply["command"], reply["id"], reply["ok"]) == (name, request_id, ok)
+                    assert words in reply["text"]
+                    assert reply["t_utc"] == "2026-11-20T23:33:07.123Z"
+                assert taken[0] == SetPosition(**position)
+                assert len(taken) == it.publisher.counters["mqtt_commands"] == 2
+                assert it.publisher.counters["mqtt_commands_refused"] == len(cases) - 2 + 1
+                assert "mqtt_command_failed" in it.codes()
+
+
+async def test_commands_that_are_not_configured_do_nothing(tmp_path: Path) -> None:
+    taken: list[Command] = []
+    with Broker(tmp_path) as broker:
+        enabled = options(broker, commands=("reset_filter",))
+        async with listening(broker) as (listener, client):
+            async with running(enabled, on_command=handler(taken)):
+                await listener.until(heard("online"))
+                await client.publish(f"{BASE}/cmd/request_fix", b'{"id":"1"}', qos=1)
+                await client.publish(f"{BASE}/cmd/reset_fliter", b'{"id":"1"}', qos=1)
+                await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"2"}', qos=1)
+                raw = await listener.until(lambda li: len(r := heard("reply")(li)) == 3 and r)
+                replies = [json.loads(reply) for reply in raw]
+                assert [(r["id"], r["ok"]) for r in replies] == [
+                    ("1", False),
+                    (None, False),
+                    ("2", True),
+                ]
+                assert "not listed in mqtt.commands" in replies[0]["text"]
+                assert "no such command; there are set_position" in replies[1]["text"]
+            async with running(options(broker), on_command=handler(taken)) as it:
+                await it.until(lambda r: r.publisher.counters["mqtt_published"])
+                await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"3"}', qos=1)
+                it.publisher.take(EVENT, event("after the command"))
+                await listener.until(heard("event"))
+    assert [c.id for c in taken] == ["2"]
+
+
+async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(tmp_path: Path) -> None:
+    taken: list[Command] = []
+    flood = 3000
+
+    def replies(li: Listener) -> list[dict[str, Any]]:
+        return [json.loads(payload) for payload in heard("reply")(li)]
+
+    with Broker(tmp_path) as broker:
+        async with (
+            listening(broker, f"{BASE}/+") as (listener, client),
+            running(
+                options(broker, commands=("reset_filter",), keepalive_s=60),
+                on_command=handler(taken),
+            ) as it,
+        ):
+            # Not at the commands: the broker drops what comes faster than a busy listener reads.
+            await listener.until(heard("online"))
+            sender = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-c", FLOOD, str(broker.port), str(flood))
+            )
+            sent = 0
+            while sender.returncode is None:
+                it.publisher.take(NAV, nav(float(sent)))
+                sent += 1
+                await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
+            it.publisher.take(EVENT, event("after the flood"))
+            await listener.until(heard("event"))
+            # Commands and replies keep their order: whoever has the reply to a later one has all of
+            # the flood's. One of too many is not answered, so it is asked for until it is.
+            while "later" not in [r["id"] for r in replies(listener)]:
+                await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"later"}', qos=1)
+                it.publisher.take(NAV, nav(float(sent)))
+                sent += 1
+                await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
+    answers = replies(listener)
+    refused = [r for r in answers if not r["ok"]]
+    carried_out = {c.id for c in taken if c.id.startswith("flood")}
+    assert it.publisher.counters["mqtt_commands_limited"] > 0
+    assert len(carried_out) >= BURST
+    # With QoS 1 a reply may come twice, where the host was too busy to confirm it in time.
+    assert {r["id"] for r in answers if r["ok"]} - {"later"} == carried_out
+    assert len(refused) < 5
+    assert all("too many commands" in r["text"] for r in refused)
+
+
+FLOOD = """
+import sys
+import paho.mqtt.client as mqtt
+client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+client.connect("127.0.0.1", int(sys.argv[1]))
+client.loop_start()
+for k in range(int(sys.argv[2])):
+    last = client.publish("fusiond/truck/cmd/reset_filter", '{"id": "flood%d"}' % k, qos=1)
+last.wait_for_publish()
+"""
+
+
+def test_the_bucket_fills_at_its_rate_and_the_first_of_a_row_is_answered() -> None:
+    now_s = 100.0
+    counters: Counter[str] = Counter()
+    intake = CommandIntake(
+        ("reset_filter",),
+        handler([]),
+        counters,
+        lambda *_: None,
+        lambda: UTC_NS,
+        lambda: now_s,
+    )
+
+    def ask() -> bool | None:
+        reply = intake.answer("reset_filter", b'{"id":"1"}', False)
+        return None if reply is None else reply.ok
+
+    assert [ask() for _ in range(23)] == [True] * 20 + [False, None, None]
+    now_s += 1.0
+    assert [ask() for _ in range(7)] == [True] * 5 + [None] * 2  # the same row
+    now_s += 10.0
+    assert [ask() for _ in range(22)] == [True] * 20 + [False, None]
+    assert counters == {"mqtt_commands": 45, "mqtt_commands_limited": 7}
