@@ -52,7 +52,8 @@ class DeviceTime:
         self.restarts = 0
         self._modulus = modulus
         self._tick_ns = tick_ns
-        per_tick = 1e9 / float(tick_ns)
+        self._tick = float(tick_ns)
+        per_tick = 1e9 / self._tick
         # Half a period tells forth from back; a short one cannot tell of a restart.
         self._slack = min(RESTART_S * per_tick, modulus / 4)
         self._restart = RESTART_S * per_tick
@@ -95,7 +96,7 @@ class DeviceTime:
         step = (raw - self._ticks) % self._modulus
         found: tuple[int, float, float] | None = None
         for now, before in zip(arrivals_ns, self._arrivals_ns, strict=True):
-            elapsed = (now - before) / float(self._tick_ns)
+            elapsed = (now - before) / self._tick
             drift = DEVICE_DRIFT * abs(elapsed)
             most = self._late + elapsed + self._slack + drift
             advance = step + self._modulus * int((most - step) // self._modulus)
@@ -113,7 +114,7 @@ class DeviceTime:
             advance = (raw - doubt.ticks) % self._modulus
             gone = (raw - doubt.first_ticks) % self._modulus
             passed = [
-                (now - first) / float(self._tick_ns)
+                (now - first) / self._tick
                 for now, first in zip(arrivals_ns, doubt.first_ns, strict=True)
             ]
             on_pace = any(LEAST_PACE * gone <= p <= gone + self._slack for p in passed)

@@ -153,7 +153,9 @@ class Pairing:
         last, time = self._last[index], self._plans[index].time
         distance_ns = arrival_ns - last.arrival_ns
         if time is not None and ticks is not None and last.ticks is not None:
-            distance_ns = int((ticks - last.ticks) % time.modulus * time.tick_ns)
+            tick_ns = time.tick_ns
+            passed = (ticks - last.ticks) % time.modulus
+            distance_ns = passed * tick_ns.numerator // tick_ns.denominator
         if last.seen and distance_ns > 0:
             self._intervals_ns.append(distance_ns)
             if len(self._intervals_ns) >= INTERVALS_NEEDED:

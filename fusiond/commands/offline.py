@@ -75,7 +75,7 @@ def process(
     if smooth and out is None:
         raise typer.BadParameter("--smooth: name a file to write with --out")
     loaded = load(config)
-    from fusiond.offline.can_log import MissingPackageError  # noqa: PLC0415
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
     from fusiond.offline.process import process as run_process  # noqa: PLC0415
 
     wanted = _systems_argument(systems)
@@ -107,8 +107,8 @@ def calibrate(
     if (imu is None) == (can is None):
         raise typer.BadParameter("--imu or --can: the samples come of one of the two")
     loaded = load(config)
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
     from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
-    from fusiond.offline.can_log import MissingPackageError  # noqa: PLC0415
 
     try:
         with config_errors(), data_errors(), progress_bar("calibrating") as bar:

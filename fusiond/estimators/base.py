@@ -19,28 +19,28 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.propagation import propagate_for, scratch_size, sensor_estimates
+from fusiond.estimators.propagation import (
+    CARRY,
+    HOLD_HEIGHT,
+    RECORD,
+    propagate_for,
+    scratch_size,
+    sensor_estimates,
+)
 from fusiond.estimators.reading import sigmas
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
+from fusiond.navigation.distributions import chi_square_bound
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, STEP_SMOOTH_N
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Span = tuple[
-    *tuple[bool, NDArray[np.bool_], Indices, Indices, Array, int],  # of the model
-    *tuple[Indices, Array, Array, int, int],  # of the samples
-    *tuple[int, int, int],  # from, to, gap
-    *tuple[bool, Array, Array],  # whether to record, and where
-]
 
 # One sigma added when the motion is in doubt: to the attitude (rad) what an alignment on the move
 # can be wrong by, to the sensor errors what a damaged or loose unit shows, a hundred times the bias
@@ -53,7 +53,7 @@ DOUBTED_FORCE_M_S2 = 0.5
 @lru_cache(maxsize=256)
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
-    return float(chdtri(degrees, 1.0 - probability))
+    return chi_square_bound(degrees, 1.0 - probability)
 
 
 # Ranges that must fail together before a jump of the receiver's clock is a better explanation than
@@ -168,17 +168,21 @@ class ErrorStateFilter:
         self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
-        self.nav: Array = np.zeros(NAV_SIZE)
-        self.xi: Array = np.zeros(model.size)
-        self.step: Array = np.zeros(STEP_SIZE)
         count, width = len(shares), model.width
+        sizes = (NAV_SIZE, model.size, STEP_SIZE, scratch_size(width))
+        self._state: Array = np.zeros(sum(sizes))  # one array for the kernel
+        parts = np.split(self._state, np.cumsum(sizes)[:-1])
+        self.nav: Array
+        self.xi: Array
+        self.step: Array
+        self.nav, self.xi, self.step, self._scratch = parts
         self._covs: Array = np.zeros((count, width, width))
         self._dxs: Array = np.zeros((count, model.size))
         self._shares: Array = np.array(shares)
         self._phi: Array = np.zeros((0, 0))
         self._holding = False
         self._carrying = False
-        self._scratch: Array = np.zeros(scratch_size(width))
+        self._options = HOLD_HEIGHT if model.hold_height else 0
         self._kernel = propagate_for(width)
 
     @property
@@ -212,42 +216,28 @@ class ErrorStateFilter:
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+        model, start, options = self.model, imu.start, self._options
+        if record:
+            options |= RECORD
+        if self._holding or self._carrying:
+            options |= CARRY
         first, self.t_ns = self._kernel(
-            self.nav,
-            self.xi,
+            self._state,
             self._covs,
             self._dxs,
             self._shares,
             self._phi,
-            self.step,
-            self._scratch,
-            *self._span(imu, target_ns, record),
-            self._holding or self._carrying,
-        )
-        self.sample = first + imu.start
-
-    def _span(self, imu: ImuBuffer, target_ns: int, record: bool) -> Span:
-        """What every propagation kernel is told of the model, the samples and how far to go."""
-        model = self.model
-        return (
-            model.hold_height,
-            model.active,
-            model.sensor_terms,
-            model.rate_terms,
-            model.noise,
+            model.packed,
+            imu.packed,
             model.time_slot,
-            imu.times,
-            imu.samples,
-            imu.densities,
-            self.sample - imu.start,
+            self.sample - start,
             imu.end,
             self.t_ns,
             target_ns,
             min(self.gap_ns, imu.hold_ns),
-            record,
-            imu.nav,
-            imu.sigmas,
+            options,
         )
+        self.sample = first + start
 
     @property
     def state(self) -> State:

@@ -37,6 +37,10 @@ class TableError(Exception):
     """A file that cannot be read as the table it should be; the text names file and reason."""
 
 
+class MissingPackageError(Exception):
+    """A format of files needs a package that is not installed; the text says which."""
+
+
 @dataclass(frozen=True, slots=True)
 class Rejection:
     """A row that is not used: line in the file (the header is 1), reason's name, what was seen."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import NamedTuple
 
 # A position comes back once its innovations are known not to run away by three times this (m/s):
@@ -175,7 +176,7 @@ class Series:
 
     def copied(self) -> Series:
         """A copy for a checkpoint."""
-        return Series(*[getattr(self, name) for name in Series.__slots__])
+        return Series(*_FIELDS(self))
 
     def learn(self, t_ns: int, fast: float, slow: float) -> None:
         """Take in the means' squares, by degree of freedom, at an instant."""
@@ -225,3 +226,6 @@ class Series:
     def believed(self) -> bool:
         """Whether its last innovation was fused."""
         return not (self.refused or self.excluded)
+
+
+_FIELDS = attrgetter(*Series.__slots__)

@@ -30,6 +30,7 @@ from fusiond.live.service_manager import ServiceManager
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
+from fusiond.navigation.compiled import load_kernels
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.timeline import Entry
 from fusiond.outputs.base import Output
@@ -72,6 +73,7 @@ class Daemon:
         self.recorder = Recorder(config, self.clock, recording_event)
         saved = self._state.load()
         self._chain = Chain(config, self.clock, self._events, saved, self._on_outcome)
+        load_kernels()  # none is linked inside a tick
         self.navigator = self._chain.navigator
         self.sources = self._chain.sources
         self._calibration.offer(self.navigator)

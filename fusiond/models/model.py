@@ -119,6 +119,13 @@ class Model:
         return {}
 
     @cached_property
+    def packed(self) -> NDArray[np.uint8]:
+        """`noise`, `sensor_terms`, `rate_terms` and `active` one after another in bytes, which a
+        kernel takes for less than four arrays."""
+        parts = (self.noise, self.sensor_terms, self.rate_terms, self.active)
+        return np.concatenate([part.ravel().view(np.uint8) for part in parts])
+
+    @cached_property
     def stated(self) -> NDArray[np.bool_]:
         """(9,): whether position, velocity (n, e, d), roll, pitch, yaw are estimated at all, and
         not held."""

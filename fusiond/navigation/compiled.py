@@ -1,9 +1,10 @@
 """The one way in which numerics are compiled: explicit signature, on disk, IEEE arithmetic.
 
-With an explicit signature numba compiles when the module is imported, or loads from its cache, and
-never again: no compilation can happen inside the navigation loop. `error_model="numpy"` drops the
-zero-division checks that would keep loops from being vectorised; `fastmath` stays off because it
-would let results depend on the order that the compiler picks.
+With an explicit signature numba compiles when the module is imported and never again: no
+compilation can happen inside the navigation loop. A kernel that is in the cache already is linked
+when it is first called; `load_kernels` does that for all at once, before a loop that keeps time.
+`error_model="numpy"` drops the zero-division checks that would keep loops from being vectorised;
+`fastmath` stays off because it would let results depend on the order that the compiler picks.
 
 The cache lies in a folder named by a digest of the sources of all rooms that a kernel takes code or
 constants from, since it has them inlined: any edit there or upgrade starts a new one.
@@ -23,11 +24,13 @@ import os
 import secrets
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
 from numba.core.bytecode import FunctionIdentity
+from numba.core.compiler_lock import global_compiler_lock
 
 from fusiond.navigation.kernel_cache import KernelCache, remove_strays
 
@@ -56,7 +59,9 @@ def _cache_folder() -> Path:
 
 FOLDER = _cache_folder()
 remove_strays(FOLDER)
-_names: set[str] = set()
+_names: dict[str, int] = {}  # in the order of definition: what a kernel calls comes before it
+_in_cache = set(os.listdir(FOLDER)) if FOLDER.is_dir() else set()
+_waiting: dict[int, Callable[[], None]] = {}
 
 # 2^48 starts: no two processes that filled a cache count through the same numbers.
 setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48)))  # noqa: B010
@@ -78,12 +83,46 @@ def compiled(
         name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
         if name in _names:
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
-        _names.add(name)
+        place = _names[name] = len(_names)
         kernel = numba.njit(error_model="numpy", **options)(function)
-        kernel._cache = KernelCache(FOLDER, name)
-        kernel.compile(signature)
-        kernel.disable_compile()
+        kernel._cache = cache = KernelCache(FOLDER, name, partial(load_kernels, place))
+        if cache.file_name(signature, kernel.targetctx) in _in_cache:
+            _load_when_called(kernel, signature, place)
+        else:
+            kernel.compile(signature)
+            kernel.disable_compile()
         finished: Callable[P, R] = kernel
         return finished
 
     return compile_function
+
+
+def load_kernels(before: int | None = None) -> None:
+    """Link every kernel that has been imported and not been called yet, before a loop that keeps
+    time.
+
+    Those defined `before` one that is about to be compiled: it finds a kernel that it calls by the
+    signature which that has once it is linked.
+    """
+    with global_compiler_lock:
+        for place, load in sorted(_waiting.items()):
+            if before is None or place < before:
+                load()
+
+
+def _load_when_called(kernel: Any, signature: str, place: int) -> None:
+    """A dispatcher that knows no signature yet asks `_compile_for_args` for the one of a call."""
+
+    def load() -> None:
+        with global_compiler_lock:
+            if _waiting.pop(place, None) is not None:
+                del kernel._compile_for_args
+                kernel.compile(signature)
+                kernel.disable_compile()
+
+    def first_call(*_: Any, **__: Any) -> Any:
+        load()
+        return kernel  # it is what is called next, with the arguments' types looked at
+
+    kernel._compile_for_args = first_call
+    _waiting[place] = load

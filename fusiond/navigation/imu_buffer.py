@@ -29,6 +29,9 @@ HOLD_PERIODS = 3.5
 # Intervals whose median is the sample period as seen, and how far from the present one it must be
 # (1) to count: a few seconds, whatever single intervals do.
 PERIOD_WINDOW, PERIOD_CHANGE = 256, 0.5
+# What a row holds beside its time: rate and force, their densities, solution, sigmas.
+ROW_WIDTHS = (6, 6, NAV_SIZE, 9)
+ROW_SIZE = 1 + sum(ROW_WIDTHS)
 # Rows kept before the oldest needed one: the slopes of a sample use the two before it.
 MARGIN = 3
 
@@ -91,12 +94,8 @@ class ImuBuffer:
         crosstalk: Crosstalk | None = None,
     ) -> None:
         capacity = int(rate_hz * keep_s * 2.5) + 1000
-        self.times: Stamps = np.zeros(capacity, dtype=np.int64)
-        self.samples: Array = np.zeros((capacity, 6))
-        self.densities: Array = np.zeros((capacity, 6))
+        self._allocate(capacity)
         self._vibration, self._crosstalk = vibration, crosstalk
-        self.nav: Array = np.full((capacity, NAV_SIZE), np.nan)
-        self.sigmas: Array = np.full((capacity, 9), np.nan)
         self.start = 0
         self.end = 0
         self.needed: int | None = None
@@ -107,24 +106,35 @@ class ImuBuffer:
         self._keep_ns = round(keep_s * 1e9)
         self._gap_ns = round(gap_s * 1e9)
         self._configured_ns = self._period_ns = 1e9 / rate_hz
+        self.hold_ns = self._hold()
+        """A sample may stand for this long at most; beyond it the covariance grows as for a gap."""
         self._intervals: list[Stamps] = []
         self._unjudged = 0
         self._offset_ns = round(time_offset_s * 1e9)
         self._turn = np.zeros((6, 6))
         self._turn[:3, :3] = self._turn[3:, 3:] = sensor_to_body.T
 
+    def _allocate(self, capacity: int) -> None:
+        """Room for so many rows, all arrays in one: `packed`, which a kernel takes for less."""
+        self.packed: Array = np.zeros(ROW_SIZE * capacity)
+        self.times: NDArray[np.int64] = self.packed[:capacity].view(np.int64)
+        parts: list[Array] = []
+        first = 1
+        for width in ROW_WIDTHS:
+            rows = self.packed[first * capacity : (first + width) * capacity]
+            parts.append(rows.reshape(capacity, width))
+            first += width
+        self.samples, self.densities, self.nav, self.sigmas = parts
+        self.nav[:] = self.sigmas[:] = np.nan
+
     @property
     def next_sample(self) -> int:
         """Absolute number of the sample that will come next."""
         return self.start + self.end
 
-    @property
-    def hold_ns(self) -> int:
-        """A sample may stand for this long at most; beyond it the covariance grows as for a gap.
-
-        The slower of the configured rate and the one seen counts: a bus that hands over samples in
-        bursts does not make its sensor fast.
-        """
+    def _hold(self) -> int:
+        """The slower of the configured rate and the one seen counts: a bus that hands over samples
+        in bursts does not make its sensor fast."""
         slower = max(self._period_ns, self._configured_ns)
         return min(self._gap_ns, round(HOLD_PERIODS * slower))
 
@@ -204,6 +214,7 @@ class ImuBuffer:
             seen = float(np.median(intervals[:PERIOD_WINDOW]))
             if abs(seen - self._period_ns) > PERIOD_CHANGE * self._period_ns:
                 self._period_ns = seen
+                self.hold_ns = self._hold()
             intervals = intervals[PERIOD_WINDOW:]
         self._intervals, self._unjudged = [intervals], len(intervals)
 
@@ -235,9 +246,8 @@ class ImuBuffer:
 
     def _grow(self, capacity: int) -> None:
         """More rows: the IMU is faster than configured, or the filter has not run for long."""
-        more = capacity - len(self.times)
-        self.times = np.concatenate([self.times, np.zeros(more, dtype=np.int64)])
-        self.samples = np.concatenate([self.samples, np.zeros((more, 6))])
-        self.densities = np.concatenate([self.densities, np.zeros((more, 6))])
-        self.nav = np.concatenate([self.nav, np.full((more, NAV_SIZE), np.nan)])
-        self.sigmas = np.concatenate([self.sigmas, np.full((more, 9), np.nan)])
+        held = self.times, self.samples, self.densities, self.nav, self.sigmas
+        self._allocate(capacity)
+        grown = self.times, self.samples, self.densities, self.nav, self.sigmas
+        for array, before in zip(grown, held, strict=True):
+            array[: len(before)] = before

@@ -12,7 +12,9 @@ can be written, kernels are compiled at each start.
 
 A start that finds all kernels compiles nothing, and so does without what numba needs to compile:
 its tables of implementations (a fifth of the processor time of a start) and the bitcode of the
-kernels, which others inline (another seventh). Both come when a kernel is missing.
+kernels, which others inline (another seventh). Both come when a kernel is missing. A kernel that is
+there is linked when it is first called, 2 ms each: of a hundred that are imported a drive on files
+calls twenty (fusiond.navigation.compiled).
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import pickle
 import secrets
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,19 +47,33 @@ _DIGEST_SIZE = hashlib.sha256().digest_size
 
 
 class KernelCache(NullCache):
-    """What a numba dispatcher asks for its one signature; `name` is the kernel's alone."""
+    """What a numba dispatcher asks for its one signature; `name` is the kernel's alone.
 
-    def __init__(self, folder: Path, name: str) -> None:
+    `on_missing` is called before the kernel is compiled, since there is nothing sound.
+    """
+
+    def __init__(self, folder: Path, name: str, on_missing: Callable[[], None]) -> None:
         self._folder = folder
         self._name = name
+        self._on_missing = on_missing
 
     @property
     def cache_path(self) -> str:
         """The folder of the files."""
         return str(self._folder)
 
+    def file_name(self, signature: object, target: Any) -> str:
+        """The name of the kernel's file in the folder."""
+        return self._path(signature, target.codegen()).name
+
     def load_overload(self, signature: object, target: Any) -> Any:
         """What was compiled for this processor, or None where there is nothing sound."""
+        found = self._load(signature, target)
+        if found is None:
+            self._on_missing()
+        return found
+
+    def _load(self, signature: object, target: Any) -> Any:
         rtsys.initialize(target)  # what kernels allocate arrays with
         path = self._path(signature, target.codegen())
         try:

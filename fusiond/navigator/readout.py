@@ -36,8 +36,10 @@ def solution_of(
     published = np.empty(NAV_SIZE)
     in_fix_time(nav, estimator.xi, estimator.step, estimator.model.time_slot, published)
     nav = published
-    sd = np.where(estimator.model.stated, estimator.sigmas(), np.nan).tolist()
-    values = [float(v) for v in nav]
+    sigmas = estimator.sigmas()
+    sigmas[~estimator.model.stated] = math.nan
+    sd = sigmas.tolist()
+    values = nav.tolist()
     bias = estimator.sensor_errors.tolist()
     return Solution(
         t_ns,

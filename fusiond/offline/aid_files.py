@@ -23,8 +23,6 @@ from drivers.measurements import (
     UtcStamp,
     WheelSpeed,
 )
-from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import RawEvent, RawGnssEpoch
 from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
@@ -226,6 +224,8 @@ def _read_barometer(path: Path, _: ImuTable, source: str) -> _Read:
 def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
     """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
     maps to: GPS second of week (below 604800) or POSIX seconds."""
+    from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding  # noqa: PLC0415
+
     decoder = NmeaDecoder(source, NmeaDecoding(earliest_date=EARLIEST_DATE))
     found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
@@ -251,6 +251,8 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     on for some minutes: a recording that starts in the middle would take half a minute to several
     to say it again.
     """
+    from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
+
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     epochs: list[Arrival] = []

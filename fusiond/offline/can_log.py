@@ -19,12 +19,12 @@ from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import can
 import numpy as np
 
 from drivers.base import Emitted
 from drivers.can.bus import CanFrame
 from drivers.can.driver import CanDriver
+from drivers.can.python_can import can, with_mf4
 from drivers.measurements import (
     DeviceEvent,
     ImuSample,
@@ -35,7 +35,7 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, TableError
+from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
 from fusiond.files.tables import ImuTable
 from fusiond.offline.aid_files import Arrival
 
@@ -203,10 +203,6 @@ class _Replay:
 # --------------------------------------------------------------------------- frames
 
 
-class MissingPackageError(Exception):
-    """A format needs a package that is not installed; the text says which."""
-
-
 def messages(path: Path, damaged: Callable[[str], None]) -> Iterator[can.Message]:
     """The messages of a log in its order; `damaged` hears of what ends it before its end.
 
@@ -264,6 +260,7 @@ def _reader(path: Path, suffix: str, zipped: bool, stack: contextlib.ExitStack) 
             raise MissingPackageError(
                 "MF4 logs need the package asammdf: pip install 'fusiond[mf4]'"
             )
+        with_mf4()
         return can.MF4Reader(path)
     opened = gzip.open if zipped else open
     source: Any = stack.enter_context(opened(path, "rb" if suffix == ".blf" else "rt"))

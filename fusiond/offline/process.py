@@ -33,7 +33,6 @@ from fusiond.models.model import Model
 from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import READERS, Arrival, source_of
-from fusiond.offline.can_log import read_can_log
 from fusiond.offline.outages import Outage, named, withheld
 from fusiond.offline.reasons import FileRead, nothing_navigated, wrong_units
 from fusiond.offline.rows import Rows, RowsWriter
@@ -112,6 +111,9 @@ def _read(
     arrivals: list[Arrival] = []
     files: dict[str, FileRead] = {}
     if can_log is not None:
+        # python-can and the DBC files' reader come only where there is a bus to be read.
+        from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
+
         log = read_can_log(can_log, config)
         imu, arrivals = log.imu, log.arrivals
         events += [{"code": code, "text": text} for code, text in log.events]

@@ -11,13 +11,20 @@ from fusiond.configuration.schema import Config
 from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.chrony import ChronySocket
 from fusiond.outputs.commands import Handler
-from fusiond.outputs.foxglove.server import FoxgloveServer
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.home_assistant import HomeAssistantDiscovery
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.nmea import NmeaServer
 from fusiond.outputs.owntracks import OwnTracksLocations
 from fusiond.outputs.prometheus import PrometheusEndpoint
+
+
+def _foxglove(section: Any, around: Surroundings) -> Output:
+    """It brings websockets along, which few need."""
+    from fusiond.outputs.foxglove.server import FoxgloveServer  # noqa: PLC0415
+
+    return FoxgloveServer(section, around)
+
 
 MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "gpsd": GpsdServer,
@@ -26,7 +33,7 @@ MAKERS: dict[str, Callable[[Any, Surroundings], Output]] = {
     "chrony": ChronySocket,
     "home_assistant": HomeAssistantDiscovery,
     "prometheus": PrometheusEndpoint,
-    "foxglove": FoxgloveServer,
+    "foxglove": _foxglove,
 }
 """By the section's name below `[outputs]`."""
 

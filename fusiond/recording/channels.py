@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -43,17 +45,17 @@ class InnovationMessage:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel as MCAP has it."""
+    """A channel as MCAP has it; `schema()` is made when a file needs it."""
 
     topic: str
     schema_name: str
     schema_encoding: str
-    schema: bytes
+    schema: Callable[[], bytes]
     encoding: str
 
 
-def _json_channel(topic: str, name: str, schema: dict[str, Any]) -> Channel:
-    return Channel(topic, name, "jsonschema", json.dumps(schema).encode(), "json")
+def _json_channel(topic: str, name: str, schema: Callable[[], dict[str, Any]]) -> Channel:
+    return Channel(topic, name, "jsonschema", lambda: json.dumps(schema()).encode(), "json")
 
 
 OF_FOXGLOVE = tuple(c for c in foxglove.CHANNELS if c.schema_name.startswith("foxglove."))
@@ -65,19 +67,17 @@ CHANNELS: dict[str, Channel] = {
             INPUT,
             "fusiond.Records",
             "text",
-            b"little-endian records; see docs/recording.md of fusiond",
+            lambda: b"little-endian records; see docs/recording.md of fusiond",
             INPUT_ENCODING,
         ),
-        _json_channel(STATE, "fusiond.KeptState", {"type": "object"}),
+        _json_channel(STATE, "fusiond.KeptState", lambda: {"type": "object"}),
         *(_json_channel(c.name, c.schema_name, c.schema) for c in OF_FOXGLOVE),
-        _json_channel(
-            INNOVATION, "fusiond.Innovation", TypeAdapter(InnovationMessage).json_schema()
-        ),
+        _json_channel(INNOVATION, "fusiond.Innovation", TypeAdapter(InnovationMessage).json_schema),
         *(
             _json_channel(
                 f"/{topic.name}",
                 f"fusiond.{topic.message.__name__}",
-                topic.message.model_json_schema(mode="serialization"),
+                partial(topic.message.model_json_schema, mode="serialization"),
             )
             for topic in TOPICS
         ),

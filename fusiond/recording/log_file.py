@@ -75,11 +75,12 @@ class LogFile:
         self.messages += 1
 
     def _register(self, channel: Channel) -> int:
-        key = channel.schema_name, channel.schema
+        content = channel.schema()
+        key = channel.schema_name, content
         schema = self._schemas.get(key)
         if schema is None:
             schema = self._writer.register_schema(
-                channel.schema_name, channel.schema_encoding, channel.schema
+                channel.schema_name, channel.schema_encoding, content
             )
             self._schemas[key] = schema
         number = self._writer.register_channel(channel.topic, channel.encoding, schema)

@@ -62,6 +62,9 @@ class Kind(IntEnum):
     COMMAND = 9
 
 
+_KINDS = {int(kind): kind for kind in Kind}
+
+
 class Record(NamedTuple):
     """One record; `payload` is as in the table above."""
 
@@ -110,10 +113,13 @@ def unpack(data: bytes) -> Iterator[Record]:
             if len(payload) < length:
                 raise DamagedRecordError("a record goes beyond its message")
             at += length
-            readings = [_READING.unpack_from(data, at + k * _READING.size) for k in range(count)]
-            at += count * _READING.size
-            yield Record(Kind(kind), source, t_ns, payload, readings)
-    except (struct.error, ValueError) as error:
+            readings: list[Reading] = []
+            if count:  # one record in ten has any
+                rows = range(at, at + count * _READING.size, _READING.size)
+                readings = [_READING.unpack_from(data, row) for row in rows]
+                at += count * _READING.size
+            yield Record(_KINDS[kind], source, t_ns, payload, readings)
+    except (struct.error, KeyError) as error:
         raise DamagedRecordError(str(error)) from error
 
 

@@ -114,7 +114,9 @@ class Replay:
                     continue
             if record.t_ns <= after_ns:
                 continue
-            yield from self._handle(record)
+            tick = self._handle(record)
+            if tick is not None:
+                yield tick
 
     # ------------------------------------------------------------------ start
 
@@ -148,7 +150,7 @@ class Replay:
         for name, inputs in self._doors.items():
             inputs.heard = self._listener(name)
         self.exact = self._same and from_start and self._log.first_part
-        self._finish(record)
+        self._finish()
         return after_ns
 
     def _on_the_way(self, start: dict[str, Any]) -> tuple[Loaded, int]:
@@ -172,15 +174,16 @@ class Replay:
 
     # ------------------------------------------------------------------ on the way
 
-    def _handle(self, record: Record) -> Iterator[ReplayedTick]:
+    def _handle(self, record: Record) -> ReplayedTick | None:
         assert self.chain is not None
         self._time.t_ns = record.t_ns
         self._readings.give(record.readings)
+        tick = None
         match record.kind:
             case Kind.TICK if not self._navigate:
                 self.chain.sources.take_imu()
             case Kind.TICK:
-                yield self._tick(record)
+                tick = self._tick(record)
             case Kind.COMMAND:
                 self._command(record)
             case Kind.SENT:
@@ -188,9 +191,10 @@ class Replay:
             case _:
                 self._inputs += 1
                 self._take(record)
-        self._finish(record)
+        self._finish()
+        return tick
 
-    def _finish(self, record: Record) -> None:
+    def _finish(self) -> None:
         """The daemon read its host's clocks for outputs too, which a replay need not have."""
         assert self.chain is not None
         while self._readings.pending:

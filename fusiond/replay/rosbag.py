@@ -19,15 +19,12 @@ from drivers.raw.messages import RawGnssEpoch
 from fusiond.clock.answers import Instant
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import sensor_to_body
+from fusiond.files.csv_tables import MissingPackageError
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
 from fusiond.replay.tables import arrivals
 
 _TO_ROS = np.array([1.0, -1.0, -1.0])
-
-
-class MissingPackageError(Exception):
-    """rosbags is not installed."""
 
 
 def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]:

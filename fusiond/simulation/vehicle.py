@@ -25,10 +25,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
-import can
 import numpy as np
 
 from drivers.can.imu import CanImuOptions
+from drivers.can.python_can import can
 from fusiond.configuration.load import load_config
 from fusiond.navigation.gps_time import utc_ns_to_gps
 from fusiond.simulation.can.aids import CanAid, can_aids

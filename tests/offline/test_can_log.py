@@ -11,14 +11,15 @@ import can
 import numpy as np
 import pytest
 
+from drivers.can.python_can import with_mf4
 from drivers.measurements import Heading, MonotonicStamp, PositionFix, WheelSpeed
 from drivers.rounding import rounded_speed
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import TableError
+from fusiond.files.csv_tables import MissingPackageError, TableError
 from fusiond.files.tables import read_gnss, read_imu, read_wheel
 from fusiond.offline.aid_files import READERS, Arrival
-from fusiond.offline.can_log import CanLog, MissingPackageError, read_can_log
+from fusiond.offline.can_log import CanLog, read_can_log
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.places import DATA, REPOSITORY
 
@@ -115,6 +116,7 @@ def test_blf_that_is_zipped(tmp_path: Path) -> None:
     reason="the package asammdf is not installed: pip install 'fusiond[mf4]'",
 )
 def test_mf4(tmp_path: Path) -> None:
+    with_mf4()
     path = written(tmp_path / "bus.mf4", recorded(0, 0))
     check(read_can_log(path, configuration(tmp_path)), 2e-6)
 

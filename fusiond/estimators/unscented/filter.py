@@ -110,6 +110,7 @@ class UnscentedEstimator(KalmanEstimator):
         if not self.propagation:
             super().propagate(imu, target_ns, record)
             return
+        model = self.model
         first, self.t_ns = propagate_points(
             self.nav,
             self.xi,
@@ -117,7 +118,23 @@ class UnscentedEstimator(KalmanEstimator):
             self._dxs[0],
             self.step,
             self.spread,
-            *self._span(imu, target_ns, record),
+            model.hold_height,
+            model.active,
+            model.sensor_terms,
+            model.rate_terms,
+            model.noise,
+            model.time_slot,
+            imu.times,
+            imu.samples,
+            imu.densities,
+            self.sample - imu.start,
+            imu.end,
+            self.t_ns,
+            target_ns,
+            min(self.gap_ns, imu.hold_ns),
+            record,
+            imu.nav,
+            imu.sigmas,
             self._holding,
             self._scratch[-work_size(self.model.width) :],
         )

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-import can
-
 from drivers.can.aids import (
     CanAttitudeDecoder,
     CanAttitudeOptions,
@@ -15,6 +13,7 @@ from drivers.can.aids import (
 )
 from drivers.can.decoder import CanDecoder
 from drivers.can.height import CanHeightOptions
+from drivers.can.python_can import can
 from fusiond.simulation.aid_sensors import (
     SarOptions,
     SarRadar,

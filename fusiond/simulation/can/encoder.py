@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import can
 from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 
 from drivers.can.decoder import CanDecoder
+from drivers.can.python_can import can
 
 
 class CanEncoder:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import can
-
 from drivers.can.imu import CanImuDecoder, CanImuOptions
+from drivers.can.python_can import can
 from fusiond.simulation.can.encoder import CanEncoder
 
 SIM_IMU = CanImuOptions(

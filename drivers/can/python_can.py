@@ -1,0 +1,26 @@
+"""The package python-can, without asammdf, which its reader and writer of MF4 logs bring along.
+
+`import can` imports every format of logs that there is, and asammdf imports pandas and lxml: 0.35 s
+of processor time at the start of a daemon that reads no such log. So it is kept out at first.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+_known = sys.modules.get("asammdf")
+sys.modules["asammdf"] = None  # type: ignore[assignment]  # to an import: not installed
+try:
+    import can
+finally:
+    del sys.modules["asammdf"]
+    if _known is not None:
+        sys.modules["asammdf"] = _known
+
+__all__ = ["can", "with_mf4"]
+
+
+def with_mf4() -> None:
+    """From now on python-can reads and writes MF4 too, where asammdf is installed."""
+    importlib.reload(importlib.import_module("can.io.mf4"))
