@@ -19,6 +19,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.propagation import (
@@ -35,7 +36,6 @@ from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
-from fusiond.navigation.distributions import chi_square_bound
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, STEP_SMOOTH_N
@@ -53,7 +53,7 @@ DOUBTED_FORCE_M_S2 = 0.5
 @lru_cache(maxsize=256)
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
-    return chi_square_bound(degrees, 1.0 - probability)
+    return float(chdtri(degrees, 1.0 - probability))
 
 
 # Ranges that must fail together before a jump of the receiver's clock is a better explanation than

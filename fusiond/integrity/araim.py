@@ -50,8 +50,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from fusiond.navigation.distributions import chi_square_bound, normal_quantile
+from scipy.special import chdtri, ndtri
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -207,7 +206,7 @@ def _risk_of(terms: list[tuple[float, float, float]], level: float) -> float:
 def _level_of(term: tuple[float, float, float], risk: float) -> float:
     """Where one term alone has `risk`; minus infinity where it never has as much."""
     weight, offset, sigma = term
-    return offset - normal_quantile(min(1.0, risk / weight)) * sigma
+    return offset - float(ndtri(min(1.0, risk / weight))) * sigma
 
 
 def fault_modes(epoch: Epoch, unmonitored_risk: float) -> tuple[tuple[FaultMode, ...], float]:
@@ -260,8 +259,8 @@ def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
     accuracy = epoch.accuracy_sigma_m**2
     separation_sigma = np.sqrt(((gain - gain[0]) ** 2) @ accuracy)
     number = max(1, len(kept))
-    k_horizontal = -normal_quantile(requirement.horizontal_false_alarm / (4.0 * number))
-    k_vertical = -normal_quantile(requirement.vertical_false_alarm / (2.0 * number))
+    k_horizontal = -ndtri(requirement.horizontal_false_alarm / (4.0 * number))
+    k_vertical = -ndtri(requirement.vertical_false_alarm / (2.0 * number))
     threshold = separation_sigma * np.array([k_horizontal, k_horizontal, k_vertical])
     separation = Separation(
         gain,
@@ -319,7 +318,7 @@ def detect(epoch: Epoch, protection: Protection, y: Array, requirement: Requirem
     apart = np.abs((gain[1:] - gain[0]) @ y)
     ratio = np.divide(apart, threshold[1:], out=np.zeros_like(apart), where=threshold[1:] > 0.0)
     residual, degrees = _residual(epoch, y)
-    bound = chi_square_bound(degrees, requirement.residual_false_alarm) if degrees else math.inf
+    bound = float(chdtri(degrees, requirement.residual_false_alarm)) if degrees else math.inf
     return Detection(float(ratio.max(initial=0.0)), residual, bound)
 
 

@@ -41,14 +41,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from fusiond.navigation.distributions import (
-    f_quantile,
-    f_tail,
-    gamma_quantile,
-    gamma_tail,
-    noncentrality,
-    normal_quantile,
+from scipy.special import (
+    chndtrinc,
+    fdtrc,
+    fdtri,
+    gammainc,
+    gammaincc,
+    gammainccinv,
+    gammaincinv,
+    ndtri,
 )
 
 Array = NDArray[np.float64]
@@ -180,12 +181,12 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
     level = 1.0 - math.sqrt(1.0 - alpha)
     n = dof if whitened else k
     d, nu = 8.0 + 207.0 / n - 1670.0 / n**2, 13.6 + 0.277 * n
-    r = -normal_quantile((1.0 - INTERVAL_LEVEL) / 2.0) / math.sqrt(n)
+    r = -float(ndtri((1.0 - INTERVAL_LEVEL) / 2.0)) / math.sqrt(n)
 
     def between(outside: float) -> Interval:
         return (
-            scale * gamma_quantile(shape, outside / 2.0, False),
-            scale * gamma_quantile(shape, outside / 2.0, True),
+            scale * float(gammaincinv(shape, outside / 2.0)),
+            scale * float(gammainccinv(shape, outside / 2.0)),
         )
 
     return Limits(
@@ -196,7 +197,7 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
         n + 2.0 * (1.0 - _LAG / k),
         (d, nu),
         (-r, r),
-        f_quantile(d, nu, level) * LAGS * (nu - 2.0) / nu,
+        float(fdtri(d, nu, 1.0 - level)) * LAGS * (nu - 2.0) / nu,
     )
 
 
@@ -206,9 +207,9 @@ def _average_law(k: int, dof: int, gate: float) -> tuple[float, float]:
     E[x^j; x < g] of a chi-square with m degrees: m (m + 2) .. (m + 2j - 2) F_{m+2j}(g).
     """
     m = dof / k
-    g = 2.0 * gamma_quantile(m / 2.0, gate, False)
-    mean = m * gamma_tail(m / 2.0 + 1.0, g / 2.0, False) / gate
-    variance = m * (m + 2.0) * gamma_tail(m / 2.0 + 2.0, g / 2.0, False) / gate - mean * mean
+    g = 2.0 * float(gammaincinv(m / 2.0, gate))
+    mean = m * float(gammainc(m / 2.0 + 1.0, g / 2.0)) / gate
+    variance = m * (m + 2.0) * float(gammainc(m / 2.0 + 2.0, g / 2.0)) / gate - mean * mean
     return k * mean * mean / variance, variance / (mean * dof)
 
 
@@ -220,10 +221,10 @@ def _detectable(
     limits = limits_of(k, dof, alpha, gate, whitened)
     low, high = limits.nis_limits
     ratio = (
-        low / (limits.scale * gamma_quantile(limits.shape, POWER, False)),
-        high / (limits.scale * gamma_quantile(limits.shape, POWER, True)),
+        low / (limits.scale * float(gammaincinv(limits.shape, POWER))),
+        high / (limits.scale * float(gammainccinv(limits.shape, POWER))),
     )
-    shift = noncentrality(limits.portmanteau, float(LAGS), 1.0 - POWER)
+    shift = float(chndtrinc(limits.portmanteau, LAGS, 1.0 - POWER))
     return ratio, min(1.0, math.sqrt(shift / (dof if whitened else k)))
 
 
@@ -251,8 +252,8 @@ def judge(
     values = np.asarray(rho, dtype=float)
     q = float(limits.weights @ (values * values))
     tails = (
-        gamma_tail(limits.shape, average / limits.scale, False),
-        gamma_tail(limits.shape, average / limits.scale, True),
+        float(gammainc(limits.shape, average / limits.scale)),
+        float(gammaincc(limits.shape, average / limits.scale)),
     )
     d, nu = limits.freedom
     verdict = verdict_of(average, q, limits)
@@ -269,7 +270,7 @@ def judge(
         rho_interval=limits.rho_interval,
         portmanteau=q,
         portmanteau_limit=limits.portmanteau,
-        portmanteau_p=f_tail(d, nu, q * nu / (LAGS * (nu - 2.0))),
+        portmanteau_p=float(fdtrc(d, nu, q * nu / (LAGS * (nu - 2.0)))),
         alpha=alpha,
         detectable_ratio=ratio,
         detectable_rho=single,

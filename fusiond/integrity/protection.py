@@ -38,9 +38,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from fusiond.integrity.araim import protection_level
-from fusiond.navigation.distributions import normal_quantile
 
 Array = NDArray[np.float64]
 
@@ -77,9 +77,11 @@ def axis_level(variance: Array, separation: Array, share: float, limits: Integri
     """The level of an axis: `variance` (1 + k,) m^2 of all aids and of the subsets, `separation`
     (k,) m of the subsets, `share` of the risk. Infinite where there is no bound."""
     sigma = np.sqrt(variance)
-    k_fa = -normal_quantile(
-        limits.false_alarm
-        / (2.0 * len(AXIS_SHARE) * max(1, len(separation)) * INDEPENDENT_PER_HOUR)
+    k_fa = -float(
+        ndtri(
+            limits.false_alarm
+            / (2.0 * len(AXIS_SHARE) * max(1, len(separation)) * INDEPENDENT_PER_HOUR)
+        )
     )
     # Gates differ: a subset may have taken more than the whole.
     threshold = k_fa * np.sqrt(np.maximum(0.0, variance[1:] - variance[0]))
