@@ -4,9 +4,9 @@ A heading error turns all that was felt since the heading was last of no matter:
 driven off in an unknown direction is somewhere on an arc. In dx that is a bent distribution; here
 it is a normal one. Of a state with attitude C^, velocity v^ and position p^, all computed:
 
-    C = R(psi) exp(t x) C^
-    v = v^ - v_t + R(psi) v_t - R_i eta_v        R(psi) the turn about the vertical
-    p = p^ - p_t + R(psi) p_t - R_i eta_p        R_i R(psi) at the estimate
+    C = E C^                               E = R(psi) exp(t x), R a turn about the vertical
+    v = v^ - v_t + E v_t - R eta_v
+    p = p^ - p_t + E p_t - R eta_p
 
 xi = (t_n, t_e, psi, eta_v, eta_p, parameters), psi of any size. v_t and p_t are what of velocity
 and position turns with the heading, and P itself tells them: the regression on psi,
@@ -18,13 +18,20 @@ but for the Earth's own rate), and F gathers that in P. From rest v_t = v^ and p
 and xi is the right-invariant error of the group SE_2(3) about the place of departure, in which such
 a distribution stays normal exactly. What was measured in north and east by itself does not turn:
 its v_t and p_t are 0, and no fix at rest tells a heading. (The invariant error proper turns all,
-the noise of the fixes too; a Gauss-Newton step then sees a heading in it.) To first order
+the noise of the fixes too; a Gauss-Newton step then sees a heading in it.)
 
-    dx = J xi,   J = diag(R_i, R_i, R_i, I),  and in psi's column  R_i v_t x z,  R_i p_t x z
+Once the heading is known to `WIDE_SD_RAD` v_t is v^: the vehicle goes the way it faces, and what
+turns is its speed, v = E (v^ - eta_v) with eta_v of any size. No slip (C^T v) is then linear in
+eta_v whatever speed and heading, where the plain error has it depend on a speed that the next fix
+may double, and grows sure of heading and pitch for it. To first order, at the state of xi_i,
 
-at a state that xi_i leads to; before an update R_i = I. Between updates P is that of dx, so kernels
-and aids are those of every filter. An update runs in xi about the state before it and is linearised
-about the one that it leads to (Gauss-Newton): with P_xi = J^-1 P J^-T
+    dx = J_i xi,   dv = R eta_v + [E v_t x] R phi,   dr = R eta_p + [E p_t x] R phi
+
+with E (v_t - eta_v) in place of E v_t, and E eta_v, where v_t is the speed. What does not turn
+keeps the axes of the estimate: R in R eta is that of xi_i, and no slope of psi. Between updates P
+is that of dx, so kernels and aids are those of every filter. An update runs in xi about the state
+before it and is linearised about the one that it leads to (Gauss-Newton): with
+P_xi = J_0^-1 P J_0^-T
 
     nu_i = z(x_i) + H_i J_i xi_i,   xi_(i+1) = K_i nu_i,   P = J_i P_xi J_i^T  after it
 
@@ -66,6 +73,7 @@ from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.rotation import (
     dcm_from_quaternion,
     rotation_vector_to_quaternion,
+    skew,
 )
 from fusiond.navigation.strapdown import (
     HEIGHT,
@@ -94,6 +102,15 @@ FELT_SIGMAS = 1.0
 # Below this sigma of the heading both coordinates say the same: at 15 m/s the velocity across is
 # known to 0.5 m/s, and a speed that is off by a tenth changes what no slip says by 5 cm/s.
 PLAIN_SD_RAD = math.radians(2.0)
+
+
+class Turning(NamedTuple):
+    """What of velocity and position (3,) turns with the heading; and whether that is the speed, so
+    that an error of the velocity changes it."""
+
+    velocity: Array
+    place: Array
+    speeds: bool
 
 
 class Sought(NamedTuple):
@@ -142,18 +159,33 @@ class InvariantFilter(KalmanEstimator):
         m[~self.model.active] = 0.0
         return m
 
-    def turning(self, p: Array) -> Array:
-        """v_t and p_t (6,) of P (n, n) whose attitude error is the vehicle's."""
-        by_psi = p[DV : DR + 3, PHI + 2] / max(p[PHI + 2, PHI + 2], 1e-12)
-        return np.array([-by_psi[1], by_psi[0], 0.0, -by_psi[4], by_psi[3], 0.0])
+    def turning(self, nav: Array, p: Array) -> Turning:
+        """Of a state (10,) and P (n, n) whose attitude error is the vehicle's."""
+        variance = float(p[PHI + 2, PHI + 2])
+        n, e, _, y, x, _ = p[DV : DR + 3, PHI + 2] / max(variance, 1e-12)
+        place = np.array([-x, y, 0.0])
+        if variance > WIDE_SD_RAD**2:
+            return Turning(np.array([-e, n, 0.0]), place, False)
+        return Turning(nav[VN : VN + 3].copy(), place, True)
 
-    def jacobian(self, psi: float, turning: Array, sign: float = 1.0) -> Array:
-        """J (n, n) of an attitude error that is the vehicle's; of psi = 0 its inverse with -1."""
-        j, turn = np.eye(self.model.size), turned_by(np.array([0.0, 0.0, psi]))
+    def jacobian(self, error: Array, turning: Turning) -> Array:
+        """J (n, n) at the state that an error (n,) leads to; attitude errors are the vehicle's."""
+        j, turn, whole = np.eye(self.model.size), _about_down(error[PHI + 2]), turn_of(error)
         for first in (PHI, DV, DR):
             j[first : first + 3, first : first + 3] = turn
-        for first, part in ((DV, turn @ turning[:3]), (DR, turn @ turning[3:])):
-            j[first, PHI + 2], j[first + 1, PHI + 2] = sign * part[1], -sign * part[0]
+        velocity = turning.velocity
+        if turning.speeds:
+            velocity = velocity - error[DV : DV + 3]
+            j[DV : DV + 3, DV : DV + 3] = whole
+        j[DV : DV + 3, PHI : PHI + 3] = skew(whole @ velocity) @ turn
+        j[DR : DR + 3, PHI : PHI + 3] = skew(whole @ turning.place) @ turn
+        return j
+
+    def straight(self, turning: Turning) -> Array:
+        """J^-1 (n, n) at no error."""
+        j = np.eye(self.model.size)
+        j[DV : DV + 3, PHI : PHI + 3] = -skew(turning.velocity)
+        j[DR : DR + 3, PHI : PHI + 3] = -skew(turning.place)
         return j
 
     def vehicle(self, nav: Array, xi: Array) -> Array:
@@ -164,13 +196,13 @@ class InvariantFilter(KalmanEstimator):
         pitch, yaw = xi[self._mounting]
         return dcm @ turned_by(np.array([0.0, pitch, yaw])).T
 
-    def without(self, nav: Array, xi: Array, error: Array, turning: Array) -> tuple[Array, Array]:
+    def without(self, nav: Array, xi: Array, error: Array, turning: Turning) -> tuple[Array, Array]:
         """The state (10,) and parameters (n,) less an `error` (n,) in xi."""
-        turn = turned_by(np.array([0.0, 0.0, error[PHI + 2]]))
-        d = error.copy()
-        for first, part in ((DV, turning[:3]), (DR, turning[3:])):
-            d[first : first + 3] = part - turn @ (part - error[first : first + 3])
-        turn = turn @ turned_by(np.array([error[PHI], error[PHI + 1], 0.0]))
+        turn, d = turn_of(error), error.copy()
+        about_down = _about_down(error[PHI + 2])
+        for first, part in ((DV, turning.velocity), (DR, turning.place)):
+            axes = turn if turning.speeds and first == DV else about_down
+            d[first : first + 3] = part - turn @ part + axes @ error[first : first + 3]
         if self._mounting:
             turn = turn @ turned_by(self.vehicle(nav, xi)[:, 1:] @ error[self._mounting])
         d[PHI : PHI + 3] = _rotation_vector(turn)
@@ -179,16 +211,17 @@ class InvariantFilter(KalmanEstimator):
         feed_back(nav, xi, d)
         return nav, xi
 
-    def between(self, nav: Array, xi: Array, turning: Array) -> Array:
+    def between(self, nav: Array, xi: Array, turning: Turning) -> Array:
         """The error (n,) in xi of this filter's state, if another's were true."""
         mine, true = self.vehicle(self.nav, self.xi), self.vehicle(nav, xi)
         error, turn = xi - self.xi, true @ mine.T
         psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-        back = turned_by(np.array([0.0, 0.0, -psi]))
+        back = _about_down(-psi)
         error[PHI : PHI + 2], error[PHI + 2] = _rotation_vector(back @ turn)[:2], psi
         apart = self.nav[VN : VN + 3] - nav[VN : VN + 3], _way(nav, self.nav)
-        for first, d, part in zip((DV, DR), apart, (turning[:3], turning[3:]), strict=True):
-            error[first : first + 3] = back @ (d - part) + part
+        for first, d, part in zip((DV, DR), apart, turning[:2], strict=True):
+            axes = turn.T if turning.speeds and first == DV else back
+            error[first : first + 3] = axes @ (d - part + turn @ part)
         error[~self.model.active] = 0.0
         return error
 
@@ -212,8 +245,8 @@ class InvariantFilter(KalmanEstimator):
         prior = float(p[PHI + 2, PHI + 2])
         if prior > WIDE_SD_RAD**2:
             self._unfelt(p)
-        turning = self.turning(p)
-        straight = self.jacobian(0.0, turning, -1.0)
+        turning = self.turning(self.nav, p)
+        straight = self.straight(turning)
         p = straight @ p @ straight.T
         found = self._seek(aid, p, turning, 0.0)
         if isinstance(found, NotApplicable):
@@ -228,18 +261,17 @@ class InvariantFilter(KalmanEstimator):
             return Outcome("not_finite", found.nis, found.degrees)
         if not found.passed:
             return Outcome("gated", found.nis, found.degrees, (), found.rows)
-        psi = float(found.error[PHI + 2])
         nav, xi = self.without(self.nav, self.xi, found.error, turning)
-        after = self.of_vehicle(nav, xi) @ self.jacobian(psi, turning)
+        after = self.of_vehicle(nav, xi) @ self.jacobian(found.error, turning)
         p = after @ found.covariance @ after.T
         self.covariance[:] = 0.5 * (p + p.T)
         self.nav[:], self.xi[:] = nav, xi
-        self.step[:] = _turned(self.step, psi)
+        self.step[:] = _turned(self.step, float(found.error[PHI + 2]))
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
     def _unfelt(self, p: Array) -> None:
-        """Let v_t that is no more than noise not turn in P (n, n): what an IMU feels at rest F counts
-        as noise and as a motion that turns, which would tell a vehicle that stands its heading."""
+        """Let a v_t that is no more than noise not turn in P (n, n): F counts what is felt at rest
+        as noise, and as a motion that turns, which would tell a parked vehicle its heading."""
         turned = p[DV : DV + 2, PHI + 2] / p[PHI + 2, PHI + 2]
         own = p[DV : DV + 2, DV : DV + 2] - np.outer(turned, turned) * p[PHI + 2, PHI + 2]
         if float(turned @ turned) < FELT_SIGMAS**2 * float(np.trace(own)):
@@ -248,19 +280,18 @@ class InvariantFilter(KalmanEstimator):
                 p[:, DV + axis] -= turned[axis] * p[:, PHI + 2]
 
     def _seek(
-        self, aid: Linearised, p: Array, turning: Array, psi: float
+        self, aid: Linearised, p: Array, turning: Turning, psi: float
     ) -> Sought | NotApplicable:
         """Gauss-Newton with P_xi (n, n), from a heading that is off by `psi` (rad)."""
         error = np.zeros(self.model.size)
         error[PHI + 2] = psi
         for _ in range(ITERATIONS):
             nav, xi = self.without(self.nav, self.xi, error, turning)
-            psi = float(error[PHI + 2])
-            step = _turned(self.step, psi)
+            step = _turned(self.step, float(error[PHI + 2]))
             rows = aid.innovation(State(nav, xi, step, self.model, self.covariance))
             if isinstance(rows, NotApplicable):
                 return rows
-            to_dx = self.of_vehicle(nav, xi) @ self.jacobian(psi, turning)
+            to_dx = self.of_vehicle(nav, xi) @ self.jacobian(error, turning)
             h = np.ascontiguousarray(rows.h @ to_dx)
             found = self._solved(aid, Innovation(rows.z + h @ error, h, rows.r), p)
             last, error = error, found.error
@@ -276,9 +307,10 @@ class InvariantFilter(KalmanEstimator):
             rows = reweighted(rows, self.model, p, nothing)
         nu, h, r = rows
         if aid.screened:
-            s = self._screen(aid, rows, p, nothing)
-            codes, passed = tuple(s.codes.tolist()), bool((s.codes == KEPT).any())
-            return Sought(s.dx, s.cov, s.nis, passed, 0.0, tuple(s.y.tolist()), codes)
+            by_rows = self._screen(aid, rows, p, nothing)
+            codes, passed = tuple(by_rows.codes.tolist()), bool((by_rows.codes == KEPT).any())
+            y = tuple(by_rows.y.tolist())
+            return Sought(by_rows.dx, by_rows.cov, by_rows.nis, passed, 0.0, y, codes)
         s = h @ p @ h.T + np.diag(r)
         gain = np.linalg.solve(s, h @ p).T
         kept = np.eye(self.model.size) - gain @ h
@@ -287,8 +319,8 @@ class InvariantFilter(KalmanEstimator):
         threshold = gate_threshold(aid.gate, len(nu))
         log = -0.5 * (min(nis, threshold) + float(np.linalg.slogdet(s)[1]))
         passed = nis <= threshold
-        y = np.linalg.solve(np.linalg.cholesky(s), nu) if passed else np.zeros(len(nu))
-        return Sought(gain @ nu, after, nis, passed, log, tuple(y.tolist()))
+        whitened = np.linalg.solve(np.linalg.cholesky(s), nu) if passed else nu
+        return Sought(gain @ nu, after, nis, passed, log, tuple(whitened.tolist()))
 
     def _own_snapshot(self) -> object:
         return self.turns
@@ -312,12 +344,22 @@ def _way(a: Array, b: Array) -> Array:
 
 def _turned(step: Array, psi: float) -> Array:
     """The last step (21,) of a vehicle that is turned by psi (rad)."""
-    step, turn = step.copy(), turned_by(np.array([0.0, 0.0, psi]))
+    step, turn = step.copy(), _about_down(psi)
     for first in (STEP_FORCE_N, STEP_SMOOTH_N):
         step[first : first + 3] = turn @ step[first : first + 3]
     dcm = step[STEP_DCM:STEP_SMOOTH_N].reshape(3, 3)
     dcm[:] = turn @ dcm
     return step
+
+
+def _about_down(psi: float) -> Array:
+    c, s = math.cos(psi), math.sin(psi)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def turn_of(error: Array) -> Array:
+    """E (3, 3) of an error (n,) in xi."""
+    return _about_down(error[PHI + 2]) @ turned_by(np.array([error[PHI], error[PHI + 1], 0.0]))
 
 
 def turned_by(phi: Array) -> Array:
