@@ -26,8 +26,8 @@ HEADING_AGE_NS = 2_000_000_000
 SAVED, CONFIGURED = "saved state", "configured heading"
 CLAIMS = (SAVED, CONFIGURED)
 """Headings that nothing measured at the start."""
-# A claim that is poorer than this is no start where driving tells the heading: the filter would find
-# it as well, but what it says until then helps nobody.
+# A claim that is poorer than this is no start where driving tells the heading: the filter would
+# find it as well, but what it says until then helps nobody.
 POOR_SD_RAD = math.radians(15.0)
 ON_THE_WAY = frozenset({"gnss_course", "positions"})
 """Sources that give a heading as the vehicle drives."""
