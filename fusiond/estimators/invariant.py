@@ -1,23 +1,46 @@
 r"""The error-state filter in coordinates that a wrong heading does not spoil.
 
-Of a state with attitude C^, velocity v^ and the way p^ from a fixed origin, all computed:
+A heading error turns all that was felt since the heading was last of no matter: a vehicle that has
+driven off in an unknown direction is somewhere on an arc. In dx that is a bent distribution; here
+it is a normal one. Of a state with attitude C^, velocity v^ and position p^, all computed:
 
-    C = exp(phi x) C^,   v = exp(phi x) (v^ - xi_v),   p = exp(phi x) (p^ - xi_p)
+    C = E C^                               E = R(psi) exp(t x), R a turn about the vertical
+    v = v^ - v_t + E v_t - R eta_v
+    p = p^ - p_t + E p_t - R eta_p
 
-xi = (phi, xi_v, xi_p, parameters) is the right-invariant error of the group SE_2(3); to first order
+xi = (t_n, t_e, psi, eta_v, eta_p, parameters), psi of any size. v_t and p_t are what of velocity
+and position turns with the heading, and P itself tells them: the regression on psi,
 
-    dx = T(x^) xi,   dv = xi_v + [v^ x] phi,   dr = xi_p + [p^ x] phi
+    cov(dv, psi) / var(psi) = v_t x z,   cov(dr, psi) / var(psi) = p_t x z        z down
 
-A heading error turns the whole way about its origin, and the speed along the body is no part of it:
-no slip (C^T v) is linear in xi_v whatever the heading, where the plain error has it depend on a
-velocity that the next fix may double, and grows sure of the heading for it. Between updates
-F is the same in both coordinates, so kernels and aids are those of every filter. An update runs in
-xi, about the state it leads to (Gauss-Newton): with P_xi = T^-1 P T^-T at the state before,
+for turned about the vertical a solution of the equations of motion is one again (gravity is down;
+but for the Earth's own rate), and F gathers that in P. From rest v_t = v^ and p_t is the way since,
+and xi is the right-invariant error of the group SE_2(3) about the place of departure, in which such
+a distribution stays normal exactly. What was measured in north and east by itself does not turn:
+its v_t and p_t are 0, and no fix at rest tells a heading. (The invariant error proper turns all,
+the noise of the fixes too; a Gauss-Newton step then sees a heading in it.)
 
-    nu_i = z(x_i) + H_i T(x_i) xi_i,   xi_(i+1) = K_i nu_i,   x_(i+1) = x^ less xi_(i+1)
+Once the heading is known to `WIDE_SD_RAD` v_t is v^: the vehicle goes the way it faces, and what
+turns is its speed, v = E (v^ - eta_v) with eta_v of any size. No slip (C^T v) is then linear in
+eta_v whatever speed and heading, where the plain error has it depend on a speed that the next fix
+may double, and grows sure of heading and pitch for it. To first order, at the state of xi_i,
 
-and P comes back by T of the state after it: the covariance transform of an error state that is
-reset. Where the model has the IMU's mounting m against the vehicle, C is the vehicle's attitude,
+    dx = J_i xi,   dv = R eta_v + [E v_t x] R phi,   dr = R eta_p + [E p_t x] R phi
+
+with E (v_t - eta_v) in place of E v_t, and E eta_v, where v_t is the speed. What does not turn
+keeps the axes of the estimate: R in R eta is that of xi_i, and no slope of psi. Between updates P
+is that of dx, so kernels and aids are those of every filter. An update runs in xi about the state
+before it and is linearised about the one that it leads to (Gauss-Newton): with
+P_xi = J_0^-1 P J_0^-T
+
+    nu_i = z(x_i) + H_i J_i xi_i,   xi_(i+1) = K_i nu_i,   P = J_i P_xi J_i^T  after it
+
+the covariance transform of an error that is reset, without which tilt and velocity errors would,
+after a correction of 90 deg, be correlated with the sensor errors of the wrong axes. One start of
+Gauss-Newton finds a heading that is off by up to 150 deg; with a sigma that reaches beyond it is
+begun at four headings, and the likeliest counts.
+
+Where the model has the IMU's mounting m against the vehicle, C is the vehicle's attitude,
 C_nb exp[m x]^T, since it is the vehicle that does not slide; the IMU's own error is then
 
     phi_nb = phi + C dm
@@ -32,13 +55,16 @@ method, IEEE TAC 38 (1993), eq. 13.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Linearised, NotApplicable, State
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.robust import reweighted
+from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import feed_back
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
@@ -49,60 +75,118 @@ from fusiond.navigation.rotation import (
     rotation_vector_to_quaternion,
     skew,
 )
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    LON,
+    Q0,
+    STEP_DCM,
+    STEP_FORCE_N,
+    STEP_SMOOTH_N,
+    VN,
+)
 
 Array = NDArray[np.float64]
 
 # Steps of Gauss-Newton at most, and the step, in sigmas, that ends them: what is left is a
-# hundredth of the variance.
-ITERATIONS, CONVERGED = 5, 0.1
+# hundredth of the variance. A heading that is off by d comes back by sin d in one: from 150 deg
+# in six.
+ITERATIONS, CONVERGED = 8, 0.1
+# Beyond this sigma of the heading 150 deg are less than five sigma.
+WIDE_SD_RAD = math.radians(30.0)
+# Where else it is begun then, if the heading's variance falls by more than a hundredth.
+BEGINNINGS_RAD = (0.5 * math.pi, -0.5 * math.pi, math.pi)
+TOLD = 0.99
+# What was felt is motion beyond so many sigmas of what does not turn.
+FELT_SIGMAS = 1.0
 # Below this sigma of the heading both coordinates say the same: at 15 m/s the velocity across is
 # known to 0.5 m/s, and a speed that is off by a tenth changes what no slip says by 5 cm/s.
 PLAIN_SD_RAD = math.radians(2.0)
 
 
-class InvariantFilter(KalmanEstimator):
-    """The centralised filter, whose updates run in xi while it has an `origin`.
+class Turning(NamedTuple):
+    """What of velocity and position (3,) turns with the heading; and whether that is the speed, so
+    that an error of the velocity changes it."""
 
-    One that `settles` gives its origin up when the heading is known to `PLAIN_SD_RAD`.
+    velocity: Array
+    place: Array
+    speeds: bool
+
+
+class Sought(NamedTuple):
+    """Where an update leads: the error xi (n,), P_xi (n, n) after it, and how the innovation stands
+    to its gate; of a screened aid what became of each row."""
+
+    error: Array
+    covariance: Array
+    nis: float
+    passed: bool
+    log_likelihood: float
+    whitened: tuple[float, ...]
+    rows: tuple[int, ...] = ()
+
+    @property
+    def degrees(self) -> int:
+        """How many rows count."""
+        return self.rows.count(KEPT) if self.rows else len(self.whitened)
+
+    def likelier(self, other: Sought) -> bool:
+        """Whether more rows fit, or as many and better."""
+        return (-self.degrees, self.nis) < (-other.degrees, other.nis)
+
+
+class InvariantFilter(KalmanEstimator):
+    """The centralised filter, whose updates run in xi while it `turns`.
+
+    One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`.
     """
 
     def __init__(self, model: Model, gap_s: float, settles: bool = True) -> None:
         super().__init__(model, gap_s)
         self._settles = settles
-        self.origin: Array | None = None
-        """Where p^ begins (rad, rad, m). A filter without updates as any other does."""
+        self.turns = False
+        """Whether updates run in xi: the heading may be far off."""
         self._mounting = model.slots_of(MOUNTING)
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
         that fails its gate counts as one at the gate: it may be the measurement's fault."""
 
-    def way(self, nav: Array) -> Array:
-        """North, east, down (3,) in m from the origin."""
-        origin = self.origin
-        assert origin is not None
-        lat, height = float(nav[LAT]), float(nav[HEIGHT])
-        east = math.remainder(float(nav[LON] - origin[1]), 2.0 * math.pi)
-        return np.array(
-            [
-                (lat - origin[0]) * (meridian_radius(lat) + height),
-                east * (transverse_radius(lat) + height) * math.cos(lat),
-                origin[2] - height,
-            ]
-        )
-
-    def transform(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
-        """T (n, n) of a state, or its inverse with a `sign` of -1."""
-        t = np.eye(self.model.size)
-        by_turn = np.vstack([skew(nav[VN : VN + 3]), skew(self.way(nav))])
-        t[DV : DR + 3, PHI : PHI + 3] = sign * by_turn
+    def of_vehicle(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
+        """M (n, n): dx of one whose attitude error is the vehicle's; its inverse with -1."""
+        m = np.eye(self.model.size)
         if self._mounting:
-            b = self.vehicle(nav, xi)[:, 1:]
-            t[PHI : PHI + 3, self._mounting] = sign * b
-            if sign < 0.0:
-                t[DV : DR + 3, self._mounting] = by_turn @ b
-        t[~self.model.active] = 0.0
-        return t
+            m[PHI : PHI + 3, self._mounting] = sign * self.vehicle(nav, xi)[:, 1:]
+        m[~self.model.active] = 0.0
+        return m
+
+    def turning(self, nav: Array, p: Array) -> Turning:
+        """Of a state (10,) and P (n, n) whose attitude error is the vehicle's."""
+        variance = float(p[PHI + 2, PHI + 2])
+        n, e, _, y, x, _ = p[DV : DR + 3, PHI + 2] / max(variance, 1e-12)
+        place = np.array([-x, y, 0.0])
+        if variance > WIDE_SD_RAD**2:
+            return Turning(np.array([-e, n, 0.0]), place, False)
+        return Turning(nav[VN : VN + 3].copy(), place, True)
+
+    def jacobian(self, error: Array, turning: Turning) -> Array:
+        """J (n, n) at the state that an error (n,) leads to; attitude errors are the vehicle's."""
+        j, turn, whole = np.eye(self.model.size), _about_down(error[PHI + 2]), turn_of(error)
+        for first in (PHI, DV, DR):
+            j[first : first + 3, first : first + 3] = turn
+        velocity = turning.velocity
+        if turning.speeds:
+            velocity = velocity - error[DV : DV + 3]
+            j[DV : DV + 3, DV : DV + 3] = whole
+        j[DV : DV + 3, PHI : PHI + 3] = skew(whole @ velocity) @ turn
+        j[DR : DR + 3, PHI : PHI + 3] = skew(whole @ turning.place) @ turn
+        return j
+
+    def straight(self, turning: Turning) -> Array:
+        """J^-1 (n, n) at no error."""
+        j = np.eye(self.model.size)
+        j[DV : DV + 3, PHI : PHI + 3] = -skew(turning.velocity)
+        j[DR : DR + 3, PHI : PHI + 3] = -skew(turning.place)
+        return j
 
     def vehicle(self, nav: Array, xi: Array) -> Array:
         """C_nv (3, 3) of the vehicle, which goes the way it faces."""
@@ -112,85 +196,170 @@ class InvariantFilter(KalmanEstimator):
         pitch, yaw = xi[self._mounting]
         return dcm @ turned_by(np.array([0.0, pitch, yaw])).T
 
-    def without(self, nav: Array, xi: Array, error: Array) -> tuple[Array, Array]:
+    def without(self, nav: Array, xi: Array, error: Array, turning: Turning) -> tuple[Array, Array]:
         """The state (10,) and parameters (n,) less an `error` (n,) in xi."""
-        turn = turned_by(error[PHI : PHI + 3])
-        d = error.copy()
-        v, way = nav[VN : VN + 3], self.way(nav)
-        d[DV : DV + 3] = v - turn @ (v - error[DV : DV + 3])
-        d[DR : DR + 3] = way - turn @ (way - error[DR : DR + 3])
+        turn, d = turn_of(error), error.copy()
+        about_down = _about_down(error[PHI + 2])
+        for first, part in ((DV, turning.velocity), (DR, turning.place)):
+            axes = turn if turning.speeds and first == DV else about_down
+            d[first : first + 3] = part - turn @ part + axes @ error[first : first + 3]
         if self._mounting:
-            b = self.vehicle(nav, xi)[:, 1:]
-            d[PHI : PHI + 3] = _rotation_vector(turn @ turned_by(b @ error[self._mounting]))
+            turn = turn @ turned_by(self.vehicle(nav, xi)[:, 1:] @ error[self._mounting])
+        d[PHI : PHI + 3] = _rotation_vector(turn)
         d[~self.model.active] = 0.0
         nav, xi = nav.copy(), xi.copy()
         feed_back(nav, xi, d)
         return nav, xi
 
-    def between(self, nav: Array, xi: Array) -> Array:
+    def between(self, nav: Array, xi: Array, turning: Turning) -> Array:
         """The error (n,) in xi of this filter's state, if another's were true."""
         mine, true = self.vehicle(self.nav, self.xi), self.vehicle(nav, xi)
-        error = xi - self.xi
-        error[PHI : PHI + 3] = _rotation_vector(true @ mine.T)
-        back = turned_by(error[PHI : PHI + 3]).T
-        error[DV : DV + 3] = self.nav[VN : VN + 3] - back @ nav[VN : VN + 3]
-        error[DR : DR + 3] = self.way(self.nav) - back @ self.way(nav)
+        error, turn = xi - self.xi, true @ mine.T
+        psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        back = _about_down(-psi)
+        error[PHI : PHI + 2], error[PHI + 2] = _rotation_vector(back @ turn)[:2], psi
+        apart = self.nav[VN : VN + 3] - nav[VN : VN + 3], _way(nav, self.nav)
+        for first, d, part in zip((DV, DR), apart, turning[:2], strict=True):
+            axes = turn.T if turning.speeds and first == DV else back
+            error[first : first + 3] = axes @ (d - part + turn @ part)
         error[~self.model.active] = 0.0
         return error
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
-        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), and without an origin."""
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.origin = None
+        self.turns = False
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
-        if self.origin is None or self._holding or aid.screened:
+        if not self.turns or self._holding:
             return super().update(aid)
         outcome = self._update(aid)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
-            self.origin = None
+            self.turns = False
         return outcome
 
     def _update(self, aid: Linearised) -> Outcome:
-        before = self.transform(self.nav, self.xi, -1.0)
+        before = self.of_vehicle(self.nav, self.xi, -1.0)
         p = before @ self.covariance @ before.T
-        sd = np.sqrt(np.maximum(np.diag(p), 1e-30))
-        error = np.zeros(self.model.size)
-        nav, xi = self.nav, self.xi
-        for _ in range(ITERATIONS):
-            rows = aid.innovation(State(nav, xi, self.step, self.model, self.covariance))
-            if isinstance(rows, NotApplicable):
-                return Outcome(rows.outcome)
-            z, r = rows.z, np.diag(rows.r)
-            h = rows.h @ self.transform(nav, xi)
-            nu = z + h @ error
-            s = h @ p @ h.T + r
-            gain = np.linalg.solve(s, h @ p).T
-            last, error = error, gain @ nu
-            nav, xi = self.without(self.nav, self.xi, error)
-            if np.abs((error - last) / sd).max() < CONVERGED:
-                break
-        nis = float(nu @ np.linalg.solve(s, nu))
-        threshold = gate_threshold(aid.gate, len(z))
-        self.log_likelihood = -0.5 * (min(nis, threshold) + float(np.linalg.slogdet(s)[1]))
-        if not nis <= threshold:
-            return Outcome("gated", nis, len(z))
-        kept = np.eye(self.model.size) - gain @ h
-        p = kept @ p @ kept.T + gain @ r @ gain.T
-        after = self.transform(nav, xi)
-        p = after @ p @ after.T
+        prior = float(p[PHI + 2, PHI + 2])
+        if prior > WIDE_SD_RAD**2:
+            self._unfelt(p)
+        turning = self.turning(self.nav, p)
+        straight = self.straight(turning)
+        p = straight @ p @ straight.T
+        found = self._seek(aid, p, turning, 0.0)
+        if isinstance(found, NotApplicable):
+            return Outcome(found.outcome)
+        if prior > WIDE_SD_RAD**2 and found.covariance[PHI + 2, PHI + 2] < TOLD * prior:
+            for beginning in BEGINNINGS_RAD:
+                other = self._seek(aid, p, turning, beginning)
+                if not isinstance(other, NotApplicable) and other.likelier(found):
+                    found = other
+        self.log_likelihood = found.log_likelihood
+        if not math.isfinite(found.nis):
+            return Outcome("not_finite", found.nis, found.degrees)
+        if not found.passed:
+            return Outcome("gated", found.nis, found.degrees, (), found.rows)
+        nav, xi = self.without(self.nav, self.xi, found.error, turning)
+        after = self.of_vehicle(nav, xi) @ self.jacobian(found.error, turning)
+        p = after @ found.covariance @ after.T
         self.covariance[:] = 0.5 * (p + p.T)
         self.nav[:], self.xi[:] = nav, xi
-        y = np.linalg.solve(np.linalg.cholesky(s), nu)
-        return Outcome("fused", nis, len(z), tuple(y.tolist()))
+        self.step[:] = _turned(self.step, float(found.error[PHI + 2]))
+        return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
+
+    def _unfelt(self, p: Array) -> None:
+        """Let a v_t that is no more than noise not turn in P (n, n): F counts what is felt at rest
+        as noise, and as a motion that turns, which would tell a parked vehicle its heading."""
+        turned = p[DV : DV + 2, PHI + 2] / p[PHI + 2, PHI + 2]
+        own = p[DV : DV + 2, DV : DV + 2] - np.outer(turned, turned) * p[PHI + 2, PHI + 2]
+        if float(turned @ turned) < FELT_SIGMAS**2 * float(np.trace(own)):
+            for axis in (0, 1):
+                p[DV + axis] -= turned[axis] * p[PHI + 2]
+                p[:, DV + axis] -= turned[axis] * p[:, PHI + 2]
+
+    def _seek(
+        self, aid: Linearised, p: Array, turning: Turning, psi: float
+    ) -> Sought | NotApplicable:
+        """Gauss-Newton with P_xi (n, n), from a heading that is off by `psi` (rad)."""
+        error = np.zeros(self.model.size)
+        error[PHI + 2] = psi
+        for _ in range(ITERATIONS):
+            nav, xi = self.without(self.nav, self.xi, error, turning)
+            step = _turned(self.step, float(error[PHI + 2]))
+            rows = aid.innovation(State(nav, xi, step, self.model, self.covariance))
+            if isinstance(rows, NotApplicable):
+                return rows
+            to_dx = self.of_vehicle(nav, xi) @ self.jacobian(error, turning)
+            h = np.ascontiguousarray(rows.h @ to_dx)
+            found = self._solved(aid, Innovation(rows.z + h @ error, h, rows.r), p)
+            last, error = error, found.error
+            sd = np.sqrt(np.maximum(np.diag(found.covariance), 1e-30))
+            if not np.abs((error - last) / sd).max() > CONVERGED:
+                break
+        return found
+
+    def _solved(self, aid: Linearised, rows: Innovation, p: Array) -> Sought:
+        """The update of xi = 0 with P_xi (n, n) by rows that are linear in it."""
+        nothing = np.zeros(self.model.size)
+        if aid.robust:
+            rows = reweighted(rows, self.model, p, nothing)
+        nu, h, r = rows
+        if aid.screened:
+            by_rows = self._screen(aid, rows, p, nothing)
+            codes, passed = tuple(by_rows.codes.tolist()), bool((by_rows.codes == KEPT).any())
+            y = tuple(by_rows.y.tolist())
+            return Sought(by_rows.dx, by_rows.cov, by_rows.nis, passed, 0.0, y, codes)
+        s = h @ p @ h.T + np.diag(r)
+        gain = np.linalg.solve(s, h @ p).T
+        kept = np.eye(self.model.size) - gain @ h
+        after = kept @ p @ kept.T + (gain * r) @ gain.T
+        nis = float(nu @ np.linalg.solve(s, nu))
+        threshold = gate_threshold(aid.gate, len(nu))
+        log = -0.5 * (min(nis, threshold) + float(np.linalg.slogdet(s)[1]))
+        passed = nis <= threshold
+        whitened = np.linalg.solve(np.linalg.cholesky(s), nu) if passed else nu
+        return Sought(gain @ nu, after, nis, passed, log, tuple(whitened.tolist()))
 
     def _own_snapshot(self) -> object:
-        return self.origin
+        return self.turns
 
     def _own_restore(self, extra: object) -> None:
-        assert extra is None or isinstance(extra, np.ndarray)
-        self.origin = extra
+        self.turns = bool(extra)
+
+
+def _way(a: Array, b: Array) -> Array:
+    """North, east, down (3,) in m from the place of one state (10,) to that of another."""
+    lat, height = float(b[LAT]), float(b[HEIGHT])
+    east = math.remainder(float(b[LON] - a[LON]), 2.0 * math.pi)
+    return np.array(
+        [
+            (lat - a[LAT]) * (meridian_radius(lat) + height),
+            east * (transverse_radius(lat) + height) * math.cos(lat),
+            a[HEIGHT] - height,
+        ]
+    )
+
+
+def _turned(step: Array, psi: float) -> Array:
+    """The last step (21,) of a vehicle that is turned by psi (rad)."""
+    step, turn = step.copy(), _about_down(psi)
+    for first in (STEP_FORCE_N, STEP_SMOOTH_N):
+        step[first : first + 3] = turn @ step[first : first + 3]
+    dcm = step[STEP_DCM:STEP_SMOOTH_N].reshape(3, 3)
+    dcm[:] = turn @ dcm
+    return step
+
+
+def _about_down(psi: float) -> Array:
+    c, s = math.cos(psi), math.sin(psi)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def turn_of(error: Array) -> Array:
+    """E (3, 3) of an error (n,) in xi."""
+    return _about_down(error[PHI + 2]) @ turned_by(np.array([error[PHI], error[PHI + 1], 0.0]))
 
 
 def turned_by(phi: Array) -> Array:

@@ -228,7 +228,7 @@ class Navigator:
             first = self.imu.index_after(start.t_ns) + self.imu.start
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             if isinstance(self.estimator, InvariantFilter):
-                self.estimator.origin = start.origin
+                self.estimator.turns = start.turns
             self.timeline.start()
             self.verdicts.reset()
             self.started = start

@@ -65,11 +65,34 @@ def test_a_mounting_scale_and_offset_explain_what_is_measured() -> None:
     wheel = replace(wheel, rounding=WHEEL_ROUNDING, shared_step_m_s=KM_H)
     assert innovation_of(wheel, state).z == pytest.approx([0.0], abs=1e-9)
     arm = dcm @ np.add(LEVER, rest)
-    antenna = nav[:3] + (arm + np.array(VELOCITY) * late) / runs.metres(*nav[[0, 2]])
+    moved = np.array(VELOCITY) + dcm @ np.cross(RATE_SENSED, np.add(LEVER, rest))
+    moved = moved * late + 0.5 * np.array(ACCELERATION) * late**2
+    antenna = nav[:3] + (arm + moved) / runs.metres(*nav[[0, 2]])
     lat, lon, height = (float(x) for x in antenna)
     fix = PositionAid(*SOURCE, lat, lon, height, (1.0, 1.0, 1.0), LEVER)
     fix = replace(fix, time=FIX_TIME, rest=ANTENNA_LEVER)
     assert innovation_of(fix, state).z == pytest.approx([0.0, 0.0, 0.0], abs=1e-4)
+
+
+def test_what_a_late_fix_leaves_out_of_its_jacobian_is_noise() -> None:
+    """Innovations of drawn errors, less H dx: their variance is what r states beyond the fix's."""
+    model = vehicle_model()
+    nav, xi = runs.level_nav(RPY, VELOCITY), np.zeros(model.size)
+    (late,) = model.slots_of(FIX_TIME)
+    aid = replace(position_aid(nav), time=FIX_TIME, rest=ANTENNA_LEVER)
+    root = np.zeros((model.size, 4))  # of the offset, correlated with the velocity, and that
+    root[late, 0] = 0.08
+    root[3:6, 0] = 0.3, -0.2, 0.1
+    root[3:6, 1:] = np.diag([0.5, 0.8, 0.3])
+    state = state_of(model, nav, xi)._replace(covariance=root @ root.T)
+    z, h, r = innovation_of(aid, state)
+    rng, left = np.random.default_rng(5), []
+    for error in rng.standard_normal((3000, 4)) @ root.T:
+        off = runs.with_error(nav, error[:9])
+        found = innovation_of(aid, state_of(model, off, xi - np.r_[np.zeros(9), error[9:]]))
+        left.append(found.z - z - h @ error)
+    assert r - np.square(aid.sd) == pytest.approx(np.var(left, axis=0), rel=0.15)
+    assert (innovation_of(aid, state_of(model, nav, xi)).r == np.square(aid.sd)).all()
 
 
 def test_innovation_is_zero_where_the_measurement_is_true() -> None:

@@ -49,7 +49,7 @@ def test_from_a_fair_start_both_filters_agree() -> None:
 
 def test_tables_and_picture(tmp_path: Path) -> None:
     ((_, header, rows),) = ukf.tables(result())
-    assert len(rows) == 12
+    assert len(rows) == len(ukf_runs.PROBLEMS) * len(ukf_runs.FILTERS) == 20
     assert {len(row) for row in rows} == {len(header)}
     pytest.importorskip("matplotlib")
     ukf.plot(result(), tmp_path / "ukf.png")

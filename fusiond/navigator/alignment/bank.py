@@ -111,20 +111,23 @@ class HeadingBank:
     def mixture(self) -> Mixture:
         """Mean and covariance of all cells, about the likeliest."""
         best = self._best.filter
-        back = best.transform(best.nav, best.xi, -1.0)
+        back = best.of_vehicle(best.nav, best.xi, -1.0)
+        turning = best.turning(best.nav, back @ best.covariance @ back.T)
         means, spread = [], np.zeros((best.model.size, best.model.size))
         for cell in self._cells:
             f = cell.filter
-            means.append(best.between(f.nav, f.xi))
-            own = back if f is best else f.transform(f.nav, f.xi, -1.0)
+            apart = best.between(f.nav, f.xi, turning)
+            means.append(apart)
+            jacobian = best.jacobian(apart, turning)
+            own = np.linalg.solve(jacobian, f.of_vehicle(f.nav, f.xi, -1.0))
             spread += cell.weight * own @ f.covariance @ own.T
         weights = np.array([cell.weight for cell in self._cells])
         apart = np.array(means)
         mean = weights @ apart
         apart -= mean
         spread += (apart * weights[:, None]).T @ apart
-        nav, xi = best.without(best.nav, best.xi, mean)
-        t = best.transform(nav, xi)
+        nav, xi = best.without(best.nav, best.xi, mean, turning)
+        t = best.of_vehicle(nav, xi) @ best.jacobian(mean, turning)
         covariance = t @ spread @ t.T
         return Mixture(nav, xi, 0.5 * (covariance + covariance.T))
 

@@ -32,7 +32,18 @@ class Basis(NamedTuple):
     track: Track
 
 
-def rest_bias(noise: ImuNoise, standing: Standing, dcm: Array, lat: float) -> tuple[Array, float]:
-    """Rate bias (3,) seen at rest and its sigma."""
+def rest_bias(
+    noise: ImuNoise, standing: Standing, dcm: Array, lat: float, sd_yaw: float = 0.0
+) -> tuple[Array, float]:
+    """Rate bias (3,) seen at rest and its sigma.
+
+    Of the Earth's level rate w a heading that is off by y, one sigma s, takes out the wrong part,
+    w (cos y - 1, sin y): w y is the start's to correlate, the rest, half of it an axis, is
+
+        E (sin y - y)^2 + E (1 - cos y)^2 = s^2 + 2 - 2 (1 + s^2) exp(-s^2 / 2)
+    """
     earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
-    return standing.mean_rate - dcm.T @ earth, noise.rate_noise / math.sqrt(standing.seconds)
+    rest = sd_yaw**2 + 2.0 - 2.0 * (1.0 + sd_yaw**2) * math.exp(-0.5 * sd_yaw**2)
+    wrong = float(earth[0]) * math.sqrt(0.5 * rest)
+    white = noise.rate_noise / math.sqrt(standing.seconds)
+    return standing.mean_rate - dcm.T @ earth, math.hypot(white, wrong)

@@ -6,21 +6,28 @@ import math
 
 import numpy as np
 
+from fusiond.estimators.invariant import PLAIN_SD_RAD
 from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import CONTRADICTION_SIGMAS
-from fusiond.navigator.alignment.start import Place, Start, as_geodetic, build_start
+from fusiond.navigator.alignment.start import (
+    Place,
+    Start,
+    as_geodetic,
+    build_start,
+    turned_at_rest,
+)
 
 # A heading that came this long ago no longer describes a body at rest that may have been moved.
 HEADING_AGE_NS = 2_000_000_000
 SAVED, CONFIGURED = "saved state", "configured heading"
 CLAIMS = (SAVED, CONFIGURED)
 """Headings that nothing measured at the start."""
-# A claim that is poorer than this is no start where driving tells the heading: a filter that is
-# linear in the heading is honest to 10 deg, and at 20 to 30 its NEES is 14 to 22 of 3.
+# A claim that is poorer than this is no start where driving tells the heading: the filter would
+# find it as well, but what it says until then helps nobody.
 POOR_SD_RAD = math.radians(15.0)
 ON_THE_WAY = frozenset({"gnss_course", "positions"})
 """Sources that give a heading as the vehicle drives."""
@@ -39,7 +46,8 @@ def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> 
         return None
     roll, pitch = level(standing.mean_force)
     dcm = dcm_from_rpy(roll, pitch, yaw)
-    return build_start(
+    wide = sd > PLAIN_SD_RAD
+    start = build_start(
         by.model,
         standing.end_ns,
         place,
@@ -48,9 +56,10 @@ def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> 
         np.zeros(3),
         REST_VELOCITY_SD,
         how,
-        bias=rest_bias(by.noise, standing, dcm, place[1][0]),
+        bias=rest_bias(by.noise, standing, dcm, place[1][0], sd if wide else 0.0),
         levelled=True,
     )
+    return turned_at_rest(by.model, start, place, dcm) if wide else start
 
 
 def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:

@@ -30,8 +30,9 @@ from fusiond.estimators.invariant import InvariantFilter
 from fusiond.models.model import Model, TooManyStatesError
 from fusiond.models.vehicle import MOUNTING, mounting
 from fusiond.navigation.alignment import level
+from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_rpy
+from fusiond.navigation.rotation import dcm_from_rpy, skew
 from fusiond.navigator.alignment.bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import FIXES_NS, Standing
@@ -160,8 +161,7 @@ class Track:
             )
             return None
         n = self._size
-        origin = found.nav[:3].copy()
-        return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, origin)
+        return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, turns=True)
 
     def _begin(self, by: Basis, imu: ImuBuffer, where: Array, until_ns: int) -> HeadingBank | None:
         """A bank, where there is something to begin with: the end of a rest, or the first fix."""
@@ -231,18 +231,20 @@ class Track:
                 dcm * np.square((ROAD_SPEED_SD_M_S, ACROSS_SD_M_S, ACROSS_SD_M_S))
             ) @ dcm.T
             cell = self._cell(imu, start, weight)
-            # The speed is one along the body, whatever the heading: T P_xi T^T.
-            turn = cell.filter.transform(start.nav, start.xi)
+            # The speed is one along the body, whatever the heading: dv = e + [v x] phi.
+            turn = np.eye(self._model.size)
+            turn[DV : DV + 3, PHI : PHI + 3] = skew(velocity)
+            turn = cell.filter.of_vehicle(start.nav, start.xi) @ turn
             cell.filter.covariance[:] = turn @ cell.filter.covariance @ turn.T
             cells.append(cell)
         return cells
 
     def _cell(self, imu: ImuBuffer, start: Start, weight: float) -> Cell:
-        """A filter that has started, about the place of its start."""
+        """A filter that has started."""
         found = InvariantFilter(self._model, self._options.gap_s, settles=False)
         first = imu.index_after(start.t_ns) + imu.start
         found.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
-        found.origin = start.nav[:3].copy()
+        found.turns = True
         return Cell(found, weight)
 
     def _place(self, where: Array, t_ns: int) -> tuple[Array, float]:

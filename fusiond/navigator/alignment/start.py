@@ -4,7 +4,7 @@ covariance."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,8 @@ from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, meridian_radius, transverse_radius
-from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm
+from fusiond.navigation.error_model import DR, PHI
+from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm, skew
 
 Array = NDArray[np.float64]
 
@@ -50,8 +51,8 @@ def velocity_of(offer: VelocityOffer) -> tuple[Array, Array]:
 class Start:
     """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
 
-    `origin` (rad, rad, m), where the heading is known so poorly that the filter should update in
-    the coordinates of `fusiond.estimators.invariant`, about that place.
+    `turns`: the heading is known so poorly that the filter should update in the coordinates of
+    `fusiond.estimators.invariant`.
     """
 
     t_ns: int
@@ -59,7 +60,7 @@ class Start:
     xi: Array
     covariance: Array
     how: str
-    origin: Array | None = None
+    turns: bool = False
 
 
 def build_start(
@@ -108,6 +109,27 @@ def build_start(
     if levelled:
         _correlate(model, p, dcm, lat, height, compassed)
     return Start(t_ns, nav, xi, p, how)
+
+
+def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Start:
+    """A start of a vehicle that stands, whose heading may be any.
+
+    The fix is where the antenna is, not the IMU: its lever arm l turns with the heading,
+    dr = e - [C l x] phi, e the error of the fix. And the rate that was felt is that of a vehicle at
+    rest, whatever its heading: as much of the Earth's level rate w as psi puts on the east axis is
+    in the bias, db = w psi (C^T)_E, or standing still would tell the heading of the start.
+    """
+    fix, where, _ = place
+    by_turn = np.eye(len(start.xi))
+    if fix is not None:
+        by_turn[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
+    for axis in range(3):
+        slot = model.parameters(9 + axis)[0]
+        taken = 1.0 - float(start.covariance[slot, slot] / model.initial[slot] ** 2)
+        rate = EARTH_RATE_RAD_S * math.cos(float(where[0])) * float(dcm[1, axis])
+        by_turn[slot, PHI + 2] = taken * rate
+    p = by_turn @ start.covariance @ by_turn.T
+    return replace(start, covariance=p, turns=True)
 
 
 def _start_biases(model: Model, p: Array, xi: Array, bias: Array, sd: float) -> None:

@@ -5,7 +5,8 @@ r"""Unscented against extended filter: the problems, and one Monte Carlo run of 
 `pseudorange`   pseudoranges and rates of 4 to 10 BeiDou satellites every second, with the states of
                 a receiver clock whose drift is a first-order Markov process (paper 003)
 
-each from a fair start and, as `*_poor`, from one that is off by 10 km and 5 deg, one sigma an axis.
+each from a fair start and, as `*_poor`, from one that is off by 10 km and 5 deg, one sigma an axis;
+pseudoranges also, as `*_heading`, from a fair start but for its heading, of 90 deg, one sigma.
 Estimator, timeline, gates and screening are the daemon's. The vehicle is the drive of `fusiond
 simulate`, 500 s as in paper 003. A run draws IMU, clock, noise, satellites and start, every filter
 gets the same; errors are drawn from the very models that the filters assume, so NEES of the
@@ -31,6 +32,7 @@ from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
 from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
+from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.unscented.filter import UnscentedEstimator
@@ -89,8 +91,10 @@ FILTERS: dict[str, Callable[[Model], KalmanEstimator]] = {
     "ukf": lambda model: UnscentedEstimator(model, IMU.gap_s, propagation=True),
     "ukf_measurements": lambda model: UnscentedEstimator(model, IMU.gap_s),
     "ekf": lambda model: KalmanEstimator(model, IMU.gap_s),
+    "invariant": lambda model: InvariantFilter(model, IMU.gap_s),
 }
-"""Sigma points for all, for the measurements alone (the daemon's default), and none."""
+"""Sigma points for all, for the measurements alone (the daemon's default), and none:
+in plain errors, and with what turns with the heading, as the daemon's `kalman` starts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +114,7 @@ PROBLEMS = (
     Problem("double_star_poor", False, 1.5, _POOR),
     Problem("pseudorange", True, 1.0, _FAIR),
     Problem("pseudorange_poor", True, 1.0, _POOR),
+    Problem("pseudorange_heading", True, 1.0, (*_FAIR[:4], 90.0)),
 )
 
 
@@ -310,6 +315,8 @@ def simulate(problem: Problem, seed: int, number: int) -> dict[str, Trace]:
     for name, make in FILTERS.items():
         live = LiveFilter(make(model), IMU.gap_s, samples, start, sd)
         estimator = live.estimator
+        if isinstance(estimator, InvariantFilter):
+            estimator.turns = True
         off, nees, first = np.empty(len(aids)), [], math.nan
         for k, epoch in enumerate(aids):
             live.advance((k + 1) * problem.every_s, epoch)

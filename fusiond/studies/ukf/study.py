@@ -1,11 +1,13 @@
 """Study `ukf`: unscented against extended filter on double-star ranges and on pseudoranges.
 
 The problems are those of `fusiond.studies.ukf.runs`, each from a fair start and from one that is
-off by 10 km and 5 deg. `ukf` has sigma points for measurements and propagation, `ukf_measurements`
-for measurements alone, `ekf` none. Errors and NEES count from 30 s on; `nees_first` is that right
-after the first epoch, where a range from a start that is 10 km off is not linear; `refused` counts
-rows that gate or residual test refused, over all runs. NEES has 9 degrees
-of freedom; `nees_interval` is the 95 % interval of its average over the runs at one instant.
+off by 10 km and 5 deg, and pseudoranges from a heading that is off by 90 deg. `ukf` has sigma
+points for measurements and propagation, `ukf_measurements` for measurements alone, `ekf` none;
+nor has `invariant`, in whose updates velocity and position turn with the heading. Errors and NEES
+count from 30 s on; `nees_first` is that right after the first epoch, where a range from a start
+that is 10 km off is not linear; `refused` counts rows that gate or residual test refused, over all
+runs. NEES has 9 degrees of freedom; `nees_interval` is the 95 % interval of its average over the
+runs at one instant.
 """
 
 from __future__ import annotations
@@ -156,8 +158,8 @@ def plot(result: dict[str, Any], path: Path) -> None:
         s = found["series"]
         for number, label in enumerate(FILTERS):
             style = {
-                "linewidth": 4.0 - 1.4 * number,  # the later may lie on the earlier
-                "alpha": 0.4 + 0.3 * number,
+                "linewidth": 4.0 - number,  # the later may lie on the earlier
+                "alpha": 0.4 + 0.2 * number,
                 "label": label.replace("_", " "),
             }
             axes[0].plot(s["t_s"], s["horizontal_rms_m"][label], **style)
