@@ -15,7 +15,7 @@ Source: Groves, 2nd ed., eq. 14.103 to 14.113; paper 000, eq. 3.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -114,6 +114,10 @@ class PositionAid(Aid):
         if self.sd_time_s:
             r += np.square(nav[VN : VN + rows] * self.sd_time_s)
         return Innovation(z, h, r)
+
+    def coarser(self, factor: float) -> PositionAid:
+        north, east, down = self.sd
+        return replace(self, sd=(factor * north, factor * east, factor * down))
 
     def offers(self) -> tuple[PositionOffer, ...]:
         place = self.lat_rad, self.lon_rad, self.height_m
