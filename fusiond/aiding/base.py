@@ -122,6 +122,10 @@ class Aid:
         the aid's instant: itself, unless its corrections depend on the place."""
         return self
 
+    def coarser(self, factor: float) -> Aid:
+        """The same with so many times its sigma; itself where it is no position."""
+        return self
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
         raise NotImplementedError

@@ -27,7 +27,7 @@ section 10.3.2 (second-order terms).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -158,6 +158,10 @@ class PositionAid(Aid):
         if self.sd_time_s:
             r += np.square(nav[VN : VN + rows] * self.sd_time_s)
         return Innovation(z, h, r)
+
+    def coarser(self, factor: float) -> PositionAid:
+        north, east, down = self.sd
+        return replace(self, sd=(factor * north, factor * east, factor * down))
 
     def offers(self) -> tuple[PositionOffer, ...]:
         place = self.lat_rad, self.lon_rad, self.height_m

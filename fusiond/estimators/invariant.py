@@ -102,6 +102,10 @@ FELT_SIGMAS = 1.0
 # Below this sigma of the heading both coordinates say the same: at 15 m/s the velocity across is
 # known to 0.5 m/s, and a speed that is off by a tenth changes what no slip says by 5 cm/s.
 PLAIN_SD_RAD = math.radians(2.0)
+# Above this sigma of the heading, as after a doubt of the motion (DOUBTED_ATTITUDE_RAD and a gyro
+# that is wrong by DOUBTED_RATE_RAD_S), they do not: a correction of 12 deg in a bend at 20 m/s
+# leaves 0.04 m/s^2 in the bias of an accelerometer, three of its sigmas.
+LARGE_SD_RAD = 2.0 * PLAIN_SD_RAD
 
 
 class Turning(NamedTuple):
@@ -138,7 +142,8 @@ class Sought(NamedTuple):
 class InvariantFilter(KalmanEstimator):
     """The centralised filter, whose updates run in xi while it `turns`.
 
-    One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`.
+    One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
+    when it is known no better than `LARGE_SD_RAD`.
     """
 
     def __init__(self, model: Model, gap_s: float, settles: bool = True) -> None:
@@ -232,6 +237,8 @@ class InvariantFilter(KalmanEstimator):
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
+        if self._settles and self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2:
+            self.turns = True
         if not self.turns or self._holding:
             return super().update(aid)
         outcome = self._update(aid)

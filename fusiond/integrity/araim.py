@@ -23,6 +23,9 @@ modes:
     2 Q((VPL - b_0) / sigma_0) + sum_k p_k Q((VPL - T_k - b_k) / sigma_k)
         = P_HMI,V (1 - P_not_monitored / (P_HMI,V + P_HMI,H))
 
+Where the exposure holds n independent samples, as an hour does, probabilities of a fault stay those
+of the exposure, and P_HMI - P_not_monitored and P_fa are shared out among the samples.
+
 HPL is the root of the sum of squares of two such levels with half of P_HMI,H each. The effective
 monitor threshold is EMT = max T_k (vertical) over the modes of p_k >= P_EMT.
 
@@ -67,8 +70,8 @@ follow: half, as nothing says that either is more precious."""
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What is allowed, as probabilities over the same exposure as the priors (an approach, or an
-    independent sample of an hour). `tolerance_m` is that of a protection level."""
+    """What is allowed, as probabilities over the same exposure as the priors: an approach, an hour.
+    It holds so many independent `samples`. `tolerance_m` is that of a protection level."""
 
     vertical_risk: float
     horizontal_risk: float
@@ -78,6 +81,7 @@ class Requirement:
     unmonitored_risk: float
     effective_monitor_prior: float
     tolerance_m: float = 1e-3
+    samples: float = 1.0
 
 
 LPV_200 = Requirement(9.8e-8, 2e-9, 3.9e-6, 9e-8, 1e-8, 8e-8, 1e-5)
@@ -259,8 +263,9 @@ def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
     accuracy = epoch.accuracy_sigma_m**2
     separation_sigma = np.sqrt(((gain - gain[0]) ** 2) @ accuracy)
     number = max(1, len(kept))
-    k_horizontal = -ndtri(requirement.horizontal_false_alarm / (4.0 * number))
-    k_vertical = -ndtri(requirement.vertical_false_alarm / (2.0 * number))
+    tests = number * requirement.samples
+    k_horizontal = -ndtri(requirement.horizontal_false_alarm / (4.0 * tests))
+    k_vertical = -ndtri(requirement.vertical_false_alarm / (2.0 * tests))
     threshold = separation_sigma * np.array([k_horizontal, k_horizontal, k_vertical])
     separation = Separation(
         gain,
@@ -271,7 +276,7 @@ def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
     )
     prior = np.array([mode.prior for mode in kept])
     horizontal, vertical = requirement.horizontal_risk, requirement.vertical_risk
-    share = 1.0 - not_monitored / (horizontal + vertical)
+    share = (1.0 - not_monitored / (horizontal + vertical)) / requirement.samples
     weight = np.concatenate([[2.0], prior])
     north, east, down = (
         protection_level(
@@ -318,7 +323,8 @@ def detect(epoch: Epoch, protection: Protection, y: Array, requirement: Requirem
     apart = np.abs((gain[1:] - gain[0]) @ y)
     ratio = np.divide(apart, threshold[1:], out=np.zeros_like(apart), where=threshold[1:] > 0.0)
     residual, degrees = _residual(epoch, y)
-    bound = float(chdtri(degrees, requirement.residual_false_alarm)) if degrees else math.inf
+    false_alarm = requirement.residual_false_alarm / requirement.samples
+    bound = float(chdtri(degrees, false_alarm)) if degrees else math.inf
     return Detection(float(ratio.max(initial=0.0)), residual, bound)
 
 

@@ -20,7 +20,8 @@ aids that are fused correct its tilt more than its P allows (fusiond.integrity.t
 An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
 over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
 filter's own bound, grown as the IMU's errors let it, or another source then supports it. Patience
-does not.
+does not. After an outage of all positions the first that comes back is taken at once, but counts
+less until it is seen to go with the motion (fusiond.integrity.proof).
 
 With all series of position refused nobody can say who is wrong from innovations alone; how it began
 can. An IMU's fault reaches the velocity before the position, and moves the position by no more than
@@ -47,11 +48,11 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
-from fusiond.integrity.series import DRIFTS, NO_TREND, PACES, Offset, Proof, Series
+from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart
+from fusiond.integrity.series import DRIFTS, PACES, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
-from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VE, VN
+from fusiond.navigation.strapdown import LAT, LON, VE, VN
 
 Array = NDArray[np.float64]
 
@@ -126,6 +127,13 @@ class Isolation:
         """Series that are left out, and why."""
         return {name: r.excluded for name, r in self._records.items() if r.excluded}
 
+    def unproven(self, series: str, t_ns: int) -> bool:
+        """Whether a fine position is not yet seen to go with the motion since an outage."""
+        record = self._records.get(series)
+        if record is None or not 0.0 < record.sd_m <= FINE_M:
+            return False
+        return record.proof is not None or support.outage(self._records, t_ns)
+
     def lost(self, t_ns: int) -> Lost | None:
         """Set while positions come and none is believed: since when, and who is to blame."""
         return support.lost(self._records, t_ns)
@@ -166,9 +174,11 @@ class Isolation:
         passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
         offers = aid.offers()
         offer = next((o for o in offers if isinstance(o, PositionOffer)), None)
-        offset = offer and _apart(offer, float(nav[LAT]), float(nav[LON]), float(nav[HEIGHT]))
+        offset = offer and apart(offer, float(nav[LAT]), float(nav[LON]), nav)
         if offer is not None and offset is not None:
             record.sd_m, record.away_m = max(offer.sd[:2]), math.hypot(offset.north, offset.east)
+        elif record.moves:
+            record.sd_m_s = _velocity_sd(offers)
         moving = math.hypot(nav[VN], nav[VE]) > MOVING_M_S
         value = _value(offers)
         repeats = value is not None and record.repeats_itself(value, moving)
@@ -186,9 +196,11 @@ class Isolation:
                 return Action.NONE
             away = record.away_m if aid.locates else _velocity_away(offers, nav)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
-        if offer is not None:
-            self._prove(record, t_ns, offer, nav)
+        runs = offer is not None and self._prove(record, offer, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
+        if runs:
+            self._exclude(record, t_ns, DRIFTS, jumped=True)
+            return self._doubted(Action.DOUBT_MEASURED, t_ns)
         self._average(record, outcome.whitened)
         if not self._biased(record, t_ns):
             return Action.NONE
@@ -216,22 +228,18 @@ class Isolation:
         record.heard_ns = t_ns
         return record
 
-    def _prove(self, record: Series, t_ns: int, offer: PositionOffer, nav: Array) -> None:
-        """A position is fused: after an outage it must be seen to go with the motion, for the
-        filter has nothing as good to compare it with."""
-        v = float(nav[VN]), float(nav[VE])
-        if support.outage(self._records, t_ns):
-            record.proof = Proof(offer.lat_rad, offer.lon_rad, t_ns, t_ns, v)
-        if (p := record.proof) is None:
-            return
-        half_s = 0.5e-9 * (t_ns - p.t_ns)
-        way = p.way[0] + half_s * (v[0] + p.velocity[0]), p.way[1] + half_s * (v[1] + p.velocity[1])
-        moved = _apart(offer, p.lat_rad, p.lon_rad, float(nav[HEIGHT]))
-        z = Offset(moved.north + way[0], moved.east + way[1], moved.sd)
-        trend = p.trend.with_one(z, (t_ns - p.begin_ns) * 1e-9)
-        record.proof = (
-            None if trend.steady() else p._replace(t_ns=t_ns, velocity=v, way=way, trend=trend)
-        )
+    def _prove(self, record: Series, offer: PositionOffer, nav: Array) -> bool:
+        """A position is fused; whether it runs away from the motion since an outage, which a
+        velocity of the same device supports."""
+        if support.outage(self._records, offer.t_ns):
+            record.proof = Proof.begun(offer, nav, record.colour)
+        elif record.proof is not None:
+            sd_m_s = support.velocity_sd(self._records, record.device)
+            proof = record.proof.with_one(offer, nav, sd_m_s)
+            record.proof = None if proof.proven else proof
+            limit = gate_threshold(self._pass, 2)
+            return proof.drifts(limit) and self._supported(record.device, offer.t_ns)
+        return False
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:
@@ -370,6 +378,11 @@ def _value(offers: Sequence[Offer]) -> tuple[float, ...] | None:
     return None
 
 
+def _velocity_sd(offers: Sequence[Offer]) -> float:
+    """Sigma (m/s) of a measured velocity, horizontally; 0 where none was measured."""
+    return max((max(o.sd[:2]) for o in offers if isinstance(o, VelocityOffer)), default=0.0)
+
+
 def _velocity_away(offers: Sequence[Offer], nav: Array) -> float:
     """How far a measured velocity is from the filter's (m/s); a lever arm that turns is left to the
     sigma. 0 where none was measured."""
@@ -377,14 +390,3 @@ def _velocity_away(offers: Sequence[Offer], nav: Array) -> float:
     if velocity is None:
         return 0.0
     return math.hypot(velocity.v_ned[0] - float(nav[VN]), velocity.v_ned[1] - float(nav[VE]))
-
-
-def _apart(offer: PositionOffer, lat: float, lon: float, height: float) -> Offset:
-    """From a measured position to a place; a lever arm of metres is left to the sigma."""
-    east = lon - offer.lon_rad
-    east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
-    return Offset(
-        (lat - offer.lat_rad) * (meridian_radius(lat) + height),
-        east * (transverse_radius(lat) + height) * math.cos(lat),
-        math.hypot(max(offer.sd[:2]), *offer.lever[:2]),
-    )

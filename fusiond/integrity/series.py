@@ -1,4 +1,4 @@
-"""What is known of one series of innovations, and of a position that was left out.
+"""What is known of one series of innovations.
 
 A series is what one source says of one thing; fusiond.integrity.isolation judges it.
 """
@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import NamedTuple
 
-# A position comes back once its innovations are known not to run away by three times this (m/s):
-# a drift of 0.2 m/s is what a filter with an honest velocity still tells from its own.
-TREND_SD_M_S = 0.07
-# One that was left out because it drifted, by a third and less: 0.1 m/s is what a receiver's honest
-# velocity shows within twenty seconds, and five of this. Not so one that was seen to run away by
-# five times the above: a drift as slow as that is not what has to be over.
-DRIFT_SD_M_S = 0.02
-RUNS_SD_M_S, RUNS_M_S = 0.5 * TREND_SD_M_S, 5.0 * TREND_SD_M_S
+from fusiond.integrity.proof import (
+    DRIFT_SD_M_S,
+    NO_TREND,
+    TREND_SD_M_S,
+    Proof,
+    Trend,
+)
+
 DRIFTS = "drifts"
 # Paces of the mean: some 11 and some 59 innovations deep, (2 - a) / a.
 PACES = (1.0 / 6.0, 1.0 / 30.0)
@@ -42,66 +42,6 @@ CHANCE, REPEATS_KEPT = 1e-9, 100.0
 NEVER_NS = -(2**62)
 
 
-class Offset(NamedTuple):
-    """How far a filter is from a position that was measured, north and east (m), and one sigma of
-    the measurement (m)."""
-
-    north: float
-    east: float
-    sd: float
-
-
-class Trend(NamedTuple):
-    """Sums over innovations of a position (m) against time (s): does it still run away?"""
-
-    n: int = 0
-    t: float = 0.0
-    tt: float = 0.0
-    north: float = 0.0
-    east: float = 0.0
-    t_north: float = 0.0
-    t_east: float = 0.0
-    sd: float = 0.0
-
-    def with_one(self, z: Offset, t_s: float) -> Trend:
-        """With one innovation more."""
-        return Trend(
-            self.n + 1,
-            self.t + t_s,
-            self.tt + t_s * t_s,
-            self.north + z.north,
-            self.east + z.east,
-            self.t_north + t_s * z.north,
-            self.t_east + t_s * z.east,
-            max(self.sd, z.sd),
-        )
-
-    @property
-    def slope(self) -> tuple[float, float]:
-        """How fast they run away (m/s), and the sigma of one of its axes; infinite where nothing is
-        known."""
-        spread = self.tt - self.t * self.t / self.n if self.n else 0.0
-        if spread <= 0.0:
-            return 0.0, math.inf
-        north = (self.t_north - self.t * self.north / self.n) / spread
-        east = (self.t_east - self.t * self.east / self.n) / spread
-        return math.hypot(north, east), self.sd / math.sqrt(spread)
-
-    def steady(self, least_sd: float = TREND_SD_M_S) -> bool:
-        """Whether the slope of a line through them is known to `least_sd` (m/s), and zero."""
-        slope, sd = self.slope
-        return sd <= least_sd and slope <= 3.0 * least_sd
-
-    @property
-    def runs_away(self) -> bool:
-        """Whether the slope is known to be that of no slow drift."""
-        slope, sd = self.slope
-        return sd <= RUNS_SD_M_S and slope > RUNS_M_S
-
-
-NO_TREND = Trend()
-
-
 class Shown(NamedTuple):
     """Sums of the means' squares, by degree of freedom, over so many innovations since an
     instant."""
@@ -113,23 +53,6 @@ class Shown(NamedTuple):
 
 
 NOTHING_SHOWN = Shown(NEVER_NS)
-
-
-class Proof(NamedTuple):
-    """How a position goes with the motion of the filter: where it was first (rad, rad), the way
-    since then by the filter's velocity, north and east (m), that velocity (m/s) and instant (ns),
-    and the trend of what is between both ways.
-
-    Positions alone would not do: a filter follows what it has nothing better than.
-    """
-
-    lat_rad: float
-    lon_rad: float
-    begin_ns: int
-    t_ns: int
-    velocity: tuple[float, float]
-    way: tuple[float, float] = (0.0, 0.0)
-    trend: Trend = NO_TREND
 
 
 @dataclass(slots=True)
@@ -145,6 +68,8 @@ class Series:
     sd_m: float = 0.0
     away_m: float = 0.0
     """Horizontally, of a position: its last innovation."""
+    sd_m_s: float = 0.0
+    """Of a velocity, horizontally."""
     refused: int = 0
     """Failures of the gate in a row, the first at `refused_ns`."""
     refused_ns: int = 0
@@ -201,6 +126,12 @@ class Series:
     def least_trend_sd(self) -> float:
         """How well (m/s) it must be known that it does not run away before it comes back."""
         return DRIFT_SD_M_S if self.excluded == DRIFTS and not self.ran else TREND_SD_M_S
+
+    @property
+    def colour(self) -> float:
+        """By how much (1) the sigma of a mean over many errors is more than if they were white, as
+        the series has shown."""
+        return math.sqrt(max(1.0, self.slow_spread / WHITE[1]))
 
     def forget_shown(self) -> None:
         """A fault has followed what the means have shown lately."""

@@ -72,7 +72,12 @@ def contested(records: Records, t_ns: int) -> str | None:
         # A velocity that jumped away is wrong by itself; one that left slowly may be right.
         if r.moves and r.excluded and not r.jumped and not _moving(records, r, t_ns):
             return f"{name} is left out ({r.excluded}), or the IMU is wrong"
-        if r.proof and r.believed and not others(records, r, t_ns, FINE_M):
+        if (
+            r.proof
+            and not r.proof.goes_along
+            and r.believed
+            and not others(records, r, t_ns, FINE_M)
+        ):
             return f"{name} is back and not yet seen to go with the motion"
     return None
 
@@ -85,6 +90,12 @@ def supported(records: Records, device: str, t_ns: int) -> bool:
     )
 
 
+def velocity_sd(records: Records, device: str) -> float:
+    """Sigma (m/s) of the device's velocities as a mean of many shows it; 0 without any."""
+    found = (r.sd_m_s * r.colour for r in records.values() if r.moves and r.device == device)
+    return max(found, default=0.0)
+
+
 def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:
     """Whether other positions, good to `sd_m`, have been believed lately: a coarse one cannot
     say that a fine one is wrong."""
@@ -92,7 +103,7 @@ def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:
         r.locates
         and r is not record
         and r.believed
-        and r.proof is None
+        and (r.proof is None or r.proof.goes_along)
         and r.sd_m <= sd_m
         and t_ns - r.fused_ns <= OTHERS_NS
         for r in records.values()

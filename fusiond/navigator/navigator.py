@@ -43,7 +43,7 @@ from fusiond.navigator.saved_calibration import SavedCalibration, refuted, take_
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
 from fusiond.navigator.state_file import RefusedStateError
-from fusiond.navigator.timeline import Entry, Timeline
+from fusiond.navigator.timeline import JUDGED, Entry, Timeline
 from fusiond.navigator.warm_start import WarmStart
 
 Array = NDArray[np.float64]
@@ -191,6 +191,7 @@ class Navigator:
         """Forget the solution and align anew, with a saved state if it still holds."""
         self.started = None
         self.timeline.clear()
+        self._protection.restart()
         self._saved, self.warm = saved, None
         self._aligner = self._new_aligner()
         self._aligner.reason = why
@@ -382,6 +383,8 @@ class Navigator:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
         if outcome is not None:
             entry.aid.judged(outcome.rows, outcome.whitened)
+            if outcome.name in JUDGED:
+                self._protection.look(entry.aid)
         if entry.error:
             self._failed.tell(entry.aid.source, entry.error)
         if self._on_outcome is not None:

@@ -1,24 +1,40 @@
-"""Protection levels of the solution, and what an operator hears when they pass the alert limits."""
+"""Protection levels of the solution, and what an operator hears when they pass the alert limits.
+
+Each level bounds the error by itself: that of solution separation in the filter
+(fusiond.integrity.protection), and that of each raw receiver's epochs
+(fusiond.navigator.epoch_protection). The least of them is published; each is computed at its equal
+part of the integrity risk, so that the least holds whichever it is.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
+from fusiond.aiding.base import Aid
+from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.separation import SeparatedEstimator
-from fusiond.integrity.protection import (
-    FilterProtection,
-    IntegrityRisk,
-    filter_protection,
-)
+from fusiond.integrity.protection import IntegrityRisk, filter_protection
 from fusiond.navigation.solution import Bound, BoundState
+from fusiond.navigator.epoch_protection import EpochProtection
+from fusiond.navigator.raw_gnss import RawEpochAid
 
 RETURN_NS = 5_000_000_000
 """The levels must have been inside the limits for this long before the alarm ends: a level that
 moves about its limit is one alarm. An alarm begins at once."""
+
+
+class _Levels(NamedTuple):
+    """Horizontal and vertical level (m; vertical None where the model holds the height), and what
+    does not fit, in words."""
+
+    hpl_m: float
+    vpl_m: float | None
+    blamed: list[str]
 
 
 class ProtectionWatch:
@@ -37,10 +53,13 @@ class ProtectionWatch:
         self._limits = options.horizontal_alert_limit_m, options.vertical_alert_limit_m
         self._beyond = False
         self._inside_since_ns = 0
-        self._last: tuple[int, FilterProtection] | None = None
+        self._last: tuple[int, _Levels] | None = None
+        self._raw = [name for name, s in config.aiding.items() if isinstance(s, RawAiding)]
+        risk = options.integrity_risk_per_hour / (1 + len(self._raw))
+        self._epochs = EpochProtection(risk, options.false_alarm_per_hour)
         if self._estimator is not None:
             self._risk = IntegrityRisk(
-                options.integrity_risk_per_hour,
+                risk,
                 options.false_alarm_per_hour,
                 options.priors(self._estimator.devices),
             )
@@ -49,6 +68,16 @@ class ProtectionWatch:
                     "integrity: two devices at fault in one hour are likelier than"
                     " integrity_risk_per_hour: no protection level can be stated"
                 )
+
+    def look(self, aid: Aid) -> None:
+        """An aid has been looked at; the estimator is where that left it."""
+        if self._estimator is not None and isinstance(aid, RawEpochAid):
+            self._epochs.look(aid, self._estimator.state)
+
+    def restart(self) -> None:
+        """The solution begins anew: what was heard said nothing of it."""
+        self._epochs.clear()
+        self._last = None
 
     def unknown(self) -> Bound:
         """Without a solution."""
@@ -76,17 +105,28 @@ class ProtectionWatch:
             self._inside_since_ns = e.t_ns
             if not self._beyond:
                 self._beyond = True
-                self._event("protection_level", "; ".join(passed + _apart(e, found)))
+                self._event("protection_level", "; ".join(passed + found.blamed))
         elif self._beyond and e.t_ns - self._inside_since_ns >= RETURN_NS:
             self._beyond = False
             self._event("protection_restored", f"horizontal {found.hpl_m:.1f} m")
 
-    def _levels(self, e: SeparatedEstimator) -> FilterProtection:
-        return filter_protection(
-            e.covariances(), e.separations(), self._risk, vertical=not e.model.hold_height
+    def _levels(self, e: SeparatedEstimator) -> _Levels:
+        vertical = not e.model.hold_height
+        of_filter = filter_protection(
+            e.covariances(), e.separations(), self._risk, vertical=vertical
         )
+        names = zip(e.devices, of_filter.apart.tolist(), strict=True)
+        blamed = [f"the solution without {name} is apart" for name, apart in names if apart]
+        hpl, vpl = [of_filter.hpl_m], [math.inf if of_filter.vpl_m is None else of_filter.vpl_m]
+        for source in self._raw:
+            level = self._epochs.level(source, e)
+            hpl.append(level.hpl_m)
+            vpl.append(level.vpl_m)
+            if level.left_out:
+                blamed.append(f"{source} fits without {', '.join(level.left_out)}")
+        return _Levels(min(hpl), min(vpl) if vertical else None, blamed)
 
-    def _passed(self, found: FilterProtection) -> list[str]:
+    def _passed(self, found: _Levels) -> list[str]:
         """Which levels are beyond their limits, in words; a level that is not a number is."""
         levels = zip(("horizontal", "vertical"), (found.hpl_m, found.vpl_m), strict=True)
         return [
@@ -94,8 +134,3 @@ class ProtectionWatch:
             for (name, level), limit in zip(levels, self._limits, strict=True)
             if limit is not None and level is not None and not level <= limit
         ]
-
-
-def _apart(e: SeparatedEstimator, found: FilterProtection) -> list[str]:
-    names = zip(e.devices, found.apart.tolist(), strict=True)
-    return [f"the solution without {name} is apart" for name, apart in names if apart]

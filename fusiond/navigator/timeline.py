@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
+from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.integrity.tilt import Attitude
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import Q0
@@ -204,7 +205,7 @@ class Timeline:
         before = Attitude.of(estimator.nav[Q0:], estimator.covariance) if tilts else None
         try:
             aid = entry.aid.at(estimator.nav)
-            outcome = estimator.update(aid) if believed else estimator.look(aid)
+            outcome = self._update(aid) if believed else estimator.look(aid)
         except RAISED_BY_NUMBERS as error:
             entry.error = repr(error)
             return Outcome("failed")
@@ -216,6 +217,15 @@ class Timeline:
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome
+
+    def _update(self, aid: Aid) -> Outcome:
+        """Fold one aid in; as coarser than it says where its motion is yet to be seen. Its
+        innovation then says nothing of the sigma that it states."""
+        unproven = aid.locates and self.isolation.unproven(aid.source, aid.t_ns)
+        if not unproven or self.estimator.isolates:
+            return self.estimator.update(aid)
+        outcome = self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))
+        return outcome._replace(whitened=())
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         counts = self.counters.outcomes[entry.aid.source]

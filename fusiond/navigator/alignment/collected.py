@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import HeadingOffer, HeightOffer, PositionOffer, VelocityOffer
 from fusiond.aiding.witnesses import LEAST_SD_M_S, Witnesses
-from fusiond.integrity.series import NO_TREND, Offset
+from fusiond.integrity.proof import NO_TREND, Offset
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import FEWEST_SAMPLES, Window

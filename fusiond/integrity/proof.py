@@ -1,0 +1,203 @@
+r"""Whether a position goes with the motion: the trend of what is between the two.
+
+A filter that comes out of an outage takes the first positions for what they are: it has nothing as
+good to compare them with. A receiver that drifts from its first fix on takes the filter along, and
+innovations do not show it. What shows it is the way that the filter has gone since, by velocities,
+against the way of the fixes: with n fixes of sigma s over a time T, a drift d and a line through
+what is between both ways,
+
+    position, mean of the fixes      sigma s / sqrt(n)             off by d T / 2
+    slope of the line                sigma sqrt(12) s / (T sqrt(n))
+    position, where the line began   sigma 2 s / sqrt(n)           whatever d
+
+A drift that has taken the filter away by k of its sigmas shows in the slope with k / sqrt(3): no
+test is as quick as the error. So until it is known whether there is one, the position is not known
+better than the line knows it. Fixes count with `UNPROVEN_SIGMAS` times their sigma, a mean of which
+has the sigma of the line, and the slope is beyond chance (5.3 sigma, one in a million) before an
+error that it causes is beyond 5 sigma: that is at a slope of 5.8.
+
+Errors that last make means and slopes less certain than white ones would: by the `colour` that the
+series has shown before. The way has errors of its own: of velocities of sigma s_v, of which a slope
+gets sqrt(1.2) s_v / sqrt(n).
+
+Source: least squares; Brumback, Srinath, IEEE Trans. AC 32 (1987), 1133.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.offers import PositionOffer
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.rotation import dcm_elements
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VE, VN
+
+Array = NDArray[np.float64]
+
+# A filter's velocity may be off for some seconds after an outage, until its sensor errors have
+# settled: by 0.12 m/s for ten seconds and by 0.2 for five in drive_0708. So long its sigma is not
+# below TREND_SD_M_S.
+SETTLED_NS = 20_000_000_000
+# The sigma of where a line begins, over that of the mean of its points.
+UNPROVEN_SIGMAS = 2.0
+# Of the slope of a random walk's line, over the walk's sigma by time.
+WALKED = math.sqrt(1.2)
+# A position comes back once its innovations are known not to run away by three times this (m/s):
+# a drift of 0.2 m/s is what a filter with an honest velocity still tells from its own.
+TREND_SD_M_S = 0.07
+# One that was left out because it drifted, by a third and less: 0.1 m/s is what a receiver's honest
+# velocity shows within twenty seconds, and five of this. Not so one that was seen to run away by
+# five times the above: a drift as slow as that is not what has to be over.
+DRIFT_SD_M_S = 0.02
+RUNS_SD_M_S, RUNS_M_S = 0.5 * TREND_SD_M_S, 5.0 * TREND_SD_M_S
+
+
+class Offset(NamedTuple):
+    """How far a filter is from a position that was measured, north and east (m), and one sigma of
+    the measurement (m)."""
+
+    north: float
+    east: float
+    sd: float
+
+
+class Trend(NamedTuple):
+    """Sums over innovations of a position (m) against time (s): does it still run away?"""
+
+    n: int = 0
+    t: float = 0.0
+    tt: float = 0.0
+    north: float = 0.0
+    east: float = 0.0
+    t_north: float = 0.0
+    t_east: float = 0.0
+    sd: float = 0.0
+
+    def with_one(self, z: Offset, t_s: float) -> Trend:
+        """With one innovation more."""
+        return Trend(
+            self.n + 1,
+            self.t + t_s,
+            self.tt + t_s * t_s,
+            self.north + z.north,
+            self.east + z.east,
+            self.t_north + t_s * z.north,
+            self.t_east + t_s * z.east,
+            max(self.sd, z.sd),
+        )
+
+    @property
+    def slope(self) -> tuple[float, float]:
+        """How fast they run away (m/s), and the sigma of one of its axes; infinite where nothing is
+        known."""
+        spread = self.tt - self.t * self.t / self.n if self.n else 0.0
+        if spread <= 0.0:
+            return 0.0, math.inf
+        north = (self.t_north - self.t * self.north / self.n) / spread
+        east = (self.t_east - self.t * self.east / self.n) / spread
+        return math.hypot(north, east), self.sd / math.sqrt(spread)
+
+    def steady(self, least_sd: float = TREND_SD_M_S) -> bool:
+        """Whether the slope of a line through them is known to `least_sd` (m/s), and zero."""
+        slope, sd = self.slope
+        return sd <= least_sd and slope <= 3.0 * least_sd
+
+    @property
+    def runs_away(self) -> bool:
+        """Whether the slope is known to be that of no slow drift."""
+        slope, sd = self.slope
+        return sd <= RUNS_SD_M_S and slope > RUNS_M_S
+
+
+NO_TREND = Trend()
+
+
+class Proof(NamedTuple):
+    """What is seen of a position that came back: where the body's origin was at its first fix (rad,
+    rad; ns), the way since then by the filter's velocity, north and east (m), that velocity (m/s)
+    and instant (ns), the sigma (m/s) of a velocity as a mean of many shows it, the trend of what is
+    between both ways, and the series' `colour` (1).
+    """
+
+    lat_rad: float
+    lon_rad: float
+    begin_ns: int
+    t_ns: int
+    velocity: tuple[float, float]
+    colour: float
+    sd_m_s: float = 0.0
+    way: tuple[float, float] = (0.0, 0.0)
+    trend: Trend = NO_TREND
+
+    @staticmethod
+    def begun(offer: PositionOffer, nav: Array, colour: float) -> Proof:
+        """With the first fix; `nav` (10,) the filter's state."""
+        lat, lon = float(nav[LAT]), float(nav[LON])
+        z = apart(offer, lat, lon, nav)
+        to_m = metres_a_radian(nav)
+        place = lat - z.north / to_m[0], lon - z.east / to_m[1]
+        return Proof(*place, offer.t_ns, offer.t_ns, (float(nav[VN]), float(nav[VE])), colour)
+
+    def with_one(self, offer: PositionOffer, nav: Array, sd_m_s: float) -> Proof:
+        """With one fix more, and the sigma of the velocities that there are now."""
+        v = float(nav[VN]), float(nav[VE])
+        half_s = 0.5e-9 * (offer.t_ns - self.t_ns)
+        north = self.way[0] + half_s * (v[0] + self.velocity[0])
+        east = self.way[1] + half_s * (v[1] + self.velocity[1])
+        moved = apart(offer, self.lat_rad, self.lon_rad, nav)
+        z = Offset(moved.north + north, moved.east + east, moved.sd)
+        trend = self.trend.with_one(z, (offer.t_ns - self.begin_ns) * 1e-9)
+        return self._replace(
+            t_ns=offer.t_ns, velocity=v, sd_m_s=sd_m_s, way=(north, east), trend=trend
+        )
+
+    @property
+    def sigma(self) -> float:
+        """Of one axis of the slope (m/s)."""
+        walked = WALKED * self.sd_m_s / math.sqrt(max(self.trend.n, 1))
+        return math.hypot(self.trend.slope[1] * self.colour, walked)
+
+    @property
+    def goes_along(self) -> bool:
+        """Whether the slope is known well enough to say so, and zero as far as it is known."""
+        return self.trend.slope[1] <= TREND_SD_M_S and self._none
+
+    @property
+    def proven(self) -> bool:
+        """Whether the slowest drift that is told from none would show."""
+        return self.trend.slope[1] * self.colour <= DRIFT_SD_M_S and self._none
+
+    @property
+    def _none(self) -> bool:
+        return self.trend.slope[0] <= 3.0 * max(self.sigma, DRIFT_SD_M_S)
+
+    def drifts(self, chi_square: float) -> bool:
+        """Whether the slope is beyond chance: `chi_square` of its two axes."""
+        settled = self.t_ns - self.begin_ns >= SETTLED_NS
+        sd = self.sigma if settled else math.hypot(self.sigma, TREND_SD_M_S)
+        return self.trend.slope[0] ** 2 > chi_square * sd * sd
+
+
+def metres_a_radian(nav: Array) -> tuple[float, float]:
+    """Of latitude and of longitude, where the filter is."""
+    lat, height = float(nav[LAT]), float(nav[HEIGHT])
+    east = (transverse_radius(lat) + height) * math.cos(lat)
+    return meridian_radius(lat) + height, east
+
+
+def apart(offer: PositionOffer, lat: float, lon: float, nav: Array) -> Offset:
+    """From the body's origin as measured to a place (rad, rad); `nav` (10,) turns the lever arm."""
+    c = dcm_elements(nav[Q0:])
+    x, y, z = offer.lever
+    to_m = metres_a_radian(nav)
+    east = lon - offer.lon_rad
+    east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
+    return Offset(
+        (lat - offer.lat_rad) * to_m[0] + c[0] * x + c[1] * y + c[2] * z,
+        east * to_m[1] + c[3] * x + c[4] * y + c[5] * z,
+        max(offer.sd[:2]),
+    )

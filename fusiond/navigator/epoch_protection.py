@@ -1,0 +1,157 @@
+r"""How far off the solution may be, by raw epochs: advanced RAIM of each, and the way to it.
+
+The position x_e of an epoch's ranges alone has levels PL_e that hold whatever one satellite or
+constellation does (fusiond.integrity.araim). With x_0 the published solution after the epoch
+
+    |error of x_0|  <=  |x_0 - x_e| + |error of x_e|
+
+so |x_0 - x_e| + PL_e bounds it, too, whatever the filter has made of the ranges: screened them, or
+left the whole receiver out. With the corrected ranges z less what the solution predicts, S of the
+satellites that are kept, and t the displacement that the model has all ranges share,
+
+    x_0 - x_e = S z - t
+
+Until the next epoch the level grows by K sigma_v dt of the filter's velocity, K the two-sided
+quantile of the risk.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from fusiond.aiding.base import NotApplicable, State
+from fusiond.aiding.pseudorange import RANGE_BIAS
+from fusiond.estimators.base import Estimator
+from fusiond.gnss.ecef import ned_axes
+from fusiond.integrity.araim import LPV_200, Epoch, Requirement, exclude
+from fusiond.integrity.protection import INDEPENDENT_PER_HOUR
+from fusiond.navigation.strapdown import LAT, LON
+from fusiond.navigator.raw_gnss import RawEpochAid
+
+Array = NDArray[np.float64]
+
+SATELLITE_FAULT, CONSTELLATION_FAULT = 1e-5, 1e-4
+"""In an hour: GPS SPS Performance Standard, 5th ed., 2020, section 3.5.1; Working Group C ARAIM,
+Milestone 3 report, 2016."""
+NOMINAL_BIAS_M = 0.75
+"""Of a range that is not at fault (signal deformation, antenna): Blanch et al., IEEE Trans. AES 51
+(2015), 713."""
+UNMONITORED = LPV_200.unmonitored_risk / (LPV_200.vertical_risk + LPV_200.horizontal_risk)
+"""Part of the risk that faults nobody looks for may have, as in the reference."""
+HOLDS_NS = 2_000_000_000
+"""An epoch speaks for the solution for so long: of a receiver that sends each second one may be
+lost."""
+
+
+def requirement(risk: float, false_alarm: float) -> Requirement:
+    """Of an hour: half of either to the vertical, half to the horizontal."""
+    return Requirement(
+        vertical_risk=0.5 * risk,
+        horizontal_risk=0.5 * risk,
+        vertical_false_alarm=0.5 * false_alarm,
+        horizontal_false_alarm=0.5 * false_alarm,
+        residual_false_alarm=false_alarm,
+        unmonitored_risk=UNMONITORED * risk,
+        effective_monitor_prior=LPV_200.effective_monitor_prior,
+        samples=INDEPENDENT_PER_HOUR,
+    )
+
+
+class EpochLevel(NamedTuple):
+    """Levels (m) of the solution at the epoch's instant, infinite where nothing bounds it, and the
+    satellites that do not fit the others."""
+
+    hpl_m: float
+    vpl_m: float
+    left_out: tuple[str, ...] = ()
+
+
+NO_BOUND = EpochLevel(math.inf, math.inf)
+
+
+@dataclass(slots=True)
+class _Heard:
+    """An epoch at `t_ns`: its ranges z (n,) m less the solution's, the shared displacement t (3,) m
+    north, east, down; its level once that was asked for."""
+
+    t_ns: int
+    satellites: tuple[str, ...]
+    epoch: Epoch
+    z: Array
+    shared: Array
+    level: EpochLevel | None = None
+
+
+class EpochProtection:
+    """Levels from raw epochs, at a `risk` and a rate of `false_alarm`s, each an hour."""
+
+    def __init__(self, risk: float, false_alarm: float) -> None:
+        self._requirement = requirement(risk, false_alarm)
+        self._quantile = -float(ndtri(0.5 * risk / INDEPENDENT_PER_HOUR))
+        self._heard: dict[str, _Heard] = {}
+
+    def clear(self) -> None:
+        """The solution has begun anew."""
+        self._heard.clear()
+
+    def look(self, aid: RawEpochAid, state: State) -> None:
+        """An epoch, and the filter's state at its instant when it has been looked at."""
+        self._heard.pop(aid.source, None)
+        corrected = aid.memory.corrected
+        if corrected is None:
+            return
+        rows, ranges = corrected.rows, np.isfinite(corrected.aid.ranges)
+        innovation = corrected.aid.innovation(state)
+        if isinstance(innovation, NotApplicable):
+            return
+        n = int(ranges.sum())
+        axes = ned_axes(float(state.nav[LAT]), float(state.nav[LON]))
+        _, clocks = np.unique(corrected.aid.clock[ranges], return_inverse=True)
+        sigma = np.sqrt(corrected.aid.range_variance[ranges])
+        epoch = Epoch(
+            rows.line_of_sight[ranges] @ axes,
+            clocks.astype(np.int64),
+            sigma,
+            sigma,
+            np.full(n, NOMINAL_BIAS_M),
+            np.full(n, SATELLITE_FAULT),
+            np.full(int(clocks.max(initial=-1)) + 1, CONSTELLATION_FAULT),
+        )
+        slots = [slot for block in RANGE_BIAS for slot in state.model.slots_of(block)]
+        shared = state.xi[slots] if len(slots) == 3 else np.zeros(3)
+        names = tuple(s for s, here in zip(rows.satellites, ranges, strict=True) if here)
+        self._heard[aid.source] = _Heard(aid.t_ns, names, epoch, innovation.z[:n], shared.copy())
+
+    def level(self, source: str, estimator: Estimator) -> EpochLevel:
+        """Of the estimator's present state, by the last epoch of a receiver."""
+        heard = self._heard.get(source)
+        if heard is None or not 0 <= estimator.t_ns - heard.t_ns <= HOLDS_NS:
+            return NO_BOUND
+        if heard.level is None:
+            heard.level = self._level(heard)
+        north, east, down = estimator.sigmas()[3:6].tolist()
+        grown = self._quantile * (estimator.t_ns - heard.t_ns) * 1e-9
+        found = heard.level
+        return found._replace(
+            hpl_m=found.hpl_m + grown * math.hypot(north, east), vpl_m=found.vpl_m + grown * down
+        )
+
+    def _level(self, heard: _Heard) -> EpochLevel:
+        found = exclude(heard.epoch, self._requirement, heard.z)
+        if found is None:
+            return NO_BOUND
+        kept = ~found.out
+        gain = found.protection.separation.gain[0]
+        north, east, down = (gain @ heard.z[kept] - heard.shared).tolist()
+        left_out = tuple(s for s, out in zip(heard.satellites, found.out, strict=True) if out)
+        return EpochLevel(
+            found.protection.hpl_m + math.hypot(north, east),
+            found.protection.vpl_m + abs(down),
+            left_out,
+        )

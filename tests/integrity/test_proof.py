@@ -1,0 +1,183 @@
+"""Whether a position goes with the motion: what a drift does to a mean, and what a line tells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.estimators.base import Outcome, gate_threshold
+from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.proof import (
+    DRIFT_SD_M_S,
+    SETTLED_NS,
+    UNPROVEN_SIGMAS,
+    Proof,
+    metres_a_radian,
+)
+from fusiond.navigation.rotation import quaternion_from_rpy
+from fusiond.navigation.strapdown import LAT, LON, Q0, VE, VN
+
+S = 1_000_000_000
+RATE_HZ = 5.0
+SD_M, SD_M_S = 0.8, 0.05
+LIMIT = gate_threshold(1.0 - 1e-6, 2)
+START = np.array([0.53, 1.99, 40.0, 8.0, 3.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+class Journey:
+    """A vehicle that goes straight on, its velocity as the filter has it, and the fixes of an
+    antenna at `lever` (m, body axes); `turn_rad_s` turns the body, not the way."""
+
+    def __init__(
+        self, seed: int, lever: tuple[float, float, float] = (0.0,) * 3, turn_rad_s: float = 0.0
+    ) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._lever, self._turn = lever, turn_rad_s
+
+    def at(self, k: int, drift_m_s: float = 0.0) -> tuple[PositionOffer, np.ndarray]:
+        """Fix k, which has drifted to the north, and the filter's state (10,) then."""
+        t_s = k / RATE_HZ
+        nav = START.copy()
+        nav[VN : VE + 1] += SD_M_S * self._rng.standard_normal(2)
+        yaw = self._turn * t_s
+        nav[Q0:] = quaternion_from_rpy(0.0, 0.0, yaw)
+        x, y, _ = self._lever
+        antenna = (
+            START[VN] * t_s + x * math.cos(yaw) - y * math.sin(yaw) + drift_m_s * t_s,
+            START[VE] * t_s + x * math.sin(yaw) + y * math.cos(yaw),
+        )
+        north, east = np.array(antenna) + SD_M * self._rng.standard_normal(2)
+        to_m = metres_a_radian(START)
+        place = START[LAT] + north / to_m[0], START[LON] + east / to_m[1], 40.0
+        return PositionOffer(round(t_s * S), *place, (SD_M,) * 3, self._lever), nav
+
+    def proof(self, seconds: float, drift_m_s: float = 0.0) -> Proof:
+        """Of all fixes in so many seconds."""
+        proof = Proof.begun(*self.at(0), colour=1.0)
+        for k in range(1, round(seconds * RATE_HZ) + 1):
+            proof = proof.with_one(*self.at(k, drift_m_s), SD_M_S)
+        return proof
+
+
+def test_the_slope_has_the_sigma_that_it_states() -> None:
+    slopes = []
+    for seed in range(60):
+        proof = Journey(seed).proof(12.0)
+        slopes.append(proof.trend.slope[0] / proof.sigma)
+    # Mean square of a radius of two axes: 2 +- 0.26.
+    assert np.mean(np.square(slopes)) == pytest.approx(2.0, abs=4.0 * 0.26)
+
+
+def test_a_drift_shows_in_the_slope_before_it_is_beyond_the_widened_sigma() -> None:
+    """Of errors of 5 sigma the slope has 5.8, where chance is at 5.3."""
+    drift_m_s = 0.2
+    n = 10.0 * RATE_HZ
+    sigma = UNPROVEN_SIGMAS * SD_M / math.sqrt(n)
+    beyond_s = 2.0 * 5.0 * sigma / drift_m_s  # when half the way that it has drifted is 5 sigma
+    assert beyond_s > 10.0
+    slope_sd = math.sqrt(12.0) * SD_M / (beyond_s * math.sqrt(beyond_s * RATE_HZ))
+    assert drift_m_s / slope_sd > math.sqrt(LIMIT)
+
+
+@pytest.mark.parametrize("lever", [(0.0, 0.0, -1.0), (1.5, -0.8, -1.0)])
+def test_what_goes_along_is_proven_whatever_the_antenna_does(
+    lever: tuple[float, float, float],
+) -> None:
+    """The body turns by half a turn under an antenna that does not sit in its middle."""
+    for seed in range(5):
+        proof = Journey(seed, lever, turn_rad_s=math.pi / 20.0).proof(20.0)
+        assert proof.trend.slope[1] < DRIFT_SD_M_S
+        assert proof.proven
+        assert proof.goes_along
+        assert not proof.drifts(LIMIT)
+
+
+@pytest.mark.parametrize("drift_m_s", [0.15, 0.5])
+def test_what_drifts_is_told_and_never_proven(drift_m_s: float) -> None:
+    settled_s = SETTLED_NS / S
+    for seed in range(5):
+        early = Journey(seed).proof(0.8 * settled_s, drift_m_s)
+        late = Journey(seed).proof(1.2 * settled_s, drift_m_s)
+        assert not early.goes_along
+        assert not early.proven
+        # Until the filter's velocity has settled a slow drift may be the filter's.
+        assert early.drifts(LIMIT) is (drift_m_s > 0.4)
+        assert late.drifts(LIMIT)
+
+
+class Returned:
+    """A receiver that is back after an outage, in the eyes of an isolation: what it believed."""
+
+    def __init__(self, velocities: bool) -> None:
+        self.isolation = Isolation()
+        self._journey = Journey(1)
+        self._noise = np.random.default_rng(2)
+        self._velocities = velocities
+
+    def _white(self, count: int) -> tuple[float, ...]:
+        return tuple(self._noise.standard_normal(count).tolist())
+
+    def fixes(self, first: int, last: int, drift_m_s: float = 0.0) -> list[tuple[bool, Action]]:
+        """Of fixes `first` to before `last`: whether each counts less, and what follows."""
+        found = []
+        for k in range(first, last):
+            offer, nav = self._journey.at(k, drift_m_s)
+            aid = PositionAid(
+                "gnss",
+                offer.t_ns,
+                0.9999,
+                offer.lat_rad,
+                offer.lon_rad,
+                offer.height_m,
+                offer.sd,
+                offer.lever,
+            )
+            # The filter is where it believes to be: its state is of no matter but for the way.
+            nav[LAT], nav[LON] = offer.lat_rad, offer.lon_rad
+            less = self.isolation.unproven("gnss", aid.t_ns)
+            name = "fused" if self.isolation.believes("gnss") else "isolated"
+            outcome = Outcome(name, 1.0, 3, () if less else self._white(3))
+            found.append((less, self.isolation.judge(aid, outcome, nav)))
+            if self._velocities:
+                v, sd = (8.0, 3.0), (SD_M_S, SD_M_S)
+                moving = VelocityAid("gnss_velocity", aid.t_ns, 0.9999, v, sd, offer.lever)
+                self.isolation.judge(moving, Outcome("fused", 1.0, 2, self._white(2)), nav)
+        return found
+
+
+# After fix 600 there is an outage of 40 s. By then the series has shown that its noise is white.
+LAST, BACK = 600, 800
+
+
+def test_positions_count_less_after_an_outage_until_they_are_proven() -> None:
+    returned = Returned(velocities=True)
+    assert not any(less for less, _ in returned.fixes(0, LAST))
+    found = returned.fixes(BACK, BACK + 150)
+    less = [less for less, _ in found]
+    until = less.index(False)
+    # sqrt(12) s / (T sqrt(n)) is DRIFT_SD_M_S after 15.7 s.
+    assert 15.0 * RATE_HZ < until < 25.0 * RATE_HZ
+    assert not any(less[until:])
+    assert {action for _, action in found} == {Action.NONE}
+
+
+def test_one_that_drifts_from_its_first_fix_on_is_left_out() -> None:
+    returned = Returned(velocities=True)
+    returned.fixes(0, LAST)
+    found = returned.fixes(BACK, BACK + 150, drift_m_s=0.15)
+    assert Action.DOUBT_MEASURED in {action for _, action in found}
+    assert returned.isolation.excluded == {"gnss": "drifts"}
+
+
+def test_without_a_velocity_nobody_can_say_that_it_drifts() -> None:
+    """The way is then the filter's own, which follows the fixes."""
+    returned = Returned(velocities=False)
+    returned.fixes(0, LAST)
+    returned.fixes(BACK, BACK + 150, drift_m_s=0.15)
+    assert not returned.isolation.excluded
+    assert returned.isolation.contested((BACK + 149) * S // round(RATE_HZ)) is not None
