@@ -8,17 +8,17 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # All extras but fuzz, which `make fuzz` installs where it is to be had.
-TOOLS := demo foxglove mf4 raw report ros dev
+TOOLS := dashboard demo foxglove mf4 raw report ros dev
 COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load lock clean \
-	kernels systemd test-packages
+	dashboard-check kernels systemd test-packages
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
 
 install: $(STAMP) ## locked dependencies and fusiond (editable) in .venv
 
@@ -34,8 +34,8 @@ $(STAMP): requirements-dev.lock pyproject.toml | $(BIN)/python
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-demo: $(STAMP) ## simulated vehicle, real daemon; ARGS="--duration 60 --headless"
-	$(BIN)/fusiond demo $(ARGS)
+demo: $(STAMP) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 60 --headless"
+	$(BIN)/fusiond demo --dashboard $(ARGS)
 
 test: $(STAMP) ## everything that CI checks; one core compiles while the other lints
 	$(MAKE) --jobs=2 --output-sync lint kernels
@@ -100,10 +100,15 @@ soak: $(STAMP) test-packages ## the daemon for HOURS of real time, with faults n
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)
 
+dashboard-check: $(STAMP) ## the dashboard in Debian's Chromium beside the daemon; ARGS="--minutes 60"
+	@PYTHON="$(PYTHON)" tools/debian-packages.sh look
+	@$(BIN)/python -c 'import playwright' 2>/dev/null || $(PIP) install --quiet 'playwright>=1.49'
+	$(BIN)/python benchmarks/dashboard_check.py $(ARGS)
+
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
 	$(COMPILE) $(TOOLS:%=--extra %) $(ARGS) --output-file requirements-dev.lock pyproject.toml
 	cp requirements-dev.lock requirements.lock
-	$(COMPILE) --extra demo --extra raw --output-file requirements.lock pyproject.toml
+	$(COMPILE) --extra dashboard --extra demo --extra raw --output-file requirements.lock pyproject.toml
 
 golden: $(STAMP) ## what the kept recordings give now, into tests/golden; git diff shows what changed
 	$(BIN)/python -m tests.golden.golden $(ARGS)

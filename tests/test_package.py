@@ -16,6 +16,8 @@ from tests.places import REPOSITORY
 
 CONFIG = REPOSITORY / "config"
 PAGE = "fusiond/report/assets"
+DASHBOARD = "fusiond/dashboard/static"
+PLOTS = f"{DASHBOARD}/uplot"  # a link to the report's
 
 
 def _run(*command: str | Path, folder: Path) -> str:
@@ -65,7 +67,9 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
-    folders = {"drivers/config": CONFIG, PAGE: REPOSITORY / PAGE}
+    linked = (REPOSITORY / PLOTS).resolve()
+    pages = {name: REPOSITORY / name for name in (PAGE, DASHBOARD)}
+    folders = {"drivers/config": CONFIG, **pages, PLOTS: linked}
     shipped = {
         f"{name}/{path.relative_to(folder)}": path.read_bytes()
         for name, folder in folders.items()
@@ -80,6 +84,7 @@ def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
         }
     assert held == shipped
     assert {"drivers/config/vehicle.toml", "drivers/config/dbc/xsens_mti600.dbc"} < set(held)
+    assert {f"{DASHBOARD}/index.html", f"{PLOTS}/uPlot.iife.min.js", f"{PLOTS}/LICENSE"} < set(held)
 
 
 def test_shipped_files_are_the_installed_ones(installed: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 #!/bin/sh
-# Install the Debian packages that `make install` (argument: run) or `make test` (run test) needs
-# and that are missing. Says what it does; asks for root only if something is missing.
+# Install the Debian packages that `make install` (argument: run), `make test` (run test) or
+# `make dashboard-check` (look) needs and that are missing. Says what it does; asks for root only if
+# something is missing.
 set -eu
 
 packages=""
@@ -41,8 +42,11 @@ for purpose in "$@"; do
             fi
         fi
         ;;
+    look)
+        need chromium "browser that looks at the dashboard"
+        ;;
     *)
-        echo "usage: $0 run|test ..." >&2
+        echo "usage: $0 run|test|look ..." >&2
         exit 64
         ;;
     esac

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from fusiond.commands import live, offline, recordings, reporting, research
+from fusiond.commands import dashboard, live, offline, recordings, reporting, research
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
@@ -52,7 +52,7 @@ def _root(
 
 # In the order of `--help`.
 for command in (
-    *(live.run, live.demo, live.check, live.doctor),
+    *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor),
     *(recordings.replay, reporting.report),
     *(offline.process, offline.calibrate, offline.simulate, offline.compare),
     *(research.schema, research.study, research.model, research.bench),

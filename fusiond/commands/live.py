@@ -40,13 +40,16 @@ def demo(
     duration: Annotated[float, typer.Option(min=1.0, help="Seconds.")] = 60.0,
     headless: Annotated[bool, typer.Option("--headless", help="No live view.")] = False,
     record: RecordPath = None,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Also serve the page of `fusiond dashboard`.")
+    ] = False,
 ) -> None:
     """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
     from fusiond.demo.broker import DemoError  # noqa: PLC0415
     from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
 
     try:
-        summary = run_demo(duration, headless or not sys.stdout.isatty(), record)
+        summary = run_demo(duration, headless or not sys.stdout.isatty(), record, dashboard)
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error

@@ -30,6 +30,7 @@ from fusiond.configuration.load import load_config
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config, Source
 from fusiond.demo.broker import DemoBroker
+from fusiond.demo.page import DemoPage
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -64,8 +65,11 @@ _TOWN = (
 )
 
 
-def demo(duration_s: float, headless: bool, record: Path | None = None) -> dict[str, Any]:
-    """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`.
+def demo(
+    duration_s: float, headless: bool, record: Path | None = None, dashboard: bool = False
+) -> dict[str, Any]:
+    """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`; with
+    `dashboard` there is a page to open, whose address the view says.
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
@@ -77,10 +81,12 @@ def demo(duration_s: float, headless: bool, record: Path | None = None) -> dict[
     with (
         DemoBroker() as broker,
         tempfile.TemporaryDirectory(prefix="fusiond-demo-") as folder,
+        DemoPage(broker.port) if dashboard else contextlib.nullcontext() as page,
         _log_kept_out(headless),
     ):
-        run = _Run(duration_s, headless, broker.port, Path(folder), record)
-        return asyncio.run(run.run())
+        live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
+        view = HeadlessView(sys.stderr) if headless else LiveView()
+        return asyncio.run(_Run(live, view, Path(folder), record).run())
 
 
 def drive(duration_s: float) -> Motion:
@@ -115,13 +121,11 @@ class View(Protocol):
 
 
 class _Run:
-    def __init__(
-        self, duration_s: float, headless: bool, port: int, folder: Path, record: Path | None
-    ) -> None:
-        self._duration_s = duration_s
-        self._port = port
+    def __init__(self, live: Live, view: View, folder: Path, record: Path | None) -> None:
+        self._duration_s = duration_s = live.duration_s
+        self._port = live.port
         links = folder / "gnss", folder / "rdss"
-        config = demo_config(port, *links)
+        config = demo_config(live.port, *links)
         if record is not None:
             recording = Recording(directory=record.absolute())
             config = config.model_copy(update={"recording": recording})
@@ -133,8 +137,8 @@ class _Run:
         )
         self._score = Score()
         self._daemon = Daemon(config, on_solution=self._on_solution)
-        self._live = Live(duration_s, port, VEHICLE)
-        self._view: View = HeadlessView(sys.stderr) if headless else LiveView()
+        self._live = live
+        self._view = view
 
     async def run(self) -> dict[str, Any]:
         """Drive until the end, Ctrl-C or SIGTERM; then the summary."""

@@ -50,10 +50,12 @@ _MADE_INSIDE = "made by the filter or part of another source"
 class Live:
     """What came out of the broker last, and what the simulation knows besides."""
 
-    def __init__(self, duration_s: float, port: int, vehicle: str) -> None:
+    def __init__(self, duration_s: float, port: int, vehicle: str, page: str | None = None) -> None:
         self.duration_s = duration_s
         self.port = port
         self.vehicle = vehicle
+        self.page = page
+        """Address of the dashboard, if there is one."""
         self.started = time.monotonic()
         self.nav: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
@@ -113,6 +115,8 @@ class HeadlessView:
 
     async def run(self, live: Live) -> None:
         """Write until cancelled."""
+        if live.page is not None:
+            print(f"dashboard: {live.page}", file=self._out, flush=True)
         while True:
             await asyncio.sleep(LINE_EVERY_S)
             print(line(live), file=self._out, flush=True)
@@ -266,7 +270,10 @@ class Screen:
             overflow="ellipsis",
             style="dim",
         )
-        return [Rule(style="dim"), text, mqtt]
+        if live.page is None:
+            return [Rule(style="dim"), text, mqtt]
+        page = Text(f"in a browser: {live.page}", no_wrap=True, overflow="ellipsis")
+        return [Rule(style="dim"), text, mqtt, page]
 
 
 def _rejected(reasons: dict[str, int]) -> Text:

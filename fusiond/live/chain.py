@@ -13,6 +13,7 @@ from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
 from fusiond.live.injection import Injection
+from fusiond.live.innovations import Innovations
 from fusiond.live.operator import Operator
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.sources import Sources
@@ -38,7 +39,9 @@ class Chain:
         self.clock = clock
         self.events = events
         navigator_event = partial(events.report, "navigator")
-        self.navigator = Navigator(config, saved, navigator_event, on_outcome)
+        self.innovations = Innovations(clock)
+        self._on_outcome = on_outcome
+        self.navigator = Navigator(config, saved, navigator_event, self._ended)
         self.injection = Injection(events.report)
         self.sources = Sources(config, clock, self.navigator, self.injection, events.report)
         self.operator = Operator(self.navigator, self.sources, self.injection)
@@ -46,6 +49,11 @@ class Chain:
         self.changed = False
         """Whether the last tick brought another mode."""
         self._second = Every(SECOND_NS)
+
+    def _ended(self, entry: Entry) -> None:
+        self.innovations.take(entry)
+        if self._on_outcome is not None:
+            self._on_outcome(entry)
 
     def tick(self, t_ns: int) -> Solution:
         """Run the filter on all that has come, and read the solution at `t_ns`."""

@@ -18,9 +18,19 @@ from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.health import OutputHealth, SchedulerStatus, health_message
+from fusiond.outputs.messages.innovations import innovations_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.status import RecordingStatus, status_message
-from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, HEALTH, NAV, STATUS, TRACKER, Topic
+from fusiond.outputs.topics import (
+    CALIBRATION,
+    CONSISTENCY,
+    HEALTH,
+    INNOVATIONS,
+    NAV,
+    STATUS,
+    TRACKER,
+    Topic,
+)
 from fusiond.outputs.tracking import Tracking
 
 STATUS_EVERY_S = 1
@@ -46,6 +56,7 @@ class Publishing:
         self._scheduler = scheduler
         self._outputs = outputs
         self._recording = recording
+        self._innovations = chain.innovations
         self._usage = ProcessUsage()
         self._version = version("fusiond")
         self._digest = config_digest(config)
@@ -136,6 +147,9 @@ class Publishing:
         reports = self._navigator.verdicts.reports()
         if reports:
             self._tell(CONSISTENCY, consistency_message(utc_ns, reports))
+        innovations = self._innovations.since()
+        if innovations:
+            self._tell(INNOVATIONS, innovations_message(utc_ns, innovations))
 
 
 def _health(output: Output) -> OutputHealth:

@@ -11,6 +11,7 @@ from fusiond.outputs.messages.calibration import CalibrationMessage
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.health import HealthMessage
+from fusiond.outputs.messages.innovations import InnovationsMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import StatusMessage
@@ -36,11 +37,12 @@ NAV = Topic("nav", NavMessage, 0, False)
 STATUS = Topic("status", StatusMessage, 1, True)
 HEALTH = Topic("health", HealthMessage, 0, True)
 CONSISTENCY = Topic("consistency", ConsistencyMessage, 0, True)
+INNOVATIONS = Topic("innovations", InnovationsMessage, 0, False)
 CALIBRATION = Topic("calibration", CalibrationMessage, 1, True)
 TRACKER = Topic("tracker", TrackerMessage, 1, True)
 EVENT = Topic("event", EventMessage, 1, False)
 REPLY = Topic("reply", ReplyMessage, 1, False)
-TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, CALIBRATION, TRACKER, EVENT, REPLY)
+TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, INNOVATIONS, CALIBRATION, TRACKER, EVENT, REPLY)
 
 
 def base_topic(vehicle: str) -> str:

@@ -29,7 +29,7 @@ from fusiond.estimators.base import Outcome
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.status import RecordingState, RecordingStatus
-from fusiond.outputs.topics import Topic
+from fusiond.outputs.topics import INNOVATIONS, Topic
 from fusiond.recording.about import about_run
 from fusiond.recording.channels import INNOVATION, INPUT, STATE, innovation
 from fusiond.recording.log_writer import Item, LogWriter, log_stem
@@ -199,9 +199,9 @@ class Recorder:
 
     def take(self, topic: Topic, message: Message) -> None:
         """A message of a topic goes into the log; an event of `recording.events` starts it where
-        that is wanted."""
+        that is wanted. `innovations` does not: the log has each of them by itself."""
         t_ns = self._clock.now_ns()
-        if self.active:
+        if self.active and topic is not INNOVATIONS:
             self._put(Item(f"/{topic.name}", t_ns + self._epoch_ns, message))
         if isinstance(message, EventMessage):
             self._look_at(message, t_ns)

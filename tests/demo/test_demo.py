@@ -11,6 +11,8 @@ import threading
 from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -57,9 +59,9 @@ def command() -> list[str]:
 def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(
     command: list[str], tmp_path: Path
 ) -> None:
-    """And what it recorded gives the same bits once more."""
+    """And what it recorded gives the same bits once more. Its page is there as long as it is."""
     with subprocess.Popen(
-        [*command, "--duration", "300", "--record", str(tmp_path)],
+        [*command, "--duration", "300", "--record", str(tmp_path), "--dashboard"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -72,6 +74,9 @@ def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(
         said = list(takewhile(lambda text: "navigating" not in text, process.stderr))
         assert process.poll() is None, said
         assert any("aligning" in text for text in said)
+        page = said[0].removeprefix("dashboard: ").strip()
+        with urlopen(page, timeout=PATIENCE_S) as answer:
+            assert b"<title>fusiond</title>" in answer.read()
         os.killpg(process.pid, signal.SIGINT)  # as the terminal does: to the broker's process too
         out, err = process.communicate(timeout=PATIENCE_S)
         bound.cancel()
@@ -88,6 +93,8 @@ def test_navigates_on_all_sources_and_ctrl_c_ends_with_the_summary(
     assert summary["nees"] > 0.0
     assert summary["mqtt_published"] > 0
     assert "Traceback" not in err
+    with pytest.raises(URLError):
+        urlopen(page, timeout=PATIENCE_S)
     again = replay(list(tmp_path.glob("*.mcap")), Wish())
     assert again["identical"] is True, again["first_difference"]
     assert again["compared"] == summary["ticks"]

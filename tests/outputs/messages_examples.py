@@ -19,6 +19,7 @@ from fusiond.outputs.messages.health import (
     SourceHealth,
     health_message,
 )
+from fusiond.outputs.messages.innovations import Innovation, innovations_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.messages.status import RecordingStatus, status_message
@@ -143,6 +144,25 @@ EXAMPLES: dict[str, Any] = {
                 (-0.4054, -0.0259, -0.0411, -0.0881, 0.1637, -0.1903, 0.0842, 0.1781),
             )
         },
+    ),
+    "innovations": innovations_message(
+        UTC_NS,
+        [
+            Innovation(
+                source="gnss",
+                t_ms=UTC_NS // 1_000_000 - 71,
+                outcome="fused",
+                nis=2.114,
+                degrees=3,
+            ),
+            Innovation(
+                source="rdss",
+                t_ms=UTC_NS // 1_000_000 - 1420,
+                outcome="gated",
+                nis=31.9,
+                degrees=2,
+            ),
+        ],
     ),
     "calibration": calibration_message(
         UTC_NS,

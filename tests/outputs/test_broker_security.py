@@ -17,12 +17,23 @@ import aiomqtt
 import pytest
 
 from fusiond.configuration.schema import Mqtt
+from fusiond.dashboard import broker as dashboard_broker
+from fusiond.dashboard.broker import Access
+from fusiond.dashboard.hub import Hub
 from fusiond.outputs.commands import Command
 from fusiond.outputs.mqtt import MqttPublisher
-from fusiond.outputs.topics import CALIBRATION, CONSISTENCY, EVENT, HEALTH, NAV, STATUS
+from fusiond.outputs.topics import (
+    CALIBRATION,
+    CONSISTENCY,
+    EVENT,
+    HEALTH,
+    INNOVATIONS,
+    NAV,
+    STATUS,
+)
 from tests.broker import Broker, Listener, listening
 from tests.outputs.messages_examples import EXAMPLES
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 
 HOST = "broker.example.org"
@@ -129,9 +140,11 @@ async def test_each_user_may_do_what_is_its_business(broker: Broker, certificate
             publisher.take(STATUS, EXAMPLES["status"])
             publisher.take(HEALTH, EXAMPLES["health"])
             publisher.take(CONSISTENCY, EXAMPLES["consistency"])
+            publisher.take(INNOVATIONS, EXAMPLES["innovations"])
             publisher.take(CALIBRATION, EXAMPLES["calibration"])
             publisher.take(EVENT, EXAMPLES["event"])
-            for topic in ("nav", "status", "health", "consistency", "calibration", "event"):
+            figures = ("nav", "status", "health", "consistency", "innovations", "calibration")
+            for topic in (*figures, "event"):
                 await seen.until(lambda li, name=topic: li.payloads(f"fusiond/truck/{name}"))
             # The broker has confirmed, and dropped, the dashboard's command before the operator's.
             await dashboard_client.publish(COMMAND, b'{"id": "dashboard"}', qos=1)
@@ -161,6 +174,20 @@ async def test_a_vehicle_speaks_for_itself_only(broker: Broker, certificates: Pa
             await client.publish("fusiond/truck/nav", b"true", qos=1)
             await seen.until(lambda li: li.payloads("fusiond/truck/nav"))
             assert [message.topic.value for message in seen.messages] == ["fusiond/truck/nav"]
+
+
+async def test_the_dashboard_listens_as_its_own_user(broker: Broker, certificates: Path) -> None:
+    hub = Hub(asyncio.get_running_loop().time, "test")
+    tls = _shown(certificates, "dashboard")
+    with broker:
+        listener = dashboard_broker.Broker(Access("127.0.0.1", broker.port, tls=tls), hub)
+        listens = asyncio.create_task(listener.run())
+        async with _daemon(broker, certificates, []) as publisher:
+            publisher.take(STATUS, EXAMPLES["status"])
+            await until(lambda: "truck" in hub.vehicles and hub.vehicles["truck"].said("status"))
+        assert hub.link.state == "up"
+        listens.cancel()
+        await asyncio.gather(listens, return_exceptions=True)
 
 
 # MQTT 3.1.1, section 3.1: CONNECT of protocol level 4, clean session, 60 s, identifier "x"; and

@@ -1,0 +1,82 @@
+"""Command dashboard: what a vehicle says, in a browser."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, load
+
+if TYPE_CHECKING:
+    from fusiond.dashboard.broker import Access
+
+TOKEN_VARIABLE = "FUSIOND_DASHBOARD_TOKEN"
+
+
+def dashboard(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[LOG...]", help="Play a recording instead: all its files, .mcap."),
+    ] = None,
+    mqtt: Annotated[str, typer.Option(metavar="HOST:PORT", help="The broker.")] = "localhost:1883",
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="C.toml", help="Broker, user and certificates of its [mqtt]."),
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to serve at.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8770,
+    speed: Annotated[
+        float, typer.Option(min=0.01, max=1000.0, help="Of a recording, times real time.")
+    ] = 1.0,
+    commands: Annotated[
+        bool, typer.Option("--commands", help="Whoever has the token may send commands.")
+    ] = False,
+) -> None:
+    """Show a vehicle in the browser: from its broker, or from a recording."""
+    from fusiond.dashboard.serve import (  # noqa: PLC0415
+        DashboardError,
+        Serving,
+        serve_broker,
+        serve_log,
+    )
+
+    token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
+    serving = Serving(host, port, token if commands and not logs else None)
+    if not serving.loopback:
+        typer.echo("fusiond: everyone who reaches this address sees the vehicle", err=True)
+    try:
+        if logs:
+            from fusiond.commands.recordings import log_errors  # noqa: PLC0415
+
+            with log_errors():
+                serve_log(logs, speed, serving, typer.echo)
+        else:
+            access = _at(mqtt) if config is None else _of(config)
+            serve_broker(access, serving, typer.echo)
+    except DashboardError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+
+
+def _at(address: str) -> Access:
+    from fusiond.dashboard.broker import Access  # noqa: PLC0415
+
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise typer.BadParameter(f"{address!r} is no HOST:PORT", param_hint="--mqtt")
+    return Access(host.strip("[]"), int(port))
+
+
+def _of(path: Path) -> Access:
+    """The broker of a configuration."""
+    from fusiond.dashboard.broker import Access  # noqa: PLC0415
+    from fusiond.outputs import broker_access  # noqa: PLC0415
+
+    options = load(path).mqtt
+    with config_errors():
+        password, tls = broker_access.password(options), broker_access.tls_context(options)
+    return Access(options.host, options.port, options.username, password, tls)

@@ -1,0 +1,100 @@
+"""The link to an MQTT broker: listens to every vehicle, comes back by itself, sends commands."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import ssl
+from dataclasses import dataclass
+
+import aiomqtt
+
+from fusiond.dashboard.hub import Hub
+
+BASE = "fusiond"
+RETRY_S = 1.0
+"""Between attempts: a person is waiting, and the broker is on this computer or near."""
+KEEPALIVE_S = 5
+"""A broker that has stopped answering is noticed after one and a half of it."""
+MOST_WAITING = 1000
+"""Messages in the client's queue, of which it discards more: ten seconds at 100 Hz."""
+COMMANDS_WAITING = 8
+_LOG = logging.getLogger("fusiond.dashboard.mqtt")
+_LOG.setLevel(logging.ERROR)
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """Where the broker is and how it lets us in."""
+
+    host: str = "localhost"
+    port: int = 1883
+    username: str | None = None
+    password: str | None = None
+    tls: ssl.SSLContext | None = None
+
+
+class Broker:
+    """Feeds a hub from a broker. `send_command` queues a command; more than
+    `COMMANDS_WAITING` that could not be sent yet are forgotten."""
+
+    def __init__(self, access: Access, hub: Hub) -> None:
+        self._access = access
+        self._hub = hub
+        self._commands: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue(COMMANDS_WAITING)
+
+    def send_command(self, vehicle: str, name: str, request_id: str) -> None:
+        """Put a command on its way to a vehicle."""
+        if self._commands.full():
+            self._commands.get_nowait()
+        payload = json.dumps({"id": request_id}).encode()
+        self._commands.put_nowait((f"{BASE}/{vehicle}/cmd/{name}", payload))
+
+    async def run(self) -> None:
+        """Listen until cancelled."""
+        while True:
+            try:
+                async with self._client() as client:
+                    await client.subscribe(f"{BASE}/+/+", qos=0)
+                    self._hub.linked("up")
+                    await self._serve(client)
+            except aiomqtt.MqttError as error:
+                self._hub.linked("lost", str(error))
+            await asyncio.sleep(RETRY_S)
+
+    def _client(self) -> aiomqtt.Client:
+        access = self._access
+        return aiomqtt.Client(
+            access.host,
+            access.port,
+            username=access.username,
+            password=access.password,
+            tls_context=access.tls,
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=MOST_WAITING,
+            logger=_LOG,
+        )
+
+    async def _serve(self, client: aiomqtt.Client) -> None:
+        """Until the connection fails; both tasks end with it."""
+        tasks = [asyncio.create_task(self._listen(client)), asyncio.create_task(self._ask(client))]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        for task in done:
+            task.result()
+
+    async def _listen(self, client: aiomqtt.Client) -> None:
+        async for message in client.messages:
+            levels = message.topic.value.split("/")
+            if isinstance(message.payload, bytes) and len(levels) == 3:
+                self._hub.take(levels[1], levels[2], message.payload, message.retain)
+
+    async def _ask(self, client: aiomqtt.Client) -> None:
+        while True:
+            topic, payload = await self._commands.get()
+            await client.publish(topic, payload, qos=1)

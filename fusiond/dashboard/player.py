@@ -1,0 +1,53 @@
+"""Plays a log's messages at their own pace, or a multiple of it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from fusiond.dashboard.hub import Hub
+from fusiond.recording.reader import Log
+
+TOPICS = ("/status", "/nav", "/health", "/consistency", "/calibration", "/event", "/innovation")
+SECOND = 1_000_000_000
+AT_ONCE = 64
+"""Messages handed over before the browsers get their turn, where the log is played fast."""
+
+
+class Player:
+    """A log as the source of a hub. Raises `LogError` and OSError for what cannot be read."""
+
+    def __init__(self, paths: Sequence[Path], speed: float) -> None:
+        self._log = Log(paths)
+        self.speed = speed
+        self.vehicle = self._log.about.metadata["vehicle"]
+        self.origin = ", ".join(path.name for path in self._log.paths)
+        self._began = 0.0
+        self._next_s = 0.0
+
+    def now_s(self) -> float:
+        """Seconds of the log that have been played: never beyond the message that is next."""
+        return min(self._elapsed_s, self._next_s)
+
+    @property
+    def _elapsed_s(self) -> float:
+        return (time.monotonic() - self._began) * self.speed
+
+    async def run(self, hub: Hub) -> None:
+        """Play to the end, then stand there until cancelled."""
+        first_ns: int | None = None
+        hub.linked("up")
+        for count, message in enumerate(self._log.messages(*TOPICS)):
+            if first_ns is None:
+                first_ns, self._began = message.t_log_ns, time.monotonic()
+            self._next_s = max(self._next_s, (message.t_log_ns - first_ns) / SECOND)
+            ahead_s = self._next_s - self._elapsed_s
+            if ahead_s > 0.0 or count % AT_ONCE == 0:
+                await asyncio.sleep(max(0.0, ahead_s) / self.speed)
+            if ahead_s < 0.0:  # it cannot be played so fast: the clock waits for it
+                self._began -= ahead_s / self.speed
+            hub.take(self.vehicle, message.topic[1:], message.data)
+        hub.linked("ended", "; ".join(self._log.problems))
+        await asyncio.Event().wait()

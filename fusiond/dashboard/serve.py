@@ -1,0 +1,139 @@
+"""`fusiond dashboard`: the hub, its source and the web server in one event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import socket
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
+
+from fusiond.dashboard.broker import Access, Broker
+from fusiond.dashboard.hub import Hub
+
+INSTALL = "the dashboard's packages are not installed: pip install 'fusiond[dashboard]'"
+SEND_BUFFER = 128 * 1024
+"""Bytes that the kernel holds for a browser: some frames, not minutes of them."""
+
+
+Source = Callable[[], Coroutine[Any, Any, None]]
+"""Feeds a hub until cancelled."""
+
+
+class DashboardError(Exception):
+    """The dashboard cannot start; the text says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """Where to serve. `token`: whoever has it may send commands; None: nobody."""
+
+    host: str = "127.0.0.1"
+    port: int = 8770
+    token: str | None = None
+
+    @property
+    def loopback(self) -> bool:
+        return is_loopback(self.host)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach `host`."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def serve_broker(access: Access, serving: Serving, tell: Callable[[str], None]) -> None:
+    """Show the vehicles of a broker until a signal. `tell` hears the page's address."""
+    hub = Hub(time.monotonic, f"{access.host}:{access.port}")
+    broker = Broker(access, hub)
+    if serving.token is not None:
+        hub.send_command = broker.send_command
+    _run(hub, broker.run, serving, tell)
+
+
+def serve_log(
+    paths: Sequence[Path], speed: float, serving: Serving, tell: Callable[[str], None]
+) -> None:
+    """Play a log. Raises `LogError` for what is none."""
+    from fusiond.dashboard.player import Player  # noqa: PLC0415 - 150 MB of numerics behind it
+
+    player = Player(paths, speed)
+    hub = Hub(player.now_s, player.origin, speed)
+
+    async def play() -> None:
+        await player.run(hub)
+
+    _run(hub, play, serving, tell)
+
+
+def _run(
+    hub: Hub,
+    source: Source,
+    serving: Serving,
+    tell: Callable[[str], None],
+) -> None:
+    if importlib.util.find_spec("uvicorn") is None or importlib.util.find_spec("starlette") is None:
+        raise DashboardError(INSTALL)
+    door = listening(serving)
+    port = door.getsockname()[1]
+    host = f"[{serving.host}]" if ":" in serving.host else serving.host
+    tell(f"http://{host}:{port}/" + (f"#token={serving.token}" if serving.token else ""))
+
+    # A signal is the web server's: it ends in order, then lets the signal do its work.
+    asyncio.run(serve(hub, source, serving, door, asyncio.Event()))
+
+
+def listening(serving: Serving) -> socket.socket:
+    """A socket that listens there. Raises `DashboardError` where none can."""
+    try:
+        family, _, _, _, address = socket.getaddrinfo(
+            serving.host, serving.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        made = socket.socket(family, socket.SOCK_STREAM)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        made.bind(address)
+        made.listen()
+    except OSError as error:
+        text = f"{serving.host}:{serving.port}: {error.strerror or error}"
+        raise DashboardError(f"{text}: choose another with --host and --port") from error
+    return made
+
+
+async def serve(
+    hub: Hub, source: Source, serving: Serving, door: socket.socket, stop: asyncio.Event
+) -> None:
+    """Serve at `door` what `source` feeds into the hub, until `stop` is set or the source fails."""
+    import uvicorn  # noqa: PLC0415 - an extra
+
+    from fusiond.dashboard.web import application  # noqa: PLC0415 - the same
+
+    config = uvicorn.Config(
+        application(hub, serving.token, serving.loopback),
+        ws="websockets-sansio",
+        ws_per_message_deflate=False,  # a core's worth of it, for a local network
+        ws_max_size=65536,
+        log_level="error",
+        access_log=False,
+        lifespan="off",
+        timeout_graceful_shutdown=1,
+    )
+    server = uvicorn.Server(config)
+    feeding = asyncio.create_task(source(), name="source")
+    served = asyncio.create_task(server.serve(sockets=[door]), name="server")
+    stopped = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait({feeding, served, stopped}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        server.should_exit = True
+        failed = feeding.done() or served.done()
+        for task in (feeding, stopped):
+            task.cancel()
+        await asyncio.gather(served, feeding, stopped, return_exceptions=not failed)

@@ -1,0 +1,101 @@
+// Each source: what it is doing, how often it comes, what became of it, how old and how late it is.
+import { agedFurther, sourceLimit } from "./age.js";
+import { byId, element, fillRows, known, short, stretch, whole } from "./text.js";
+
+const table = byId("sources"),
+  body = table.createTBody();
+const head = table.createTHead().insertRow();
+const HEAD = [
+  ["source", ""],
+  ["state", ""],
+  ["age", "n"],
+  ["latency", "n wide-only"],
+  ["rate", "n wide-only"],
+  ["received", "n wide-only"],
+  ["used", "n"],
+  ["refused", "n"],
+  ["why", "wide-only"],
+];
+for (const [text, name] of HEAD) head.append(element("th", name, text));
+
+// What is no device says so in its `detail`.
+export const derived = (source) => (source.detail || "").startsWith("made by the filter");
+
+const rates = new Map(); // source: [received, t of the hub, Hz]
+
+// From two messages of `health`; of what is slower than they are, from several.
+function rate(name, source, at) {
+  const [count, t, hz] = rates.get(name) || [null, 0, null];
+  if (count === null || source.received < count || at < t) {
+    rates.set(name, [source.received, at, null]);
+    return null;
+  }
+  const since = at - t;
+  if (since < 1.9) return hz;
+  if (source.received - count < 2 && since < 60) return hz;
+  const now = (source.received - count) / since;
+  rates.set(name, [source.received, at, now]);
+  return now;
+}
+
+// How many were refused, and the commonest reasons.
+function refusals(rejected) {
+  const all = Object.entries(rejected || {}).sort((a, b) => b[1] - a[1]);
+  const words = ([reason, count]) => `${reason.replaceAll("_", " ")} ${whole(count)}`;
+  return {
+    count: all.reduce((sum, [, count]) => sum + count, 0),
+    why: all.slice(0, 2).map(words).join(", ") + (all.length > 2 ? ", \u2026" : ""),
+    title: all.map(words).join("\n"),
+  };
+}
+
+const frequency = (hz) =>
+  !known(hz)
+    ? "–"
+    : hz >= 10
+      ? `${hz.toFixed(0)} Hz`
+      : hz >= 0.95
+        ? `${hz.toFixed(1)} Hz`
+        : hz > 0
+          ? `1 in ${(1 / hz).toFixed(0)} s`
+          : "0";
+
+export function showSources(store) {
+  const health = store.said("health");
+  if (!health) return;
+  const heard = store.heard.health,
+    uptime = (store.said("status") || {}).uptime_s;
+  const rows = [];
+  const sources = Object.entries(health.sources).sort((a, b) => derived(a[1]) - derived(b[1]));
+  for (const [name, s] of sources) {
+    const inside = derived(s);
+    const hz = heard.at === null ? null : rate(name, s, heard.at);
+    const seen = agedFurther(inside ? s.fused_age_s : s.age_s, heard, store.now);
+    const old = seen !== null && !inside && seen > sourceLimit(s.received, uptime);
+    const state = s.isolated ? "left out" : s.state;
+    const { count, why, title } = refusals(s.rejected);
+    const used = agedFurther(s.fused_age_s, heard, store.now);
+    const row = [
+      { text: name, title: s.detail, className: inside ? "quiet" : "" },
+      {
+        text: inside ? "derived" : state,
+        className: `state ${inside ? "inside quiet" : s.state}`,
+        title: s.isolated || s.detail,
+      },
+      {
+        text: stretch(seen),
+        className: "n",
+        title: used === null ? "" : `used ${stretch(used)} ago`,
+      },
+      { text: short(s.latency_s), className: "n wide-only" },
+      { text: inside ? "" : frequency(hz), className: "n wide-only" },
+      { text: whole(s.received), className: "n wide-only" },
+      { text: whole(s.fused), className: "n" },
+      { text: count ? whole(count) : "\u2013", className: "n", title },
+      { text: why, className: "wide-only", title },
+    ];
+    row.rowClass = old ? "old" : "";
+    rows.push(row);
+  }
+  fillRows(body, rows);
+}

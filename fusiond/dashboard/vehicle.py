@@ -1,0 +1,207 @@
+"""What one vehicle has said: the latest of each topic, when it came, and ten minutes of history.
+
+Everything that is kept has a number from one count that only grows. Whoever looks remembers the
+count and asks for what is newer: a slow one gets the newest and never a queue of what is old.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Reversible
+from dataclasses import dataclass, field
+from itertools import takewhile
+from statistics import median
+from typing import Any
+
+from fusiond.dashboard.advice import advice
+
+Said = Mapping[str, Any]
+
+LIMITS_S = {"nav": 1.0, "status": 3.0, "health": 3.0, "consistency": 3.0, "calibration": 90.0}
+"""Age from which a figure is old, if its topic comes at least so often: three messages missed of
+those that come every second (`status`, and `health` by default) or every 30 s (`calibration`); a
+second for `nav`, of which ten come by default. Docs/mqtt.md has the rates."""
+MISSED = 3
+"""Messages missed until a topic that comes at a slower rate is old."""
+INTERVALS = 8
+"""Intervals of a topic, by whose median its rate is known: one long silence does not change it."""
+ROW_EVERY_S = 0.5
+"""Spacing of the rows of a solution: ten minutes are 1200 points, about a plot's pixels."""
+MOST_ROWS = {"nav": 1200, "nis": 4800, "delay": 500, "event": 200}
+"""By kind. `nis`: eight sources for ten minutes at 1 Hz."""
+MOST_INNOVATIONS = 12000
+"""20 a second for ten minutes: position and velocity of a receiver at 10 Hz."""
+CARRIED = ("nav", "status", "health", "consistency", "calibration")
+
+
+@dataclass
+class Heard:
+    """The last message of a topic. `at_s` is when it came, None where the broker had kept it."""
+
+    number: int
+    at_s: float | None
+    said: Any
+    intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
+
+
+class Vehicle:
+    """Takes messages in, in the order of their arrival (`at_s`, seconds of one clock)."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.count = 0
+        self._latest: dict[str, Heard] = {}
+        self._rows: dict[str, deque[tuple[int, list[Any]]]] = {
+            kind: deque(maxlen=most) for kind, most in MOST_ROWS.items()
+        }
+        self._innovations: dict[tuple[str, float], tuple[int, list[Any]]] = {}
+        self._next_row_s = float("-inf")
+        self._received: dict[str, int] = {}
+
+    def take(self, topic: str, said: Any, at_s: float, kept: bool = False) -> None:
+        """A message of `topic`. `kept`: the broker had it, nobody knows here for how long."""
+        if topic == "online":
+            if said in ("online", "offline"):
+                self._put(topic, said, None if kept else at_s)
+        elif not isinstance(said, Mapping):
+            return
+        elif topic == "event":
+            self._row("event", [None if kept else at_s, said])
+        elif topic == "innovation":  # of a recording: one by one
+            self._innovation(said, number(said, "t_ns"), at_s)
+        elif topic == "innovations":
+            self._bundle(said, at_s)
+        elif topic == "reply":
+            self._put(topic, said, at_s)
+        elif topic in CARRIED:
+            self._put(topic, said, None if kept else at_s)
+            self._remember(topic, said, at_s, kept)
+
+    # ------------------------------------------------------------------ what is asked
+
+    def since(self, count: int) -> dict[str, Any]:
+        """All that is newer than `count`: `messages` by topic, `rows` by kind."""
+        messages = {
+            topic: {"at": heard.at_s, "limit": self.limit_s(topic), "said": heard.said}
+            for topic, heard in self._latest.items()
+            if heard.number > count
+        }
+        rows: dict[str, list[list[Any]]] = {}
+        kinds: dict[str, Reversible[tuple[int, list[Any]]]] = {
+            **self._rows,
+            "innovation": self._innovations.values(),
+        }
+        for kind, kept in kinds.items():
+            newer = [row for _, row in takewhile(lambda each: each[0] > count, reversed(kept))]
+            if newer:
+                rows[kind] = newer[::-1]
+        return {"messages": messages, "rows": rows}
+
+    def limit_s(self, topic: str) -> float | None:
+        """Age from which what `topic` said is old, in s; None for what does not age."""
+        least = LIMITS_S.get(topic)
+        if least is None:
+            return None
+        intervals = self._latest[topic].intervals if topic in self._latest else ()
+        return max(least, MISSED * median(intervals)) if intervals else least
+
+    def said(self, topic: str) -> Any:
+        """The last message of a topic, an empty one before the first."""
+        heard = self._latest.get(topic)
+        return {} if heard is None else heard.said
+
+    # ------------------------------------------------------------------ inside
+
+    def _put(self, topic: str, said: Any, at_s: float | None) -> None:
+        self.count += 1
+        before = self._latest.get(topic)
+        heard = Heard(self.count, at_s, said)
+        if before is not None:
+            heard.intervals = before.intervals
+            if at_s is not None and before.at_s is not None:
+                heard.intervals.append(at_s - before.at_s)
+        self._latest[topic] = heard
+
+    def _row(self, kind: str, row: list[Any]) -> None:
+        self.count += 1
+        self._rows[kind].append((self.count, row))
+
+    def _remember(self, topic: str, said: Said, at_s: float, kept: bool) -> None:
+        if topic == "nav":
+            if at_s >= self._next_row_s:
+                self._next_row_s = at_s + ROW_EVERY_S
+                self._row("nav", nav_row(said, at_s))
+            return
+        if topic == "consistency" and not kept:
+            for source, tests in _mappings(said, "sources"):
+                row = [number(tests, key) for key in ("nis_average", "nis_low", "nis_high")]
+                if row[0] is not None:
+                    self._row("nis", [at_s, source, *row])
+        if topic == "health":
+            self._delays(said, None if kept else at_s)
+        if topic in ("status", "health"):
+            said_now = advice(self.said("status"), self.said("health"))
+            if said_now != self.said("advice"):
+                self._put("advice", said_now, at_s)
+
+    def _delays(self, said: Said, at_s: float | None) -> None:
+        """The delay of each fix that was asked for: who counts requests is a terminal."""
+        for source, health in _mappings(said, "sources"):
+            counters = health.get("counters")
+            if not isinstance(counters, Mapping) or "requested" not in counters:
+                continue
+            received, delay_s = health.get("received"), number(health, "latency_s")
+            if received != self._received.get(source) and delay_s is not None:
+                self._row("delay", [at_s, source, delay_s])
+            self._received[source] = received if isinstance(received, int) else 0
+
+    def _bundle(self, said: Said, at_s: float) -> None:
+        """`innovations`: each at the instant of its validity."""
+        innovations, now_ms = said.get("innovations"), number(said, "t_ms")
+        for place, one in enumerate(innovations if isinstance(innovations, list) else ()):
+            if not isinstance(one, Mapping):
+                continue
+            t_ms = number(one, "t_ms")
+            if t_ms is None or now_ms is None:  # no UTC yet: a rewind cannot be told
+                self._innovation(one, -at_s - 1e-6 * place, at_s)
+            else:
+                self._innovation(one, t_ms, at_s - (now_ms - t_ms) / 1000.0)
+
+    def _innovation(self, said: Said, key: float | None, at_s: float) -> None:
+        """A rewind applies an aid again: the last one counts, in its old place. `key` is the
+        instant of its validity."""
+        source, outcome = said.get("source"), said.get("outcome")
+        if not (isinstance(source, str) and isinstance(outcome, str) and key is not None):
+            return
+        _, before = self._innovations.pop((source, key), (0, [at_s]))
+        row = [before[0], source, outcome, number(said, "nis"), number(said, "degrees")]
+        self.count += 1
+        self._innovations[source, key] = self.count, row
+        if len(self._innovations) > MOST_INNOVATIONS:
+            del self._innovations[next(iter(self._innovations))]
+
+
+NAV_COLUMNS = (
+    *("lat_deg", "lon_deg", "height_m", "sd_n_m", "sd_e_m", "sd_d_m", "sd_yaw_deg"),
+    *("v_n_m_s", "v_e_m_s", "yaw_deg"),
+)
+
+
+def nav_row(said: Said, at_s: float) -> list[Any]:
+    """A row of history: arrival, the instant of validity, mode, then `NAV_COLUMNS`."""
+    mode = said.get("mode")
+    head = [at_s, number(said, "t_ms"), mode if isinstance(mode, str) else None]
+    return [*head, *(number(said, name) for name in NAV_COLUMNS)]
+
+
+def number(said: Said, name: str) -> float | None:
+    """A field that is a number, else None."""
+    value = said.get(name)
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _mappings(said: Said, name: str) -> list[tuple[str, Said]]:
+    inner = said.get(name)
+    if not isinstance(inner, Mapping):
+        return []
+    return [(key, value) for key, value in inner.items() if isinstance(value, Mapping)]

@@ -1,0 +1,113 @@
+"""The page and its WebSocket over HTTP: our own files, and nothing that any other host sends.
+
+A page of another site must not read where the vehicle is: its browser names the site in `Origin`,
+and a name that was made to point here (DNS rebinding) stands in `Host`. Both are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.viewer import MOST_VIEWERS, Viewer
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+HEADERS = (
+    (
+        b"content-security-policy",
+        b"default-src 'none'; script-src 'self'; style-src 'self'; "
+        b"connect-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
+        b"frame-ancestors 'none'",
+    ),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"cache-control", b"no-cache"),
+)
+"""Of every answer."""
+
+
+def application(hub: Hub, token: str | None, loopback: bool) -> Starlette:
+    """The application. `loopback`: bound to it, so that no other name for us is right."""
+    static = str(files("fusiond.dashboard").joinpath("static"))
+    viewers: set[Viewer] = set()
+
+    async def index(request: Request) -> FileResponse:
+        return FileResponse(f"{static}/index.html")
+
+    async def watch(socket: WebSocket) -> None:
+        if not of_our_page(socket.headers):
+            await socket.close(1008, "of another site")
+            return
+        if len(viewers) >= MOST_VIEWERS:
+            await socket.close(1013, "too many viewers")
+            return
+        await socket.accept()
+        viewer = Viewer(hub, socket, token)
+        viewers.add(viewer)
+        try:
+            await viewer.run()
+        finally:
+            viewers.discard(viewer)
+
+    return Starlette(
+        routes=[
+            Route("/", index),
+            WebSocketRoute("/watch", watch),
+            Mount("/static", StaticFiles(directory=static, follow_symlink=True)),
+        ],
+        middleware=[Middleware(_Door, loopback=loopback)],
+    )
+
+
+def of_our_page(headers: Mapping[str, str]) -> bool:
+    """Whether no browser asks, or one that shows our own page."""
+    origin = headers.get("origin")
+    return origin is None or urlsplit(origin).netloc == headers.get("host")
+
+
+def host_name(host: str) -> str | None:
+    """The name in a `Host` header, without port and brackets."""
+    try:
+        return urlsplit(f"//{host}").hostname
+    except ValueError:
+        return None
+
+
+class _Door:
+    """Refuses names that are not ours, and puts the headers on every answer."""
+
+    def __init__(self, app: ASGIApp, loopback: bool) -> None:
+        self._app = app
+        self._loopback = loopback
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        host = next(
+            (value.decode("latin-1") for key, value in scope["headers"] if key == b"host"), ""
+        )
+        if self._loopback and host_name(host) not in LOOPBACK:
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008, "reason": "unknown host"})
+            else:
+                await PlainTextResponse("unknown host\n", 421)(scope, receive, send)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *HEADERS]
+            await send(message)
+
+        await self._app(scope, receive, with_headers)

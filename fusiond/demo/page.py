@@ -1,0 +1,61 @@
+"""The demo's dashboard: `fusiond dashboard` on the demo's broker, in a process of its own."""
+
+from __future__ import annotations
+
+import ctypes
+import signal
+import subprocess
+import sys
+from types import TracebackType
+
+from fusiond.demo.broker import DemoError
+
+_END_S = 5.0
+_PR_SET_PDEATHSIG = 1
+
+
+def _end_with_the_demo() -> None:
+    """Ask the kernel for SIGTERM when the parent dies, however it does (prctl(2))."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class DemoPage:
+    """A dashboard process, as a context; `address` is where a browser finds it.
+
+    Raises `DemoError` if it cannot start; why stands on standard error.
+    """
+
+    def __init__(self, broker_port: int) -> None:
+        command = [sys.executable, "-m", "fusiond", "dashboard", "--port", "0"]
+        self._process = subprocess.Popen(
+            [*command, "--mqtt", f"127.0.0.1:{broker_port}"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C goes to the whole terminal; the demo ends in order
+            preexec_fn=_end_with_the_demo,  # noqa: PLW1509 - no thread has begun yet
+        )
+        self.address = ""
+
+    def __enter__(self) -> DemoPage:
+        assert self._process.stdout is not None
+        self.address = self._process.stdout.readline().strip()
+        if not self.address:
+            self._process.wait()
+            raise DemoError("the dashboard did not start; its error stands above")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()

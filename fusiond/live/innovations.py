@@ -1,0 +1,47 @@
+"""How aids ended since it was last asked: what `innovations` says."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from fusiond.clock.clock import Clock
+from fusiond.navigator.timeline import Entry, Key
+from fusiond.outputs.messages.base import stamp
+from fusiond.outputs.messages.innovations import Innovation
+
+MOST = 200
+"""Of one message: positions and velocities of a receiver at 20 Hz for 5 s, 20 kB. The oldest go."""
+
+
+class Innovations:
+    """Takes outcomes in the tick. Constraints that the filter makes by itself are left out: nobody
+    judges them, and they are many."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._ended: dict[Key, Entry] = {}
+
+    def take(self, entry: Entry) -> None:
+        """An aid has ended; one that a rewind brings again is there already."""
+        if entry.aid.constraint:
+            return
+        self._ended[entry.key] = entry
+        if len(self._ended) > MOST:
+            del self._ended[next(iter(self._ended))]
+
+    def since(self) -> list[Innovation]:
+        """All since the last call, by validity."""
+        ended, self._ended = self._ended, {}
+        return [told for key in sorted(ended) if (told := self._told(ended[key])) is not None]
+
+    def _told(self, entry: Entry) -> Innovation | None:
+        outcome = entry.outcome
+        if outcome is None:
+            return None
+        return Innovation(
+            source=entry.aid.source,
+            t_ms=stamp(self._clock.utc_ns(entry.key[0]))[1],
+            outcome=outcome.name,
+            nis=round(outcome.nis, 3) if isfinite(outcome.nis) else None,
+            degrees=outcome.degrees,
+        )

@@ -1,0 +1,36 @@
+"""`innovations`: how the latest aids ended when the filter met them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from fusiond.outputs.messages.base import Count, Message, Number, stamp
+
+
+class Innovation(BaseModel):
+    """One aid. A late measurement rewinds the filter: an aid after it comes again, with the same
+    source and `t_ms`, and the last one counts."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    source: str
+    t_ms: int | None = Field(description="of validity, POSIX milliseconds, UTC")
+    outcome: str = Field(description="`fused`, `gated`, ... as `health` counts them")
+    nis: Number = Field(description="nu^T S^-1 nu; null where there was none")
+    degrees: Count = Field(description="of freedom: what `nis` is expected to be")
+
+
+class InnovationsMessage(Message):
+    """Those since the last message, in the order of their validity."""
+
+    innovations: tuple[Innovation, ...]
+
+
+def innovations_message(
+    utc_ns: int | None, innovations: Iterable[Innovation]
+) -> InnovationsMessage:
+    """`innovations` of what has ended since the last."""
+    t_utc, t_ms = stamp(utc_ns)
+    return InnovationsMessage(t_utc=t_utc, t_ms=t_ms, innovations=tuple(innovations))

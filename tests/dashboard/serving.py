@@ -1,0 +1,109 @@
+"""A dashboard at work on a free port, and browsers made of a WebSocket."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from typing import Any
+
+import websockets
+from websockets.asyncio.client import ClientConnection, connect
+
+from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.serve import Serving, listening, serve
+from fusiond.outputs.topics import TOPICS
+from tests.outputs.messages_examples import EXAMPLES
+from tests.patience import PATIENCE_S
+
+NAMES = [topic.name for topic in TOPICS if topic.name in EXAMPLES]
+
+
+def payload(topic: str, **changed: Any) -> bytes:
+    """The example of docs/mqtt.md with some figures changed."""
+    message = EXAMPLES[topic].model_copy(update=changed)
+    return bytes(message.model_dump_json().encode())
+
+
+def said(topic: str, **changed: Any) -> Any:
+    return json.loads(payload(topic, **changed))
+
+
+async def _nothing() -> None:
+    await asyncio.Event().wait()
+
+
+@asynccontextmanager
+async def at_work(
+    hub: Hub,
+    source: Callable[[], Coroutine[Any, Any, None]] = _nothing,
+    token: str | None = None,
+) -> AsyncIterator[str]:
+    """Its address as HOST:PORT."""
+    serving = Serving(port=0, token=token)
+    door = listening(serving)
+    stop = asyncio.Event()
+    task = asyncio.create_task(serve(hub, source, serving, door, stop))
+    try:
+        yield f"127.0.0.1:{door.getsockname()[1]}"
+        assert not task.done(), task
+    finally:
+        stop.set()
+        await asyncio.wait_for(task, PATIENCE_S)
+
+
+class Browser:
+    """What a page has heard: the last message of each topic, all rows, the last link."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+        self.hello: dict[str, Any] = {}
+        self.frames = 0
+        self.heard: dict[str, dict[str, Any]] = {}
+        self.rows: dict[str, list[Any]] = {}
+        self.last: dict[str, Any] = {}
+        self.answers: list[dict[str, Any]] = []
+
+    def take(self, text: str | bytes) -> None:
+        frame = json.loads(text)
+        if "hello" in frame:
+            self.hello = frame["hello"]
+            return
+        self.frames += 1
+        if frame.get("first"):
+            self.heard, self.rows = {}, {}
+        self.last = frame
+        self.heard.update(frame["messages"])
+        for kind, rows in frame["rows"].items():
+            self.rows.setdefault(kind, []).extend(rows)
+        self.answers += frame["answers"]
+
+    async def until(self, condition: Callable[[Browser], Any]) -> Any:
+        """The first true value of `condition(self)`."""
+        async with asyncio.timeout(PATIENCE_S):
+            while not (value := condition(self)):
+                self.take(await self.connection.recv())
+        return value
+
+    async def ask(self, **request: Any) -> dict[str, Any]:
+        """The answer to a request."""
+        before = len(self.answers)
+        await self.connection.send(json.dumps(request))
+        await self.until(lambda b: len(b.answers) > before)
+        return self.answers[-1]
+
+
+@asynccontextmanager
+async def browsing(address: str, **options: Any) -> AsyncIterator[Browser]:
+    async with connect(f"ws://{address}/watch", **options) as connection:
+        yield Browser(connection)
+
+
+async def refused(address: str, **options: Any) -> int:
+    """The HTTP status with which a WebSocket is refused."""
+    try:
+        async with connect(f"ws://{address}/watch", **options):
+            return 101
+    except websockets.InvalidStatus as error:
+        return error.response.status_code

@@ -1,0 +1,147 @@
+"""What is kept of a vehicle's words, how old it may be, and what a viewer is told of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from fusiond.dashboard.vehicle import LIMITS_S, MOST_INNOVATIONS, MOST_ROWS, ROW_EVERY_S, Vehicle
+from tests.dashboard.serving import NAMES, said
+
+
+def heard(vehicle: Vehicle, count: int = 0) -> dict[str, dict[str, object]]:
+    messages = vehicle.since(count)["messages"]
+    assert isinstance(messages, dict)
+    return messages
+
+
+def test_every_topic_is_taken() -> None:
+    vehicle = Vehicle("truck")
+    vehicle.take("online", "online", 0.5)
+    for k, topic in enumerate(NAMES):
+        vehicle.take(topic, said(topic), 1.0 + k)
+    new = vehicle.since(0)
+    for k, topic in enumerate(NAMES):
+        if topic == "event":
+            assert new["rows"]["event"] == [[1.0 + k, said("event")]]
+        elif topic not in ("tracker", "innovations"):  # `nav` says it better; rows do
+            assert new["messages"][topic]["said"] == said(topic)
+            assert new["messages"][topic]["at"] == 1.0 + k
+    assert new["rows"]["nav"][0][3:5] == [said("nav")["lat_deg"], said("nav")["lon_deg"]]
+    assert [row[1:] for row in new["rows"]["nis"]] == [["rdss", 0.893, 0.7422, 1.2956]]
+    assert new["messages"]["online"]["said"] == "online"
+
+
+def test_only_what_is_new_is_told() -> None:
+    vehicle = Vehicle("truck")
+    vehicle.take("nav", said("nav"), 1.0)
+    vehicle.take("status", said("status"), 1.0)
+    count = vehicle.count
+    assert vehicle.since(count) == {"messages": {}, "rows": {}}
+    vehicle.take("nav", said("nav", height_m=5.0), 1.1)
+    vehicle.take("nav", said("nav", height_m=6.0), 1.0 + ROW_EVERY_S)
+    assert set(heard(vehicle, count)) == {"nav"}
+    assert heard(vehicle, count)["nav"]["said"]["height_m"] == 6.0  # type: ignore[index]
+    assert [row[5] for row in vehicle.since(count)["rows"]["nav"]] == [6.0]
+
+
+def test_what_the_broker_has_kept_has_no_age() -> None:
+    vehicle = Vehicle("truck")
+    vehicle.take("status", said("status"), 100.0, kept=True)
+    vehicle.take("health", said("health"), 100.0, kept=True)
+    vehicle.take("consistency", said("consistency"), 100.0, kept=True)
+    assert heard(vehicle)["status"]["at"] is None
+    assert "nis" not in vehicle.since(0)["rows"]
+    vehicle.take("status", said("status"), 101.0)
+    assert heard(vehicle)["status"]["at"] == 101.0
+
+
+@pytest.mark.parametrize(
+    ("every_s", "limit_s"), [(0.1, LIMITS_S["health"]), (1.0, 3.0), (5.0, 15.0), (10.0, 30.0)]
+)
+def test_a_topic_is_old_after_three_of_its_own_intervals(every_s: float, limit_s: float) -> None:
+    vehicle = Vehicle("truck")
+    for k in range(6):
+        vehicle.take("health", said("health"), k * every_s)
+    assert vehicle.limit_s("health") == pytest.approx(limit_s)
+
+
+def test_a_long_silence_does_not_make_what_comes_later_young() -> None:
+    vehicle = Vehicle("truck")
+    for at_s in (0.0, 0.1, 0.2, 0.3, 600.0, 600.1, 600.2):
+        vehicle.take("nav", said("nav"), at_s)
+    assert vehicle.limit_s("nav") == LIMITS_S["nav"]
+
+
+def test_what_is_no_message_is_left() -> None:
+    vehicle = Vehicle("truck")
+    vehicle.take("nav", [1, 2], 0.0)
+    vehicle.take("online", "maybe", 0.0)
+    vehicle.take("cmd", {"id": "a"}, 0.0)
+    vehicle.take("event", 5, 0.0)
+    assert vehicle.count == 0
+    vehicle.take("nav", {"lat_deg": "here", "mode": 7, "t_ms": True}, 0.0)
+    vehicle.take("health", {"sources": {"gnss": 5, "rdss": {"counters": []}}}, 0.0)
+    vehicle.take("health", {"sources": []}, 1.0)
+    assert vehicle.since(0)["rows"] == {"nav": [[0.0, *[None] * 12]]}
+
+
+def test_history_is_bounded_and_in_order() -> None:
+    vehicle = Vehicle("truck")
+    for k in range(MOST_ROWS["nav"] + 50):
+        vehicle.take("nav", said("nav"), k * ROW_EVERY_S)
+    for k in range(MOST_ROWS["event"] + 5):
+        vehicle.take("event", said("event"), k)
+    rows = vehicle.since(0)["rows"]
+    times = [row[0] for row in rows["nav"]]
+    assert len(times) == MOST_ROWS["nav"]
+    assert times == sorted(times)
+    assert times[-1] == (MOST_ROWS["nav"] + 49) * ROW_EVERY_S
+    assert len(rows["event"]) == MOST_ROWS["event"]
+
+
+def test_each_fix_of_a_terminal_has_one_delay() -> None:
+    vehicle = Vehicle("truck")
+    source = said("health")["sources"]["rdss"]
+
+    def terminal(received: int, latency_s: float) -> dict[str, object]:
+        counters = {"requested": received + 1}
+        rdss = {**source, "received": received, "latency_s": latency_s, "counters": counters}
+        return {"sources": {"rdss": rdss, "gnss": said("health")["sources"]["gnss"]}}
+
+    for k, (received, latency_s) in enumerate([(1, 1.4), (1, 1.4), (2, 0.9), (2, 0.9), (2, 0.9)]):
+        vehicle.take("health", terminal(received, latency_s), float(k))
+    assert vehicle.since(0)["rows"]["delay"] == [[0.0, "rdss", 1.4], [2.0, "rdss", 0.9]]
+
+
+def test_innovations_of_a_bundle_stand_at_their_validity() -> None:
+    vehicle = Vehicle("truck")
+    for at_s in (10.0, 11.0):  # the same two again: a rewind
+        vehicle.take("innovations", said("innovations"), at_s)
+    rows = vehicle.since(0)["rows"]["innovation"]
+    assert [row[1:] for row in rows] == [["gnss", "fused", 2.114, 3], ["rdss", "gated", 31.9, 2]]
+    assert [row[0] for row in rows] == pytest.approx([10.0 - 0.071, 10.0 - 1.42])
+    count = vehicle.count
+    for bad in ({}, {"innovations": 5}, {"t_ms": 1, "innovations": [3, {"source": 1}]}):
+        vehicle.take("innovations", bad, 12.0)
+    assert vehicle.count == count
+
+
+def test_an_innovation_that_comes_again_takes_the_place_of_the_first() -> None:
+    vehicle = Vehicle("truck")
+
+    def innovation(t_ns: int, outcome: str, nis: float | None) -> dict[str, object]:
+        return {"t_ns": t_ns, "source": "gnss", "outcome": outcome, "nis": nis, "degrees": 3}
+
+    vehicle.take("innovation", innovation(1, "gated", 40.0), 1.0)
+    vehicle.take("innovation", innovation(2, "fused", 3.0), 2.0)
+    count = vehicle.count
+    vehicle.take("innovation", innovation(1, "fused", 2.5), 3.0)
+    vehicle.take("innovation", {"source": "gnss"}, 4.0)
+    assert vehicle.since(count)["rows"]["innovation"] == [[1.0, "gnss", "fused", 2.5, 3]]
+    assert vehicle.since(0)["rows"]["innovation"] == [
+        [2.0, "gnss", "fused", 3.0, 3],
+        [1.0, "gnss", "fused", 2.5, 3],
+    ]
+    for t_ns in range(MOST_INNOVATIONS + 100):
+        vehicle.take("innovation", innovation(t_ns, "fused", 1.0), float(t_ns))
+    assert len(vehicle.since(0)["rows"]["innovation"]) == MOST_INNOVATIONS
