@@ -1,8 +1,8 @@
 """The command line. Each command imports what it needs when it runs, so that `--help` is quick.
 
 Exit codes follow sysexits.h: 65 a data file that cannot be used, 69 a package that a command needs
-is not installed, 74 a file that cannot be written, 78 a configuration mistake; 2 a
-wrong command line; 130 after Ctrl-C.
+is not installed or a daemon that does not answer, 74 a file that cannot be written, 78 a
+configuration mistake; 2 a wrong command line; 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from fusiond.commands import live, offline, recordings, reporting, research
+from fusiond.commands.status import status
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
@@ -45,7 +46,7 @@ def _root(
 
 # In the order of `--help`.
 for command in (
-    *(live.run, live.demo, live.check, live.doctor),
+    *(live.run, live.demo, live.check, live.doctor, status),
     *(recordings.replay, reporting.report),
     *(offline.process, offline.calibrate, offline.simulate, offline.compare),
     *(research.schema, research.study, research.model, research.bench),

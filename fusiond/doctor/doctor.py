@@ -298,10 +298,6 @@ async def _broker(config: Config) -> Report:
     except ConfigError as error:
         report.findings.append(str(error))
     except (aiomqtt.MqttError, TimeoutError) as error:
-        why = str(error) or "no answer"
-        if isinstance(error, aiomqtt.MqttCodeError):
-            advice = "[mqtt] username and the password (FUSIOND_MQTT_PASSWORD or password_file)"
-        else:
-            advice = f"is a broker running there (systemctl status mosquitto), is {where} right?"
-        report.findings.append(f"{why}: {advice}")
+        failed = error if isinstance(error, aiomqtt.MqttError) else aiomqtt.MqttError("no answer")
+        report.findings.append(broker_access.advice(failed, m.host, m.port))
     return report
