@@ -150,7 +150,9 @@ def _refused(reasons: dict[str, int]) -> str:
 def _time(seconds: float | None) -> str:
     if seconds is None:
         return _UNKNOWN
-    return f"{seconds * 1e3:.0f} ms" if abs(seconds) < 1.0 else duration(seconds)
+    # What came a moment after the tick that this message is of has a negative age.
+    seconds = max(0.0, seconds)
+    return f"{seconds * 1e3:.0f} ms" if seconds < 1.0 else duration(seconds)
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:

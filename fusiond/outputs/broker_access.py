@@ -80,7 +80,7 @@ def advice(error: aiomqtt.MqttError, host: str, port: int) -> str:
         if "expired" in why or "not yet valid" in why:
             return f"{why}: renew the broker's certificate, or set this computer's clock"
         return f"{why}: set mqtt.ca_file to the authority that signed the broker's certificate"
-    return f"{why}: is a broker running at {where} (systemctl status mosquitto)?"
+    return f"{why}: is a broker running there (systemctl status mosquitto), is {where} right?"
 
 
 def _unusable(key: str, path: Path, error: Exception) -> ConfigError:
