@@ -61,9 +61,12 @@ def check(
 ) -> None:
     """Validate a configuration: 0, or 78 with every mistake.
 
-    With --compile also that the model, with all that its aids add, fits the kernels.
+    What is valid and cannot work is told too, marked with !, and leaves the exit code at 0. With
+    --compile also that the model, with all that its aids add, fits the kernels.
     """
     loaded = load(config)
+    from fusiond.configuration.doubts import doubts  # noqa: PLC0415
+
     if compile_kernels:
         import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
@@ -79,6 +82,8 @@ def check(
     for name, aid in loaded.aiding.items():
         if name not in loaded.sources:
             typer.echo(f"  {name}: aids as {aid.kind}, no source (for `process`)")
+    for doubt in doubts(loaded):
+        typer.echo(f"  ! {doubt}")
 
 
 def doctor(

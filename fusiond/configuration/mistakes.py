@@ -7,6 +7,7 @@ refuses it refuses what pydantic would convert (`"100"` or `true` for a number) 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from math import isfinite
@@ -19,6 +20,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+_SECRET = re.compile("passw|secret|token", re.IGNORECASE)
+"""In the name of a key whose value is not for a log. No key of ours is one."""
 Location = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)
 
@@ -77,7 +80,8 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
     if detail["type"] == "extra_forbidden":
         section = _annotation(model, data, at[:-1])
         known = section.model_fields if _is_model(section) else ()
-        return f"{_equals(value)}: no such key; {did_you_mean(at[-1], known)}"
+        shown = "" if _SECRET.search(str(at[-1])) else _equals(value)
+        return f"{shown}: no such key; {did_you_mean(at[-1], known)}"
     if detail["type"] == "union_tag_not_found":
         kinds = _kinds(_annotation(model, data, at))
         return f": lacks the key kind; allowed: {', '.join(kinds)}"
