@@ -89,9 +89,12 @@ def check(
 def doctor(
     config: ConfigPath,
     seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen.")] = 5.0,
+    transmit: Annotated[
+        bool, typer.Option("--transmit", help="Let an RDSS terminal ask for fixes: it transmits.")
+    ] = False,
 ) -> None:
     """Open every port for some seconds: what arrives, how often, how old, what is wrong."""
     loaded = load(config)
     from fusiond.doctor.doctor import doctor as run_doctor  # noqa: PLC0415
 
-    raise typer.Exit(run_doctor(loaded, seconds))
+    raise typer.Exit(run_doctor(loaded, seconds, transmit))
