@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -46,11 +47,16 @@ def demo(
     from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
 
     try:
-        summary = run_demo(duration, headless or not sys.stdout.isatty(), record)
+        summary = run_demo(duration, headless or not draws(), record)
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
     typer.echo(json.dumps(plain(summary), allow_nan=False))
+
+
+def draws() -> bool:
+    """Whether standard output is a terminal that can be drawn on."""
+    return sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def check(

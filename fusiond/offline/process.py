@@ -68,10 +68,10 @@ def process(
     `systems` are the satellite systems of raw data to use, instead of the configuration's.
     `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` sees the navigator
     each time it has advanced; `progress(done, total)` counts samples. With `smooth` the solution
-    written at each sample is of all measurements, not of those until then. Raises `TableError` for a file that cannot be read as
-    what it is said to be, and for an outage of a source that there is not; `ConfigError` for a
-    filter that cannot be smoothed; `MissingPackageError` for a format whose package is not
-    installed.
+    written at each sample is of all measurements, not of those until then. Raises `TableError` for
+    a file that cannot be read as what it is said to be, and for an outage of a source that there is
+    not; `ConfigError` for a filter that cannot be smoothed; `MissingPackageError` for a format
+    whose package is not installed.
     """
     with _imports_left_alone():
         read = _read(config, imu_path, aids, outages or (), systems, can_log)
