@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from fusiond.commands import live, offline, recordings, reporting, research
+from fusiond.commands import configure, live, offline, recordings, reporting, research
 from fusiond.commands.status import status
 
 app = typer.Typer(
@@ -52,4 +52,5 @@ for command in (
     *(research.schema, research.study, research.model, research.bench),
 ):
     app.command()(command)
+app.add_typer(configure.config, name="config")
 app.add_typer(recordings.log, name="log")
