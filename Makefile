@@ -14,7 +14,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb lock clean \
 	kernels test-packages
 
 help: ## this list
@@ -96,6 +96,12 @@ soak: $(STAMP) test-packages ## the daemon for HOURS of real time, with faults n
 
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)
+
+man: $(STAMP) ## manual pages in build/man: fusiond(1), fusiond.toml(5)
+	$(BIN)/python -m tools.man_pages
+
+deb: $(STAMP) ## a Debian package in build/deb; ARGS="--python /usr/bin/python3"
+	$(BIN)/python -m tools.debian_package $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
 	$(COMPILE) $(TOOLS:%=--extra %) $(ARGS) --output-file requirements-dev.lock pyproject.toml

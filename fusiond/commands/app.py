@@ -7,6 +7,7 @@ configuration mistake; 2 a wrong command line; 130 after Ctrl-C.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
@@ -18,7 +19,8 @@ from fusiond.commands.status import status
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
     no_args_is_help=True,
-    add_completion=False,
+    # Asked for by the shell's script alone (docs/install.md): no option of it clutters `--help`.
+    add_completion="_FUSIOND_COMPLETE" in os.environ,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich" if sys.stdout.isatty() and sys.stderr.isatty() else None,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -22,7 +22,7 @@ ARM = typer.Option(metavar="F,R,D", help="m forward, right, down of the IMU.")
 
 @config.command()
 def init(
-    out: Annotated[Path, typer.Argument(metavar="[CONFIG]", help="File to write.")] = Path(
+    out: Annotated[Path, typer.Argument(metavar="CONFIG", help="File to write.")] = Path(
         "vehicle.toml"
     ),
     vehicle: Annotated[str | None, typer.Option(help="Its name, as in the MQTT topics.")] = None,

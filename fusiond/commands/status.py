@@ -63,7 +63,7 @@ class UnansweredError(Exception):
 def status(
     config: Annotated[
         Path | None,
-        typer.Argument(metavar="[CONFIG]", help="Whose broker and vehicle; localhost if none."),
+        typer.Argument(metavar="CONFIG", help="Whose broker and vehicle; localhost if none."),
     ] = None,
     mqtt: Annotated[
         str | None, typer.Option("--mqtt", metavar="HOST[:PORT]", help="The broker to ask.")
