@@ -14,7 +14,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--no-emit-trusted-host --no-emit-options
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb lock clean \
 	dashboard-check kernels systemd test-packages
 
 help: ## this list
@@ -104,6 +104,12 @@ dashboard-check: $(STAMP) ## the dashboard in Debian's Chromium beside the daemo
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh look
 	@$(BIN)/python -c 'import playwright' 2>/dev/null || $(PIP) install --quiet 'playwright>=1.49'
 	$(BIN)/python benchmarks/dashboard_check.py $(ARGS)
+
+man: $(STAMP) ## manual pages in build/man: fusiond(1), fusiond.toml(5)
+	$(BIN)/python -m tools.man_pages
+
+deb: $(STAMP) ## a Debian package in build/deb; ARGS="--python /usr/bin/python3"
+	$(BIN)/python -m tools.debian_package $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
 	$(COMPILE) $(TOOLS:%=--extra %) $(ARGS) --output-file requirements-dev.lock pyproject.toml

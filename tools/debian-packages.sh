@@ -33,6 +33,7 @@ for purpose in "$@"; do
         need can-utils "candump, to look at a bus by hand"
         need systemd "verifies the unit, and installs and runs it in the test kernel"
         need udev "udevadm, which the installation calls"
+        need groff-base "reads the manual pages"
         need openssl "certificates for the tests of the broker"
         if [ "$(dpkg --print-architecture)" = amd64 ]; then
             need user-mode-linux "a kernel with vcan, for hosts that have none"

@@ -113,6 +113,7 @@ class TerminalOptions:
     request_interval_s: float | None = None
     suppression_hold_s: float = 600.0
     timeout_s: float = 30.0
+    transmit: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,3 +168,5 @@ DETAIL = {
     State.SILENT: "radio silence is set on the terminal: not transmitting until it is lifted",
 }
 """What a state says of itself to an operator."""
+READ_ONLY_DETAIL = "card {card}, {service} s: read only, no fix is asked for; {beams}"
+"""READY without the option `transmit`."""

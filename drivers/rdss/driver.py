@@ -67,6 +67,8 @@ class RdssOptions(DriverOptions):
     """Wanted spacing of requests; the card's service frequency is never undercut."""
     suppression_hold_s: Annotated[float, Field(ge=60.0)] = 600.0
     """After a suppression that nobody lifts, try again after this."""
+    transmit: bool = True
+    """False: the terminal is read, and never asked for a fix, with which it would transmit."""
     timeout_s: Annotated[float, Field(ge=20.0)] = 30.0
     """Nothing intelligible for this long: look again who is there. Reads go out every 10 s."""
 
@@ -111,6 +113,7 @@ class RdssDriver:
                 request_interval_s=options.request_interval_s,
                 suppression_hold_s=options.suppression_hold_s,
                 timeout_s=options.timeout_s,
+                transmit=options.transmit,
             ),
             self.counters,
         )

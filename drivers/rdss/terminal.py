@@ -10,8 +10,9 @@ the actions they return, and `next_deadline_ns`, when to call `tick` next. Only 
               NO_CARD        NO_BEAM            NO_BEAM, HOLDING, SUPPRESSED, SILENT, READY
 
 What is never sent: a lift of radio silence, an emergency request, a request while another is in
-flight, earlier than the card's service frequency and one second after the one before, or while
-the terminal has said that it is suppressed or silent. Figures: PROTOCOLS 1.1 and 1.5.
+flight, earlier than the card's service frequency and one second after the one before, while the
+terminal has said that it is suppressed or silent, or at all without the option `transmit`.
+Figures: PROTOCOLS 1.1 and 1.5.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from drivers.rdss.cycle import (
     POLL_NS,
     POLL_REPLY_NS,
     PROBE_NS,
+    READ_ONLY_DETAIL,
     SECOND,
     TIMEOUTS_ALARM,
     Action,
@@ -137,7 +139,7 @@ class Terminal:
         code = "rdss_request"
         if session.state in IN_FLIGHT:
             return Notice(code, "a request is in flight already")
-        if session.state is not State.READY:
+        if session.state is not State.READY or not self._options.transmit:
             return Notice(code, f"refused: {self.detail}")
         session.pace.asap = True
         return Notice(code, f"request in {self._seconds_to(session.pace.due_ns)} s")
@@ -150,7 +152,10 @@ class Terminal:
         session = self._session
         due = session.deadline_ns
         if session.state is State.READY:
-            due = max(min(session.next_poll_ns, session.pace.due_ns), self._quiet_until_ns)
+            due = session.next_poll_ns
+            if self._options.transmit:
+                due = min(due, session.pace.due_ns)
+            due = max(due, self._quiet_until_ns)
         if due is not None and session.answered:
             due = min(due, session.heard_ns + int(self._options.timeout_s * SECOND))
         return due
@@ -190,6 +195,8 @@ class Terminal:
         """What it is doing, in words."""
         session = self._session
         words = DETAIL[session.state]
+        if session.state is State.READY and not self._options.transmit:
+            words = READ_ONLY_DETAIL
         return words.format(
             baud=self.baud,
             families=" and ".join(self._options.families),
@@ -252,6 +259,8 @@ class Terminal:
         session = self._session
         if t_ns >= session.next_poll_ns:
             self._poll(t_ns, actions)
+        elif not self._options.transmit:
+            return
         elif session.levels_ns is None or t_ns - session.levels_ns > BEAMS_STALE_NS:
             session.proceed(t_ns)
         else:

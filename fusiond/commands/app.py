@@ -1,24 +1,27 @@
 """The command line. Each command imports what it needs when it runs, so that `--help` is quick.
 
 Exit codes follow sysexits.h: 65 a data file that cannot be used, 69 a package that a command needs
-is not installed, 74 a file that cannot be written, 78 a configuration mistake; 2 a
-wrong command line; 130 after Ctrl-C.
+is not installed or a daemon that does not answer, 74 a file that cannot be written, 78 a
+configuration mistake; 2 a wrong command line; 130 after Ctrl-C.
 """
 
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from typing import Annotated
 
 import typer
 
-from fusiond.commands import dashboard, live, offline, recordings, reporting, research
+from fusiond.commands import configure, dashboard, live, offline, recordings, reporting, research
+from fusiond.commands.status import status
 
 app = typer.Typer(
     help="Inertial navigation aided by BeiDou RDSS and GNSS.",
     no_args_is_help=True,
-    add_completion=False,
+    # Asked for by the shell's script alone (docs/install.md): no option of it clutters `--help`.
+    add_completion="_FUSIOND_COMPLETE" in os.environ,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich" if sys.stdout.isatty() and sys.stderr.isatty() else None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -52,10 +55,11 @@ def _root(
 
 # In the order of `--help`.
 for command in (
-    *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor),
+    *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor, status),
     *(recordings.replay, reporting.report),
     *(offline.process, offline.calibrate, offline.simulate, offline.compare),
     *(research.schema, research.study, research.model, research.bench),
 ):
     app.command()(command)
+app.add_typer(configure.config, name="config")
 app.add_typer(recordings.log, name="log")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -49,11 +50,16 @@ def demo(
     from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
 
     try:
-        summary = run_demo(duration, headless or not sys.stdout.isatty(), record, dashboard)
+        summary = run_demo(duration, headless or not draws(), record, dashboard)
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
     typer.echo(json.dumps(plain(summary), allow_nan=False))
+
+
+def draws() -> bool:
+    """Whether standard output is a terminal that can be drawn on."""
+    return sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def check(
@@ -64,9 +70,12 @@ def check(
 ) -> None:
     """Validate a configuration: 0, or 78 with every mistake.
 
-    With --compile also that the model, with all that its aids add, fits the kernels.
+    What is valid and cannot work is told too, marked with !, and leaves the exit code at 0. With
+    --compile also that the model, with all that its aids add, fits the kernels.
     """
     loaded = load(config)
+    from fusiond.configuration.doubts import doubts  # noqa: PLC0415
+
     if compile_kernels:
         import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
         from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
@@ -82,14 +91,19 @@ def check(
     for name, aid in loaded.aiding.items():
         if name not in loaded.sources:
             typer.echo(f"  {name}: aids as {aid.kind}, no source (for `process`)")
+    for doubt in doubts(loaded):
+        typer.echo(f"  ! {doubt}")
 
 
 def doctor(
     config: ConfigPath,
     seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen.")] = 5.0,
+    transmit: Annotated[
+        bool, typer.Option("--transmit", help="Let an RDSS terminal ask for fixes: it transmits.")
+    ] = False,
 ) -> None:
     """Open every port for some seconds: what arrives, how often, how old, what is wrong."""
     loaded = load(config)
     from fusiond.doctor.doctor import doctor as run_doctor  # noqa: PLC0415
 
-    raise typer.Exit(run_doctor(loaded, seconds))
+    raise typer.Exit(run_doctor(loaded, seconds, transmit))

@@ -80,8 +80,18 @@ def process(
 
     wanted = _systems_argument(systems)
     try:
-        with config_errors(), data_errors(), spinner("processing"):
-            result = run_process(loaded, imu, aids, outages, out, wanted, can, smooth=smooth)
+        with config_errors(), data_errors(), progress_bar("processing") as bar:
+            result = run_process(
+                loaded,
+                imu,
+                aids,
+                outages,
+                out,
+                wanted,
+                can,
+                smooth=smooth,
+                progress=bar or (lambda done, total: None),
+            )
     except MissingPackageError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
@@ -236,12 +246,15 @@ def _print_summary(result: dict[str, Any], err: bool) -> None:
     rows = result["solution_rows"]
     if not rows:
         return
+    for line in result["apart"]:
+        typer.echo(f"! {line}", err=err)
     how = result["aligned"] or "lost again"
     typer.echo(f"aligned at {result['solution_from_s']:.3f} s: {how}", err=err)
     samples = result["files"]["imu"]
     used = samples["rows"] - sum(samples["rejected"].values())
     modes = ", ".join(f"{n} {mode}" for mode, n in result["solution_modes"].items())
-    typer.echo(f"solution: {rows} of {used} samples: {modes}", err=err)
+    share = 100.0 * rows / used
+    typer.echo(f"solution: {rows} of {used} samples: {modes} ({share:.1f} %)", err=err)
     if "smoothed" in result:
         smoothed = result["smoothed"]
         starts = f", by {smoothed['starts']} starts" if smoothed["starts"] > 1 else ""

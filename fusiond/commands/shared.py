@@ -24,6 +24,20 @@ JsonPath = Annotated[
 ]
 
 
+def parse_mqtt(text: str) -> tuple[str, int]:
+    """Host and port of HOST, HOST:PORT or [IPV6]:PORT. Raises `typer.BadParameter`."""
+    from urllib.parse import urlsplit  # noqa: PLC0415
+
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if not host or parts.path or "@" in text:
+        raise typer.BadParameter(f"--mqtt {text}: HOST, HOST:PORT or [IPV6]:PORT")
+    return host, 1883 if port is None else port
+
+
 @contextmanager
 def config_errors() -> Iterator[None]:
     """Every mistake of a configuration on standard error, and exit 78."""

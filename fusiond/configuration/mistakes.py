@@ -7,6 +7,7 @@ refuses it refuses what pydantic would convert (`"100"` or `true` for a number) 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from difflib import get_close_matches
 from math import isfinite
@@ -19,6 +20,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+_SECRET = re.compile("passw|secret|token", re.IGNORECASE)
+"""In the name of a key whose value is not for a log. No key of ours is one."""
 Location = tuple[str | int, ...]
 M = TypeVar("M", bound=BaseModel)
 
@@ -77,7 +80,8 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
     if detail["type"] == "extra_forbidden":
         section = _annotation(model, data, at[:-1])
         known = section.model_fields if _is_model(section) else ()
-        return f"{_equals(value)}: no such key; {did_you_mean(at[-1], known)}"
+        shown = "" if _SECRET.search(str(at[-1])) else _equals(value)
+        return f"{shown}: no such key; {did_you_mean(at[-1], known)}"
     if detail["type"] == "union_tag_not_found":
         kinds = _kinds(_annotation(model, data, at))
         return f": lacks the key kind; allowed: {', '.join(kinds)}"
@@ -87,7 +91,7 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
     if detail["type"] in ("value_error", "assertion_error"):
         return f"{_equals(value)}: {detail['msg'].partition(', ')[2]}"
     annotation = _annotation(model, data, at)
-    expected = _described(annotation)
+    expected = described(annotation)
     if detail["type"] == "missing":
         return f": missing; expected {expected}"
     arms = _arms(annotation)
@@ -97,21 +101,21 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
     return f"{_equals(value)}: expected {expected}"
 
 
-def _described(annotation: Any) -> str:
+def described(annotation: Any) -> str:
     """What a value of this type looks like in the file."""
     base, constraints = _unpacked(annotation)
     origin = get_origin(base)
     if origin in (Union, UnionType):
         arms = [arm for arm in get_args(base) if arm is not NoneType]
-        return " or ".join(dict.fromkeys(map(_described, arms)))
+        return " or ".join(dict.fromkeys(map(described, arms)))
     if origin is Literal:
         choices = [json.dumps(choice) for choice in get_args(base)]
         return choices[0] if len(choices) == 1 else "one of " + ", ".join(choices)
     if origin in (tuple, list):
         args = get_args(base)
         if origin is list or args[-1] is Ellipsis:
-            return f"a list, each {_described(args[0])}"
-        return f"a list of {len(args)}, each {_described(args[0])}"
+            return f"a list, each {described(args[0])}"
+        return f"a list of {len(args)}, each {described(args[0])}"
     if base is bool:
         return "true or false"
     if base in (int, float):
@@ -242,7 +246,7 @@ def _converted(model: type[BaseModel], data: Any, at: Location) -> Iterator[tupl
         elif isinstance(value, float) and not isfinite(value):
             yield at, f"{_equals(value).lower()}: expected a finite number"
         elif _is_converted(annotation, value):
-            yield at, f"{_equals(value)}: expected {_described(annotation)}"
+            yield at, f"{_equals(value)}: expected {described(annotation)}"
 
     yield from walk(model, data, at)
 

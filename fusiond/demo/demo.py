@@ -31,6 +31,7 @@ from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config, Source
 from fusiond.demo.broker import DemoBroker
 from fusiond.demo.page import DemoPage
+from fusiond.demo.story import story
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -136,6 +137,7 @@ class _Run:
             rdss_link=links[1],
         )
         self._score = Score()
+        self._without_gnss: list[tuple[float, float]] = []
         self._daemon = Daemon(config, on_solution=self._on_solution)
         self._live = live
         self._view = view
@@ -171,6 +173,7 @@ class _Run:
             await asyncio.gather(*others, ended, return_exceptions=True)
             await asyncio.wait([daemon])
         daemon.result()
+        self._tell()
         return self._summary(duration_s)
 
     def _on_solution(self, solution: Solution) -> None:
@@ -216,10 +219,12 @@ class _Run:
             start = started + number * OUTAGE_EVERY_S + OUTAGE_START_S
             await asyncio.sleep(start - loop.time())
             self._vehicle.unplug("gnss")
+            pulled_s = time.monotonic()
             self._live.outage_until = time.monotonic() + OUTAGE_S
             await asyncio.sleep(start + OUTAGE_S - loop.time())
             self._vehicle.plug("gnss")
             self._live.outage_until = None
+            self._without_gnss.append((pulled_s, time.monotonic()))
         await asyncio.Event().wait()
 
     def _summary(self, duration_s: float) -> dict[str, Any]:
@@ -241,6 +246,14 @@ class _Run:
             "rejected_by_source": {name: source.rejected for name, source in health.items()},
         }
 
+    def _tell(self) -> None:
+        """What happened, on standard error: the last line of the output is the summary."""
+        t_s, error_m, sigma_m = self._score.horizontal(self._vehicle)
+        start_s = self._vehicle.start_ns * 1e-9
+        outages = [(begin - start_s, end - start_s) for begin, end in self._without_gnss]
+        for sentence in story(t_s, error_m, sigma_m, outages):
+            print(sentence, file=sys.stderr)
+
 
 class Score:
     """Solutions of the running daemon, ten a second, to compare with the truth at the end."""
@@ -257,6 +270,15 @@ class Score:
         p = covariance
         cov = float(p[6, 6]), float(p[6, 7]), float(p[7, 7])
         self._rows.append((s.t_ns, s.lat_rad, s.lon_rad, s.height_m, s.rpy_rad[2], *cov))
+
+    def horizontal(self, vehicle: SimulatedVehicle) -> tuple[Array, Array, Array]:
+        """Instants on the vehicle's clock (s), true horizontal errors and one sigma (m), (n,)."""
+        rows = np.array([r[1:] for r in self._rows]).reshape(-1, 7)
+        t_s = np.array([r[0] - vehicle.start_ns for r in self._rows]) * 1e-9
+        if not len(t_s):
+            return t_s, t_s, t_s
+        error = ned_error(rows[:, :3], vehicle.truth.at(t_s).position)[:, :2]
+        return t_s, np.linalg.norm(error, axis=1), np.sqrt(rows[:, 4] + rows[:, 6])
 
     def against(self, vehicle: SimulatedVehicle) -> dict[str, float | None]:
         """`horizontal_rms_m`, `yaw_rms_deg`, `nees`."""

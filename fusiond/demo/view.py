@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, TextIO
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -21,6 +22,8 @@ WIDE = 112
 """Columns from which the two tables stand side by side."""
 RATE_WINDOW_S = 5.0
 _EVENTS = 40
+_LEAST_EVENTS = 3
+"""Lines for events on a small terminal: what the parts of the filter do gives way to them."""
 _SWITCH_INTERVAL_S = 0.0005
 """Rendering takes about 10 ms in a thread; this is how long a tick waits for the interpreter."""
 _MODE_STYLE = {
@@ -32,18 +35,20 @@ _MODE_STYLE = {
 }
 _STATE_STYLE = {"running": "green", "starting": "yellow", "silent": "yellow"}
 _LEVEL_STYLE = {"warning": "yellow", "error": "red"}
-# label, field of `nav`, decimals, unit, field of its sigma
-_ROWS = (
-    ("latitude", "lat_deg", 7, "°", "sd_n_m", "m"),
-    ("longitude", "lon_deg", 7, "°", "sd_e_m", "m"),
-    ("height", "height_m", 2, "m", "sd_d_m", "m"),
-    ("v north", "v_n_m_s", 3, "m/s", "sd_vn_m_s", "m/s"),
-    ("v east", "v_e_m_s", 3, "m/s", "sd_ve_m_s", "m/s"),
-    ("v down", "v_d_m_s", 3, "m/s", "sd_vd_m_s", "m/s"),
-    ("roll", "roll_deg", 2, "°", "sd_roll_deg", "°"),
-    ("pitch", "pitch_deg", 2, "°", "sd_pitch_deg", "°"),
-    ("yaw", "yaw_deg", 2, "°", "sd_yaw_deg", "°"),
+_Row = tuple[int, str, str, int, str, str, str]
+# place among the true errors, label, field of `nav`, decimals, unit, field of its sigma, its unit
+_ROWS: tuple[_Row, ...] = (
+    (0, "latitude", "lat_deg", 7, "°", "sd_n_m", "m"),
+    (1, "longitude", "lon_deg", 7, "°", "sd_e_m", "m"),
+    (2, "height", "height_m", 2, "m", "sd_d_m", "m"),
+    (3, "v north", "v_n_m_s", 3, "m/s", "sd_vn_m_s", "m/s"),
+    (4, "v east", "v_e_m_s", 3, "m/s", "sd_ve_m_s", "m/s"),
+    (5, "v down", "v_d_m_s", 3, "m/s", "sd_vd_m_s", "m/s"),
+    (6, "roll", "roll_deg", 2, "°", "sd_roll_deg", "°"),
+    (7, "pitch", "pitch_deg", 2, "°", "sd_pitch_deg", "°"),
+    (8, "yaw", "yaw_deg", 2, "°", "sd_yaw_deg", "°"),
 )
+_WITHOUT_VELOCITY = tuple(row for row in _ROWS if not row[1].startswith("v "))
 _MADE_INSIDE = "made by the filter or part of another source"
 
 
@@ -172,17 +177,20 @@ class Screen:
         width, height = options.max_width, console.height
         live = self._live
         head: list[RenderableType] = [self._title(), self._mode(), Rule(style="dim")]
-        solution, sources = self._solution(), self._sources()
-        if width >= WIDE:
-            body = Table.grid(padding=(0, 2))
-            body.add_row(solution, sources)
-            used = len(head) + max(solution.row_count, sources.row_count) + 1
-            parts = [*head, body]
-        else:
-            used = len(head) + solution.row_count + sources.row_count + 2
-            parts = [*head, solution, sources]
         foot = self._foot()
-        room = height - used - len(foot) - 1
+        for inside, rows in ((True, _ROWS), (False, _ROWS), (False, _WITHOUT_VELOCITY)):
+            solution, sources = self._solution(rows), self._sources(inside)
+            if width >= WIDE:
+                body = Table.grid(padding=(0, 2))
+                body.add_row(solution, sources)
+                used = len(head) + max(solution.row_count, sources.row_count) + 1
+                parts = [*head, body]
+            else:
+                used = len(head) + solution.row_count + sources.row_count + 2
+                parts = [*head, solution, sources]
+            room = height - used - len(foot) - 1
+            if room >= _LEAST_EVENTS:
+                break
         events = list(live.events)[-room:] if room > 0 else []
         if events:
             parts += [Rule("events", style="dim", align="left"), *map(self._event, events)]
@@ -204,7 +212,7 @@ class Screen:
         text.append(f"  {live.status.get('why', '')}")
         return text
 
-    def _solution(self) -> Table:
+    def _solution(self, rows: Sequence[_Row]) -> Table:
         table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="dim")
         table.add_column("solution", min_width=9, no_wrap=True)
         table.add_column("", min_width=13, justify="right", no_wrap=True)
@@ -212,21 +220,21 @@ class Screen:
         table.add_column("true error", min_width=11, justify="right", no_wrap=True)
         table.add_column("ratio", justify="right", no_wrap=True)
         nav, errors = self._live.nav, self._live.errors
-        for row, (label, key, digits, unit, sd_key, sd_unit) in enumerate(_ROWS):
+        for place, label, key, digits, unit, sd_key, sd_unit in rows:
             value, sd = nav.get(key), nav.get(sd_key)
             if value is None or sd is None:
                 table.add_row(label, "-", "-", "-", "-")
                 continue
             error = ratio = Text("-")
             if errors:
-                size = abs(errors[row]) / sd if sd > 0.0 else float("inf")
+                size = abs(errors[place]) / sd if sd > 0.0 else float("inf")
                 style = "green" if size <= 2.0 else "yellow" if size <= 3.0 else "red"
-                error = Text(f"{errors[row]:+.3f} {sd_unit}")
+                error = Text(f"{errors[place]:+.3f} {sd_unit}")
                 ratio = Text(f"{size:.1f}", style=style)
             table.add_row(label, f"{value:.{digits}f} {unit}", f"{sd:.3f} {sd_unit}", error, ratio)
         return table
 
-    def _sources(self) -> Table:
+    def _sources(self, with_inside: bool) -> Table:
         table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="dim")
         table.add_column("source", min_width=13, no_wrap=True)
         table.add_column("state", min_width=8, no_wrap=True)
@@ -236,6 +244,8 @@ class Screen:
         table.add_column("age", min_width=6, justify="right", no_wrap=True)
         for name, source in self._live.health.get("sources", {}).items():
             inside = source["detail"] == _MADE_INSIDE
+            if inside and not with_inside:
+                continue
             state = "" if inside else source["state"]
             table.add_row(
                 Text(name, style="dim" if inside else ""),

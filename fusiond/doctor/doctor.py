@@ -1,7 +1,8 @@
 """`fusiond doctor`: opens every port through its own driver for some seconds; what is wrong.
 
 Each finding names the symptom and what would do; the exit status is 0 when there is none. Nothing
-is sent but what the daemon itself would send (an RDSS terminal is asked who it is, and for fixes).
+is sent but what the daemon itself would send: an RDSS terminal is asked who it is and how it hears
+its satellites, and for fixes, with which it transmits, only if that is wanted.
 """
 
 from __future__ import annotations
@@ -24,13 +25,12 @@ from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
+from fusiond.doctor.values import KEPT, Values
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.outputs import broker_access
 
 Array = NDArray[np.float64]
 
-KEPT = 20_000
-"""Measurements of a kind remembered for rate and age: 20 s of an IMU at 1 kHz."""
 BURST_S = 0.1
 """What comes within one read of a line, such as all ephemerides, has no rate."""
 MAX_TILT_DEG = 30.0
@@ -51,8 +51,10 @@ _SHOWN_EVENTS = 6
 
 @dataclass(slots=True)
 class Kind:
-    """Arrivals of one kind of measurement: monotonic ns, and s from validity to arrival."""
+    """Arrivals of one kind of measurement: monotonic ns, s from validity to arrival, and what they
+    say."""
 
+    values: Values
     seen_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
     age_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT))
     count: int = 0
@@ -83,8 +85,9 @@ class Heard:
         if isinstance(item, DeviceEvent):
             self.events.append(f"{item.code}: {item.text}")
             return
-        kind = self.kinds.setdefault(type(item).__name__, Kind())
+        kind = self.kinds.setdefault(type(item).__name__, Kind(Values(type(item))))
         kind.count += 1
+        kind.values.take(item)
         kind.seen_ns.append(item.t_seen_ns)
         if isinstance(item, TimeReport):
             self._clock.report(item)
@@ -106,17 +109,22 @@ class Report:
     findings: list[str] = field(default_factory=list)
 
 
-def doctor(config: Config, seconds: float) -> int:
-    """Listen for `seconds`, print the report; 0 when all is well, 1 otherwise."""
-    return asyncio.run(examine(config, seconds, sys.stdout))
+def doctor(config: Config, seconds: float, transmit: bool = False) -> int:
+    """Listen for `seconds`, print the report; 0 when all is well, 1 otherwise.
+
+    With `transmit` an RDSS terminal is asked for fixes, too.
+    """
+    return asyncio.run(examine(config, seconds, sys.stdout, transmit))
 
 
-async def examine(config: Config, seconds: float, out: TextIO) -> int:
+async def examine(config: Config, seconds: float, out: TextIO, transmit: bool = False) -> int:
     """`doctor` inside a running loop."""
     clock = Clock(config.clock)
     sources: list[Heard] = []
     for name, section in config.sources.items():
         options = driver_entry_points()[section.driver].load().Options(**section.options)
+        if not transmit and "transmit" in type(options).model_fields:
+            options = options.model_copy(update={"transmit": False})
         sources.append(Heard(name, section.driver, options, clock))
     broker = asyncio.create_task(_broker(config))
     tasks = [asyncio.create_task(s.driver.run(), name=s.name) for s in sources]
@@ -151,6 +159,7 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
     report = Report(title + (f" ({status.detail})" if status.detail else ""))
     for name, kind in heard.kinds.items():
         report.facts.append(_kind_line(name, kind))
+        report.facts += [f"  {line}" for line in kind.values.lines()]
     report.facts += list(dict.fromkeys(heard.events))[-_SHOWN_EVENTS:]
     counters = {name: count for name, count in heard.driver.counters.items() if count}
     if counters:
@@ -298,10 +307,6 @@ async def _broker(config: Config) -> Report:
     except ConfigError as error:
         report.findings.append(str(error))
     except (aiomqtt.MqttError, TimeoutError) as error:
-        why = str(error) or "no answer"
-        if isinstance(error, aiomqtt.MqttCodeError):
-            advice = "[mqtt] username and the password (FUSIOND_MQTT_PASSWORD or password_file)"
-        else:
-            advice = f"is a broker running there (systemctl status mosquitto), is {where} right?"
-        report.findings.append(f"{why}: {advice}")
+        failed = error if isinstance(error, aiomqtt.MqttError) else aiomqtt.MqttError("no answer")
+        report.findings.append(broker_access.advice(failed, m.host, m.port))
     return report

@@ -1,8 +1,8 @@
 """Numeric CSV tables with a header row: read fast, and name every row that cannot be true.
 
-Plain decimals are read by a compiled reader, other numbers by numpy's. Where both stumble (an empty
-cell, a word, a cut line, a blank line), each row is read with care instead, so that what is refused
-carries its line and the reason.
+`fusiond.files.dialect` makes one dialect of several. Plain decimals are read by a compiled reader,
+other numbers by numpy's. Where both stumble (an empty cell, a word, a cut line, a blank line), each
+row is read with care instead, so that what is refused carries its line and the reason.
 
 Reasons: `columns` (more or fewer cells than the header), `unreadable` (not a number), `missing`
 (empty where the value must be known), `not_finite` (nan or inf), `out_of_range`,
@@ -16,13 +16,15 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from io import BytesIO, TextIOWrapper
 from math import inf, isfinite, nan
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.files.dialect import DialectError, plain_csv
 from fusiond.files.fixed_decimal import parse_rows
 
 Floats = NDArray[np.float64]
@@ -116,14 +118,17 @@ def read_table(
     """
     path = Path(path)
     try:
-        with path.open(encoding="utf-8-sig") as stream:
-            header = [cell.strip() for cell in stream.readline().split(",")]
-            _check_header(path, header, columns)
-            parsed = None if text else _read_plain(path, header)
-            if parsed is None:
-                parsed = _read_clean(path, header, text)
-            if parsed is None:
-                parsed = _read_with_care(stream, header, columns, text)
+        data = plain_csv(path)
+        stream = _as_text(data)
+        header = [cell.strip() for cell in stream.readline().split(",")]
+        _check_header(path, header, columns)
+        parsed = None if text else _read_plain(data, header)
+        if parsed is None:
+            parsed = _read_clean(data, header, text)
+        if parsed is None:
+            parsed = _read_with_care(stream, header, columns, text)
+    except DialectError as error:
+        raise TableError(f"{path}: {error}") from error
     except OSError as error:
         raise TableError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
@@ -162,9 +167,12 @@ def _check_header(path: Path, header: list[str], columns: Sequence[Column]) -> N
         raise TableError(f"{path}, line 1: lacks {', '.join(lacking)}; it has {', '.join(header)}")
 
 
-def _read_plain(path: Path, header: list[str]) -> _Parsed | None:
+def _as_text(data: bytearray) -> TextIO:
+    return TextIOWrapper(BytesIO(data), encoding="utf-8-sig")
+
+
+def _read_plain(data: bytearray, header: list[str]) -> _Parsed | None:
     """A file of plain decimals, such as this project writes; None if there is anything else."""
-    data = bytearray(path.read_bytes())
     start = data.find(b"\n") + 1
     rows = data.count(b"\n", start) + (not data.endswith(b"\n"))
     if not start or start == len(data):
@@ -176,17 +184,12 @@ def _read_plain(path: Path, header: list[str]) -> _Parsed | None:
     return dict(zip(header, values, strict=True)), {}, lines, []
 
 
-def _read_clean(path: Path, header: list[str], text: Sequence[str]) -> _Parsed | None:
+def _read_clean(data: bytearray, header: list[str], text: Sequence[str]) -> _Parsed | None:
     """The whole file through numpy's C reader; None if anything in it asks for a closer look."""
-    with path.open("rb") as raw:
-        newlines, last = 0, b"\n"
-        while block := raw.read(1 << 20):
-            newlines += block.count(b"\n")
-            last = block[-1:]
-    rows = newlines - 1 + (last != b"\n")
+    rows = data.count(b"\n") - 1 + (not data.endswith(b"\n"))
     if rows <= 0:
         return None
-    with path.open(encoding="utf-8-sig") as stream:
+    with _as_text(data) as stream:
         stream.readline()
         try:
             if text:

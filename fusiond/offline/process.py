@@ -34,7 +34,7 @@ from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import READERS, Arrival, source_of
 from fusiond.offline.outages import Outage, named, withheld
-from fusiond.offline.reasons import FileRead, nothing_navigated, wrong_units
+from fusiond.offline.reasons import FileRead, apart, nothing_navigated, wrong_units
 from fusiond.offline.rows import Rows, RowsWriter
 
 if TYPE_CHECKING:
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 # this spacing, and memory stays bounded.
 CHUNK = 512
 _SHOWN = 20
+_TOLD_EVERY = 2000
+"""Samples between two words on the progress: some tenths of a second of work."""
 
 
 def process(
@@ -56,6 +58,7 @@ def process(
     can_log: Path | None = None,
     watch: Callable[[Navigator], None] = lambda navigator: None,
     smooth: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Navigate through the files; returns rows, rejections, outcomes by source and the end state.
 
@@ -63,15 +66,15 @@ def process(
     Samples whose units cannot be what the columns say are not navigated, and no `out` is written.
     `systems` are the satellite systems of raw data to use, instead of the configuration's.
     `can_log` is the bus of the sources on CAN, in place of `imu_path`. `watch` sees the navigator
-    each time it has advanced. With `smooth` the solution written at each sample is of all
-    measurements, not of those until then. Raises `TableError` for a file that cannot be read as
-    what it is said to be, and for an outage of a source that there is not; `ConfigError` for a
-    filter that cannot be smoothed; `MissingPackageError` for a format whose package is not
-    installed.
+    each time it has advanced; `progress(done, total)` counts samples. With `smooth` the solution
+    written at each sample is of all measurements, not of those until then. Raises `TableError` for
+    a file that cannot be read as what it is said to be, and for an outage of a source that there is
+    not; `ConfigError` for a filter that cannot be smoothed; `MissingPackageError` for a format
+    whose package is not installed.
     """
     with _imports_left_alone():
         read = _read(config, imu_path, aids, outages or (), systems, can_log)
-        return _process(read, out, watch, smooth)
+        return _process(read, out, watch, smooth, progress)
 
 
 @contextmanager
@@ -152,7 +155,11 @@ def _imu_read(imu: ImuTable) -> FileRead:
 
 
 def _process(
-    read: _Read, out: Path | None, watch: Callable[[Navigator], None], smooth: bool
+    read: _Read,
+    out: Path | None,
+    watch: Callable[[Navigator], None],
+    smooth: bool,
+    progress: Callable[[int, int], None],
 ) -> dict[str, Any]:
     config, imu, arrivals, events = read.config, read.imu, read.arrivals, read.events
     navigator = Navigator(
@@ -165,7 +172,7 @@ def _process(
     smoothed = _smoothed(navigator, writer) if smooth and writer is not None else None
     recorder = _Recorder(navigator, writer, smoothed, watch)
     if why is None:
-        _run(navigator, imu, arrivals, recorder)
+        _run(navigator, imu, arrivals, recorder, progress)
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     if why is None and not recorder.rows:
         why = nothing_navigated(read.files, navigator.refused, reason)
@@ -178,6 +185,7 @@ def _process(
         "solution_modes": dict(recorder.modes),
         "solution_from_s": recorder.first_s,
         "why": why,
+        "apart": apart(read.files),
         "aligned": None if navigator.started is None else navigator.started.how,
         "mode": str(mode),
         "reason": reason,
@@ -259,7 +267,13 @@ def _valid_ns(m: Measurement | RawGnssEpoch) -> int:
     return stamp.t_ns
 
 
-def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], recorder: _Recorder) -> None:
+def _run(
+    navigator: Navigator,
+    imu: ImuTable,
+    arrivals: list[Arrival],
+    recorder: _Recorder,
+    progress: Callable[[int, int], None],
+) -> None:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
     samples = np.hstack([imu.gyro, imu.accel])
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
@@ -267,7 +281,7 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], recorder:
     breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
     late = [_is_late(a, navigator.config) for a in arrivals]
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
-    done = given = 0
+    done = given = told = 0
     while done < len(times) or given < len(arrivals):
         # Samples up to the next arrival that must find the filter where it then stood. One that is
         # valid when it comes need not: the timeline keeps it until the samples reach it.
@@ -286,6 +300,9 @@ def _run(navigator: Navigator, imu: ImuTable, arrivals: list[Arrival], recorder:
         navigator.advance(record=True)
         recorder.take()
         given, done = ahead, upto
+        if done - told >= _TOLD_EVERY:
+            told = done
+            progress(done, len(times))
         if given < len(arrivals) and breaks[given] <= done and (alone or late[given]):
             _give(navigator, arrivals[given])
             given += 1

@@ -78,12 +78,24 @@ def nothing_navigated(
     (imu_name, imu), *aids = files.items()
     if not aids:
         return f"no aid was given: {reason}"
-    apart = [f"{name} from {_span(file)}" for name, file in aids if not _overlap(imu, file)]
-    if len(apart) == len(aids):
-        ranges = " and ".join(apart)
+    others = [f"{name} from {_span(file)}" for name, file in aids if not _overlap(imu, file)]
+    if len(others) == len(aids):
+        ranges = " and ".join(others)
         return f"no time in common: {imu_name} from {_span(imu)}, {ranges}"
     kept = [f"{n} of {source} {name}" for source, o in refused.items() for name, n in o.items()]
     return f"{reason} ({', '.join(kept)})" if kept else reason
+
+
+def apart(files: Mapping[str, FileRead]) -> list[str]:
+    """A line for each aid whose times have nothing in common with the IMU's, which come first."""
+    if not files:
+        return []
+    (imu_name, imu), *aids = files.items()
+    return [
+        f"{name} from {_span(file)}: no time in common with {imu_name}, from {_span(imu)}"
+        for name, file in aids
+        if not _overlap(imu, file)
+    ]
 
 
 def _refused_rows(name: str, file: FileRead) -> str:

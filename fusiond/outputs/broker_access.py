@@ -7,6 +7,8 @@ import ssl
 from collections.abc import Mapping
 from pathlib import Path
 
+import aiomqtt
+
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Mqtt
 
@@ -64,6 +66,21 @@ def tls_context(options: Mqtt) -> ssl.SSLContext | None:
         except OSError as error:
             raise _unusable("cert_file", options.cert_file, error) from error
     return context
+
+
+def advice(error: aiomqtt.MqttError, host: str, port: int) -> str:
+    """Why the broker did not let us in, and what would do."""
+    why = str(error) or "no answer"
+    where = f"{host}:{port}"
+    if isinstance(error, aiomqtt.MqttCodeError):
+        return f"{why}: look at mqtt.username and the password ({PASSWORD_VARIABLE}, password_file)"
+    if "CERTIFICATE_VERIFY_FAILED" in why:
+        if "mismatch" in why:
+            return f"{why}: mqtt.host must be a name that the broker's certificate has"
+        if "expired" in why or "not yet valid" in why:
+            return f"{why}: renew the broker's certificate, or set this computer's clock"
+        return f"{why}: set mqtt.ca_file to the authority that signed the broker's certificate"
+    return f"{why}: is a broker running there (systemctl status mosquitto), is {where} right?"
 
 
 def _unusable(key: str, path: Path, error: Exception) -> ConfigError:

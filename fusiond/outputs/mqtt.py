@@ -24,8 +24,10 @@ from fusiond.configuration.schema import Mqtt
 from fusiond.outputs import broker_access
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import Handler
+from fusiond.outputs.messages.event import EventMessage
+from fusiond.outputs.messages.events import MOST_KEPT, events_message
 from fusiond.outputs.reconnecting import Reconnecting
-from fusiond.outputs.topics import REPLY, STATUS, Topic, base_topic
+from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
@@ -84,6 +86,7 @@ class MqttPublisher:
         # The latest of what is retained and confirmed, and which of it is yet to be sent.
         self._retained: dict[Topic, BaseModel] = {}
         self._due: dict[Topic, None] = {}
+        self._events: deque[EventMessage] = deque(maxlen=MOST_KEPT)
         self._heard: dict[str, Callable[[bytes], None]] = {}
         self._latest_ready = asyncio.Event()
         self._confirmed_ready = asyncio.Event()
@@ -112,6 +115,8 @@ class MqttPublisher:
             self._retain(topic, message)
         else:
             self._enqueue(topic, message)
+        if isinstance(message, EventMessage):
+            self._keep_event(message)
 
     def _replace(self, topic: Topic, message: BaseModel) -> None:
         self.counters["mqtt_dropped"] += topic in self._latest
@@ -128,6 +133,13 @@ class MqttPublisher:
         self.counters["mqtt_dropped"] += len(self._queue) == self._queue.maxlen
         self._queue.append((topic, message))
         self._confirmed_ready.set()
+
+    def _keep_event(self, message: EventMessage) -> None:
+        """The last events are retained, so that who comes later sees them; nothing is lost when
+        the list grows before it is sent."""
+        self._events.append(message)
+        self._retained[EVENTS] = events_message(tuple(self._events))
+        self._due[EVENTS] = None
 
     # ------------------------------------------------------------------ the connection
 
@@ -155,9 +167,10 @@ class MqttPublisher:
                 self._look_for_a_rival(loop.time() - since_s, _OVERDUE not in reason)
             except aiomqtt.MqttError as error:
                 self._reconnecting.failed()
+                why = broker_access.advice(error, self._options.host, self._options.port)
                 if self.status.state != "absent":
-                    self._on_event("mqtt_absent", str(error))
-                self.status = DriverStatus("absent", str(error))
+                    self._on_event("mqtt_absent", why)
+                self.status = DriverStatus("absent", why)
             finally:
                 _hang_up(client)
             _honour_cancellation()

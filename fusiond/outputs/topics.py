@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from fusiond.outputs.messages.calibration import CalibrationMessage
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
+from fusiond.outputs.messages.events import EventsMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.innovations import InnovationsMessage
 from fusiond.outputs.messages.nav import NavMessage
@@ -41,8 +42,12 @@ INNOVATIONS = Topic("innovations", InnovationsMessage, 0, False)
 CALIBRATION = Topic("calibration", CalibrationMessage, 1, True)
 TRACKER = Topic("tracker", TrackerMessage, 1, True)
 EVENT = Topic("event", EventMessage, 1, False)
+EVENTS = Topic("events", EventsMessage, 1, True)
 REPLY = Topic("reply", ReplyMessage, 1, False)
-TOPICS = (NAV, STATUS, HEALTH, CONSISTENCY, INNOVATIONS, CALIBRATION, TRACKER, EVENT, REPLY)
+TOPICS = (
+    *(NAV, STATUS, HEALTH, CONSISTENCY, INNOVATIONS, CALIBRATION, TRACKER),
+    *(EVENT, EVENTS, REPLY),
+)
 
 
 def base_topic(vehicle: str) -> str:

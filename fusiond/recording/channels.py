@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from fusiond.estimators.base import Outcome
 from fusiond.outputs.foxglove import channels as foxglove
-from fusiond.outputs.topics import TOPICS
+from fusiond.outputs.topics import EVENTS, TOPICS
 
 INPUT = "/fusiond/input"
 STATE = "/fusiond/state"
@@ -80,6 +80,7 @@ CHANNELS: dict[str, Channel] = {
                 partial(topic.message.model_json_schema, mode="serialization"),
             )
             for topic in TOPICS
+            if topic is not EVENTS  # a log has each event at its own time
         ),
     )
 }

@@ -62,8 +62,18 @@ def refused(imu: Path, *aids: str, out: Path) -> str:
 def test_a_good_run_says_when_it_aligned_and_how_much_it_navigated(
     drive: Path, tmp_path: Path
 ) -> None:
+    """One aid is as a spreadsheet left it, another of another day."""
+
+    def a_day_later(rows: Any, names: list[str]) -> Any:
+        for k in (k for k, n in enumerate(names) if n.startswith("t_")):
+            rows[:, k] += 86_400.0
+        return rows
+
+    rdss = changed(drive, "rdss.csv", a_day_later, tmp_path)
+    gnss = tmp_path / "gnss.csv"
+    gnss.write_text((drive / "gnss.csv").read_text().replace(",", ";").replace(".", ","))
     code, text, errors, report = process(
-        drive / "imu.csv", f"gnss={drive / 'gnss.csv'}", out=tmp_path
+        drive / "imu.csv", f"gnss={gnss}", f"rdss={rdss}", out=tmp_path
     )
     assert (code, errors, report["why"]) == (0, "", None)
     first_s, rows = report["solution_from_s"], report["solution_rows"]
@@ -73,6 +83,10 @@ def test_a_good_run_says_when_it_aligned_and_how_much_it_navigated(
     assert f"aligned at {first_s:.3f} s: GNSS course" in text.splitlines()
     samples = report["files"]["imu"]["rows"]
     assert f"solution: {rows} of {samples} samples: " in text
+    (line,) = report["apart"]
+    assert line.startswith("rdss from 864")
+    assert "no time in common with imu, from 0." in line
+    assert f"! {line}" in text.splitlines()
     begin = float((tmp_path / "solution.csv").read_text().splitlines()[1].split(",")[0])
     assert begin == pytest.approx(first_s, abs=1e-6)
 

@@ -28,7 +28,8 @@ from fusiond.demo.demo import (
     ned_error,
     wrapped,
 )
-from fusiond.demo.view import Live, Screen, line
+from fusiond.demo.story import story
+from fusiond.demo.view import _MADE_INSIDE, Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.replay.run import Wish, replay
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -164,6 +165,26 @@ def test_score_against_the_truth(tmp_path: Path) -> None:
     expected = np.array([3.0, 4.0]) @ np.linalg.inv(covariance[6:8, 6:8]) @ [3.0, 4.0]
     assert result["nees"] == pytest.approx(expected, rel=1e-3)
 
+    t_s, error_m, sigma_m = score.horizontal(vehicle)
+    assert t_s[[0, -1]] == pytest.approx([12.0, 13.0])
+    assert error_m == pytest.approx([5.0] * 3, abs=2e-3)
+    assert sigma_m == pytest.approx([13.0**0.5] * 3)
+
+
+def test_story_tells_the_outages_that_were_lived_through() -> None:
+    t_s = np.arange(10.05, 60.0, 0.1)
+    error_m = np.where((t_s > 18.0) & (t_s < 30.0), 0.5 + (t_s - 18.0) * 0.25, 0.5)
+    told = list(story(t_s, error_m, np.full_like(t_s, 1.0), [(2.0, 5.0), (18.0, 30.0)]))
+    assert told == [
+        "12 s without GNSS: the error grew from 0.50 to 3.49 m at most, and sigma said "
+        "1.00 m there",
+        "the car was within two sigma for 88 % of the 50 s that it was navigated",
+    ]
+    none = np.zeros(0)
+    assert list(story(none, none, none, [(1.0, 2.0)])) == [
+        "nothing was navigated: the car had not driven off yet"
+    ]
+
 
 def test_wrapped() -> None:
     assert wrapped(np.array([np.pi + 0.1, -np.pi - 0.1, 6.0 * np.pi])) == pytest.approx(
@@ -224,6 +245,28 @@ def test_screen_fits_and_shows_errors_beside_sigma(size: tuple[int, int]) -> Non
     assert "3 gated +1" in text
     assert "70 ms" in text
     assert "…" not in "\n".join(row for row in lines if "source" in row)
+    assert "mosquitto_sub -p 1883" in text
+
+
+def test_a_small_terminal_shows_events_and_the_broker() -> None:
+    """What the filter makes inside gives way on 24 lines, not on 60."""
+    live = _live()
+    inside = {**live.health["sources"]["source0"], "detail": _MADE_INSIDE}
+    live.health["sources"] |= {f"source{n}": inside for n in range(3, 7)}
+
+    def shown(height: int) -> str:
+        console = Console(width=80, height=height, force_terminal=True, color_system=None)
+        with console.capture() as captured:
+            console.print(Screen(live))
+        assert len(captured.get().rstrip("\n").splitlines()) <= height
+        return captured.get()
+
+    small = shown(24)
+    assert small.count("imu x: yyy") >= 2
+    assert "mosquitto_sub -p 1883" in small
+    assert "source2" in small
+    assert "source3" not in small
+    assert "source6" in shown(60)
 
 
 def test_line() -> None:

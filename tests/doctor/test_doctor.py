@@ -62,9 +62,11 @@ async def vehicle(tmp_path: Path) -> AsyncIterator[SimulatedVehicle]:
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def report(config: Config, seconds: float = SECONDS) -> tuple[int, str]:
+async def report(
+    config: Config, seconds: float = SECONDS, *, transmit: bool = False
+) -> tuple[int, str]:
     out = io.StringIO()
-    code = await examine(config, seconds, out)
+    code = await examine(config, seconds, out, transmit)
     return code, out.getvalue()
 
 
@@ -87,6 +89,17 @@ async def test_all_is_well(tmp_path: Path) -> None:
     assert in_time or any("samples a second" in f for f in findings), text
     assert f"imu: can_imu on virtual {tmp_path}: running" in text
     assert "ImuSample: " in text
+    # x forward, y left, z up, at rest: every figure with its spread.
+    (force,) = re.findall(
+        r"^ +force x (\S+) \+- (\S+), y (\S+) \+- .*, z (\S+) \+- .* m/s2$", text, re.M
+    )
+    assert abs(float(force[0])) < 0.5
+    assert 0.0 < float(force[1]) < 0.1
+    assert abs(float(force[3]) - 9.8) < 0.1
+    assert re.search(r"^ +\|force\| 9\.\d{3} \+- 0\.\d{3} m/s2$", text, re.M)
+    assert re.search(r"^ +position lat 30\.\d{7} \+- 0\.\d{7}, lon 114\.\d{7} \+- ", text, re.M)
+    assert "read only, no fix is asked for" in text
+    assert "requested" not in text
     assert "at rest: specific force 9.8" in text
     assert "PositionFix: " in text
     assert "gnss: nmea on " in text
@@ -181,7 +194,7 @@ async def test_terminal_that_does_not_answer(tmp_path: Path) -> None:
 async def test_suppressed_terminal(tmp_path: Path) -> None:
     async with vehicle(tmp_path) as car:
         car.terminal.suppressed = True
-        code, text = await report(without(config(tmp_path), "imu", "gnss"))
+        code, text = await report(without(config(tmp_path), "imu", "gnss"), transmit=True)
     assert code == 1
     assert "the centre has switched the transmitter off" in text
 

@@ -16,6 +16,7 @@ import pytest
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.commands import COMMANDS
 from fusiond.outputs.mqtt import MqttPublisher
+from fusiond.recording.reader import Log
 from fusiond.replay.run import Wish, replay
 from tests.broker import Broker, Listener, free_port, listening
 from tests.live.daemon_bench import PARKED, RDSS, Bench, driving, running
@@ -90,11 +91,20 @@ async def test_commands_of_an_operator(bench: Bench, tmp_path: Path) -> None:
     status = [json.loads(p) for p in listener.payloads("fusiond/test/status")]
     assert ["imu: drop for 1 s"] in [m["injected"] for m in status]
     assert {"recording", "off"} >= {m["recording"] for m in status}
+    bundles = [json.loads(p) for p in listener.payloads("fusiond/test/innovations")]
+    told = [one for bundle in bundles for one in bundle["innovations"]]
+    fixes = {one["outcome"]: one for one in told if one["source"] == "operator"}
+    assert {"fused", "gated"} <= fixes.keys()
+    assert fixes["gated"]["nis"] > 1e6 > fixes["fused"]["nis"] >= 0.0
+    assert not any("zero" in one["source"] for one in told)  # constraints are not told
     first, second = sorted((tmp_path / "logs").iterdir(), key=lambda p: p.stat().st_mtime)
     again = replay([first], Wish())  # commands and all
     assert again["identical"] is True, again["first_difference"]
     assert again["outcomes"]["operator"]["gated"] >= 1
     assert replay([second], Wish())["identical"] is None  # it was started on the way
+    channels = {message.topic for message in Log([first]).messages()}
+    assert "/innovation" in channels
+    assert "/innovations" not in channels
 
 
 async def _ask(

@@ -13,6 +13,7 @@ from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
+from fusiond.outputs.messages.events import events_message
 from fusiond.outputs.messages.health import (
     OutputHealth,
     SchedulerStatus,
@@ -63,6 +64,14 @@ SCHEDULER = SchedulerStatus(
     gc_collections=1811,
     gc_forced=0,
     gc_max_ms=2.1,
+)
+
+EVENT = event_message(
+    UTC_NS,
+    source="rdss",
+    code="rdss_suppressed",
+    level="warning",
+    text="the terminal's transmitter is suppressed",
 )
 
 EXAMPLES: dict[str, Any] = {
@@ -198,13 +207,8 @@ EXAMPLES: dict[str, Any] = {
         False,
     ),
     "tracker": tracker_message(nav_message(SOLUTION, UTC_NS)),
-    "event": event_message(
-        UTC_NS,
-        source="rdss",
-        code="rdss_suppressed",
-        level="warning",
-        text="the terminal's transmitter is suppressed",
-    ),
+    "event": EVENT,
+    "events": events_message([EVENT]),
     "reply": ReplyMessage(
         **dict(zip(("t_utc", "t_ms"), stamp(UTC_NS), strict=True)),
         id="a1",

@@ -35,9 +35,11 @@ async def test_every_topic_arrives_and_shutdown_says_offline(tmp_path: Path) -> 
             await listener.until(lambda li: b"offline" in heard("online")(li))
             assert json.loads(heard("event")(listener)[-1])["text"] == "last words"
         async with listening(broker) as (late, _):
-            await late.until(lambda li: len(li.messages) >= 4)
+            await late.until(lambda li: len(li.messages) >= 5)
             kept = {m.topic.value.removeprefix(f"{BASE}/") for m in late.messages if m.retain}
-            assert kept == {"online", "status", "health", "calibration"}
+            assert kept == {"online", "status", "health", "calibration", "events"}
+            last = json.loads(heard("events")(late)[0])["events"]
+            assert [e["text"] for e in last] == [EXAMPLES["event"].text, "last words"]
         assert it.publisher.counters["mqtt_dropped"] == 0
         assert it.publisher.counters["mqtt_reconnects"] == 0
 

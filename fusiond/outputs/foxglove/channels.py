@@ -20,7 +20,7 @@ from fusiond.outputs.figures import known, usable
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.nav import NavMessage
-from fusiond.outputs.topics import EVENT, NAV, REPLY, TOPICS, Topic
+from fusiond.outputs.topics import EVENT, EVENTS, NAV, REPLY, TOPICS, Topic
 
 _DIAGONAL_KNOWN = 2
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
@@ -156,7 +156,8 @@ def _channels() -> Iterator[Channel]:
     yield Channel(1, "/location", "foxglove.LocationFix", lambda: _LOCATION, NAV, location_fix)
     yield Channel(2, "/tf", "foxglove.FrameTransforms", lambda: _TRANSFORMS, NAV, frame_transforms)
     yield Channel(3, "/log", "foxglove.Log", lambda: _LOG, EVENT, log)
-    for number, topic in enumerate((t for t in TOPICS if t is not REPLY), start=4):
+    served = (t for t in TOPICS if t not in (EVENTS, REPLY))
+    for number, topic in enumerate(served, start=4):
         model = topic.message
         name = f"fusiond.{model.__name__}"
         schema = partial(model.model_json_schema, mode="serialization")

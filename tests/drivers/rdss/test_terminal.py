@@ -99,6 +99,23 @@ def test_wanted_interval_never_undercuts_the_card_and_an_operator_may_ask_earlie
     assert len(fast.requests) == 2
 
 
+def test_read_only_never_asks_for_a_fix_and_goes_on_reading() -> None:
+    bench = Bench(TerminalOptions(bauds=(115200,), families=("4.0",), transmit=False))
+    bench.run(400)
+    assert bench.requests == []
+    assert bench.cycle.state is State.READY
+    assert (
+        bench.cycle.detail
+        == "card 0242286, 60 s: read only, no fix is asked for; strongest level 4"
+    )
+    reads = [t for t, m in bench.sent if isinstance(m, BeamPowerRequest)]
+    assert reads[-1] > 380
+    assert len(bench.sent) < 50
+    assert "read only" in bench.cycle.request_now(bench.t_ns).text
+    bench.run(100)
+    assert bench.requests == []
+
+
 def test_spacing_survives_a_replug() -> None:
     bench = Bench()
     bench.run(5)

@@ -1,0 +1,208 @@
+"""Command config: a first configuration, from what is plugged in and what is answered."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+
+from fusiond.commands.shared import EXIT_IO, config_errors, parse_mqtt, spinner
+
+if TYPE_CHECKING:
+    from drivers.can.bus import Interface
+    from fusiond.configuration.draft import Draft, DraftSource, Vector
+    from fusiond.doctor.finding import Device
+
+config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
+_NAMES = {"can_imu": "imu", "can_gnss": "gnss", "nmea": "gnss", "gnss": "gnss", "rdss": "rdss"}
+ARM = typer.Option(metavar="F,R,D", help="m forward, right, down of the IMU.")
+
+
+@config.command()
+def init(
+    out: Annotated[Path, typer.Argument(metavar="CONFIG", help="File to write.")] = Path(
+        "vehicle.toml"
+    ),
+    vehicle: Annotated[str | None, typer.Option(help="Its name, as in the MQTT topics.")] = None,
+    vehicle_class: Annotated[
+        str | None, typer.Option("--class", help="road, rail, marine or aircraft.")
+    ] = None,
+    sensor_class: Annotated[
+        str | None, typer.Option(help="Of the IMU: consumer, mems or tactical.")
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Sensor axes forward, right, down: +x,-y,-z."),
+    ] = None,
+    antenna: Annotated[str | None, ARM] = None,
+    axle: Annotated[str | None, ARM] = None,
+    broker: Annotated[str | None, typer.Option(metavar="HOST[:PORT]", help="MQTT.")] = None,
+    port: Annotated[
+        list[str] | None, typer.Option(help="Serial port to listen to; all by default.")
+    ] = None,
+    can: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[INTERFACE:]CHANNEL", help="CAN bus; all that are up by default."),
+    ] = None,
+    ask_terminal: Annotated[
+        bool | None,
+        typer.Option(
+            "--ask-terminal/--listen-only",
+            help="Ask silent ports who is there, as an RDSS terminal needs; it transmits nothing.",
+        ),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: defaults and options.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file.")] = False,
+) -> None:
+    """Write a first configuration: look at ports and buses, ask for the rest.
+
+    Nothing is sent to a device unless --ask-terminal (or your answer) allows it. The file is
+    commented and passes `fusiond check`, whose doubts are printed.
+    """
+    from fusiond.configuration.draft import Draft  # noqa: PLC0415
+    from fusiond.configuration.plausibility import VehicleClass  # noqa: PLC0415
+    from fusiond.configuration.sensor_class import SensorClass  # noqa: PLC0415
+
+    if out.exists() and not force:
+        raise typer.BadParameter(f"{out} is there already: --force overwrites it")
+    asks = not yes and sys.stdin.isatty()
+
+    def answer(given: str | None, question: str, default: str) -> str:
+        if given is not None:
+            return given
+        return str(typer.prompt(question, default=default)) if asks else default
+
+    if ask_terminal is None:
+        question = "Ask silent serial ports whether an RDSS terminal is there (sends bytes)?"
+        ask_terminal = asks and typer.confirm(question, default=False)
+    devices = _look(port, can, ask_terminal)
+    for device in devices:
+        typer.echo(f"found: {device.text}")
+    if not devices:
+        typer.echo("found no device that is understood")
+    imu = next((d for d in devices if d.driver == "can_imu"), None)
+    has_antenna = any(d.driver != "can_imu" for d in devices)
+    arm = _vector(
+        answer(antenna, "GNSS antenna from the IMU, m forward,right,down", "0,0,0")
+        if has_antenna or antenna is not None
+        else "0,0,0"
+    )
+    kind = _choice(answer(vehicle_class, "Vehicle class", "road"), VehicleClass)
+    rear = answer(axle, "Rear axle from the IMU, m forward,right,down (empty: later)", "")
+    draft = Draft(
+        vehicle=answer(vehicle, "Name of the vehicle", "vehicle"),
+        vehicle_class=kind,
+        sensor_class=_choice(answer(sensor_class, "Class of the IMU", "mems"), SensorClass),
+        axes=_axes(answer(axes, "IMU axes forward,right,down", "+x,+y,+z")),
+        rate_hz=100.0 if imu is None or imu.rate_hz is None else imu.rate_hz,
+        lever_arms_m={"gnss": arm, "rdss": arm},
+        axle_m=_vector(rear) if rear else None,
+        broker=parse_mqtt(answer(broker, "MQTT broker", "localhost:1883")),
+        sources=_sources(devices),
+    )
+    _write(draft, out)
+
+
+def _look(ports: list[str] | None, buses: list[str] | None, ask_terminal: bool) -> list[Device]:
+    import asyncio  # noqa: PLC0415
+
+    from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
+    from fusiond.doctor.finding import on_bus, on_port  # noqa: PLC0415
+
+    channels = [_bus(text) for text in (can_interfaces() if buses is None else buses)]
+
+    # A port that has a lasting name as well is known by that, which comes first.
+    lines = similar_ports() if ports is None else ports
+    unique = {Path(line).resolve(): line for line in reversed(lines)}
+
+    async def look() -> list[Device]:
+        found = await asyncio.gather(
+            *(on_port(line, ask_terminal=ask_terminal) for line in unique.values())
+        )
+        on_buses = await asyncio.gather(*(on_bus(*channel) for channel in channels))
+        return [
+            *(device for devices in on_buses for device in devices),
+            *(device for device in found if device is not None),
+        ]
+
+    with spinner("listening to ports and buses"):
+        return asyncio.run(look())
+
+
+def _bus(text: str) -> tuple[Interface, str]:
+    from drivers.can.bus import Interface  # noqa: PLC0415
+
+    interface, colon, channel = text.partition(":")
+    if not colon:
+        return "socketcan", text
+    return _choice(interface, Interface), channel
+
+
+def _sources(devices: list[Device]) -> list[DraftSource]:
+    """Named after what they are, with a number where there are more; the first IMU alone."""
+    from fusiond.configuration.draft import DraftSource  # noqa: PLC0415
+
+    sources: dict[str, DraftSource] = {}
+    raw = False
+    for device in devices:
+        name = base = _NAMES[device.driver]
+        if base == "imu" and base in sources:
+            continue
+        number = 1
+        while name in sources:
+            number += 1
+            name = f"{base}{number}"
+        options, driver = dict(device.options), device.driver
+        if driver == "gnss" and raw:
+            driver = "nmea"  # one receiver's raw data at most
+        raw |= driver == "gnss"
+        sources[name] = DraftSource(name, driver, options, device.text)
+    return list(sources.values())
+
+
+def _write(draft: Draft, out: Path) -> None:
+    """The file, after it has been found good."""
+    from tempfile import TemporaryDirectory  # noqa: PLC0415
+
+    from fusiond.configuration.doubts import doubts  # noqa: PLC0415
+    from fusiond.configuration.draft import toml  # noqa: PLC0415
+    from fusiond.configuration.load import load_config  # noqa: PLC0415
+
+    text = toml(draft)
+    with TemporaryDirectory(prefix="fusiond-") as folder, config_errors():
+        trial = Path(folder) / out.name
+        trial.write_text(text, encoding="utf-8")
+        loaded = load_config(trial)
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        typer.echo(f"fusiond: {out}: {error.strerror}", err=True)
+        raise typer.Exit(EXIT_IO) from error
+    typer.echo(f"{out}: written; go on with `fusiond check {out}` and `fusiond doctor {out}`")
+    for doubt in doubts(loaded):
+        typer.echo(f"  ! {doubt}")
+
+
+def _choice(text: str, literal: Any) -> Any:
+    allowed = get_args(literal)
+    if text not in allowed:
+        raise typer.BadParameter(f"{text!r}: one of {', '.join(allowed)}")
+    return text
+
+
+def _vector(text: str) -> Vector:
+    parts = text.split(",")
+    try:
+        x, y, z = (float(part) for part in parts)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r}: three numbers, forward,right,down in m") from error
+    return x, y, z
+
+
+def _axes(text: str) -> tuple[str, str, str]:
+    parts = tuple(part.strip() for part in text.split(","))
+    if len(parts) != 3:
+        raise typer.BadParameter(f"{text!r}: three axes such as +x,-y,-z")
+    return parts

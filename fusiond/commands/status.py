@@ -1,0 +1,194 @@
+"""`fusiond status`: ask the running daemon, over MQTT, how it stands.
+
+What is retained comes at once; the solution is not, and comes within a second of a daemon that
+works. So one that is `online` and says nothing has stopped, or hangs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fusiond.commands.shared import (
+    EXIT_UNAVAILABLE,
+    JsonPath,
+    config_errors,
+    load,
+    parse_mqtt,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from fusiond.configuration.schema import Mqtt
+
+EXIT_NO_SOLUTION = 1
+USABLE = ("navigating", "coasting")
+_CONNECT_S = 5.0
+_SETTLE_S = 0.3
+"""For the broker to hand over what it keeps of every vehicle, before the answer of one is taken
+for all that there is."""
+_LOOK_EVERY_S = 0.05
+_ASKED = ("status", "nav", "health")
+"""What a daemon that works has said within a second."""
+
+
+@dataclass(slots=True)
+class Heard:
+    """One vehicle's last message of each topic; `live` if any of it was said just now."""
+
+    topics: dict[str, Any] = field(default_factory=dict)
+    online: str | None = None
+    live: bool = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is nothing more to wait for."""
+        return self.online == "offline" or (self.live and all(t in self.topics for t in _ASKED))
+
+
+class UnansweredError(Exception):
+    """Nobody has answered; `state` says in a word why, the text what would do."""
+
+    def __init__(self, state: str, text: str) -> None:
+        super().__init__(text)
+        self.state = state
+
+
+def status(
+    config: Annotated[
+        Path | None,
+        typer.Argument(metavar="CONFIG", help="Whose broker and vehicle; localhost if none."),
+    ] = None,
+    mqtt: Annotated[
+        str | None, typer.Option("--mqtt", metavar="HOST[:PORT]", help="The broker to ask.")
+    ] = None,
+    vehicle: Annotated[str | None, typer.Option(help="Which, where the broker has more.")] = None,
+    wait: Annotated[
+        float, typer.Option(min=0.5, help="Seconds to wait for a daemon's answer.")
+    ] = 3.0,
+    json_path: JsonPath = None,
+) -> None:
+    """Ask the running daemon over MQTT: 0 with a usable solution, 1 without, 69 no answer."""
+    access = None
+    if config is not None:
+        loaded = load(config)
+        access, vehicle = loaded.mqtt, vehicle or loaded.vehicle
+        if not access.enabled:
+            typer.echo(
+                f"fusiond: {config}: [mqtt] is not enabled: there is no way to ask", err=True
+            )
+            raise typer.Exit(EXIT_UNAVAILABLE)
+    host, port = ("localhost", 1883) if access is None else (access.host, access.port)
+    if mqtt is not None:
+        host, port = parse_mqtt(mqtt)
+    try:
+        with config_errors():
+            name, heard = chosen(asyncio.run(ask(host, port, access, vehicle, wait)), vehicle, wait)
+    except UnansweredError as error:
+        write_json({"state": error.state, "why": str(error)}, json_path)
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    answer = {"state": "online", "vehicle": name, **heard.topics}
+    if json_path != "-":
+        from fusiond.commands.status_report import page  # noqa: PLC0415
+
+        typer.echo("\n".join(page(answer)))
+    write_json(answer, json_path)
+    if answer["status"]["mode"] not in USABLE:
+        raise typer.Exit(EXIT_NO_SOLUTION)
+
+
+async def ask(
+    host: str, port: int, access: Mqtt | None, vehicle: str | None, wait_s: float
+) -> dict[str, Heard]:
+    """What the broker has of each vehicle, or of `vehicle` alone, after `wait_s` at most.
+
+    `access`: user, password and TLS. Raises `UnansweredError` where no broker lets us in.
+    """
+    import aiomqtt  # noqa: PLC0415
+
+    vehicles: dict[str, Heard] = {}
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + wait_s
+
+    async def listen(client: aiomqtt.Client) -> None:
+        await client.subscribe(f"fusiond/{vehicle or '+'}/+", 1)
+        async for message in client.messages:
+            name, _, topic = message.topic.value.removeprefix("fusiond/").rpartition("/")
+            if isinstance(message.payload, bytes):
+                _take(vehicles.setdefault(name, Heard()), topic, message.payload, message.retain)
+
+    credentials: dict[str, Any] = {}
+    if access is not None:
+        from fusiond.outputs import broker_access  # noqa: PLC0415
+
+        credentials = {
+            "username": access.username,
+            "password": broker_access.password(access),
+            "tls_context": broker_access.tls_context(access),
+        }
+    try:
+        async with aiomqtt.Client(host, port, timeout=_CONNECT_S, **credentials) as client:
+            listening = asyncio.create_task(listen(client))
+            await asyncio.wait({listening}, timeout=min(_SETTLE_S, wait_s))
+            while loop.time() < until_s and not (
+                vehicles and all(heard.complete for heard in vehicles.values())
+            ):
+                await asyncio.wait({listening}, timeout=_LOOK_EVERY_S)
+                if listening.done():
+                    listening.result()
+            listening.cancel()
+    except aiomqtt.MqttError as error:
+        from fusiond.outputs import broker_access  # noqa: PLC0415
+
+        what = broker_access.advice(error, host, port)
+        raise UnansweredError("no_broker", f"no answer of the broker: {what}") from error
+    return vehicles
+
+
+def _take(heard: Heard, topic: str, payload: bytes, retained: bool) -> None:
+    if topic == "online":
+        heard.online = payload.decode(errors="replace")
+        return
+    with suppress(ValueError):  # another program's message below our topic
+        heard.topics[topic] = json.loads(payload)
+        heard.live |= topic in _ASKED and not retained
+
+
+def chosen(vehicles: dict[str, Heard], vehicle: str | None, wait_s: float) -> tuple[str, Heard]:
+    """The vehicle that is meant, if it answers. Raises `UnansweredError`."""
+    there = {name: heard for name, heard in vehicles.items() if heard.online or heard.live}
+    if not there:
+        whose = "no daemon" if vehicle is None else f"no daemon of a vehicle {vehicle!r}"
+        raise UnansweredError(
+            "no_daemon",
+            f"the broker knows of {whose}: start one (systemctl start fusiond, or `fusiond run`), "
+            "and look at host, port and vehicle of its configuration",
+        )
+    running = [name for name, heard in there.items() if heard.online != "offline"]
+    if len(running or there) > 1:
+        raise UnansweredError(
+            "ambiguous", f"--vehicle: which of {', '.join(sorted(running or there))}?"
+        )
+    (name,) = running or there
+    heard = there[name]
+    last = heard.topics.get("status", {})
+    said = f"; last heard {last['t_utc']}: {last['mode']}, {last['why']}" if last else ""
+    if heard.online == "offline":
+        raise UnansweredError(
+            "offline",
+            f"{name} is offline{said}. journalctl -u fusiond says why; systemctl start fusiond",
+        )
+    if not heard.live or not last:
+        raise UnansweredError(
+            "silent",
+            f"{name} is online, but has said nothing for {wait_s:g} s{said}. "
+            "It has stopped, hangs, or its network does: systemctl status fusiond",
+        )
+    return name, heard

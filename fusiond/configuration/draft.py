@@ -1,0 +1,120 @@
+"""A configuration as text that a person goes on with: what was found and answered, and comments."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fusiond.configuration.plausibility import VehicleClass
+from fusiond.configuration.schema import Axes
+from fusiond.configuration.sensor_class import SensorClass
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class DraftSource:
+    """A `[sources.NAME]`: driver, its options, and in words where it was found."""
+
+    name: str
+    driver: str
+    options: Mapping[str, Any]
+    found: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """What is known of a vehicle that has no configuration yet."""
+
+    vehicle: str = "vehicle"
+    vehicle_class: VehicleClass = "road"
+    sensor_class: SensorClass = "mems"
+    axes: Axes = ("+x", "+y", "+z")
+    rate_hz: float = 100.0
+    lever_arms_m: Mapping[str, Vector] = field(default_factory=dict)
+    axle_m: Vector | None = None
+    broker: tuple[str, int] = ("localhost", 1883)
+    sources: Sequence[DraftSource] = ()
+
+
+_NO_IMU = """\
+# No IMU was found. Say which, take the marks off, and see docs/can-imu.md for yours:
+# [sources.imu]
+# driver = "can_imu"
+# channel = "can0"
+# dbc = "xsens_mti600"
+# gyro = ["RATE_OF_TURN.GYRO_X", "RATE_OF_TURN.GYRO_Y", "RATE_OF_TURN.GYRO_Z"]
+# accel = ["ACCELERATION.ACCEL_X", "ACCELERATION.ACCEL_Y", "ACCELERATION.ACCEL_Z"]
+# device_time = "SAMPLE_TIME.TIME"
+"""
+_AIDING_KIND = {"nmea": "gnss", "gnss": "raw", "rdss": "rdss", "can_gnss": "gnss"}
+
+
+def toml(draft: Draft) -> str:
+    """The file's text; every key that is not there has its default."""
+    return "\n".join(_lines(draft)) + "\n"
+
+
+def _lines(d: Draft) -> Iterator[str]:
+    yield "# Made by `fusiond config init`. Every key: docs/configuration.md; `fusiond check` and"
+    yield "# `fusiond doctor` say what is wrong with it."
+    yield ""
+    yield f"vehicle = {_value(d.vehicle)}"
+    yield "# road, rail, marine or aircraft: what no measurement may exceed."
+    yield f"vehicle_class = {_value(d.vehicle_class)}"
+    yield ""
+    yield "[imu]"
+    yield "# Sensor axes along forward, right, down. doctor says at rest whether down is right."
+    yield f"axes = {_value(d.axes)}"
+    yield f"rate_hz = {_value(d.rate_hz)}"
+    yield "# consumer, mems or tactical; the figures of its data sheet are better:"
+    yield "# gyro_noise_deg_sqrt_h, accel_noise_m_s_sqrt_h, gyro_bias_instability_deg_h, ..."
+    yield f"sensor_class = {_value(d.sensor_class)}"
+    if not any(source.driver == "can_imu" for source in d.sources):
+        yield ""
+        yield _NO_IMU.rstrip("\n")
+    for source in d.sources:
+        yield from _source(d, source)
+    if d.vehicle_class in ("road", "rail"):
+        yield ""
+        yield "[constraints.non_holonomic]"
+        yield "# Wheels that do not slide sideways; false for what has none."
+        yield "enabled = true"
+        if d.axle_m is not None:
+            yield "# From the IMU to the middle of the rear axle: forward, right, down."
+            yield f"lever_arm_m = {_value(d.axle_m)}"
+        else:
+            yield "# From the IMU to the middle of the rear axle: forward, right, down. Measure it."
+            yield "# lever_arm_m = [-1.0, 0.0, 0.5]"
+    yield ""
+    yield "[mqtt]"
+    yield f"host = {_value(d.broker[0])}"
+    yield f"port = {_value(d.broker[1])}"
+    yield "# With a user: username here, the password in FUSIOND_MQTT_PASSWORD or a password_file."
+
+
+def _source(d: Draft, source: DraftSource) -> Iterator[str]:
+    yield ""
+    yield f"[sources.{source.name}]"
+    if source.found:
+        yield f"# Found: {source.found}"
+    yield f"driver = {_value(source.driver)}"
+    for key, value in source.options.items():
+        yield f"{key} = {_value(value)}"
+    kind = _AIDING_KIND.get(source.driver)
+    if kind is None:
+        return
+    yield ""
+    yield f"[aiding.{source.name}]"
+    if kind != source.name:
+        yield f"kind = {_value(kind)}"
+    arm = d.lever_arms_m.get(kind if kind == "rdss" else "gnss")
+    yield "# From the IMU to the antenna: forward, right, down. Measure it to a few centimetres."
+    yield f"lever_arm_m = {_value(arm or (0.0, 0.0, 0.0))}"
+
+
+def _value(value: Any) -> str:
+    """As TOML writes it: text, numbers, truth values and lists look as in JSON."""
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)

@@ -1,0 +1,184 @@
+"""What is on the ports and buses of this computer: `fusiond config init`.
+
+Listening only, but that an RDSS terminal says nothing unless it is asked who it is; the question
+does not make it transmit, and is put only where that is wanted. On a bus every device that is known
+gets every frame through its driver's own decoder: the one that completes most samples fits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.base import monotonic_ns
+from drivers.can.bus import CanBus, CanFrame, Interface
+from drivers.can.decoder import CanDecoder
+from drivers.can.gnss import CanGnssDriver
+from drivers.can.imu import CanImuDriver
+from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
+from drivers.rdss.driver import RdssDriver, RdssOptions
+from drivers.serial_line import SerialLine
+from fusiond.doctor.known_devices import KNOWN_DEVICES
+
+BAUDS = (115_200, 9_600, 38_400, 460_800, 921_600, 230_400, 57_600, 19_200, 4_800)
+"""In the order of how often receivers are found at them."""
+LISTEN_S = 2.2
+"""At each baud rate: receivers speak once a second, so two epochs and the end of a third."""
+SOUND_ITEMS = 3
+"""Checksums that are right: one of eight bits is so by chance once in 256 lines of nonsense."""
+TERMINAL_S = 25.0
+"""Two families at three baud rates, 3 s each, and a reply."""
+BUS_S = 3.0
+LEAST_SAMPLES = 5
+RATES_HZ = (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 80, 100, 125, 160, 200, 250, 400, 500, 800, 1000)
+RATE_TOLERANCE = 0.08
+"""Devices offer steps of a quarter and more; what is counted in 3 s is off by a frame or two."""
+_DRIVERS: dict[str, Any] = {"can_imu": CanImuDriver, "can_gnss": CanGnssDriver}
+# RTCM 10403.3, table 3.5-78: MSM1 to MSM7 of GPS to BeiDou are 1071 to 1127.
+_MSM = range(1071, 1128)
+_RXM_RAWX = b"\x02\x15"
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """Something that was heard: a source's driver and options, and what was heard in words."""
+
+    driver: str
+    options: dict[str, Any]
+    text: str
+    rate_hz: float | None = None
+
+
+@dataclass(slots=True)
+class _Line:
+    """What came over a serial line."""
+
+    splitter: StreamSplitter = field(default_factory=StreamSplitter)
+    kinds: Counter[str] = field(default_factory=Counter)
+
+    def take(self, data: bytes, t_seen_ns: int) -> None:
+        for item in self.splitter.feed(data):
+            self.kinds[_kind(item)] += 1
+
+    @property
+    def sound(self) -> bool:
+        return self.kinds.total() >= SOUND_ITEMS
+
+
+def _kind(item: Sentence | Frame) -> str:
+    if isinstance(item, Sentence):
+        return "rdss" if is_rdss_sentence(item) else "nmea"
+    if item.kind == "ubx":
+        return "raw" if item.raw[2:4] == _RXM_RAWX else "ubx"
+    number = int.from_bytes(item.raw[3:5], "big") >> 4
+    return "raw" if number in _MSM else "rtcm"
+
+
+async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) -> Device | None:
+    """The device on a serial port, None where nobody says anything that is understood.
+
+    `ask_terminal` lets an RDSS terminal be asked for its card: bytes go out on this port.
+    """
+    for baud in BAUDS:
+        heard = _Line()
+        line = SerialLine(port, baud)
+        async with _running(line.run(heard.take)):
+            await _until(lambda heard=heard: heard.sound, listen_s)
+        if heard.sound:
+            return _receiver(port, baud, heard.kinds)
+        if not line.counters["opened"]:
+            return None
+        if not line.counters["bytes_in"]:
+            break  # silent at one rate is silent at all
+    return await _terminal(port) if ask_terminal else None
+
+
+def _receiver(port: str, baud: int, kinds: Counter[str]) -> Device:
+    what = {
+        "nmea": "NMEA sentences",
+        "raw": "raw observations",
+        "ubx": "UBX frames",
+        "rtcm": "RTCM frames",
+        "rdss": "sentences of an RDSS terminal",
+    }
+    text = f"{port}: {', '.join(what[kind] for kind in what if kinds[kind])} at {baud} baud"
+    if kinds["rdss"] > kinds["nmea"]:
+        return Device("rdss", {"port": port}, text)
+    driver = "gnss" if kinds["raw"] else "nmea"
+    return Device(driver, {"port": port, "baud": baud}, text)
+
+
+async def _terminal(port: str) -> Device | None:
+    """The RDSS terminal that answers, and is not asked for more than who it is."""
+    options = RdssOptions(port=port, transmit=False)
+    driver = RdssDriver("rdss", options, lambda _: None, monotonic_ns)
+    async with _running(driver.run()):
+        await _until(lambda: driver.status.state in ("running", "silent"), TERMINAL_S)
+        if driver.status.state != "running":
+            return None
+    return Device("rdss", {"port": port}, f"{port}: an RDSS terminal answers")
+
+
+async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) -> list[Device]:
+    """The devices on a CAN bus whose DBC file is shipped: IMU and receiver that fit best."""
+    decoders: list[tuple[int, CanDecoder[Any]]] = []
+    for number, known in enumerate(KNOWN_DEVICES):
+        kind = _DRIVERS[known.driver]
+        options = kind.Options(**known.options, interface=interface, channel=channel)
+        decoders.append((number, kind.Decoder(known.title, options)))
+    samples: dict[int, list[int]] = {number: [] for number, _ in decoders}
+
+    def take(frame: CanFrame) -> None:
+        if frame.remote or frame.error:
+            return
+        for number, decoder in decoders:
+            samples[number] += [m.t_seen_ns for m in decoder.feed(frame)]
+
+    bus = CanBus(interface, channel)
+    async with _running(bus.run(take, lambda up, why: None, lambda state: None)):
+        await asyncio.sleep(listen_s)
+    found: dict[str, tuple[int, int]] = {}
+    for number, decoder in decoders:
+        driver, count = KNOWN_DEVICES[number].driver, len(samples[number])
+        # A foreign device on the same identifiers is refused again and again.
+        refused = sum(decoder.counters[name] for name in ("wrong_length", "out_of_range"))
+        if count >= LEAST_SAMPLES and refused < count and count > found.get(driver, (0, 0))[0]:
+            found[driver] = count, number
+    return [_on_bus(interface, channel, n, samples[n]) for _, n in found.values()]
+
+
+def _on_bus(interface: Interface, channel: str, number: int, seen_ns: list[int]) -> Device:
+    known = KNOWN_DEVICES[number]
+    rate_hz = round_rate((len(seen_ns) - 1) / max(1e-9, (seen_ns[-1] - seen_ns[0]) * 1e-9))
+    bus = {"channel": channel} if interface == "socketcan" else {}
+    if interface != "socketcan":
+        bus = {"interface": interface, "channel": channel}
+    text = f"{interface} {channel}: frames of {known.title}, {rate_hz:g} Hz"
+    return Device(known.driver, {**bus, **known.options}, text, rate_hz)
+
+
+def round_rate(rate_hz: float) -> float:
+    """The rate that devices offer nearest to one that was counted."""
+    nearest = min(RATES_HZ, key=lambda r: abs(r - rate_hz))
+    return float(nearest if abs(nearest - rate_hz) <= RATE_TOLERANCE * nearest else round(rate_hz))
+
+
+@contextlib.asynccontextmanager
+async def _running(work: Awaitable[None]) -> AsyncIterator[None]:
+    task = asyncio.ensure_future(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def _until(condition: Any, seconds: float) -> None:
+    loop = asyncio.get_running_loop()
+    end_s = loop.time() + seconds
+    while not condition() and loop.time() < end_s:  # noqa: ASYNC110 - the line has no such event
+        await asyncio.sleep(0.02)

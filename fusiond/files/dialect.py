@@ -1,0 +1,75 @@
+"""A CSV file as this project reads it: commas between cells, points in numbers, not compressed.
+
+Semicolons or tabs between the cells, and then commas in the numbers, are what spreadsheets write in
+half of the world. Each is one character for another, so that line numbers stay. `.gz` is opened.
+What cannot be told for certain is refused, with its name.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+_GZIP = b"\x1f\x8b"
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+_LOOKED_AT = 100
+"""Rows that show how numbers are written. Columns of whole numbers show nothing."""
+_COMMA_NUMBER = re.compile(rb"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
+_POINT_NUMBER = re.compile(rb"^[+-]?\d*\.\d+([eE][+-]?\d+)?$")
+
+
+class DialectError(ValueError):
+    """A way of writing a table that is not read; the text names it and says what would do."""
+
+
+def plain_csv(path: Path) -> bytearray:
+    """The file's bytes with commas between cells and points in numbers.
+
+    Raises `DialectError`, and `OSError` for a file that cannot be read.
+    """
+    data = path.read_bytes()
+    if data.startswith(_GZIP):
+        data = _unzipped(data)
+    if data.startswith(_UTF_16):
+        raise DialectError("UTF-16 text: save it as CSV in UTF-8")
+    return _with_commas(bytearray(data))
+
+
+def _unzipped(data: bytes) -> bytes:
+    import gzip  # noqa: PLC0415 - few files are
+    import zlib  # noqa: PLC0415
+
+    try:
+        return gzip.decompress(data)
+    except (EOFError, OSError, zlib.error) as error:
+        raise DialectError(f"damaged .gz: {error}") from error
+
+
+def _with_commas(data: bytearray) -> bytearray:
+    header, _, _ = data.partition(b"\n")
+    header = header.strip()
+    if b"," in header:
+        return data
+    if header.lower().startswith(b"sep="):
+        raise DialectError("line 1 is a spreadsheet's 'sep=': take it out, so that the names lead")
+    between = next((mark for mark in (b";", b"\t") if mark in header), None)
+    if between is None:
+        if len(header.split()) > 1:
+            raise DialectError("blanks between the cells: write commas, semicolons or tabs")
+        return data
+    decimal = _decimal(data, between)
+    if decimal == b",":
+        return data.translate(bytes.maketrans(between + b",", b",."))
+    return data.translate(bytes.maketrans(between, b","))
+
+
+def _decimal(data: bytearray, between: bytes) -> bytes:
+    """What stands before a number's decimals: a comma or a point."""
+    points = commas = False
+    for row in data.split(b"\n", _LOOKED_AT + 1)[1 : _LOOKED_AT + 1]:
+        for cell in row.split(between):
+            points |= _POINT_NUMBER.match(cell.strip()) is not None
+            commas |= _COMMA_NUMBER.match(cell.strip()) is not None
+    if points and commas:
+        raise DialectError("numbers with a point and numbers with a comma: write one of the two")
+    return b"," if commas else b"."

@@ -1,0 +1,148 @@
+"""What is found on ports and buses, against the simulated devices; and the file that is written."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import tomllib
+from pathlib import Path
+
+import can
+import pytest
+from typer.testing import CliRunner
+
+from drivers.can.dbc import SHIPPED
+from drivers.can.imu import CanImuOptions
+from fusiond.commands.app import app
+from fusiond.configuration.doubts import doubts
+from fusiond.configuration.load import load_config
+from fusiond.doctor.finding import on_bus, on_port, round_rate
+from fusiond.doctor.known_devices import KNOWN_DEVICES
+from fusiond.simulation.can.imu import SIM_IMU, CanImu
+from fusiond.simulation.scenarios import SCENARIOS
+from fusiond.simulation.vehicle import SimulatedVehicle
+from tests.drivers.raw.frames import measurement, rawx
+from tests.patience import PATIENCE_S, until
+from tests.places import REPOSITORY
+from tests.pty_device import Device
+
+RAWX = rawx(measurement())
+
+
+async def test_what_is_plugged_in_becomes_a_file_that_check_passes(tmp_path: Path) -> None:
+    bus = str(tmp_path)  # virtual buses are shared
+    car = SimulatedVehicle(
+        SCENARIOS["static"],
+        duration_s=60.0,
+        can_imu=SIM_IMU.model_copy(update={"channel": bus}),
+        gnss_link=tmp_path / "gnss",
+        rdss_link=tmp_path / "rdss",
+    )
+    out = tmp_path / "car.toml"
+    running = asyncio.create_task(car.run())
+    arguments = ["config", "init", str(out), "--yes", "--vehicle", "truck"]
+    arguments += ["--axes=+x,-y,-z", "--antenna=0.5,0,-1.2", "--broker", "broker.lan:8883"]
+    arguments += ["--port", str(tmp_path / "gnss"), "--port", str(tmp_path / "rdss")]
+    arguments += ["--can", f"virtual:{bus}", "--ask-terminal"]
+    await until((tmp_path / "rdss").exists)
+    done = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert done.exit_code == 0, done.output
+    assert "frames of fusiond's simulated IMU" in done.stdout
+    assert "NMEA sentences at 115200 baud" in done.stdout
+    assert "rdss: an RDSS terminal answers" in done.stdout
+    config = load_config(out)
+    assert doubts(config) == []
+    assert config.vehicle == "truck"
+    drivers = {name: source.driver for name, source in config.sources.items()}
+    assert drivers == {"imu": "can_imu", "gnss": "nmea", "rdss": "rdss"}
+    assert config.sources["imu"].options["dbc"] == "fusiond_sim_imu"
+    assert config.aiding["gnss"].lever_arm_m == (0.5, 0.0, -1.2)
+    assert (config.mqtt.host, config.mqtt.port) == ("broker.lan", 8883)
+    again = CliRunner().invoke(app, arguments)
+    assert again.exit_code == 2
+    assert "--force overwrites it" in again.stderr
+
+
+def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> None:
+    out = tmp_path / "vehicle.toml"
+    gone = str(tmp_path / "ttyUSB0")
+    arguments = ["config", "init", str(out), "--port", gone, "--can", f"virtual:{tmp_path}"]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "found no device that is understood" in done.stdout
+    assert "! sources: there is none" in done.stdout
+    assert "# [sources.imu]" in out.read_text()
+    marks_off = out.read_text().replace("# [sources.imu]", "[sources.imu]")
+    for key in ("driver", "channel", "dbc", "gyro", "accel", "device_time"):
+        marks_off = marks_off.replace(f"# {key} =", f"{key} =")
+    assert tomllib.loads(marks_off)["sources"]["imu"]["dbc"] == "xsens_mti600"
+    assert CliRunner().invoke(app, ["check", str(out)]).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("data", "driver", "said"),
+    [
+        (RAWX * 3, "gnss", "raw observations"),
+        (b"$GNVTG,,T,,M,0.0,N,0.0,K,A*3D\r\n" * 4 + RAWX, "gnss", "NMEA sentences, raw"),
+        (b"$BDICI,0242286,,,,,,60*00\r\n", None, ""),
+        (bytes(range(256)) * 4, None, ""),
+    ],
+)
+async def test_what_speaks_on_a_port(
+    tmp_path: Path, data: bytes, driver: str | None, said: str
+) -> None:
+    device = Device(tmp_path / "port")
+    device.plug()
+
+    async def send() -> None:
+        while True:
+            with contextlib.suppress(BlockingIOError):
+                device.send(data)
+            await asyncio.sleep(0.02)
+
+    sending = asyncio.create_task(send())
+    listen_s = 0.1 if driver is None else PATIENCE_S
+    found = await on_port(str(tmp_path / "port"), ask_terminal=False, listen_s=listen_s)
+    sending.cancel()
+    device.unplug()
+    assert (found.driver if found else None) == driver
+    assert found is None or said in found.text
+
+
+@pytest.mark.parametrize("page", ["can-imu.md", "can-gnss.md"])
+def test_known_devices_are_those_of_the_pages(page: str) -> None:
+    blocks = re.findall(r"```toml\n(.*?)```", (REPOSITORY / "docs" / page).read_text(), re.S)
+    sources = [s for b in blocks for s in tomllib.loads(b).get("sources", {}).values()]
+    shown = [s for s in sources if (SHIPPED / f"{s['dbc']}.dbc").is_file()]
+    known = [(d.driver, d.options) for d in KNOWN_DEVICES]
+    assert len(shown) > 1
+    for source in shown:
+        source.pop("channel")
+        assert (source.pop("driver"), source) in known
+
+
+@pytest.mark.parametrize("title", ["Bosch MM5.10", "Aceinna OpenIMU300RI"])
+async def test_a_device_is_told_from_the_others(tmp_path: Path, title: str) -> None:
+    """One that shares identifiers with another, and one that speaks SAE J1939."""
+    (known,) = (d for d in KNOWN_DEVICES if d.title == title)
+    channel = str(tmp_path)
+    options = CanImuOptions(**known.options, interface="virtual", channel=channel)
+    imu = CanImu(options)
+    looking = asyncio.create_task(on_bus("virtual", channel, 0.5))
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        number = 0
+        while not looking.done():
+            for frame in imu.frames(number, number * 10_000_000, (0.0, 0.0, 0.1), (0, 0, 9.8)):
+                bus.send(frame)
+            number += 1
+            await asyncio.sleep(0.01)
+    (found,) = looking.result()
+    assert title in found.text
+    assert found.options == {"interface": "virtual", "channel": channel, **known.options}
+
+
+def test_round_rate() -> None:
+    assert [round_rate(r) for r in (99.6, 101.9, 9.7, 48.0, 73.3)] == [100, 100, 10, 50, 73]

@@ -1,0 +1,38 @@
+"""docs/troubleshooting.md speaks of what the daemon says, in its words, and leaves none out."""
+
+from __future__ import annotations
+
+import re
+
+from tests.places import REPOSITORY
+
+PAGE = (REPOSITORY / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+NAVIGATOR = REPOSITORY / "fusiond" / "navigator"
+
+
+def quoted(section: str) -> list[str]:
+    """The first column of a section's table."""
+    text = PAGE.split(f"## {section}\n", 1)[1].split("\n## ", 1)[0]
+    return re.findall(r"^\| `([^`]+)` \|", text, flags=re.M)
+
+
+def source() -> str:
+    """All texts of the navigator's modules, with strings that are broken over lines joined."""
+    text = "\n".join(path.read_text(encoding="utf-8") for path in NAVIGATOR.rglob("*.py"))
+    return re.sub(r'"\s*\n\s*f?"', "", text)
+
+
+def test_every_sentence_of_the_page_is_one_of_the_navigator() -> None:
+    said = source()
+    rows = quoted("Alignment does not come") + quoted("It aligned, and is not `navigating`")
+    assert len(rows) > 30
+    assert [row for row in rows if row not in said] == []
+
+
+def test_every_reason_of_why_not_is_on_the_page() -> None:
+    """The texts that `why.py` can say, without their numbers."""
+    text = re.sub(r'"\s*\n\s*f?"', "", (NAVIGATOR / "alignment" / "why.py").read_text())
+    rows = quoted("Alignment does not come")
+    sentences = re.findall(r'(?:return|=) \[?\s*f?"([^"]{12,})"', text)
+    assert len(sentences) >= 12
+    assert [s for s in sentences if not any(row in s for row in rows)] == []
