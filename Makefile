@@ -13,6 +13,9 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
 	--no-emit-trusted-host --no-emit-options
 
+# The tests start hundreds of processes: modules are compiled once, whatever the caller's habit.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb lock clean \
 	dashboard-check kernels systemd test-packages
