@@ -24,7 +24,11 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 HOME = "opt/fusiond"
 VENV = f"{HOME}/.venv"
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", "fusiond", "drivers", "config")
-MAINTAINER = "The fusiond authors <fusiond@localhost>"
+# As Debian's own tools ask; a package that is given away wants an address that is read.
+MAINTAINER = "{} <{}>".format(
+    os.environ.get("DEBFULLNAME", "The fusiond authors"),
+    os.environ.get("DEBEMAIL", "fusiond@example.org"),
+)
 # Without what would let the builder's own packages in, or leave its paths in what is compiled.
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
 ENVIRONMENT["PYTHONDONTWRITEBYTECODE"] = "1"
@@ -97,14 +101,14 @@ License: Apache-2.0
 OVERRIDES = """\
 # A vendor's package: Debian's archive has no say in /opt.
 fusiond: dir-or-file-in-opt
-fusiond: hidden-file-or-dir
+# The daemon's user may not write there: without them every start would compile them.
+fusiond: package-installs-python-pycache-dir
 # Wheels as published on PyPI, whose hashes are locked.
 fusiond: unstripped-binary-or-object
 fusiond: embedded-library
 fusiond: custom-library-search-path
 fusiond: shared-library-is-executable
 fusiond: library-not-linked-against-libc
-fusiond: ocaml-dangling-cmx
 fusiond: arch-dependent-file-in-usr-share
 """
 
@@ -201,9 +205,8 @@ def system_files(tree: Tree, version: str) -> None:
     tree.write(f"{doc}/copyright", COPYRIGHT)
     entry = f"fusiond ({version}-1) unstable; urgency=medium\n\n  * See CHANGELOG.md.\n\n"
     epoch_s = int(os.environ.get("SOURCE_DATE_EPOCH", _last_commit_s()))
-    tree.packed(
-        f"{doc}/changelog.Debian", f"{entry} -- {MAINTAINER}  {formatdate(epoch_s, usegmt=True)}\n"
-    )
+    when = formatdate(epoch_s, usegmt=True).replace("GMT", "+0000")
+    tree.packed(f"{doc}/changelog.Debian", f"{entry} -- {MAINTAINER}  {when}\n")
     tree.packed(f"{doc}/changelog", (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8"))
     tree.packed("usr/share/man/man1/fusiond.1", man_pages.commands_page())
     tree.packed("usr/share/man/man5/fusiond.toml.5", man_pages.configuration_page())
