@@ -38,6 +38,7 @@ def test_every_key_with_type_default_and_text() -> None:
             assert name in page
     assert r"\fBrate_hz\fR (a number above 0; default 100.0)" in page
     assert "Angle random walk." in page
+    assert "of a shipped one such as" in page  # of a driver's options, below CanOptions
     assert r".SH [sources.NAME] driver = \(dqcan_imu\(dq" in page
 
 

@@ -7,11 +7,14 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import re
 import sys
+import textwrap
 from collections.abc import Iterator
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
@@ -137,19 +140,22 @@ def configuration_page() -> str:
         )
     )
     lines += [".SH TOP LEVEL"]
+    texts = _texts(schema.Config)
     for name, model_field in schema.Config.model_fields.items():
         if not _sections(model_field.annotation):
-            lines += _key(name, model_field)
+            lines += _key(name, model_field, texts.get(name, ""))
     for name, model in _all_sections().items():
         lines += [f".SH [{escaped(name)}]", *_about(model)]
+        texts = _texts(model)
         for key, model_field in model.model_fields.items():
             if not _sections(model_field.annotation):
-                lines += _key(key, model_field)
+                lines += _key(key, model_field, texts.get(key, ""))
     for name, point in sorted(driver_entry_points().items()):
         options = point.load().Options
         lines += [f".SH [sources.NAME] driver = \\(dq{escaped(name)}\\(dq", *_about(options)]
+        texts = _texts(options)
         for key, model_field in options.model_fields.items():
-            lines += _key(key, model_field)
+            lines += _key(key, model_field, texts.get(key, ""))
     lines += [".SH SEE ALSO", r"\fBfusiond\fR(1)"]
     return "\n".join(lines) + "\n"
 
@@ -184,7 +190,24 @@ def _about(model: type[BaseModel]) -> Iterator[str]:
         yield escaped(text)
 
 
-def _key(name: str, model_field: FieldInfo) -> Iterator[str]:
+def _texts(model: type[BaseModel]) -> dict[str, str]:
+    """What stands below each key in the source of the model and of those that it is made from."""
+    found: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        if not issubclass(base, BaseModel) or base is BaseModel:
+            continue
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(tree, ast.ClassDef)
+        for key, below in pairwise(tree.body):
+            match key, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
+                    value=ast.Constant(value=str(text))
+                ):
+                    found[name] = text
+    return found
+
+
+def _key(name: str, model_field: FieldInfo, text: str = "") -> Iterator[str]:
     value = model_field.get_default(call_default_factory=False)
     default = "required" if model_field.is_required() else f"default {_shown(value)}"
     annotation = model_field.annotation
@@ -193,7 +216,7 @@ def _key(name: str, model_field: FieldInfo) -> Iterator[str]:
     kind = described(annotation)
     yield ".TP"
     yield rf"\fB{escaped(name)}\fR ({escaped(f'{kind}; {default}')})"
-    yield escaped(model_field.description or "") or r"\&"
+    yield escaped(text) or r"\&"
 
 
 def _shown(value: Any) -> str:
