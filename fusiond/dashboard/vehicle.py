@@ -67,6 +67,8 @@ class Vehicle:
             return
         elif topic == "event":
             self._row("event", [None if kept else at_s, said])
+        elif topic == "events":
+            self._told_before(said.get("events"), kept)
         elif topic == "innovation":  # of a recording: one by one
             self._innovation(said, number(said, "t_ns"), at_s)
         elif topic == "innovations":
@@ -125,6 +127,13 @@ class Vehicle:
     def _row(self, kind: str, row: list[Any]) -> None:
         self.count += 1
         self._rows[kind].append((self.count, row))
+
+    def _told_before(self, events: object, kept: bool) -> None:
+        """The events before anybody listened here, which the broker had kept."""
+        if kept and isinstance(events, list) and not self._rows["event"]:
+            for one in events:
+                if isinstance(one, Mapping):
+                    self._row("event", [None, one])
 
     def _remember(self, topic: str, said: Said, at_s: float, kept: bool) -> None:
         if topic == "nav":

@@ -143,7 +143,7 @@ class InvariantFilter(KalmanEstimator):
     """The centralised filter, whose updates run in xi while it `turns`.
 
     One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
-    when it is known no better than `LARGE_SD_RAD`.
+    when a doubt of the motion has made it known no better than `LARGE_SD_RAD`.
     """
 
     def __init__(self, model: Model, gap_s: float, settles: bool = True) -> None:
@@ -151,6 +151,7 @@ class InvariantFilter(KalmanEstimator):
         self._settles = settles
         self.turns = False
         """Whether updates run in xi: the heading may be far off."""
+        self._doubted = False
         self._mounting = model.slots_of(MOUNTING)
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
@@ -233,17 +234,22 @@ class InvariantFilter(KalmanEstimator):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.turns = False
+        self.turns = self._doubted = False
+
+    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
+        super().doubt(aid, measured, motion)
+        self._doubted |= motion
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
-        if self._settles and self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2:
+        if self._doubted and self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2:
             self.turns = True
         if not self.turns or self._holding:
             return super().update(aid)
         outcome = self._update(aid)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
-            self.turns = False
+            self.turns = self._doubted = False
         return outcome
 
     def _update(self, aid: Linearised) -> Outcome:
@@ -330,10 +336,11 @@ class InvariantFilter(KalmanEstimator):
         return Sought(gain @ nu, after, nis, passed, log, tuple(whitened.tolist()))
 
     def _own_snapshot(self) -> object:
-        return self.turns
+        return self.turns, self._doubted
 
     def _own_restore(self, extra: object) -> None:
-        self.turns = bool(extra)
+        assert isinstance(extra, tuple)
+        self.turns, self._doubted = extra
 
 
 def _way(a: Array, b: Array) -> Array:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fusiond.configuration.settings import ARCSEC
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.sensor_errors import gauss_markov
+from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.trajectories import dcm_from_rpy
 
 Array = NDArray[np.float64]

@@ -23,12 +23,22 @@ def test_every_topic_is_taken() -> None:
     for k, topic in enumerate(NAMES):
         if topic == "event":
             assert new["rows"]["event"] == [[1.0 + k, said("event")]]
-        elif topic not in ("tracker", "innovations"):  # `nav` says it better; rows do
+        elif topic not in ("tracker", "innovations", "events"):  # `nav` says it better; rows do
             assert new["messages"][topic]["said"] == said(topic)
             assert new["messages"][topic]["at"] == 1.0 + k
     assert new["rows"]["nav"][0][3:5] == [said("nav")["lat_deg"], said("nav")["lon_deg"]]
     assert [row[1:] for row in new["rows"]["nis"]] == [["rdss", 0.893, 0.7422, 1.2956]]
     assert new["messages"]["online"]["said"] == "online"
+
+
+def test_events_before_the_first_look_are_those_that_the_broker_has_kept() -> None:
+    vehicle = Vehicle("truck")
+    vehicle.take("events", said("events"), 5.0, kept=True)
+    vehicle.take("event", said("event"), 6.0)
+    vehicle.take("events", said("events"), 6.0)
+    told = said("events")["events"]
+    expected = [*([None, one] for one in told), [6.0, said("event")]]
+    assert vehicle.since(0)["rows"]["event"] == expected
 
 
 def test_only_what_is_new_is_told() -> None:

@@ -64,6 +64,8 @@ def nees_of_tilt_and_force(kind: type[KalmanEstimator], seed: int) -> float:
     estimator = kind(model, IMU.gap_s)
     nav = with_error(start, draw)
     estimator.initialise(int(times[first - 1]), first, nav, xi, np.diag(sd**2))
+    if isinstance(estimator, InvariantFilter):
+        estimator.turns = True  # as after a doubt
     for t_s in (BEND_S + 0.02, *np.arange(FIXES_S, END_S, 0.2)):
         t_ns = round(float(t_s) * 1e9)
         estimator.propagate(buffer, t_ns)

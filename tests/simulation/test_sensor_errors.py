@@ -14,8 +14,9 @@ from fusiond.configuration.schema import Config, Imu
 from fusiond.files.tables import read_gnss, read_imu, read_rdss, read_truth
 from fusiond.simulation.files import simulate
 from fusiond.simulation.gnss.receiver import GnssOptions
+from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
-from fusiond.simulation.sensor_errors import Vibration, gauss_markov, imu_output
+from fusiond.simulation.sensor_errors import Vibration, imu_output
 from fusiond.simulation.trajectories import static
 from tests.places import REPOSITORY
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from fusiond.estimators.invariant import PLAIN_SD_RAD
 from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -29,6 +28,9 @@ CLAIMS = (SAVED, CONFIGURED)
 # A claim that is poorer than this is no start where driving tells the heading: the filter would
 # find it as well, but what it says until then helps nobody.
 POOR_SD_RAD = math.radians(15.0)
+# Up to 5 deg plain coordinates are as honest (NEES 10.0 of 9, docs/estimators.md); beyond, the
+# filter's updates turn with the heading.
+PLAIN_CLAIM_RAD = math.radians(6.0)
 ON_THE_WAY = frozenset({"gnss_course", "positions"})
 """Sources that give a heading as the vehicle drives."""
 # One sigma of velocity (m/s) of a vehicle that stands.
@@ -46,7 +48,7 @@ def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> 
         return None
     roll, pitch = level(standing.mean_force)
     dcm = dcm_from_rpy(roll, pitch, yaw)
-    wide = sd > PLAIN_SD_RAD
+    wide = sd > PLAIN_CLAIM_RAD
     start = build_start(
         by.model,
         standing.end_ns,

@@ -58,7 +58,7 @@ from fusiond.navigation.gps_time import GPS_EPOCH_POSIX_S
 from fusiond.simulation.gnss.masks import Mask, View
 from fusiond.simulation.gnss.nav_fields import quantised
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.sensor_errors import gauss_markov
+from fusiond.simulation.markov import gauss_markov
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
-from fusiond.simulation.sensor_errors import gauss_markov
+from fusiond.simulation.markov import gauss_markov
 
 Vector3 = tuple[float, float, float]
 Talker = Literal["GP", "GN", "BD", "GB"]

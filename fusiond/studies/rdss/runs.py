@@ -37,7 +37,8 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
-from fusiond.simulation.sensor_errors import gauss_markov, imu_output
+from fusiond.simulation.markov import gauss_markov
+from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Path as Trajectory
 from fusiond.studies.live_filter import CHECKPOINT_S, HISTORY_S
 from fusiond.studies.monte_carlo import on_processes

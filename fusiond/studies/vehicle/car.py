@@ -56,7 +56,8 @@ from fusiond.navigator.constraints import GATE
 from fusiond.navigator.intake import Intake
 from fusiond.simulation.barometer import Barometer, BarometerOptions
 from fusiond.simulation.imu_truth import Truth
-from fusiond.simulation.sensor_errors import gauss_markov, imu_output
+from fusiond.simulation.markov import gauss_markov
+from fusiond.simulation.sensor_errors import imu_output
 from fusiond.simulation.trajectories import Path, dcm_from_rpy
 from fusiond.studies.navigation_error import metres, true_nav
 
