@@ -32,9 +32,10 @@ $(BIN)/python:
 	@echo "creating $(VENV)"
 	$(PYTHON) -m venv $(VENV)
 
+# Of the packages little is ever imported: that is compiled when it is, not all of it here.
 $(STAMP): requirements-dev.lock pyproject.toml | $(BIN)/python
 	@echo "installing locked dependencies and fusiond into $(VENV)"
-	$(PIP) install --quiet --require-hashes -r requirements-dev.lock
+	$(PIP) install --quiet --no-compile --require-hashes -r requirements-dev.lock
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
