@@ -142,6 +142,10 @@ class Isolation:
         """Why nobody can tell whether filter or sources are right; None where that is known."""
         return support.contested(self._records, t_ns)
 
+    def velocity_left_out(self, t_ns: int) -> bool:
+        """Whether a velocity that comes is not believed."""
+        return support.velocity_left_out(self._records, t_ns)
+
     @property
     def doubts(self) -> tuple[int, ...]:
         """Instants (ns) at which the filter was in doubt, the last `DOUBTS` of them."""

@@ -90,6 +90,11 @@ def supported(records: Records, device: str, t_ns: int) -> bool:
     )
 
 
+def velocity_left_out(records: Records, t_ns: int) -> bool:
+    """Whether a velocity that comes is not believed."""
+    return any(r.moves and r.excluded and t_ns - r.heard_ns <= FORGET_NS for r in records.values())
+
+
 def velocity_sd(records: Records, device: str) -> float:
     """Sigma (m/s) of the device's velocities as a mean of many shows it; 0 without any."""
     found = (r.sd_m_s * r.colour for r in records.values() if r.moves and r.device == device)

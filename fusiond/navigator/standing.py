@@ -85,7 +85,7 @@ class Standing:
 
         `nav` (10,) at `t_ns`, the filter's instant.
         """
-        self._watch(isolation, nav)
+        self._watch(t_ns, isolation, nav)
         speed = math.hypot(nav[VN], nav[VE])
         if speed > self._max_speed:
             return f"{speed:.0f} m/s is faster than this vehicle can be"
@@ -100,11 +100,12 @@ class Standing:
             return None
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
-    def _watch(self, isolation: Isolation, nav: Array) -> None:
-        """How far the velocity has changed since the start or the last doubt."""
+    def _watch(self, t_ns: int, isolation: Isolation, nav: Array) -> None:
+        """How far the velocity has changed since the start or the last doubt, and since measured
+        velocities go along: a bend in which one is left out proves nothing."""
         since_ns = max((self._started_ns, *isolation.doubts))
         velocity = float(nav[VN]), float(nav[VE])
-        if since_ns != self._since_ns:
+        if since_ns != self._since_ns or isolation.velocity_left_out(t_ns):
             self._since_ns, self._from, self._changed = since_ns, velocity, 0.0
         self._changed = max(self._changed, math.dist(velocity, self._from))
 

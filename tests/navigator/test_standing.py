@@ -27,6 +27,13 @@ class Doubted(Isolation):
         self._doubts = tuple(round(t * S) for t in at_s)
 
 
+class WithoutVelocity(Isolation):
+    """An isolation that leaves out a velocity that comes."""
+
+    def velocity_left_out(self, t_ns: int) -> bool:
+        return True
+
+
 def at(t_s: float) -> KalmanEstimator:
     """A filter at an instant; its IMU is mounted to within 5 deg."""
     model = make_model("ins15", imu_noise(IMU), mounting(math.radians(5.0)))
@@ -102,6 +109,16 @@ def test_after_a_failure_driving_straight_on_proves_nothing() -> None:
     nav[VN], nav[VE] = 19.0, 6.0
     assert standing.failure(91 * S, isolation, nav) is None
     assert standing.shaken(at(91.0), isolation) is None
-    again = Doubted(92)  # what was proven before a doubt is not after it
-    assert standing.failure(93 * S, again, nav) is None
-    assert standing.shaken(at(110.0), again) is not None
+    isolation = WithoutVelocity()  # a bend that its velocity does not go along with
+    standing.given_up(100 * S)
+    standing.started(101 * S)
+    assert standing.failure(102 * S, isolation, nav) is None
+    nav[VN], nav[VE] = 6.0, 19.0
+    assert standing.failure(190 * S, isolation, nav) is None
+    assert standing.shaken(at(190.0), isolation) is not None
+    nav[VN], nav[VE] = 19.0, 6.0
+    assert standing.failure(191 * S, Isolation(), nav) is None
+    assert standing.shaken(at(191.0), Isolation()) is None
+    again = Doubted(192)  # what was proven before a doubt is not after it
+    assert standing.failure(193 * S, again, nav) is None
+    assert standing.shaken(at(210.0), again) is not None
