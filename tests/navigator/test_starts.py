@@ -29,8 +29,9 @@ RATE_HZ, EVERY = 50.0, 10
 """A fix after so many samples."""
 SD_M, SD_M_S = 1.5, 0.05
 RUNS = 24
-HIGH = float(chi2.ppf(0.999, 3 * RUNS)) / RUNS
-"""99.9 % of the mean of as many NEES of three states."""
+HIGH, HIGH_5 = (float(chi2.ppf(0.999, n * RUNS)) / RUNS for n in (3, 5))
+"""99.9 % of the mean of as many NEES of three states, and of five."""
+TILT_AND_FORCE = [0, 1, 12, 13, 14]
 FORWARD, BACKWARD = "GNSS course", "GNSS course, backward"
 MOVING, MOVING_BACKWARD = "GNSS course, on the move", "GNSS course, on the move, backward"
 LEVER = (3.0, 0.4, -1.0)
@@ -106,6 +107,12 @@ def _feed(
         yield
 
 
+def _run(case: Case, seed: int) -> runs.ImuRun:
+    return runs.imu_run(
+        Config.model_validate({"imu": {"rate_hz": RATE_HZ}}).imu, _truth(case), seed
+    )
+
+
 def _started(case: Case, seed: int, until_s: float = 60.0) -> Navigator:
     """Run until the start, or to `until_s`."""
     config = Config.model_validate(
@@ -115,7 +122,7 @@ def _started(case: Case, seed: int, until_s: float = 60.0) -> Navigator:
             "alignment": {"heading": ["gnss_course"]},
         }
     )
-    samples = runs.imu_run(config.imu, _truth(case), seed).samples
+    samples = _run(case, seed).samples
     navigator = Navigator(config)
     rows = range(round(case.from_s * RATE_HZ), round(until_s * RATE_HZ), EVERY)
     for _ in _feed(navigator, case, samples, rows, np.random.default_rng(seed)):
@@ -128,7 +135,7 @@ def _started(case: Case, seed: int, until_s: float = 60.0) -> Navigator:
 def test_sigma_of_a_start_is_honest(name: str) -> None:
     case = CASES[name]
     truth = _truth(case)
-    attitude, velocity, yaw_sd = [], [], []
+    attitude, velocity, tilt_and_force, yaw_sd = [], [], [], []
     for seed in range(RUNS):
         start = _started(case, seed).started
         assert start is not None, f"seed {seed}"
@@ -138,13 +145,21 @@ def test_sigma_of_a_start_is_honest(name: str) -> None:
         assert abs(error[2]) < 5.0 * math.sqrt(p[2, 2]), f"seed {seed}: yaw"
         attitude.append(error[:3] @ np.linalg.solve(p[:3, :3], error[:3]))
         velocity.append(error[3:6] @ np.linalg.solve(p[3:6, 3:6], error[3:6]))
+        # What tilt and force biases have to do with each other shows in all five together.
+        biases = _run(case, seed).biases[round(start.t_ns * 1e-9 * RATE_HZ) - 1]
+        both = np.concatenate((error[:2], biases[3:] - start.xi[12:15]))
+        five = p[np.ix_(TILT_AND_FORCE, TILT_AND_FORCE)]
+        tilt_and_force.append(both @ np.linalg.solve(five, both))
         yaw_sd.append(math.sqrt(p[2, 2]) / DEG)
     print(
         f"{name}: mean NEES of attitude {np.mean(attitude):.2f}, of velocity "
-        f"{np.mean(velocity):.2f} of 3 (to {HIGH:.2f}); sigma of yaw {np.mean(yaw_sd):.1f} deg"
+        f"{np.mean(velocity):.2f} of 3 (to {HIGH:.2f}), of tilt and force biases "
+        f"{np.mean(tilt_and_force):.2f} of 5 (to {HIGH_5:.2f}); sigma of yaw "
+        f"{np.mean(yaw_sd):.1f} deg"
     )
     assert np.mean(attitude) < HIGH
     assert np.mean(velocity) < HIGH
+    assert np.mean(tilt_and_force) < HIGH_5
     assert np.mean(yaw_sd) < 10.0
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.alignment import integrate_from_rest, level
-from fusiond.navigation.earth import gravity
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import (
     dcm_from_quaternion,
@@ -37,7 +37,9 @@ from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import Fix, Standing, place_of
 from fusiond.navigator.alignment.start import (
+    BIAS_SETTLING_S,
     LEVEL_SD_RAD,
+    Levelled,
     Place,
     Start,
     build_start,
@@ -158,6 +160,21 @@ def _moved_off(
         rate,
         "GNSS course" + (", backward" if backward else ""),
         rest_bias(by.noise, standing, at_rest, lat),
+        Levelled(at_rest, _level_sd(by, (velocity.t_ns - standing.end_ns) * 1e-9, turned, lat)),
+    )
+
+
+def _level_sd(by: Basis, seconds: float, turned: float, lat: float) -> float:
+    """Sigma (rad) of a level carried on by the gyros since a rest: white noise, what the rate bias
+    seen at rest lacks, and on the axes of before the Earth's level rate and what is not square."""
+    n = by.noise
+    aside = 2.0 * abs(math.sin(0.5 * turned))
+    return math.sqrt(
+        LEVEL_SD_RAD**2
+        + n.rate_noise**2 * seconds
+        + (LEVEL_SD_RAD / BIAS_SETTLING_S * seconds) ** 2
+        + (aside * EARTH_RATE_RAD_S * math.cos(lat) * seconds) ** 2
+        + (aside * by.options.misalignment_rad) ** 2
     )
 
 
@@ -277,6 +294,7 @@ def _build(
     rate: Array,
     how: str,
     bias: tuple[Array, float] | None = None,
+    levelled: Levelled | None = None,
 ) -> Start:
     """With the antenna's velocity taken to the body."""
     velocity, sd = velocity_of(offer)
@@ -291,6 +309,6 @@ def _build(
         sd,
         how,
         bias=bias,
-        levelled=bias is not None,
+        levelled=levelled,
         unexplained=by.known.unexplained,
     )

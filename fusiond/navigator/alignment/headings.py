@@ -13,6 +13,7 @@ from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import CONTRADICTION_SIGMAS
 from fusiond.navigator.alignment.start import (
+    Levelled,
     Place,
     Start,
     as_geodetic,
@@ -59,7 +60,7 @@ def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> 
         REST_VELOCITY_SD,
         how,
         bias=rest_bias(by.noise, standing, dcm, place[1][0], sd if wide else 0.0),
-        levelled=True,
+        levelled=Levelled(dcm),
     )
     return turned_at_rest(by.model, start, place, dcm) if wide else start
 
@@ -115,15 +116,16 @@ def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     roll, pitch = level(standing.mean_force)
     yaw = gyrocompass(standing.mean_rate, roll, pitch)
     white = by.noise.rate_noise / math.sqrt(standing.seconds)
+    dcm = dcm_from_rpy(roll, pitch, yaw)
     return build_start(
         by.model,
         standing.end_ns,
         place,
-        dcm_from_rpy(roll, pitch, yaw),
+        dcm,
         white / (EARTH_RATE_RAD_S * math.cos(lat)),
         np.zeros(3),
         REST_VELOCITY_SD,
         "gyrocompass",
-        levelled=True,
+        levelled=Levelled(dcm),
         compassed=True,
     )

@@ -18,7 +18,8 @@ class AlignmentOptions:
     """SI units; `heading` the allowed sources in order of preference, `window_s` the length of the
     standstill detector's windows, `rate_sd_rad_s` what a vehicle at rest may turn, `no_slip_m` from
     the IMU to the point that does not slide, where it is known, `quiet_rad_s` and `quiet_m_s2` the
-    standard deviations below which the sensor is quiet."""
+    standard deviations below which the sensor is quiet, `misalignment_rad` how far the axes are out
+    of square."""
 
     heading: tuple[str, ...]
     heading_rad: float | None
@@ -39,6 +40,7 @@ class AlignmentOptions:
     rate_hz: float
     quiet_rad_s: float
     quiet_m_s2: float
+    misalignment_rad: float
 
 
 def alignment_options(config: Config) -> AlignmentOptions:
@@ -65,5 +67,6 @@ def alignment_options(config: Config) -> AlignmentOptions:
         rate_hz=config.imu.rate_hz,
         quiet_rad_s=rest.gyro_sd_deg_s * DEG,
         quiet_m_s2=rest.accel_sd_m_s2,
+        misalignment_rad=config.imu.misalignment_deg * DEG,
         max_reverse_m_s=math.inf if config.vehicle_class == "rail" else MAX_REVERSE_M_S,
     )

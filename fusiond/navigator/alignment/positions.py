@@ -39,7 +39,7 @@ from fusiond.navigator.alignment.collected import FIXES_NS, Standing
 from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
 from fusiond.navigator.alignment.motion import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.start import Place, Start, build_start
+from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
 
 Array = NDArray[np.float64]
 
@@ -207,7 +207,7 @@ class Track:
                 REST_VELOCITY_SD,
                 HOW,
                 bias=rest_bias(by.noise, left, dcm, float(where[0])),
-                levelled=True,
+                levelled=Levelled(dcm),
             )
             cell = self._cell(imu, start, 1.0)
             for aid in there:

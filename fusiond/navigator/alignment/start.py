@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ Array = NDArray[np.float64]
 
 # One sigma of tilt (rad) of a vehicle that stands with its engine on.
 LEVEL_SD_RAD = math.radians(0.1)
-# The same (rad) after levelling in motion.
+# A vehicle at rest settles by so much in this time (s): it looks like a rate bias.
+BIAS_SETTLING_S = 60.0
+# One sigma of tilt (rad) after levelling in motion.
 MOTION_LEVEL_SD_RAD = math.radians(2.0)
 # One sigma of velocity (m/s) that no start claims to beat.
 LEAST_VELOCITY_SD = 0.05
@@ -45,6 +48,14 @@ def velocity_of(offer: VelocityOffer) -> tuple[Array, Array]:
     sd = max(offer.sd)
     climb = math.hypot(sd, SLOPE_SD * math.hypot(*offer.v_ned))
     return np.array([*offer.v_ned, 0.0]), np.array([sd, sd, climb])
+
+
+class Levelled(NamedTuple):
+    """Attitude C_nb (3, 3) when gravity told roll and pitch, and one sigma (rad) of what has come
+    to them since and beside the force errors of then."""
+
+    dcm: Array
+    sd: float = LEVEL_SD_RAD
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +85,16 @@ def build_start(
     how: str,
     *,
     bias: tuple[Array, float] | None = None,
-    levelled: bool = False,
+    levelled: Levelled | None = None,
     compassed: bool = False,
     unexplained: Array | None = None,
 ) -> Start:
     """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
-    at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors.
+    at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors as
+    they were turned then: a vehicle that has taken a bend since has the tilt of before on the axes
+    of before, and its sensors on others.
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
     """
     fix, where, sd_position = place
@@ -93,7 +106,7 @@ def build_start(
     if fix is not None:
         nav[:3] -= as_geodetic(dcm @ np.array(fix.lever), lat)
     p = np.diag(model.initial**2)
-    tilt_sd = LEVEL_SD_RAD if levelled else MOTION_LEVEL_SD_RAD
+    tilt_sd = MOTION_LEVEL_SD_RAD if levelled is None else levelled.sd
     p[0, 0] = p[1, 1] = tilt_sd**2
     p[2, 2] = sd_yaw**2
     p[3:6, 3:6] = np.diag(np.maximum(sd_velocity, LEAST_VELOCITY_SD) ** 2)
@@ -106,8 +119,8 @@ def build_start(
         for axis in range(3):
             slot = model.parameters(9 + axis)[0]
             p[slot, slot] += float(unexplained[axis]) ** 2
-    if levelled:
-        _correlate(model, p, dcm, lat, height, compassed)
+    if levelled is not None:
+        _correlate(model, p, levelled.dcm, lat, height, compassed)
     return Start(t_ns, nav, xi, p, how)
 
 
@@ -137,7 +150,7 @@ def _start_biases(model: Model, p: Array, xi: Array, bias: Array, sd: float) -> 
     for axis in range(3):
         slot = model.parameters(9 + axis)[0]
         prior = p[slot, slot]
-        floor = LEVEL_SD_RAD / 60.0  # a vehicle at rest that settles 0.1 deg in a minute
+        floor = LEVEL_SD_RAD / BIAS_SETTLING_S
         variance = sd**2 + floor**2
         xi[slot] = bias[axis] * prior / (prior + variance)
         p[slot, slot] = prior * variance / (prior + variance)
