@@ -10,6 +10,7 @@ all that is known may refute (`Rest.doubt`):
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
     the mean of measured speeds is not zero               `moving`    (fusiond.aiding.witnesses)
     |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
+    the same by seven sigma, and the speed is known to be zero        `turns_at_rest`
     the ride is smooth, and neither sqrt(P_vv) nor the
     sigma of a mean of measured speeds is below s_v       `quiet_at_speed`
 
@@ -51,6 +52,9 @@ Array = NDArray[np.float64]
 VELOCITY_PROBABILITY = 1e-4
 # Against the bias's sigma, each axis.
 RATE_SIGMAS = 3.0
+# The same, where it is no chance: on wheels nothing turns on the spot.
+SURE_SIGMAS = 7.0
+TURNS_AT_REST = "turns_at_rest"
 # How far back measured speeds are averaged: as many windows as a run has.
 WITNESSED_NS = 1_000_000_000
 
@@ -93,20 +97,28 @@ class Rest:
         measured = self.witnesses.measured(begin_ns, w.end_ns)
         if square > chdtri(rows, VELOCITY_PROBABILITY) or measured.contradicts:
             return "moving"
-        if self._turns(state, p, w.mean_rate, 1) or self._turns(state, p, w.run_rate, w.run):
-            return "turning"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
+        if self._turns(state, p, w.mean_rate, 1) or self._turns(state, p, w.run_rate, w.run):
+            sure = known and self._turns(state, p, w.mean_rate, 1, SURE_SIGMAS)
+            return TURNS_AT_REST if sure else "turning"
         if not known and self.witnesses.smooth_ride(w.end_ns):
             return "quiet_at_speed"
         return None
 
-    def _turns(self, state: State, p: Array, mean_rate: Array, count: int) -> bool:
+    def _turns(
+        self,
+        state: State,
+        p: Array,
+        mean_rate: Array,
+        count: int,
+        sigmas: float = RATE_SIGMAS,
+    ) -> bool:
         error = _rate_error(state, mean_rate)
         free = (self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2) / count
         for axis in range(3):
             slots = state.model.parameters(9 + axis)
             variance = float(p[np.ix_(slots, slots)].sum()) + free
-            if error[axis] ** 2 > RATE_SIGMAS**2 * variance:
+            if error[axis] ** 2 > sigmas**2 * variance:
                 return True
         return False
 

@@ -49,7 +49,7 @@ from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffe
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart
-from fusiond.integrity.series import DRIFTS, PACES, Series
+from fusiond.integrity.series import DRIFTS, NEVER_NS, PACES, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
 from fusiond.navigation.strapdown import LAT, LON, VE, VN
@@ -113,6 +113,7 @@ class Isolation:
         self._records: dict[str, Series] = {}
         self._doubts: tuple[int, ...] = ()
         self._tilting = NOT_TILTING
+        self._contradicted = False
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -161,8 +162,10 @@ class Isolation:
         self._records = {name: r.copied() for name, r in memory.records.items()}
         self._doubts, self._tilting = memory.doubts, memory.tilting
 
-    def reset(self) -> None:
-        """The filter starts anew: nobody is suspected."""
+    def reset(self, contradicted: bool = False) -> None:
+        """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
+        their velocities are to prove themselves, as after an outage."""
+        self._contradicted = contradicted
         self._records.clear()
         self._doubts, self._tilting = (), NOT_TILTING
 
@@ -235,8 +238,9 @@ class Isolation:
     def _prove(self, record: Series, offer: PositionOffer, nav: Array) -> bool:
         """A position is fused; whether it runs away from the motion since an outage, which a
         velocity of the same device supports."""
-        if support.outage(self._records, offer.t_ns):
-            record.proof = Proof.begun(offer, nav, record.colour)
+        suspect = self._contradicted and record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
+        if suspect or support.outage(self._records, offer.t_ns):
+            record.proof = Proof.begun(offer, nav, record.colour, suspect)
         elif record.proof is not None:
             sd_m_s = support.velocity_sd(self._records, record.device)
             proof = record.proof.with_one(offer, nav, sd_m_s)

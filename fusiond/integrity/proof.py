@@ -132,15 +132,18 @@ class Proof(NamedTuple):
     sd_m_s: float = 0.0
     way: tuple[float, float] = (0.0, 0.0)
     trend: Trend = NO_TREND
+    suspect: bool = False
 
     @staticmethod
-    def begun(offer: PositionOffer, nav: Array, colour: float) -> Proof:
-        """With the first fix; `nav` (10,) the filter's state."""
+    def begun(offer: PositionOffer, nav: Array, colour: float, suspect: bool = False) -> Proof:
+        """With the first fix; `nav` (10,) the filter's state. `suspect`: it was seen to run away
+        before, so nothing but the whole proof will do."""
         lat, lon = float(nav[LAT]), float(nav[LON])
         z = apart(offer, lat, lon, nav)
         to_m = metres_a_radian(nav)
         place = lat - z.north / to_m[0], lon - z.east / to_m[1]
-        return Proof(*place, offer.t_ns, offer.t_ns, (float(nav[VN]), float(nav[VE])), colour)
+        v = float(nav[VN]), float(nav[VE])
+        return Proof(*place, offer.t_ns, offer.t_ns, v, colour, suspect=suspect)
 
     def with_one(self, offer: PositionOffer, nav: Array, sd_m_s: float) -> Proof:
         """With one fix more, and the sigma of the velocities that there are now."""
@@ -164,7 +167,7 @@ class Proof(NamedTuple):
     @property
     def goes_along(self) -> bool:
         """Whether the slope is known well enough to say so, and zero as far as it is known."""
-        return self.trend.slope[1] <= TREND_SD_M_S and self._none
+        return not self.suspect and self.trend.slope[1] <= TREND_SD_M_S and self._none
 
     @property
     def proven(self) -> bool:

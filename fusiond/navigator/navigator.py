@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.standstill import TURNS_AT_REST
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
@@ -103,7 +104,8 @@ class Navigator:
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedAids(self._event)
         self._left_out = LeftOut(self.timeline, names, self._event)
-        self._standing = Standing(config.plausibility.max_speed_m_s)
+        wheeled = config.constraints.non_holonomic.enabled
+        self._standing = Standing(config.plausibility.max_speed_m_s, wheeled)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
@@ -230,7 +232,7 @@ class Navigator:
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             if isinstance(self.estimator, InvariantFilter):
                 self.estimator.turns = start.turns
-            self.timeline.start()
+            self.timeline.start(start.contradicted)
             self.verdicts.reset()
             self.started = start
             self._afterwards = Afterwards(alignment_options(self.config), start)
@@ -277,7 +279,8 @@ class Navigator:
         e, start = self.estimator, self._afterwards
         if start is None:
             return False
-        wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.witnesses)
+        doubted = bool(self.timeline.isolation.doubts)
+        wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.witnesses, doubted)
         if wrong is None:
             return False
         if wrong[0] != "heading_contradicted":  # that was the claim's fault, not the sensors'
@@ -350,9 +353,8 @@ class Navigator:
             return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
         if self.on_trial:
             return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"
-        if self._afterwards is not None and self._afterwards.unconfirmed:
-            how = self.started.how
-            return Mode.COASTING, f"heading from {how}; no motion has confirmed it yet"
+        if self._afterwards is not None and (hangs := self._afterwards.unconfirmed):
+            return Mode.COASTING, f"heading from {self.started.how}; {hangs}"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
         shaken = self._standing.shaken(self.estimator, self.timeline.isolation)
@@ -381,6 +383,8 @@ class Navigator:
             self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
             if entry.aid.locates:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
+        if outcome is not None and outcome.name == TURNS_AT_REST:
+            self._standing.turned(entry.key[0])
         if outcome is not None:
             entry.aid.judged(outcome.rows, outcome.whitened)
             if outcome.name in JUDGED:

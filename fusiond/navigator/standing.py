@@ -5,6 +5,8 @@ what follows for the operator:
 
     doubted    the motion was in doubt lately: the sigma was widened, and is not yet proven
     unchecked  positions come and none is believed: the IMU alone carries the solution
+    turned     the gyros felt a turn of a vehicle that stood: they are wrong, or what it stands on
+               has turned, and until it has moved nobody can tell
     contested  what was left out may be right: nobody can tell
     askew      the IMU does not sit on the vehicle as it was configured: whose attitude is it?
     given up   the filter is wrong, or cannot be told from wrong any more: alignment begins anew
@@ -60,10 +62,12 @@ ASKEW_SIGMAS = 4.0
 
 
 class Standing:
-    """Follows one navigation from its start; `max_speed_m_s` of the vehicle."""
+    """Follows one navigation from its start; `max_speed_m_s` of the vehicle, and whether it is one
+    that does not slide (`wheeled`) and so cannot turn on the spot."""
 
-    def __init__(self, max_speed_m_s: float) -> None:
-        self._max_speed = max_speed_m_s
+    def __init__(self, max_speed_m_s: float, wheeled: bool = False) -> None:
+        self._max_speed, self._wheeled = max_speed_m_s, wheeled
+        self._turned_ns = NEVER_NS
         self._trial_ns = 0
         self._started_ns = 0
         self._since_ns = 0
@@ -72,7 +76,12 @@ class Standing:
 
     def started(self, t_ns: int) -> None:
         """A navigation has begun."""
-        self._started_ns = t_ns
+        self._started_ns, self._turned_ns = t_ns, NEVER_NS
+
+    def turned(self, t_ns: int) -> None:
+        """The gyros have felt a turn of a vehicle that stands."""
+        if self._wheeled:
+            self._turned_ns = max(self._turned_ns, t_ns)
 
     def given_up(self, t_ns: int) -> None:
         """It was wrong: the next one is on trial."""
@@ -103,7 +112,7 @@ class Standing:
     def _watch(self, t_ns: int, isolation: Isolation, nav: Array) -> None:
         """How far the velocity has changed since the start or the last doubt, and since measured
         velocities go along: a bend in which one is left out proves nothing."""
-        since_ns = max((self._started_ns, *isolation.doubts))
+        since_ns = max((self._started_ns, self._turned_ns, *isolation.doubts))
         velocity = float(nav[VN]), float(nav[VE])
         if since_ns != self._since_ns or isolation.velocity_left_out(t_ns):
             self._since_ns, self._from, self._changed = since_ns, velocity, 0.0
@@ -127,6 +136,8 @@ class Standing:
             return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
         if self._trial_ns and self._changed < PROVING_M_S:
             return "after a failure, and no bend or change of speed has proven it since"
+        if self._turned_ns > NEVER_NS and self._changed < PROVING_M_S:
+            return "a turn was felt at rest: a gyro is wrong, or the ground has turned"
         return isolation.contested(t_ns) or _askew(estimator)
 
 

@@ -88,10 +88,11 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.isolation = Isolation()
 
-    def start(self) -> None:
-        """Begin at the estimator's state: nothing earlier can be applied any more."""
+    def start(self, contradicted: bool = False) -> None:
+        """Begin at the estimator's state: nothing earlier can be applied any more. `contradicted`:
+        positions have moved otherwise than their velocities."""
         self._next = 0
-        self.isolation.reset()
+        self.isolation.reset(contradicted)
         self._checkpoints = [
             _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())
         ]

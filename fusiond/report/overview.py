@@ -17,7 +17,10 @@ MODES = tuple(str(mode) for mode in Mode)
 MARKED_FROM = 0.05
 """Share of refusals that catches the eye: a gate alone refuses 1e-4 by its default."""
 _NO_FAULT = frozenset(
-    ("no_alignment", "no_imu", "moving", "turning", "quiet_at_speed", "too_slow", "height_held")
+    (
+        *("no_alignment", "no_imu", "moving", "turning", "turns_at_rest", "quiet_at_speed"),
+        *("too_slow", "height_held"),
+    )
 )
 """Outcomes that say nothing against the source: it could not be used just then."""
 TRACK_POINTS = 4000

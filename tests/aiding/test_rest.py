@@ -89,6 +89,14 @@ def test_a_turn_is_no_bias() -> None:
     assert runs.rest(mean_rate=fast, run=10).doubt(unknown) is None
 
 
+def test_a_turn_on_the_spot_is_told_apart_where_the_speed_is_known_to_be_zero() -> None:
+    mean_rate = (0.0, 0.0, 1.0 * DEG)
+    assert runs.rest(mean_rate=mean_rate).doubt(_state(0.0, 0.02)) == "turns_at_rest"
+    assert runs.rest(mean_rate=mean_rate).doubt(_state(0.0, 0.5)) == "turning"
+    known = runs.rest(mean_rate=mean_rate, witnesses=_fixes(0.0, 10))
+    assert known.doubt(_state(0.0, 0.5)) == "turns_at_rest"
+
+
 def test_quiet_proves_nothing_on_a_smooth_ride() -> None:
     """Once quiet windows at speed have been seen, rest takes evidence as good as its claim."""
     witnesses = Witnesses()

@@ -113,8 +113,9 @@ def test_what_drifts_is_told_and_never_proven(drift_m_s: float) -> None:
 class Returned:
     """A receiver that is back after an outage, in the eyes of an isolation: what it believed."""
 
-    def __init__(self, velocities: bool) -> None:
+    def __init__(self, velocities: bool, contradicted: bool = False) -> None:
         self.isolation = Isolation()
+        self.isolation.reset(contradicted)
         self._journey = Journey(1)
         self._noise = np.random.default_rng(2)
         self._velocities = velocities
@@ -150,6 +151,7 @@ class Returned:
         return found
 
 
+RATE = round(RATE_HZ)
 # After fix 600 there is an outage of 40 s. By then the series has shown that its noise is white.
 LAST, BACK = 600, 800
 
@@ -172,6 +174,18 @@ def test_one_that_drifts_from_its_first_fix_on_is_left_out() -> None:
     found = returned.fixes(BACK, BACK + 150, drift_m_s=0.15)
     assert Action.DOUBT_MEASURED in {action for _, action in found}
     assert returned.isolation.excluded == {"gnss": "drifts"}
+
+
+def test_one_that_ran_away_before_the_start_is_to_prove_itself() -> None:
+    """Nothing less than the whole proof will do, and a drift ends it."""
+    returned = Returned(velocities=True, contradicted=True)
+    assert all(less for less, _ in returned.fixes(0, 50)[1:])
+    assert "not yet seen to go with" in (returned.isolation.contested(50 * S // RATE) or "")
+    assert not returned.fixes(50, 200)[-1][0]
+    assert returned.isolation.contested(200 * S // RATE) is None
+    drifting = Returned(velocities=True, contradicted=True)
+    drifting.fixes(0, 110, drift_m_s=0.3)
+    assert drifting.isolation.excluded == {"gnss": "drifts"}
 
 
 def test_without_a_velocity_nobody_can_say_that_it_drifts() -> None:

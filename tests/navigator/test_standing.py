@@ -91,6 +91,31 @@ def test_an_imu_that_sits_askew_beyond_its_sigma_is_told() -> None:
     assert "-30 deg askew" in why
 
 
+def test_a_turn_felt_at_rest_is_believed_once_the_vehicle_has_moved() -> None:
+    """Of one on wheels; a ship turns as it likes."""
+    nav = np.zeros(10)
+    ship, car = Standing(150.0), Standing(150.0, wheeled=True)
+    for standing in (ship, car):
+        standing.started(0)
+        assert standing.failure(S, Isolation(), nav) is None
+        standing.turned(2 * S)
+        assert standing.failure(3 * S, Isolation(), nav) is None
+    assert ship.shaken(at(3.0), Isolation()) is None
+    why = car.shaken(at(3.0), Isolation())
+    assert why is not None
+    assert "felt at rest" in why
+    nav[VN] = 6.0
+    assert car.failure(10 * S, WithoutVelocity(), nav) is None
+    assert car.shaken(at(10.0), Isolation()) is not None  # its velocity does not go along
+    nav[VN] = 0.0
+    assert car.failure(11 * S, Isolation(), nav) is None
+    assert car.shaken(at(11.0), Isolation()) is None
+    car.turned(12 * S)
+    car.started(13 * S)
+    assert car.failure(13 * S, Isolation(), nav) is None
+    assert car.shaken(at(13.0), Isolation()) is None
+
+
 def test_after_a_failure_driving_straight_on_proves_nothing() -> None:
     standing, isolation = Standing(150.0), Isolation()
     nav = np.zeros(10)

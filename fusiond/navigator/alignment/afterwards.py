@@ -33,16 +33,25 @@ class Afterwards:
         self._options = options
         self._claim = start.how if start.how in CLAIMS else ""
         self._sd_yaw = math.sqrt(start.covariance[2, 2])
-        self.unconfirmed = start.how == CONFIGURED
-        """Only the configuration vouches for the heading: a hypothesis until the first motion. One
-        that was saved was measured, before the vehicle was parked."""
+        self._backward = start.backward and math.isfinite(options.max_reverse_m_s)
+        self._configured = start.how == CONFIGURED
         self._since_ns: int | None = None
 
+    @property
+    def unconfirmed(self) -> str:
+        """What the heading hangs on and no motion has shown, in words; empty where there is no such
+        thing. A configured heading is a hypothesis until the first motion; one that was saved was
+        measured, before the vehicle was parked. And what looks like driving backward is driving
+        forward with an IMU that is mounted the other way, until it is faster than one reverses."""
+        if self._backward:
+            return "the vehicle drives backward, or the IMU is mounted backwards"
+        return "no motion has confirmed it yet" if self._configured else ""
+
     def refuted(
-        self, t_ns: int, nav: Array, covariance: Array, measured: Witnesses
+        self, t_ns: int, nav: Array, covariance: Array, measured: Witnesses, doubted: bool
     ) -> tuple[str, str] | None:
         """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
-        the start was wrong."""
+        the start was wrong. `doubted`: it has not fitted the aids since."""
         axes = dcm_from_quaternion(nav[Q0:])
         ahead = axes[:, 0]
         backward = -float(ahead @ nav[VN : VN + 3])
@@ -53,18 +62,29 @@ class Afterwards:
                     f"driving backward at {backward:.0f} m/s, faster than the vehicle can: is the "
                     "IMU mounted backwards? Correct [imu] axes"
                 )
+        if -backward > self._options.max_reverse_m_s:
+            self._backward = False
         if not self._claim:
             return None
-        if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw:
-            self.unconfirmed = False
+        if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw and not doubted:
+            self._configured = False
         velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
-        return velocity and self._heading(t_ns, velocity, axes, math.sqrt(covariance[2, 2]))
+        return velocity and self._heading(
+            t_ns, velocity, axes, math.sqrt(covariance[2, 2]), doubted
+        )
 
     def _heading(
-        self, t_ns: int, velocity: tuple[float, float, float], axes: Array, sd_yaw: float
+        self,
+        t_ns: int,
+        velocity: tuple[float, float, float],
+        axes: Array,
+        sd_yaw: float,
+        doubted: bool,
     ) -> tuple[str, str] | None:
         """A heading that was configured or saved, against the measured course, forward or backward:
-        a filter with a wrong heading gates the velocity that says so."""
+        a filter with a wrong heading gates the velocity that says so. Once it has doubted its
+        motion for that, it turns towards the course by and by, and so do its sensor errors, which
+        were right."""
         north, east, sd_speed = velocity
         speed = math.hypot(north, east)
         if speed < self._options.course_speed_m_s + 3.0 * sd_speed:
@@ -73,8 +93,12 @@ class Afterwards:
         yaw, course = math.atan2(axes[1, 0], axes[0, 0]), math.atan2(east, north)
         apart = abs(wrap_angle(course - yaw))
         sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
+        if doubted:
+            return "heading_contradicted", (
+                f"the first motion did not fit the {self._claim}: aligning anew by the course"
+            )
         if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
-            self._claim, self.unconfirmed = "", False
+            self._claim, self._configured = "", False
             return None
         if self._since_ns is None:
             self._since_ns = t_ns

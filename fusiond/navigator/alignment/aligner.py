@@ -8,6 +8,7 @@ No heading, no navigation: `reason` says what is missing.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from fusiond.aiding.base import Aid
 from fusiond.models.blocks import ImuNoise
@@ -79,6 +80,8 @@ class Aligner:
             sources = (HEADING_SOURCES[name] for name in self._basis.options.heading)
             found = (source(self._basis, imu, place) for source in sources)
             start = next((s for s in found if s is not None), None)
+            if start is not None and self.known.contradicted:
+                start = replace(start, contradicted=True)
         if start is None:
             latitude = None if place is None else float(place[1][0])
             upside_down = self.known.upside_down

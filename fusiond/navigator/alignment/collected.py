@@ -105,6 +105,8 @@ class Collected:
         self.heading: HeadingOffer | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
+        self.contradicted = False
+        """Whether positions have moved otherwise than the velocities of their receiver."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
@@ -260,11 +262,13 @@ class Collected:
         sd = math.hypot(max(first.sd[:2]), max(latest.position.sd[:2]), WAY_SCALE * size)
         sd = math.hypot(sd, sd_v * span_s)
         if math.hypot(*(moved - way)) > CONTRADICTION_SIGMAS * sd:
+            self.contradicted = True
             return False
         slope, sd_slope = trend.slope
         lag = LAG_SD_S * math.hypot(*latest.velocity.v_ned[:2]) / max(span_s, 1.0)
         sd_slope = math.hypot(sd_slope, max(sd_v / math.sqrt(count), LEAST_SD_M_S), lag)
         if slope > CONTRADICTION_SIGMAS * sd_slope:
+            self.contradicted = True
             return False
         return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_s >= CONFIRMED_S
 

@@ -37,6 +37,7 @@ from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import Fix, Standing, place_of
 from fusiond.navigator.alignment.start import (
+    BACKWARD,
     BIAS_SETTLING_S,
     LEVEL_SD_RAD,
     Levelled,
@@ -158,7 +159,7 @@ def _moved_off(
         dcm_from_rpy(roll, pitch, yaw),
         max(sd, LEAST_YAW_SD_RAD),
         rate,
-        "GNSS course" + (", backward" if backward else ""),
+        "GNSS course" + (BACKWARD if backward else ""),
         rest_bias(by.noise, standing, at_rest, lat),
         Levelled(at_rest, _level_sd(by, (velocity.t_ns - standing.end_ns) * 1e-9, turned, lat)),
     )
@@ -261,7 +262,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
             backward_fit.dcm,
             max(math.sqrt(doubt) * backward_fit.sd_yaw, LEAST_YAW_SD_RAD),
             f.rates[-1],
-            "GNSS course, on the move, backward",
+            "GNSS course, on the move" + BACKWARD,
         )
     fast = speed > by.options.max_reverse_m_s
     moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9

@@ -30,6 +30,9 @@ LEAST_VELOCITY_SD = 0.05
 # One sigma of a road's slope: main roads are built to 3 to 6 %, streets in hills to 12 %.
 SLOPE_SD = 0.06
 
+# What `how` ends with where the vehicle was taken to drive backward.
+BACKWARD = ", backward"
+
 Place = tuple[PositionOffer | None, Array, float]
 """The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
 
@@ -63,7 +66,8 @@ class Start:
     """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
 
     `turns`: the heading is known so poorly that the filter should update in the coordinates of
-    `fusiond.estimators.invariant`.
+    `fusiond.estimators.invariant`. `contradicted`: before it, positions have moved otherwise than
+    the velocities of the same receiver.
     """
 
     t_ns: int
@@ -72,6 +76,12 @@ class Start:
     covariance: Array
     how: str
     turns: bool = False
+    contradicted: bool = False
+
+    @property
+    def backward(self) -> bool:
+        """Whether the vehicle was taken to drive backward."""
+        return self.how.endswith(BACKWARD)
 
 
 def build_start(
