@@ -39,6 +39,7 @@ from fusiond.navigator.alignment.collected import Fix, Standing, place_of
 from fusiond.navigator.alignment.start import (
     BIAS_SETTLING_S,
     LEVEL_SD_RAD,
+    Fitted,
     Levelled,
     Place,
     Start,
@@ -237,14 +238,14 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         return None
     every = math.ceil(len(usable) / motion.MOST_FIXES)
     fixes = usable[::-1][::every][::-1]
-    f = motion.felt(imu, [x.t_ns for x in fixes])
+    f = motion.felt(imu, [x.t_ns for x in fixes], np.zeros(3))
     lat, _, height = (float(v) for v in place[1])
     g = gravity(lat, height)
     course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
     fits = []
     for backward in (False, True):
         along = _along(by, velocity, f.rates[-1], backward)
-        fits.append(motion.fit(f, fixes, by.noise, g, course - along.angle, along.sd))
+        fits.append(motion.fit(imu, f, fixes, by.noise, g, course - along.angle, along.sd))
     forward_fit, backward_fit = fits
     best = min(fits, key=lambda x: x.cost)
     # Where even the better fit is poor, the sigmas are too small by as much.
@@ -259,9 +260,10 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
             velocity,
             place,
             backward_fit.dcm,
-            max(math.sqrt(doubt) * backward_fit.sd_yaw, LEAST_YAW_SD_RAD),
+            LEAST_YAW_SD_RAD,
             f.rates[-1],
             "GNSS course, on the move, backward",
+            fitted=Fitted(backward_fit.biases, doubt * backward_fit.covariance),
         )
     fast = speed > by.options.max_reverse_m_s
     moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9
@@ -279,9 +281,10 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         velocity,
         place,
         forward_fit.dcm,
-        max(math.sqrt(doubt) * forward_fit.sd_yaw, LEAST_YAW_SD_RAD),
+        LEAST_YAW_SD_RAD,
         f.rates[-1],
         "GNSS course, on the move",
+        fitted=Fitted(forward_fit.biases, doubt * forward_fit.covariance),
     )
 
 
@@ -295,6 +298,7 @@ def _build(
     how: str,
     bias: tuple[Array, float] | None = None,
     levelled: Levelled | None = None,
+    fitted: Fitted | None = None,
 ) -> Start:
     """With the antenna's velocity taken to the body."""
     velocity, sd = velocity_of(offer)
@@ -310,5 +314,6 @@ def _build(
         how,
         bias=bias,
         levelled=levelled,
+        fitted=fitted,
         unexplained=by.known.unexplained,
     )

@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
-from fusiond.navigation.earth import EARTH_RATE_RAD_S, meridian_radius, transverse_radius
-from fusiond.navigation.error_model import DR, PHI
+from fusiond.navigation.earth import (
+    EARTH_RATE_RAD_S,
+    gravity,
+    meridian_radius,
+    transverse_radius,
+)
+from fusiond.navigation.error_model import DR, FORCE_ERROR, FORCE_SCALE, PHI, RATE_ERROR
 from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm, skew
 
 Array = NDArray[np.float64]
@@ -23,8 +28,9 @@ Array = NDArray[np.float64]
 LEVEL_SD_RAD = math.radians(0.1)
 # A vehicle at rest settles by so much in this time (s): it looks like a rate bias.
 BIAS_SETTLING_S = 60.0
-# One sigma of tilt (rad) after levelling in motion.
-MOTION_LEVEL_SD_RAD = math.radians(2.0)
+# One sigma of tilt (rad) that no level found in motion claims to beat: scale factors and axes out
+# of square while the vehicle brakes and turns (1 % of 3 m/s^2).
+MOTION_LEVEL_SD_RAD = math.radians(0.2)
 # One sigma of velocity (m/s) that no start claims to beat.
 LEAST_VELOCITY_SD = 0.05
 # One sigma of a road's slope: main roads are built to 3 to 6 %, streets in hills to 12 %.
@@ -58,6 +64,14 @@ class Levelled(NamedTuple):
     sd: float = LEVEL_SD_RAD
 
 
+class Fitted(NamedTuple):
+    """Force and rate biases (6,) of a level found in motion, and the covariance (9, 9) that they
+    share with the attitude, which comes first."""
+
+    biases: Array
+    covariance: Array
+
+
 @dataclass(frozen=True, slots=True)
 class Start:
     """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
@@ -86,6 +100,7 @@ def build_start(
     *,
     bias: tuple[Array, float] | None = None,
     levelled: Levelled | None = None,
+    fitted: Fitted | None = None,
     compassed: bool = False,
     unexplained: Array | None = None,
 ) -> Start:
@@ -94,7 +109,8 @@ def build_start(
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
     at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors as
     they were turned then: a vehicle that has taken a bend since has the tilt of before on the axes
-    of before, and its sensors on others.
+    of before, and its sensors on others. `fitted`: attitude and biases were found from motion;
+    `sd_yaw` is then the least.
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
     """
     fix, where, sd_position = place
@@ -119,9 +135,35 @@ def build_start(
         for axis in range(3):
             slot = model.parameters(9 + axis)[0]
             p[slot, slot] += float(unexplained[axis]) ** 2
+    if fitted is not None:
+        _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2])
     if levelled is not None:
         _correlate(model, p, levelled.dcm, lat, height, compassed)
     return Start(t_ns, nav, xi, p, how)
+
+
+def _take_fitted(model: Model, p: Array, xi: Array, fitted: Fitted, force: Array) -> None:
+    """Take biases as fitted, with the covariance that they share with the attitude; what P has of
+    attitude already is added to it.
+
+    What was felt as a force bias is b + s f, of which f (3,) is all but gravity: where the model
+    has the scale factor s, b is known no better than s f, and cov(b, s) = -f var(s).
+    """
+    slots, rows = list(range(3)), list(range(3))
+    columns = *range(FORCE_ERROR, FORCE_ERROR + 3), *range(RATE_ERROR, RATE_ERROR + 3)
+    for row, column in enumerate(columns):
+        for slot in model.parameters(column)[:1]:
+            slots.append(slot)
+            rows.append(3 + row)
+            xi[slot] = fitted.biases[row]
+            p[slot, slot] = 0.0
+    p[np.ix_(slots, slots)] += fitted.covariance[np.ix_(rows, rows)]
+    for axis in range(3):
+        for slot in model.parameters(FORCE_ERROR + axis)[:1]:
+            for scale in model.parameters(FORCE_SCALE + axis):
+                shared = -force[axis] * p[scale, scale]
+                p[slot, slot] -= force[axis] * shared
+                p[slot, scale] = p[scale, slot] = shared
 
 
 def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Start:
