@@ -41,6 +41,7 @@ from fusiond.navigator.alignment.start import (
     LEVEL_SD_RAD,
     Fitted,
     Levelled,
+    Moves,
     Place,
     Start,
     build_start,
@@ -154,6 +155,7 @@ def _moved_off(
     at_rest = dcm_from_rpy(*level(standing.mean_force), yaw - turned)
     return _build(
         by,
+        imu,
         velocity,
         place,
         dcm_from_rpy(roll, pitch, yaw),
@@ -257,6 +259,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
             return None
         return _build(
             by,
+            imu,
             velocity,
             place,
             backward_fit.dcm,
@@ -278,6 +281,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         return None
     return _build(
         by,
+        imu,
         velocity,
         place,
         forward_fit.dcm,
@@ -290,6 +294,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
 
 def _build(
     by: Basis,
+    imu: ImuBuffer,
     offer: VelocityOffer,
     place: Place,
     dcm: Array,
@@ -303,6 +308,10 @@ def _build(
     """With the antenna's velocity taken to the body."""
     velocity, sd = velocity_of(offer)
     velocity = velocity - dcm @ np.cross(rate, offer.lever)
+    force = motion.samples_at(imu, offer.t_ns)[3:]
+    if fitted is not None:
+        force = force - fitted.biases[:3]
+    acceleration = dcm @ force + [0.0, 0.0, gravity(float(place[1][0]), float(place[1][2]))]
     return build_start(
         by.model,
         offer.t_ns,
@@ -316,4 +325,5 @@ def _build(
         levelled=levelled,
         fitted=fitted,
         unexplained=by.known.unexplained,
+        moves=Moves(offer, rate, acceleration),
     )

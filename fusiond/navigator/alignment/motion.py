@@ -90,10 +90,15 @@ class Fit(NamedTuple):
 
 
 def rate_at(imu: ImuBuffer, t_ns: int) -> Array:
-    """Mean rate (3,) of the samples around an instant: 0.1 s to each side, as many as there are."""
+    """Mean rate (3,) around an instant."""
+    return samples_at(imu, t_ns)[:3]
+
+
+def samples_at(imu: ImuBuffer, t_ns: int) -> Array:
+    """Mean (6,) of the samples around an instant: 0.1 s to each side, as many as there are."""
     first = max(0, imu.index_after(t_ns - 100_000_000) - 1)
     end = max(first + 1, imu.index_after(t_ns + 100_000_000))
-    mean: Array = imu.samples[first:end, :3].mean(axis=0)
+    mean: Array = imu.samples[first:end].mean(axis=0)
     return mean
 
 

@@ -19,7 +19,7 @@ from fusiond.navigation.earth import (
     meridian_radius,
     transverse_radius,
 )
-from fusiond.navigation.error_model import DR, FORCE_ERROR, FORCE_SCALE, PHI, RATE_ERROR
+from fusiond.navigation.error_model import DR, DV, FORCE_ERROR, FORCE_SCALE, PHI, RATE_ERROR
 from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm, skew
 
 Array = NDArray[np.float64]
@@ -72,6 +72,14 @@ class Fitted(NamedTuple):
     covariance: Array
 
 
+class Moves(NamedTuple):
+    """A measured velocity, the body's rate (3,) and acceleration (3,) NED at its instant."""
+
+    offer: VelocityOffer
+    rate: Array
+    acceleration: Array
+
+
 @dataclass(frozen=True, slots=True)
 class Start:
     """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
@@ -103,6 +111,7 @@ def build_start(
     fitted: Fitted | None = None,
     compassed: bool = False,
     unexplained: Array | None = None,
+    moves: Moves | None = None,
 ) -> Start:
     """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
@@ -112,6 +121,7 @@ def build_start(
     of before, and its sensors on others. `fitted`: attitude and biases were found from motion;
     `sd_yaw` is then the least.
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
+    `moves`: what the velocity was measured of.
     """
     fix, where, sd_position = place
     lat, height = float(where[0]), float(where[2])
@@ -139,7 +149,43 @@ def build_start(
         _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2])
     if levelled is not None:
         _correlate(model, p, levelled.dcm, lat, height, compassed)
-    return Start(t_ns, nav, xi, p, how)
+    by = np.eye(model.size)
+    if fix is not None:
+        _by_fix(model, by, fix, dcm, velocity)
+    if moves is not None:
+        _by_velocity(model, by, moves, dcm)
+    return Start(t_ns, nav, xi, by @ p @ by.T, how)
+
+
+def _by_fix(model: Model, by: Array, fix: PositionOffer, dcm: Array, velocity: Array) -> None:
+    """Rows of the position in `by` (n, n): an innovation of 0 (fusiond.aiding.position) says
+
+        dr = e + db + v dtau + C dl - [C l x] phi,   e the fix's noise
+
+    and a start without it would take the next fixes for proof that b, tau and dl are 0.
+    """
+    by[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
+    for row, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
+        by[DR + row, slot] = 1.0
+    for slot in model.slots_of(fix.time):
+        by[DR : DR + 3, slot] = velocity
+    for axis, slot in enumerate(model.slots_of(fix.rest)):
+        by[DR : DR + 3, slot] = dcm[:, axis]
+    by[~model.active] = 0.0
+
+
+def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
+    """Rows of the velocity in `by` (n, n), likewise (fusiond.aiding.velocity)
+
+    dv = e + a dtau + C [w x] dl - (C (w x l)) x phi
+    """
+    across = dcm @ np.cross(moves.rate, moves.offer.lever)
+    by[DV : DV + 3, PHI : PHI + 3] = -skew(across)
+    for slot in model.slots_of(moves.offer.time):
+        by[DV : DV + 3, slot] = moves.acceleration
+    for axis, slot in enumerate(model.slots_of(moves.offer.rest)):
+        by[DV : DV + 3, slot] = (dcm @ skew(moves.rate))[:, axis]
+    by[~model.active] = 0.0
 
 
 def _take_fitted(model: Model, p: Array, xi: Array, fitted: Fitted, force: Array) -> None:
@@ -169,19 +215,15 @@ def _take_fitted(model: Model, p: Array, xi: Array, fitted: Fitted, force: Array
 def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Start:
     """A start of a vehicle that stands, whose heading may be any.
 
-    The fix is where the antenna is, not the IMU: its lever arm l turns with the heading,
-    dr = e - [C l x] phi, e the error of the fix. And the rate that was felt is that of a vehicle at
-    rest, whatever its heading: as much of the Earth's level rate w as psi puts on the east axis is
-    in the bias, db = w psi (C^T)_E, or standing still would tell the heading of the start.
+    The rate that was felt is that of a vehicle at rest, whatever its heading: as much of the
+    Earth's level rate w as psi puts on the east axis is in the bias, db = w psi (C^T)_E, or
+    standing still would tell the heading of the start.
     """
-    fix, where, _ = place
     by_turn = np.eye(len(start.xi))
-    if fix is not None:
-        by_turn[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
     for axis in range(3):
         slot = model.parameters(9 + axis)[0]
         taken = 1.0 - float(start.covariance[slot, slot] / model.initial[slot] ** 2)
-        rate = EARTH_RATE_RAD_S * math.cos(float(where[0])) * float(dcm[1, axis])
+        rate = EARTH_RATE_RAD_S * math.cos(float(place[1][0])) * float(dcm[1, axis])
         by_turn[slot, PHI + 2] = taken * rate
     p = by_turn @ start.covariance @ by_turn.T
     return replace(start, covariance=p, turns=True)
