@@ -1,7 +1,8 @@
 """What an aid can give a filter that has not started: position, velocity, speed, heading, height.
 
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
-from the IMU to the point that was measured, body axes, m.
+from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
+of errors that all measurements of the device share, as of its aids.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ class PositionOffer(NamedTuple):
     height_m: float | None
     sd: Vector3
     lever: Vector3
+    bias: tuple[str, ...] = ()
+    time: str = ""
+    rest: str = ""
 
 
 class VelocityOffer(NamedTuple):
@@ -30,6 +34,8 @@ class VelocityOffer(NamedTuple):
     v_ned: tuple[float, ...]
     sd: tuple[float, ...]
     lever: Vector3 = (0.0, 0.0, 0.0)
+    time: str = ""
+    rest: str = ""
 
 
 class SpeedOffer(NamedTuple):

@@ -165,4 +165,5 @@ class PositionAid(Aid):
 
     def offers(self) -> tuple[PositionOffer, ...]:
         place = self.lat_rad, self.lon_rad, self.height_m
-        return (PositionOffer(self.t_ns, *place, self.sd, self.lever),)
+        shared = self.bias, self.time, self.rest
+        return (PositionOffer(self.t_ns, *place, self.sd, self.lever, *shared),)

@@ -107,4 +107,4 @@ class VelocityAid(Aid):
         return Innovation(z, h, r)
 
     def offers(self) -> tuple[VelocityOffer, ...]:
-        return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever),)
+        return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

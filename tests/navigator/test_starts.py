@@ -107,22 +107,25 @@ def _feed(
         yield
 
 
-def _run(case: Case, seed: int) -> runs.ImuRun:
-    return runs.imu_run(
-        Config.model_validate({"imu": {"rate_hz": RATE_HZ}}).imu, _truth(case), seed
-    )
+SHEET: dict[str, Any] = {"rate_hz": RATE_HZ}
 
 
-def _started(case: Case, seed: int, until_s: float = 60.0) -> Navigator:
+def _run(case: Case, seed: int, imu: dict[str, Any] = SHEET) -> runs.ImuRun:
+    return runs.imu_run(Config.model_validate({"imu": imu}).imu, _truth(case), seed)
+
+
+def _started(
+    case: Case, seed: int, until_s: float = 60.0, imu: dict[str, Any] = SHEET
+) -> Navigator:
     """Run until the start, or to `until_s`."""
     config = Config.model_validate(
         {
-            "imu": {"rate_hz": RATE_HZ},
+            "imu": imu,
             "aiding": {"gnss": {"lever_arm_m": case.lever}},
             "alignment": {"heading": ["gnss_course"]},
         }
     )
-    samples = _run(case, seed).samples
+    samples = _run(case, seed, imu).samples
     navigator = Navigator(config)
     rows = range(round(case.from_s * RATE_HZ), round(until_s * RATE_HZ), EVERY)
     for _ in _feed(navigator, case, samples, rows, np.random.default_rng(seed)):
@@ -161,6 +164,26 @@ def test_sigma_of_a_start_is_honest(name: str) -> None:
     assert np.mean(velocity) < HIGH
     assert np.mean(tilt_and_force) < HIGH_5
     assert np.mean(yaw_sd) < 10.0
+
+
+def test_an_uncalibrated_sensor_is_met_on_the_move() -> None:
+    """3 deg/s and 50 mg of bias: tilt is known no better than the force bias, and with it."""
+    case = CASES["quiet all the time, first fixes on the move"]
+    truth, attitude, rates = _truth(case), [], []
+    imu = {**SHEET, "sensor_class": "consumer"}
+    for seed in range(12):
+        start = _started(case, seed, imu=imu).started
+        assert start is not None
+        assert start.how == case.how
+        true = runs.true_nav(truth, np.array([start.t_ns * 1e-9]))[0]
+        error, p = runs.nav_error(start.nav, true)[:3], start.covariance
+        attitude.append(error @ np.linalg.solve(p[:3, :3], error))
+        biases = _run(case, seed, imu).biases[round(start.t_ns * 1e-9 * RATE_HZ) - 1]
+        wrong = biases[:3] - start.xi[9:12]
+        rates.append(wrong @ np.linalg.solve(p[9:12, 9:12], wrong))
+    high = float(chi2.ppf(0.999, 3 * len(rates))) / len(rates)
+    assert np.mean(attitude) < high
+    assert np.mean(rates) < high
 
 
 def test_straight_on_at_constant_speed_nobody_knows_forward_from_backward() -> None:

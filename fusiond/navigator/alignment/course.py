@@ -40,7 +40,9 @@ from fusiond.navigator.alignment.start import (
     BACKWARD,
     BIAS_SETTLING_S,
     LEVEL_SD_RAD,
+    Fitted,
     Levelled,
+    Moves,
     Place,
     Start,
     build_start,
@@ -154,6 +156,7 @@ def _moved_off(
     at_rest = dcm_from_rpy(*level(standing.mean_force), yaw - turned)
     return _build(
         by,
+        imu,
         velocity,
         place,
         dcm_from_rpy(roll, pitch, yaw),
@@ -238,14 +241,14 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         return None
     every = math.ceil(len(usable) / motion.MOST_FIXES)
     fixes = usable[::-1][::every][::-1]
-    f = motion.felt(imu, [x.t_ns for x in fixes])
+    f = motion.felt(imu, [x.t_ns for x in fixes], np.zeros(3))
     lat, _, height = (float(v) for v in place[1])
     g = gravity(lat, height)
     course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
     fits = []
     for backward in (False, True):
         along = _along(by, velocity, f.rates[-1], backward)
-        fits.append(motion.fit(f, fixes, by.noise, g, course - along.angle, along.sd))
+        fits.append(motion.fit(imu, f, fixes, by.noise, g, course - along.angle, along.sd))
     forward_fit, backward_fit = fits
     best = min(fits, key=lambda x: x.cost)
     # Where even the better fit is poor, the sigmas are too small by as much.
@@ -257,12 +260,14 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
             return None
         return _build(
             by,
+            imu,
             velocity,
             place,
             backward_fit.dcm,
-            max(math.sqrt(doubt) * backward_fit.sd_yaw, LEAST_YAW_SD_RAD),
+            LEAST_YAW_SD_RAD,
             f.rates[-1],
             "GNSS course, on the move" + BACKWARD,
+            fitted=Fitted(backward_fit.biases, doubt * backward_fit.covariance),
         )
     fast = speed > by.options.max_reverse_m_s
     moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9
@@ -277,17 +282,20 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         return None
     return _build(
         by,
+        imu,
         velocity,
         place,
         forward_fit.dcm,
-        max(math.sqrt(doubt) * forward_fit.sd_yaw, LEAST_YAW_SD_RAD),
+        LEAST_YAW_SD_RAD,
         f.rates[-1],
         "GNSS course, on the move",
+        fitted=Fitted(forward_fit.biases, doubt * forward_fit.covariance),
     )
 
 
 def _build(
     by: Basis,
+    imu: ImuBuffer,
     offer: VelocityOffer,
     place: Place,
     dcm: Array,
@@ -296,10 +304,15 @@ def _build(
     how: str,
     bias: tuple[Array, float] | None = None,
     levelled: Levelled | None = None,
+    fitted: Fitted | None = None,
 ) -> Start:
     """With the antenna's velocity taken to the body."""
     velocity, sd = velocity_of(offer)
     velocity = velocity - dcm @ np.cross(rate, offer.lever)
+    force = motion.samples_at(imu, offer.t_ns)[3:]
+    if fitted is not None:
+        force = force - fitted.biases[:3]
+    acceleration = dcm @ force + [0.0, 0.0, gravity(float(place[1][0]), float(place[1][2]))]
     return build_start(
         by.model,
         offer.t_ns,
@@ -311,5 +324,7 @@ def _build(
         how,
         bias=bias,
         levelled=levelled,
+        fitted=fitted,
         unexplained=by.known.unexplained,
+        moves=Moves(offer, rate, acceleration),
     )

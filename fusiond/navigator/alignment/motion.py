@@ -4,7 +4,16 @@ r"""Which way a moving vehicle faces: felt against measured changes of velocity,
 
 C_0 attitude at the first fix, C(0, t) its change by the gyros (less b_w), l the antenna's lever.
 v_0, the rotation vector phi of C_0 = exp(phi) R_z(yaw_0), b_f and b_w are sought, with the data
-sheet's biases, a road's slope and the course's sigma as priors. The cost J of the best fit is twice
+sheet's biases, a road's slope and the course's sigma as priors; C(0, t) is integrated anew with the
+rate bias found, for 3 deg/s turn the axes by a radian in 20 s. At the last fix the attitude is
+C_T = C_0 C(0, T), and its error follows from those of C_0 and b_w,
+
+    phi_T = phi + C_0 D db_w,   D = d C(0, T) / d b_w as a rotation vector (3, 3)
+
+so what is sought is phi_T in place of phi: a vehicle that stood before it drove off tells nothing
+of its yaw rate's bias until then, and a C_0 that is held would turn all that came after. Tilt and
+biases come with the covariance that they share: straight on, a tilt is known no better than the
+accelerometers' bias, and the sum of both far better. The cost J of the best fit is twice
 the negative log likelihood, up to a constant that forward (yaw_0 by the course) and backward (half
 a turn more) share, so that
 
@@ -34,6 +43,7 @@ from fusiond.navigation.rotation import (
     dcm_from_quaternion,
     dcm_from_rpy,
     rotation_vector_to_quaternion,
+    wrap_angle,
 )
 from fusiond.navigator.alignment.start import velocity_of
 
@@ -42,62 +52,77 @@ Array = NDArray[np.float64]
 # One sigma (rad) of how a road and a vehicle's body on it slope: 10 %, beyond which streets are
 # signposted.
 TILT_SD_RAD = 0.1
-# Steps for the slopes by the biases: m/s^2 and rad/s. The integral is all but linear in them.
+# Steps for the slopes by the biases: m/s^2 and rad/s.
 FORCE_STEP, RATE_STEP = 0.1, 1e-3
-ITERATIONS = 4
+# Steps of Gauss-Newton at most, and the one, in sigmas, that ends them.
+ITERATIONS, CONVERGED = 16, 0.1
+# The integrals are made anew where the rate bias found would turn the axes by more (rad) than those
+# that they were made with: what is left out is half its square, 0.3 %.
+BENT_RAD = 0.08
 MOST_FIXES = 20
 """Of the fixes, evenly: more add little, for their changes are alike."""
 
 
 class Felt(NamedTuple):
-    """Integrals from the first fix to each of k: times (k,) s, gained velocity (k, 3) and attitude
-    (k, 3, 3) in the axes of the first, slopes of the velocity by force and rate bias (k, 3, 6),
-    rates at the fixes (k, 3)."""
+    """Integrals from the first fix to each of k, with a rate bias (3,) taken off: times (k,) s,
+    gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of the velocity
+    by force and rate bias (k, 3, 6), of the last attitude (a rotation vector in the axes of the
+    first) by rate bias (3, 3), rates at the fixes (k, 3)."""
 
     t_s: Array
     gained: Array
     turned: Array
     slopes: Array
+    turns: Array
     rates: Array
+    bias: Array
 
 
 class Fit(NamedTuple):
     """The best fit under one hypothesis: cost, degrees of freedom, attitude C_nb (3, 3) at the last
-    fix, sigma (rad) of its yaw, gyro bias (3,)."""
+    fix, biases (6,) of force and rate, covariance (9, 9) of attitude and biases."""
 
     cost: float
     degrees: int
     dcm: Array
-    sd_yaw: float
-    rate_bias: Array
+    biases: Array
+    covariance: Array
 
 
 def rate_at(imu: ImuBuffer, t_ns: int) -> Array:
-    """Mean rate (3,) of the samples around an instant: 0.1 s to each side, as many as there are."""
+    """Mean rate (3,) around an instant."""
+    return samples_at(imu, t_ns)[:3]
+
+
+def samples_at(imu: ImuBuffer, t_ns: int) -> Array:
+    """Mean (6,) of the samples around an instant: 0.1 s to each side, as many as there are."""
     first = max(0, imu.index_after(t_ns - 100_000_000) - 1)
     end = max(first + 1, imu.index_after(t_ns + 100_000_000))
-    mean: Array = imu.samples[first:end, :3].mean(axis=0)
+    mean: Array = imu.samples[first:end].mean(axis=0)
     return mean
 
 
-def felt(imu: ImuBuffer, instants: Sequence[int]) -> Felt:
-    """What the IMU felt from the first instant to each."""
+def felt(imu: ImuBuffer, instants: Sequence[int], bias: Array) -> Felt:
+    """What the IMU felt from the first instant to each, less a rate bias (3,)."""
     first, end = imu.index_after(instants[0]), imu.index_after(instants[-1])
     times = np.concatenate(([instants[0]], imu.times[first:end]))
     samples = imu.samples[first:end]
     at = [imu.index_after(t) - first for t in instants]
-    zero = np.zeros(3)
-    gained, turned = _integrate(times, samples, at, zero)
-    slopes = np.empty((len(at), 3, 6))
+    gained, turned = _integrate(times, samples, at, bias)
+    slopes, turns = np.empty((len(at), 3, 6)), np.empty((3, 3))
     for axis in range(3):
         shifted = samples.copy()
         shifted[:, 3 + axis] -= FORCE_STEP
-        slopes[:, :, axis] = (_integrate(times, shifted, at, zero)[0] - gained) / FORCE_STEP
-        bias = zero.copy()
-        bias[axis] = RATE_STEP
-        slopes[:, :, 3 + axis] = (_integrate(times, samples, at, bias)[0] - gained) / RATE_STEP
+        slopes[:, :, axis] = (_integrate(times, shifted, at, bias)[0] - gained) / FORCE_STEP
+        more = bias.copy()
+        more[axis] += RATE_STEP
+        faster, aside = _integrate(times, samples, at, more)
+        slopes[:, :, 3 + axis] = (faster - gained) / RATE_STEP
+        turn = (aside[-1] @ turned[-1].T - turned[-1] @ aside[-1].T) / (2.0 * RATE_STEP)
+        turns[:, axis] = turn[2, 1], turn[0, 2], turn[1, 0]
     t_s = (np.array(instants) - instants[0]) * 1e-9
-    return Felt(t_s, gained, turned, slopes, np.array([rate_at(imu, t) for t in instants]))
+    rates = np.array([rate_at(imu, t) for t in instants]) - bias
+    return Felt(t_s, gained, turned, slopes, turns, rates, bias)
 
 
 def _integrate(
@@ -116,9 +141,15 @@ def _integrate(
 
 
 def fit(
-    f: Felt, fixes: Sequence[VelocityOffer], noise: ImuNoise, g: float, yaw: float, sd_yaw: float
+    imu: ImuBuffer,
+    f: Felt,
+    fixes: Sequence[VelocityOffer],
+    noise: ImuNoise,
+    g: float,
+    yaw: float,
+    sd_yaw: float,
 ) -> Fit:
-    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`."""
+    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, begun at `f`."""
     measured = np.array([velocity_of(x)[0] for x in fixes])
     sd = np.array([velocity_of(x)[1] for x in fixes])
     white = noise.force_noise**2 * f.t_s
@@ -127,34 +158,61 @@ def fit(
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     rate = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
     prior = np.array([TILT_SD_RAD] * 2 + [sd_yaw] + [force] * 3 + [rate] * 3)
-    turned_yaw = math.atan2(f.turned[-1, 1, 0], f.turned[-1, 0, 0])
-    base = dcm_from_rpy(0.0, 0.0, yaw - turned_yaw)
-    levers = np.array([np.cross(w, x.lever) for w, x in zip(f.rates, fixes, strict=True)])
-    arms = (f.turned @ levers[:, :, None])[:, :, 0]
-    down = np.outer(f.t_s, [0.0, 0.0, g])
-    x = np.zeros(12)  # phi, b_f, b_w, v_0
-    x[9:] = measured[0]
-    count = len(fixes)
+    gained = measured - np.outer(f.t_s, [0.0, 0.0, g])
+    instants = [x.t_ns for x in fixes]
+    here = Guess(dcm_from_rpy(0.0, 0.0, yaw), np.zeros(6), measured[0])
     for _ in range(ITERATIONS):
-        dcm = _turn(x[:3]) @ base
-        body = f.gained + f.slopes @ x[3:9] + arms
-        there = body @ dcm.T
-        z = (measured - (x[9:] + there + down)) * weight
-        h = np.zeros((count, 3, 12))
+        if np.abs(here.biases[3:] - f.bias).max() * f.t_s[-1] > BENT_RAD:
+            f = felt(imu, instants, here.biases[3:])
+        dcm, there = _since_first(f, fixes, here)
+        h = np.zeros((len(fixes), 3, 12))
         for axis in range(3):  # d(exp(phi) u) = dphi x u
             h[:, :, axis] = np.cross(np.eye(3)[axis], there)
         h[:, :, 3:9] = dcm @ f.slopes
+        h[:, :, 6:9] -= h[:, :, :3] @ (dcm @ f.turns)
         h[:, :, 9:] = np.eye(3)
         h *= weight[:, :, None]
         rows = np.vstack([h.reshape(-1, 12), np.hstack([np.diag(1.0 / prior), np.zeros((9, 3))])])
-        x += np.linalg.lstsq(rows, np.concatenate([z.ravel(), -x[:9] / prior]), rcond=None)[0]
-    dcm = _turn(x[:3]) @ base
-    there = (f.gained + f.slopes @ x[3:9] + arms) @ dcm.T
-    z = (measured - (x[9:] + there + down)) * weight
-    cost = float((z**2).sum() + ((x[:9] / prior) ** 2).sum())
-    covariance = np.linalg.inv(rows.T @ rows)
-    degrees = max(1, z.size - 3)
-    return Fit(cost, degrees, dcm @ f.turned[-1], math.sqrt(covariance[2, 2]), x[6:9])
+        z = (gained - here.first - there) * weight
+        z = np.concatenate([z.ravel(), here.apart(yaw) / prior])
+        step = np.linalg.lstsq(rows, z, rcond=None)[0]
+        here = here.moved(step)
+        if np.linalg.norm(rows @ step) < CONVERGED:
+            break
+    z = (gained - here.first - _since_first(f, fixes, here)[1]) * weight
+    cost = float((z**2).sum() + ((here.apart(yaw) / prior) ** 2).sum())
+    covariance = np.linalg.inv(rows.T @ rows)[:9, :9]
+    return Fit(cost, max(1, z.size - 3), here.last, here.biases, covariance)
+
+
+class Guess(NamedTuple):
+    """Attitude C_nb (3, 3) at the last fix, biases (6,) of force and rate, velocity (3,) at the
+    first fix."""
+
+    last: Array
+    biases: Array
+    first: Array
+
+    def moved(self, step: Array) -> Guess:
+        """By a step (12,)."""
+        last = _turn(step[:3]) @ self.last
+        return Guess(last, self.biases + step[3:9], self.first + step[9:])
+
+    def apart(self, yaw: float) -> Array:
+        """How far the priors (9,) are: level, `yaw` (rad), no biases."""
+        c = self.last
+        apart = wrap_angle(yaw - math.atan2(c[1, 0], c[0, 0]))
+        return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases])
+
+
+def _since_first(f: Felt, fixes: Sequence[VelocityOffer], here: Guess) -> tuple[Array, Array]:
+    """C_0 (3, 3), and the velocity (k, 3) gained since the first fix but for gravity's, with the
+    antenna's about the IMU."""
+    more = here.biases[3:] - f.bias
+    dcm = here.last @ (_turn(f.turns @ more) @ f.turned[-1]).T
+    levers = np.array([np.cross(w, x.lever) for w, x in zip(f.rates, fixes, strict=True)])
+    arms = (f.turned @ levers[:, :, None])[:, :, 0]
+    return dcm, (f.gained + f.slopes @ np.concatenate([here.biases[:3], more]) + arms) @ dcm.T
 
 
 def _turn(phi: Array) -> Array:

@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
-from fusiond.navigation.earth import EARTH_RATE_RAD_S, meridian_radius, transverse_radius
-from fusiond.navigation.error_model import DR, PHI
+from fusiond.navigation.earth import (
+    EARTH_RATE_RAD_S,
+    gravity,
+    meridian_radius,
+    transverse_radius,
+)
+from fusiond.navigation.error_model import DR, DV, FORCE_ERROR, FORCE_SCALE, PHI, RATE_ERROR
 from fusiond.navigation.rotation import quaternion_from_rpy, rpy_from_dcm, skew
 
 Array = NDArray[np.float64]
@@ -23,8 +28,9 @@ Array = NDArray[np.float64]
 LEVEL_SD_RAD = math.radians(0.1)
 # A vehicle at rest settles by so much in this time (s): it looks like a rate bias.
 BIAS_SETTLING_S = 60.0
-# One sigma of tilt (rad) after levelling in motion.
-MOTION_LEVEL_SD_RAD = math.radians(2.0)
+# One sigma of tilt (rad) that no level found in motion claims to beat: scale factors and axes out
+# of square while the vehicle brakes and turns (1 % of 3 m/s^2).
+MOTION_LEVEL_SD_RAD = math.radians(0.2)
 # One sigma of velocity (m/s) that no start claims to beat.
 LEAST_VELOCITY_SD = 0.05
 # One sigma of a road's slope: main roads are built to 3 to 6 %, streets in hills to 12 %.
@@ -59,6 +65,22 @@ class Levelled(NamedTuple):
 
     dcm: Array
     sd: float = LEVEL_SD_RAD
+
+
+class Fitted(NamedTuple):
+    """Force and rate biases (6,) of a level found in motion, and the covariance (9, 9) that they
+    share with the attitude, which comes first."""
+
+    biases: Array
+    covariance: Array
+
+
+class Moves(NamedTuple):
+    """A measured velocity, the body's rate (3,) and acceleration (3,) NED at its instant."""
+
+    offer: VelocityOffer
+    rate: Array
+    acceleration: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,16 +118,20 @@ def build_start(
     *,
     bias: tuple[Array, float] | None = None,
     levelled: Levelled | None = None,
+    fitted: Fitted | None = None,
     compassed: bool = False,
     unexplained: Array | None = None,
+    moves: Moves | None = None,
 ) -> Start:
     """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
     `bias`: rate bias (3,) seen at rest and its sigma. `levelled`: roll and pitch come from gravity
     at rest; `compassed`: yaw from the Earth's rate. Both correlate attitude with sensor errors as
     they were turned then: a vehicle that has taken a bend since has the tilt of before on the axes
-    of before, and its sensors on others.
+    of before, and its sensors on others. `fitted`: attitude and biases were found from motion;
+    `sd_yaw` is then the least.
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
+    `moves`: what the velocity was measured of.
     """
     fix, where, sd_position = place
     lat, height = float(where[0]), float(where[2])
@@ -129,27 +155,85 @@ def build_start(
         for axis in range(3):
             slot = model.parameters(9 + axis)[0]
             p[slot, slot] += float(unexplained[axis]) ** 2
+    if fitted is not None:
+        _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2])
     if levelled is not None:
         _correlate(model, p, levelled.dcm, lat, height, compassed)
-    return Start(t_ns, nav, xi, p, how)
+    by = np.eye(model.size)
+    if fix is not None:
+        _by_fix(model, by, fix, dcm, velocity)
+    if moves is not None:
+        _by_velocity(model, by, moves, dcm)
+    return Start(t_ns, nav, xi, by @ p @ by.T, how)
+
+
+def _by_fix(model: Model, by: Array, fix: PositionOffer, dcm: Array, velocity: Array) -> None:
+    """Rows of the position in `by` (n, n): an innovation of 0 (fusiond.aiding.position) says
+
+        dr = e + db + v dtau + C dl - [C l x] phi,   e the fix's noise
+
+    and a start without it would take the next fixes for proof that b, tau and dl are 0.
+    """
+    by[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
+    for row, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
+        by[DR + row, slot] = 1.0
+    for slot in model.slots_of(fix.time):
+        by[DR : DR + 3, slot] = velocity
+    for axis, slot in enumerate(model.slots_of(fix.rest)):
+        by[DR : DR + 3, slot] = dcm[:, axis]
+    by[~model.active] = 0.0
+
+
+def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
+    """Rows of the velocity in `by` (n, n), likewise (fusiond.aiding.velocity)
+
+    dv = e + a dtau + C [w x] dl - (C (w x l)) x phi
+    """
+    across = dcm @ np.cross(moves.rate, moves.offer.lever)
+    by[DV : DV + 3, PHI : PHI + 3] = -skew(across)
+    for slot in model.slots_of(moves.offer.time):
+        by[DV : DV + 3, slot] = moves.acceleration
+    for axis, slot in enumerate(model.slots_of(moves.offer.rest)):
+        by[DV : DV + 3, slot] = (dcm @ skew(moves.rate))[:, axis]
+    by[~model.active] = 0.0
+
+
+def _take_fitted(model: Model, p: Array, xi: Array, fitted: Fitted, force: Array) -> None:
+    """Take biases as fitted, with the covariance that they share with the attitude; what P has of
+    attitude already is added to it.
+
+    What was felt as a force bias is b + s f, of which f (3,) is all but gravity: where the model
+    has the scale factor s, b is known no better than s f, and cov(b, s) = -f var(s).
+    """
+    slots, rows = list(range(3)), list(range(3))
+    columns = *range(FORCE_ERROR, FORCE_ERROR + 3), *range(RATE_ERROR, RATE_ERROR + 3)
+    for row, column in enumerate(columns):
+        for slot in model.parameters(column)[:1]:
+            slots.append(slot)
+            rows.append(3 + row)
+            xi[slot] = fitted.biases[row]
+            p[slot, slot] = 0.0
+    p[np.ix_(slots, slots)] += fitted.covariance[np.ix_(rows, rows)]
+    for axis in range(3):
+        for slot in model.parameters(FORCE_ERROR + axis)[:1]:
+            for scale in model.parameters(FORCE_SCALE + axis):
+                shared = -force[axis] * p[scale, scale]
+                p[slot, slot] -= force[axis] * shared
+                p[slot, scale] = p[scale, slot] = shared
 
 
 def turned_at_rest(model: Model, start: Start, place: Place, dcm: Array) -> Start:
     """A start of a vehicle that stands, whose heading may be any.
 
-    The fix is where the antenna is, not the IMU: its lever arm l turns with the heading,
-    dr = e - [C l x] phi, e the error of the fix. And the rate that was felt is that of a vehicle at
-    rest, whatever its heading: as much of the Earth's level rate w as psi puts on the east axis is
-    in the bias, db = w psi (C^T)_E, or standing still would tell the heading of the start.
+    The rate that was felt is that of a vehicle at rest, whatever its heading: as much of the
+    Earth's level rate w as psi puts on the east axis is in the bias, db = w psi (C^T)_E, or
+    standing still would tell the heading of the start.
     """
-    fix, where, _ = place
     by_turn = np.eye(len(start.xi))
-    if fix is not None:
-        by_turn[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
     for axis in range(3):
         slot = model.parameters(9 + axis)[0]
         taken = 1.0 - float(start.covariance[slot, slot] / model.initial[slot] ** 2)
-        rate = EARTH_RATE_RAD_S * math.cos(float(where[0])) * float(dcm[1, axis])
+        rate = EARTH_RATE_RAD_S * math.cos(float(place[1][0])) * float(dcm[1, axis])
         by_turn[slot, PHI + 2] = taken * rate
     p = by_turn @ start.covariance @ by_turn.T
     return replace(start, covariance=p, turns=True)
