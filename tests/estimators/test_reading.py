@@ -1,6 +1,7 @@
 """What a filter publishes by the receiver's clock: sigma against the Jacobian of the values.
 
-The kernel leaves out what tau itself turns and moves, here 0.004 rad and 12 ms: a part in a hundred.
+The kernel leaves out what tau itself turns and moves, here 0.004 rad and 12 ms: a part in a
+hundred.
 """
 
 from __future__ import annotations
