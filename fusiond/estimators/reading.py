@@ -6,8 +6,12 @@ publishes for t is
 
     p + v tau,   v + a tau,   q (x) exp(w tau)
     var(p_i) = P_rr - 2 v_i P_rt + v_i^2 P_tt,   var(v_i) = P_vv - 2 a_i P_vt + a_i^2 P_tt
+    cov(phi) = P_pp + u P_tp + P_pt u^T + u u^T P_tt,   u = C_nb w
 
-which is what fixes measure: their offset's own sigma cancels in it. a is smoothed.
+P_tt is of tau's error, true minus estimate as of all parameters; that of p, v and phi is as
+fusiond.navigation.error_model has it. Fixes measure p and v: there the offset's own sigma cancels.
+Nothing measures the attitude by the receiver's clock, and in a bend w times the sigma of tau can be
+the most of what is unknown of the heading. a is smoothed.
 """
 
 from __future__ import annotations
@@ -40,6 +44,15 @@ def _acceleration(nav: Array, step: Array, axis: int) -> float:
     """Smoothed, m/s^2, along north, east or down."""
     force: float = step[STEP_SMOOTH_N + axis]
     return force + gravity(nav[LAT], nav[HEIGHT]) if axis == 2 else force
+
+
+@compiled("f8(f8[::1], i8)", forceinline=True)
+def _turning(step: Array, axis: int) -> float:
+    """Rate of the body, rad/s, about north, east or down."""
+    total = 0.0
+    for j in range(3):
+        total += step[STEP_DCM + 3 * axis + j] * step[STEP_RATE_B + j]
+    return total
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], i8, f8[::1])")
@@ -81,13 +94,21 @@ def sigmas(cov: Array, nav: Array, step: Array, time_slot: int, out: Array) -> N
             velocity = max(0.0, velocity + a * (a * cov[t, t] - 2.0 * cov[3 + i, t]))
         out[i] = math.sqrt(position)
         out[3 + i] = math.sqrt(velocity)
+    a, b, c = cov[0, 0], cov[1, 1], cov[2, 2]
+    d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
+    if t >= 0:
+        u0, u1, u2 = _turning(step, 0), _turning(step, 1), _turning(step, 2)
+        a += u0 * (u0 * cov[t, t] + 2.0 * cov[0, t])
+        b += u1 * (u1 * cov[t, t] + 2.0 * cov[1, t])
+        c += u2 * (u2 * cov[t, t] + 2.0 * cov[2, t])
+        d += u0 * (u1 * cov[t, t] + cov[1, t]) + u1 * cov[0, t]
+        e += u0 * (u2 * cov[t, t] + cov[2, t]) + u2 * cov[0, t]
+        f += u1 * (u2 * cov[t, t] + cov[2, t]) + u2 * cov[1, t]
     # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
     # 0], and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
     sp = -step[STEP_DCM + 6]
     cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
     cy, sy = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
-    a, b, c = cov[0, 0], cov[1, 1], cov[2, 2]
-    d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
     along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
     cross = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
     tangent = sp / cp

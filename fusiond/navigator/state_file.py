@@ -4,6 +4,10 @@ A start must outlive whatever lies at the path: nothing, half a file, a director
 that no vehicle has. So the size is looked at before anything is read, a parser that bounds depth
 and numbers reads it, a model of the state judges ranges, and what fails any of that is put aside,
 where a person can look at it and the next start does not meet it again.
+
+A bit that a disk has lost makes another digit of a digit, and a heading that is possible and wrong:
+the first member, `crc32`, is the check (CRC-32 of IEEE 802.3, hexadecimal) of the text without it.
+Files of before it was written have none.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import zlib
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,6 +26,8 @@ State = TypeVar("State")
 # The longest state, a covariance of the widest model (32 states, 528 numbers of 25 characters),
 # has 15 kB; what is larger is none of ours.
 MOST_BYTES = 65_536
+CHECK = b'{"crc32":"%08x",'
+CHECK_BEGINS, CHECK_SIZE = b'{"crc32":', len(CHECK % 0)
 
 
 class DamagedStateError(Exception):
@@ -50,15 +57,27 @@ def read_state(path: Path, kind: TypeAdapter[State]) -> State | None:
     except OSError as error:
         raise DamagedStateError(error.strerror or str(error)) from error
     try:
-        return kind.validate_json(text)
+        return kind.validate_json(_checked(text))
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
         where = ".".join(map(str, first["loc"])) or "file"
         raise DamagedStateError(f"{where}: {first['msg']}") from error
 
 
+def _checked(text: bytes) -> bytes:
+    """The text without its check, which is the right one. Raises `DamagedStateError`."""
+    if not text.startswith(CHECK_BEGINS):
+        return text
+    state = b"{" + text[CHECK_SIZE:]
+    if text[:CHECK_SIZE] != CHECK % zlib.crc32(state):
+        raise DamagedStateError("what it holds is not what was written: CRC-32 differs")
+    return state
+
+
 def write_state(path: Path, text: bytes, durable: bool) -> None:
-    """Write whole: whenever the process dies, the old file or the new one is there. OSError passes.
+    """Write `text`, a JSON object, with its check.
+
+    Whole: whenever the process dies, the old file or the new one is there. OSError passes.
 
     `durable`: also after a power cut; it costs the disk two flushes.
     """
@@ -66,7 +85,7 @@ def write_state(path: Path, text: bytes, durable: bool) -> None:
     with contextlib.suppress(FileNotFoundError):
         temporary.unlink()
     with temporary.open("xb") as file:
-        file.write(text)
+        file.write(CHECK % zlib.crc32(text) + text[1:])
         if durable:
             file.flush()
             os.fsync(file.fileno())

@@ -261,6 +261,19 @@ def test_a_write_cut_short_at_any_byte_leaves_a_state_or_none(kept: Kept) -> Non
     assert load_state(kept.path, state.utc_s, 60.0) == state
 
 
+def test_a_bit_turned_anywhere_is_noticed(kept: Kept) -> None:
+    """Of a heading, too, that would be as possible as the one that was written."""
+    state = SavedState(time.time(), (0.53, 1.99, 38.0), 3.0, 0.7, 0.05)
+    save_state(kept.path, state)
+    whole = kept.path.read_bytes()
+    for bit in range(8 * len(whole)):
+        turned = bytearray(whole)
+        turned[bit // 8] ^= 1 << bit % 8
+        kept.path.write_bytes(turned)
+        with pytest.raises(DamagedStateError):
+            load_state(kept.path, state.utc_s, 60.0)
+
+
 @given(st.one_of(st.binary(max_size=300), st.from_type(dict).map(repr).map(str.encode)))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_bytes_end_the_start(kept: Kept, content: bytes) -> None:

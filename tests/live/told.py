@@ -90,6 +90,12 @@ class ToldDaemon:
         """How it ended; None while it runs."""
         return None if self._process is None else self._process.returncode
 
+    @property
+    def cpu_s(self) -> float:
+        """Processor time so far, of user and system."""
+        words = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
     async def load(self) -> ToldDaemon:
         """Start it, and wait until it has loaded its code."""
         command = [sys.executable, "-c", SCRIPT, str(self._config), str(self._every)]
