@@ -269,7 +269,7 @@ def test_fields_as_pynmeagps_has_them(whole: str, other: dict[int, str], length:
     try:
         wanted = NMEAReader.parse(made(",".join([address, *printed])), validate=0)
     except NMEATypeError:
-        with pytest.raises(ValueError, match="could not convert|invalid literal"):
+        with pytest.raises(ValueError, match=r"could not convert|invalid literal"):
             typed(address[2:], printed)
         return
     found = typed(address[2:], printed)
