@@ -142,6 +142,7 @@ class MessagePlan:
     counter: Stamp | None = None
     time: Stamp | None = None
     _layout: Layout | None = None
+    _values: list[tuple[int, float, float, float, float]] = field(default_factory=list)
 
     def decode(self, data: bytes) -> Part:
         """Decode one frame's data; what is planned stands from the first on.
@@ -153,21 +154,20 @@ class MessagePlan:
         """
         if len(data) < self.message.length:
             raise RefusedFrameError("wrong_length")
-        layout = self._layout
-        if layout is None:
+        if self._layout is None:
             stamps = [stamp.signal for stamp in (self.counter, self.time) if stamp is not None]
-            wanted = [axis.signal for axis in self.axes] + stamps
-            layout = self._layout = Layout(self.message, wanted)
+            self._layout = Layout(self.message, [axis.signal for axis in self.axes] + stamps)
+            self._values = [(a.slot, a.scale, a.offset, a.low, a.high) for a in self.axes]
         try:
-            raw = layout.raw(data)
+            raw = self._layout.raw(data)
         except AbsentSignalError as error:
             raise RefusedFrameError("undecodable") from error
         values = []
-        for axis, number in zip(self.axes, raw, strict=False):  # the stamps come behind
-            value = number * axis.scale + axis.offset
-            if not axis.low <= value <= axis.high:
+        for (slot, scale, offset, low, high), number in zip(self._values, raw, strict=False):
+            value = number * scale + offset
+            if not low <= value <= high:
                 raise RefusedFrameError("out_of_range" if math.isfinite(value) else "not_finite")
-            values.append((axis.slot, value))
+            values.append((slot, value))
         ticks = None if self.time is None else raw.pop()
         counter = None if self.counter is None else raw.pop()
         return Part(values, counter, ticks)
