@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -281,6 +282,14 @@ def test_other_tools_see_position_events_and_innovations(recorded: Recorded) -> 
     gnss = [e for e in ended if e["source"] == "gnss" and e["outcome"] == "fused"]
     assert gnss
     assert all(e["degrees"] == len(e["whitened"]) for e in gnss)
+    assert {(e["unit"], e["axes"]) for e in gnss} == {("m", "ned")}
+    apart = np.array([e["raw"] for e in gnss])
+    assert np.all(np.abs(apart) < 20.0)
+    # L^-1 is lower triangular: the first row is the innovation north over its own sigma.
+    judged = [e for e in gnss if e["whitened"] and abs(e["whitened"][0]) > 1e-3]
+    sigma_m = np.array([e["raw"][0] / e["whitened"][0] for e in judged])
+    assert len(judged) > 50
+    assert np.all((sigma_m > 0.05) & (sigma_m < 10.0))
 
 
 def test_measurements_come_out_as_the_tables_that_process_reads(
