@@ -193,10 +193,17 @@ def _opened(
     return found
 
 
+class _Unindexed(StreamReader):
+    """Passes over the indices behind each chunk, a pair of numbers a message: nobody seeks here."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
+
+
 def _records(path: Path, problem: Callable[[str], None]) -> Iterator[McapRecord]:
     """Records up to the summary, chunks unopened; what is cut off goes to `problem`."""
     with path.open("rb") as file:
-        records = StreamReader(file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        records = _Unindexed(file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
         try:
             first = next(records, None)
         except _DAMAGED as error:
