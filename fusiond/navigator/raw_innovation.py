@@ -44,13 +44,20 @@ def raw_innovation(aid: Linearised, estimator: Estimator) -> RawInnovation | Non
     if isinstance(rows, NotApplicable):
         return None
     for part, unit in PARTS:
-        h = rows.h[:, part]
-        axes = np.flatnonzero(h.any(axis=0))
-        if not len(axes):
+        h = rows.h[:, part].tolist()  # three columns: numpy costs more than it saves
+        axes = [k for k in range(3) if any(row[k] for row in h)]
+        if not axes:
             continue
-        if len(axes) == len(h):
-            values, names = np.linalg.solve(h[:, axes], rows.z), "".join("ned"[k] for k in axes)
-        else:
-            values, names = rows.z / np.linalg.norm(h, axis=1), ""
-        return RawInnovation(tuple(values.tolist()), unit, names)
+        z = rows.z.tolist()
+        if len(axes) != len(h):
+            values = [value / math.hypot(*row) for value, row in zip(z, h, strict=True)]
+            return RawInnovation(tuple(values), unit, "")
+        square = [[row[k] for k in axes] for row in h]
+        if not _is_identity(square):
+            z = np.linalg.solve(square, z).tolist()
+        return RawInnovation(tuple(z), unit, "".join("ned"[k] for k in axes))
     return None
+
+
+def _is_identity(square: list[list[float]]) -> bool:
+    return all(v == (i == k) for i, row in enumerate(square) for k, v in enumerate(row))
