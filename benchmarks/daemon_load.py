@@ -1,6 +1,6 @@
 """What the daemon takes of a machine, as JSON:
 
-    python benchmarks/daemon_load.py [--seconds S] [--filter kalman] [--raw]
+    python benchmarks/daemon_load.py [--seconds S] [--filter kalman] [--raw] [--record]
 
 The daemon's own process serves a simulated vehicle in another: IMU 200 Hz, ticks 100 Hz, GNSS
 10 Hz (`--raw`: UBX of two systems as well, 10 Hz, fused tightly), RDSS, `nav` 20 Hz to a Mosquitto
@@ -10,6 +10,8 @@ on a primed cache of compiled kernels.
 
 The IMU is on `vcan0` where that interface is up, else on python-can's `udp_multicast`, whose frames
 cost more: UDP, msgpack and a Python object for each.
+
+`--record` records all of it: what that costs is the difference to a run without.
 """
 
 from __future__ import annotations
@@ -70,6 +72,10 @@ host = "127.0.0.1"
 port = {port}
 nav_rate_hz = {nav_hz}
 """
+RECORDING = """
+[recording]
+directory = "{folder}/logs"
+"""
 
 
 def _vehicle(folder: str, interface: str, channel: str, raw: bool) -> None:
@@ -102,12 +108,18 @@ def _resident_mb(pid: int) -> float:
     return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
+def _recorded_mb(folder: Path) -> float:
+    return round(sum(path.stat().st_size for path in folder.glob("logs/*")) * 1e-6, 2)
+
+
 def _bus() -> tuple[str, str]:
     up = subprocess.run(["ip", "link", "show", "vcan0", "up"], capture_output=True, check=False)
     return ("socketcan", "vcan0") if up.stdout else ("udp_multicast", "239.74.163.2")
 
 
-async def measure(folder: Path, seconds: float, name: str, raw: bool) -> dict[str, object]:
+async def measure(
+    folder: Path, seconds: float, name: str, raw: bool, record: bool
+) -> dict[str, object]:
     """Run both processes for `seconds` after alignment; the figures."""
     interface, channel = _bus()
     broker = Broker(folder)
@@ -123,6 +135,7 @@ async def measure(folder: Path, seconds: float, name: str, raw: bool) -> dict[st
             filter=name,
             kind="raw" if raw else "gnss",
         )
+        + (RECORDING.format(folder=folder) if record else "")
     )
     vehicle = multiprocessing.get_context("spawn").Process(
         target=_vehicle, args=(str(folder), interface, channel, raw), daemon=True
@@ -153,6 +166,7 @@ async def measure(folder: Path, seconds: float, name: str, raw: bool) -> dict[st
     return {
         "filter": name,
         "raw": raw,
+        "recorded_mb": _recorded_mb(folder),
         "cpu_percent": round(100.0 * used_s / elapsed_s, 1),
         "resident_mb": round(resident_mb, 1),
         "first_tick_s": round(first_tick_s, 2),
@@ -172,10 +186,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--filter", default="kalman")
     parser.add_argument("--raw", action="store_true")
+    parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
     subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
     with tempfile.TemporaryDirectory(prefix="fusiond-load-") as folder:
-        figures = asyncio.run(measure(Path(folder), args.seconds, args.filter, args.raw))
+        wish = args.seconds, args.filter, args.raw, args.record
+        figures = asyncio.run(measure(Path(folder), *wish))
         print(json.dumps(figures, indent=2))
 
 

@@ -20,6 +20,7 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from drivers.base import PermanentDriverError
+from drivers.can.layout import AbsentSignalError, Layout
 from drivers.shipped import shipped
 
 SHIPPED = shipped("dbc")
@@ -140,31 +141,36 @@ class MessagePlan:
     axes: list[Axis] = field(default_factory=list)
     counter: Stamp | None = None
     time: Stamp | None = None
+    _layout: Layout | None = None
+    _values: list[tuple[int, float, float, float, float]] = field(default_factory=list)
 
     def decode(self, data: bytes) -> Part:
-        """Decode one frame's data.
+        """Decode one frame's data; what is planned stands from the first on.
 
         RefusedFrameError: `wrong_length` (shorter than the DBC says; padding is accepted),
-        `undecodable`, `not_finite` (NaN or infinite float), `out_of_range` (beyond any sensor, or
-        outside the DBC's minimum and maximum: SAE J1939-71 says "not available" so).
+        `undecodable` (a planned signal is not in it), `not_finite` (NaN or infinite float),
+        `out_of_range` (beyond any sensor, or outside the DBC's minimum and maximum: SAE J1939-71
+        says "not available" so).
         """
         if len(data) < self.message.length:
             raise RefusedFrameError("wrong_length")
+        if self._layout is None:
+            stamps = [stamp.signal for stamp in (self.counter, self.time) if stamp is not None]
+            self._layout = Layout(self.message, [axis.signal for axis in self.axes] + stamps)
+            self._values = [(a.slot, a.scale, a.offset, a.low, a.high) for a in self.axes]
         try:
-            raw: Any = self.message.decode(data, decode_choices=False, scaling=False)
-            values = [
-                (a.slot, raw[a.signal] * a.scale + a.offset, a.low, a.high) for a in self.axes
-            ]
-            counter = None if self.counter is None else raw[self.counter.signal]
-            ticks = None if self.time is None else raw[self.time.signal]
-        except (cantools.Error, KeyError, ValueError, ArithmeticError) as error:
+            raw = self._layout.raw(data)
+        except AbsentSignalError as error:
             raise RefusedFrameError("undecodable") from error
-        for _, value, low, high in values:
-            if not math.isfinite(value):
-                raise RefusedFrameError("not_finite")
+        values = []
+        for (slot, scale, offset, low, high), number in zip(self._values, raw, strict=False):
+            value = number * scale + offset
             if not low <= value <= high:
-                raise RefusedFrameError("out_of_range")
-        return Part([(slot, value) for slot, value, _, _ in values], counter, ticks)
+                raise RefusedFrameError("out_of_range" if math.isfinite(value) else "not_finite")
+            values.append((slot, value))
+        ticks = None if self.time is None else raw.pop()
+        counter = None if self.counter is None else raw.pop()
+        return Part(values, counter, ticks)
 
 
 def find_dbc(name: str) -> Path:

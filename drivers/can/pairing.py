@@ -15,10 +15,10 @@ dt over T, rounded once a sample is on time again, so that jitter makes no losse
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 
 from drivers.can.dbc import MessagePlan, Part
 from drivers.can.device_time import DeviceTime
@@ -31,7 +31,7 @@ OPEN_GROUPS = 4
 """Most samples whose frames are awaited at once; a device queues a sample or two, not more."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Group:
     """The frames of one sample; `realtime_ns` and `first_ns` are of the first frame."""
 
@@ -41,7 +41,8 @@ class Group:
     last_ns: int
     t_seen_ns: int
     values: list[float]
-    missing: set[int]
+    missing: int
+    """A bit for each message whose frame is awaited."""
     counter: int | None = None
     ticks: int | None = None
     ticks_ns: int | None = None
@@ -92,8 +93,11 @@ class Pairing:
         time = next((p.time for p in plans if p.time), None)
         self.device_time = DeviceTime(time.modulus, time.tick_ns) if time else None
         self.interval_ns: int | None = None
-        self._intervals_ns: deque[int] = deque(maxlen=INTERVALS)
+        self._intervals_ns: deque[int] = deque()
+        self._sorted_ns: list[int] = []
         self._open: list[Group] = []
+        self._all = (1 << len(self._plans)) - 1
+        self._stamped = [p.counter is not None or p.time is not None for p in self._plans]
         self._last = [_Last() for _ in self._plans]
         self._losses = _Losses()
 
@@ -107,18 +111,17 @@ class Pairing:
         """Take the part that message `index` contributes; the sample it completes, if any."""
         arrival_ns = t_seen_ns if realtime_ns is None else realtime_ns
         key = self._key(part)
-        if self._is_duplicate(index, data, arrival_ns):
+        last = self._last[index]
+        if data == last.data and last.seen and self._is_duplicate(index, arrival_ns):
             self._counters["duplicates"] += 1
             return None
         if index == self._lead:
             self._learn_interval(index, part.ticks, arrival_ns)
-        self._last[index] = _Last(data, arrival_ns, part.ticks, True)
-        group = self._group(index, key, arrival_ns)
+        last.data, last.arrival_ns, last.ticks, last.seen = data, arrival_ns, part.ticks, True
+        group = self._group(1 << index, key, arrival_ns)
         if group is None:
-            missing = set(range(len(self._plans)))
-            group = Group(
-                realtime_ns, arrival_ns, arrival_ns, t_seen_ns, self._constants.copy(), missing
-            )
+            values = self._constants.copy()
+            group = Group(realtime_ns, arrival_ns, arrival_ns, t_seen_ns, values, self._all)
             self._make_room(OPEN_GROUPS - 1 if key is not None else 0)
             self._open.append(group)
         group.key = key if key is not None else group.key
@@ -126,7 +129,7 @@ class Pairing:
             group.values[slot] = value
         group.counter = part.counter if part.counter is not None else group.counter
         group.ticks = part.ticks if part.ticks is not None else group.ticks
-        group.missing.discard(index)
+        group.missing &= ~(1 << index)
         group.last_ns, group.t_seen_ns = arrival_ns, t_seen_ns
         group.frames += 1
         return self._finish(group) if not group.missing else None
@@ -139,15 +142,13 @@ class Pairing:
             return part.counter
         return part.ticks if self._by_time else None
 
-    def _is_duplicate(self, index: int, data: bytes, arrival_ns: int) -> bool:
+    def _is_duplicate(self, index: int, arrival_ns: int) -> bool:
         """The same content again: with the same stamp inside, or too early to be a new sample."""
-        last, plan = self._last[index], self._plans[index]
-        if not last.seen or data != last.data:
-            return False
-        if plan.counter is not None or plan.time is not None:
+        if self._stamped[index]:
             return True
         interval_ns = self.interval_ns
-        return interval_ns is not None and abs(arrival_ns - last.arrival_ns) < interval_ns / 2
+        distance_ns = abs(arrival_ns - self._last[index].arrival_ns)
+        return interval_ns is not None and distance_ns < interval_ns / 2
 
     def _learn_interval(self, index: int, ticks: int | None, arrival_ns: int) -> None:
         last, time = self._last[index], self._plans[index].time
@@ -157,13 +158,19 @@ class Pairing:
             passed = (ticks - last.ticks) % time.modulus
             distance_ns = passed * tick_ns.numerator // tick_ns.denominator
         if last.seen and distance_ns > 0:
-            self._intervals_ns.append(distance_ns)
-            if len(self._intervals_ns) >= INTERVALS_NEEDED:
-                self.interval_ns = int(median(self._intervals_ns))
+            recent, ordered = self._intervals_ns, self._sorted_ns
+            recent.append(distance_ns)
+            insort(ordered, distance_ns)
+            count = len(recent)
+            if count > INTERVALS:
+                del ordered[bisect_left(ordered, recent.popleft())]
+                count = INTERVALS
+            if count >= INTERVALS_NEEDED:
+                self.interval_ns = (ordered[(count - 1) // 2] + ordered[count // 2]) // 2
 
-    def _group(self, index: int, key: int | None, arrival_ns: int) -> Group | None:
+    def _group(self, bit: int, key: int | None, arrival_ns: int) -> Group | None:
         for group in reversed(self._open):
-            if index not in group.missing:
+            if not group.missing & bit:
                 continue
             if key is not None and group.key is not None:
                 if key == group.key:

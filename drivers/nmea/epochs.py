@@ -1,8 +1,8 @@
 """One epoch of a GNSS receiver, put together from its sentences: no I/O, no clock.
 
-pynmeagps turns a sentence into typed fields; an `Epoch` takes those that matter. A sentence with a
-field that cannot be true is refused whole (`BadFieldError`) and leaves the epoch as it was. Empty
-fields are normal and become None.
+`drivers.nmea.fields` makes typed fields of a sentence; an `Epoch` takes those that matter. A
+sentence with a field that cannot be true is refused whole (`BadFieldError`) and leaves the epoch as
+it was. Empty fields are normal and become None.
 
 Quality comes from GGA. Where only GNS is sent it comes from its mode string, one letter a system:
 the worst letter of the systems in use counts, in the order A (1), D (2), P (3), F (5), R (4), and
@@ -18,11 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import date
 
-from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError
-from pynmeagps.nmeamessage import NMEAMessage
-from pynmeagps.nmeareader import NMEAReader
-
 from drivers.measurements import Vector3
+from drivers.nmea.fields import Fields, typed
 from drivers.nmea.framing import Sentence
 from drivers.nmea.time import parse_time_of_day
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
@@ -82,12 +79,16 @@ class Epoch:
 
     def take(self, sentence: Sentence, t_seen_ns: int) -> None:
         """Add a sentence of `FORMATTERS`. BadFieldError when a field of it cannot be true."""
-        message = _parse(sentence)
-        FORMATTERS[sentence.formatter](self, message)
+        formatter = sentence.formatter
+        try:
+            fields = typed(formatter, sentence.fields)
+        except ValueError as error:
+            raise BadFieldError(str(error)) from None
+        FORMATTERS[formatter](self, fields)
         self.t_seen_ns = t_seen_ns
-        if sentence.formatter in ("RMC", "ZDA") and not self.t_day_seen_ns:
+        if formatter in ("RMC", "ZDA") and not self.t_day_seen_ns:
             self.t_day_seen_ns = t_seen_ns
-        self.cycle.append(sentence.formatter)
+        self.cycle.append(formatter)
         self.addresses.add(sentence.address)
 
     def position(self) -> tuple[float, float, int] | None:
@@ -130,18 +131,8 @@ def time_of_day_ns(sentence: Sentence) -> int | None:
 # --------------------------------------------------------------------------- fields
 
 
-def _parse(sentence: Sentence) -> NMEAMessage:
-    try:
-        message = NMEAReader.parse(sentence.raw, validate=0)  # the splitter verified it
-    except (NMEAMessageError, NMEAParseError, NMEATypeError) as error:
-        raise BadFieldError(str(error)) from None
-    if message is None:
-        raise BadFieldError(f"{sentence.address} is not understood")
-    return message
-
-
-def _number(message: NMEAMessage, name: str, least: float = -math.inf) -> float | None:
-    value = getattr(message, name, "")
+def _number(fields: Fields, name: str, least: float = -math.inf) -> float | None:
+    value = fields.get(name, "")
     if not isinstance(value, float | int):
         return None
     if not math.isfinite(value) or value < least:
@@ -149,41 +140,41 @@ def _number(message: NMEAMessage, name: str, least: float = -math.inf) -> float 
     return float(value)
 
 
-def _count(message: NMEAMessage, name: str) -> int | None:
-    number = _number(message, name, 0.0)
+def _count(fields: Fields, name: str) -> int | None:
+    number = _number(fields, name, 0.0)
     return None if number is None else int(number)
 
 
-def _sigma(message: NMEAMessage, name: str) -> float | None:
+def _sigma(fields: Fields, name: str) -> float | None:
     """A sigma that is no number is as large as can be: it must not pass for one not given."""
-    value = getattr(message, name, "")
+    value = fields.get(name, "")
     if isinstance(value, float) and not math.isfinite(value):
         return math.inf
-    return _number(message, name, 0.0)
+    return _number(fields, name, 0.0)
 
 
-def _letter(message: NMEAMessage, name: str) -> str:
-    return str(getattr(message, name, ""))
+def _letter(fields: Fields, name: str) -> str:
+    return str(fields.get(name, ""))
 
 
-def _dop(message: NMEAMessage, name: str) -> float | None:
-    dop = _number(message, name, 0.0)
+def _dop(fields: Fields, name: str) -> float | None:
+    dop = _number(fields, name, 0.0)
     return dop if dop is not None and 0.0 < dop < NO_DOP else None
 
 
-def _angle(message: NMEAMessage, name: str) -> float | None:
-    angle = _number(message, name, 0.0)
+def _angle(fields: Fields, name: str) -> float | None:
+    angle = _number(fields, name, 0.0)
     if angle is not None and angle > 360.0:
         raise BadFieldError(f"{name} = {angle} deg")
     return angle
 
 
-def _position(message: NMEAMessage) -> tuple[float | None, float | None]:
+def _position(fields: Fields) -> tuple[float | None, float | None]:
     """Signed degrees from the fields `lat`, `NS`, `lon`, `EW`, the second to fifth of GGA, GNS."""
-    lat, lon = _number(message, "lat"), _number(message, "lon")
+    lat, lon = _number(fields, "lat"), _number(fields, "lon")
     if lat is None or lon is None:
         return None, None
-    printed = ",".join(message.payload[1:5])
+    printed = ",".join(fields["printed"][1:5])
     if not _PRINTED_POSITION.match(printed):  # no hemisphere, 60 minutes, signs
         raise BadFieldError(f"not a position: {printed}")
     if abs(lat) > 90.0 or abs(lon) > 180.0:
@@ -191,21 +182,21 @@ def _position(message: NMEAMessage) -> tuple[float | None, float | None]:
     return lat, lon
 
 
-def _take_gga(epoch: Epoch, message: NMEAMessage) -> None:
-    lat, lon = _position(message)
-    quality, satellites = _count(message, "quality"), _count(message, "numSV")
-    hdop = _dop(message, "HDOP")
-    altitude, separation = _number(message, "alt"), _number(message, "sep")
+def _take_gga(epoch: Epoch, fields: Fields) -> None:
+    lat, lon = _position(fields)
+    quality, satellites = _count(fields, "quality"), _count(fields, "numSV")
+    hdop = _dop(fields, "HDOP")
+    altitude, separation = _number(fields, "alt"), _number(fields, "sep")
     epoch.lat_deg, epoch.lon_deg, epoch.quality = lat, lon, quality or 0
     epoch.altitude_m, epoch.separation_m = altitude, separation
     epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
 
 
-def _take_gns(epoch: Epoch, message: NMEAMessage) -> None:
-    lat, lon = _position(message)
-    satellites, hdop = _count(message, "numSV"), _dop(message, "HDOP")
-    altitude, separation = _number(message, "alt"), _number(message, "sep")
-    used = set(_letter(message, "posMode")) - {"N"}
+def _take_gns(epoch: Epoch, fields: Fields) -> None:
+    lat, lon = _position(fields)
+    satellites, hdop = _count(fields, "numSV"), _dop(fields, "HDOP")
+    altitude, separation = _number(fields, "alt"), _number(fields, "sep")
+    used = set(_letter(fields, "posMode")) - {"N"}
     epoch.modes |= used
     if "GGA" in epoch.cycle:
         return
@@ -216,22 +207,22 @@ def _take_gns(epoch: Epoch, message: NMEAMessage) -> None:
     epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
 
 
-def _take_rmc(epoch: Epoch, message: NMEAMessage) -> None:
-    speed, course = _number(message, "spd", 0.0), _angle(message, "cog")
-    status = _letter(message, "status")
+def _take_rmc(epoch: Epoch, fields: Fields) -> None:
+    speed, course = _number(fields, "spd", 0.0), _angle(fields, "cog")
+    status = _letter(fields, "status")
     epoch.rmc_valid = status == "A"
-    epoch.modes |= set(_letter(message, "posMode"))
-    day = getattr(message, "date", "")
+    epoch.modes |= set(_letter(fields, "posMode"))
+    day = fields.get("date", "")
     if isinstance(day, date):
         epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
     if speed is not None and status == "A":
         epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course
 
 
-def _take_vtg(epoch: Epoch, message: NMEAMessage) -> None:
-    course = _angle(message, "cogt")
-    knots, km_h = _number(message, "sogn", 0.0), _number(message, "sogk", 0.0)
-    mode = _letter(message, "posMode")
+def _take_vtg(epoch: Epoch, fields: Fields) -> None:
+    course = _angle(fields, "cogt")
+    knots, km_h = _number(fields, "sogn", 0.0), _number(fields, "sogk", 0.0)
+    mode = _letter(fields, "posMode")
     epoch.modes |= set(mode)
     if mode == "N":
         return
@@ -243,21 +234,21 @@ def _take_vtg(epoch: Epoch, message: NMEAMessage) -> None:
         epoch.speed_m_s, epoch.course_deg = km_h * KM_H_M_S, course
 
 
-def _take_gsa(epoch: Epoch, message: NMEAMessage) -> None:
-    hdop, vdop = _dop(message, "HDOP"), _dop(message, "VDOP")
-    epoch.two_dimensional |= _count(message, "navMode") == 2
+def _take_gsa(epoch: Epoch, fields: Fields) -> None:
+    hdop, vdop = _dop(fields, "HDOP"), _dop(fields, "VDOP")
+    epoch.two_dimensional |= _count(fields, "navMode") == 2
     epoch.hdop = epoch.hdop if epoch.hdop is not None else hdop
     epoch.vdop = epoch.vdop if epoch.vdop is not None else vdop
 
 
-def _take_gst(epoch: Epoch, message: NMEAMessage) -> None:
-    north, east, down = (_sigma(message, name) for name in ("stdLat", "stdLong", "stdAlt"))
+def _take_gst(epoch: Epoch, fields: Fields) -> None:
+    north, east, down = (_sigma(fields, name) for name in ("stdLat", "stdLong", "stdAlt"))
     if north is not None and east is not None and down is not None:
         epoch.sd_ned_m = (north, east, down)
 
 
-def _take_zda(epoch: Epoch, message: NMEAMessage) -> None:
-    parts = [_count(message, name) for name in ("year", "month", "day")]
+def _take_zda(epoch: Epoch, fields: Fields) -> None:
+    parts = [_count(fields, name) for name in ("year", "month", "day")]
     if parts[0] is None or parts[1] is None or parts[2] is None:
         return
     try:
@@ -267,18 +258,18 @@ def _take_zda(epoch: Epoch, message: NMEAMessage) -> None:
     epoch.day = epoch.day or day
 
 
-def _take_hdt(epoch: Epoch, message: NMEAMessage) -> None:
-    heading = _angle(message, "headingT")
+def _take_hdt(epoch: Epoch, fields: Fields) -> None:
+    heading = _angle(fields, "headingT")
     if epoch.heading_deg is None:
         epoch.heading_deg = heading
 
 
-def _take_ths(epoch: Epoch, message: NMEAMessage) -> None:
-    heading, mode = _angle(message, "headt"), _letter(message, "mi")
+def _take_ths(epoch: Epoch, fields: Fields) -> None:
+    heading, mode = _angle(fields, "headt"), _letter(fields, "mi")
     epoch.heading_deg, epoch.heading_mode = heading, mode
 
 
-FORMATTERS: dict[str, Callable[[Epoch, NMEAMessage], None]] = {
+FORMATTERS: dict[str, Callable[[Epoch, Fields], None]] = {
     "GGA": _take_gga,
     "GNS": _take_gns,
     "RMC": _take_rmc,

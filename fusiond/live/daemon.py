@@ -75,6 +75,7 @@ class Daemon:
         self._chain = Chain(config, self.clock, self._events, saved, self._on_outcome)
         load_kernels()  # none is linked inside a tick
         self.navigator = self._chain.navigator
+        self.navigator.timeline.keeps_raw = config.recording.directory is not None
         self.sources = self._chain.sources
         self._calibration.offer(self.navigator)
         if saved is None or "saved" not in config.alignment.heading:
@@ -183,8 +184,7 @@ class Daemon:
                 self.recorder.keep_state(t_ns, KEPT_STATE.dump_json(state))
 
     def _on_outcome(self, entry: Entry) -> None:
-        if entry.outcome is not None:
-            self.recorder.innovation(entry.aid.source, entry.key[0], entry.outcome)
+        self.recorder.innovation(entry)
 
     def _carry_out(self, command: Command) -> str:
         """An operator's command, and what was done. Raises `CommandRefusedError`."""

@@ -23,6 +23,7 @@ from fusiond.integrity.tilt import Attitude
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import Q0
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
+from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
 
 Key = tuple[int, str, int]
 
@@ -37,13 +38,14 @@ MOST_WAITING = 4096
 class Entry:
     """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
     `judged` that its innovation has been looked at: a rewind applies it again. `error` is what made
-    it `failed`."""
+    it `failed`; `raw` is kept where the timeline `keeps_raw`."""
 
     key: Key
     aid: Aid
     outcome: Outcome | None = None
     judged: bool = False
     error: str = ""
+    raw: RawInnovation | None = None
 
 
 @dataclass(slots=True)
@@ -79,6 +81,8 @@ class Timeline:
         self.estimator = estimator
         self.imu = imu
         self.counters = Counters()
+        self.keeps_raw = False
+        """Whether entries are to have their raw innovation: a log wants it, at 10 us an aid."""
         self._keep_ns = round(keep_s * 1e9)
         self._checkpoint_ns = round(checkpoint_s * 1e9)
         self._on_outcome = on_outcome
@@ -206,6 +210,7 @@ class Timeline:
         before = Attitude.of(estimator.nav[Q0:], estimator.covariance) if tilts else None
         try:
             aid = entry.aid.at(estimator.nav)
+            entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
             outcome = self._update(aid) if believed else estimator.look(aid)
         except RAISED_BY_NUMBERS as error:
             entry.error = repr(error)

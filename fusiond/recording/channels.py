@@ -12,11 +12,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
 from fusiond.estimators.base import Outcome
+from fusiond.navigator.timeline import Entry
 from fusiond.outputs.foxglove import channels as foxglove
 from fusiond.outputs.topics import EVENTS, TOPICS
 
@@ -41,6 +42,12 @@ class InnovationMessage:
     degrees: int
     whitened: tuple[float, ...]
     """L^-1 nu with S = L L^T: each is N(0, 1) while filter and measurement agree."""
+    raw: tuple[float, ...]
+    """Estimate minus measurement in `unit`, before the filter judged it; empty where the aid
+    measures neither position nor velocity, or was not applied. To a micrometre."""
+    unit: Literal["m", "m/s"] | None
+    axes: str
+    """A letter for each of `raw`, of `ned`; empty where each is along a direction of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +93,20 @@ CHANNELS: dict[str, Channel] = {
 }
 
 
-def innovation(source: str, t_ns: int, outcome: Outcome) -> InnovationMessage:
-    """`/innovation` of an aid valid at `t_ns` (monotonic)."""
+def innovation(entry: Entry, outcome: Outcome) -> InnovationMessage:
+    """`/innovation` of an aid that has ended so."""
     nis = outcome.nis if math.isfinite(outcome.nis) else None
     whitened = tuple(float(v) for v in outcome.whitened)
-    return InnovationMessage(t_ns, source, outcome.name, nis, outcome.degrees, whitened)
+    raw = entry.raw
+    values = () if raw is None else tuple(round(v, 6) for v in raw.values)
+    return InnovationMessage(
+        entry.key[0],
+        entry.aid.source,
+        outcome.name,
+        nis,
+        outcome.degrees,
+        whitened,
+        values,
+        None if raw is None else raw.unit,
+        "" if raw is None else raw.axes,
+    )

@@ -19,20 +19,18 @@ def state_digest(navigator: Navigator, solution: Solution) -> bytes:
     bits. 10 us a tick.
     """
     s = solution
-    found = blake2b(digest_size=DIGEST_BYTES)
-    found.update(s.mode.encode())
-    found.update(
+    parts = [
+        s.mode.encode(),
         _SOLUTION.pack(
             s.t_ns,
             *(s.lat_rad, s.lon_rad, s.height_m),
             *(*s.v_ned_m_s, *s.rpy_rad, *s.sd_ned_m, *s.sd_v_ned_m_s, *s.sd_rpy_rad),
             *(*s.gyro_bias_rad_s, *s.accel_bias_m_s2),
             *(s.bound.hpl_m, s.bound.vpl_m),
-        )
-    )
+        ),
+    ]
     if navigator.started is not None:
         e = navigator.estimator
-        found.update(struct.pack("<q", e.t_ns))
-        for array in (e.nav, e.xi, e.covariance):
-            found.update(array.tobytes())
-    return found.digest()
+        parts.append(struct.pack("<q", e.t_ns))
+        parts += [array.tobytes() for array in (e.nav, e.xi, e.covariance)]
+    return blake2b(b"".join(parts), digest_size=DIGEST_BYTES).digest()

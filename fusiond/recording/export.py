@@ -16,6 +16,8 @@ from xml.sax.saxutils import escape, quoteattr
 from fusiond.recording.reader import Log
 
 _NAVIGATED = ("navigating", "coasting")
+_ANTIMERIDIAN = "180.000000000"
+"""No longitude of GPX 1.1 (longitudeType: below 180)."""
 _HEIGHTS = "heights above the ellipsoid WGS 84"
 
 
@@ -70,8 +72,11 @@ def _gpx(file: TextIO, vehicle: str, points: list[Point]) -> None:
         f"<trk><name>{escape(vehicle)}</name><desc>{_HEIGHTS}</desc><trkseg>\n"
     )
     for p in points:
+        lon = f"{p.lon_deg:.9f}"
+        if lon == _ANTIMERIDIAN:
+            lon = f"-{lon}"
         file.write(
-            f"<trkpt lat={quoteattr(f'{p.lat_deg:.9f}')} lon={quoteattr(f'{p.lon_deg:.9f}')}>"
+            f"<trkpt lat={quoteattr(f'{p.lat_deg:.9f}')} lon={quoteattr(lon)}>"
             f"<ele>{p.height_m:.3f}</ele><time>{p.t_utc}</time><cmt>{p.mode}</cmt></trkpt>\n"
         )
     file.write("</trkseg></trk>\n</gpx>\n")
@@ -84,7 +89,7 @@ def _kml(file: TextIO, vehicle: str, points: list[Point]) -> None:
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
         'xmlns:gx="http://www.google.com/kml/ext/2.2">\n'
         f"<Document><name>{escape(vehicle)}</name><description>{_HEIGHTS}</description>\n"
-        "<Placemark><gx:Track><altitudeMode>clampToGround</altitudeMode>\n"
+        f"<Placemark><name>{escape(vehicle)}</name><gx:Track><altitudeMode>clampToGround</altitudeMode>\n"
     )
     file.writelines(f"<when>{p.t_utc}</when>\n" for p in points)
     file.writelines(

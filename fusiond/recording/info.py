@@ -52,8 +52,8 @@ def info(recording: Log) -> dict[str, Any]:
 class _Inputs:
     def __init__(self, recording: Log) -> None:
         self._about = recording.about
-        self._counts: dict[str, Counter[str]] = {}
-        self._bytes: Counter[str] = Counter()
+        self._counts = [[0] * len(Kind) for _ in self._about.sources]
+        self._bytes = [0] * len(self._counts)
         self._ahead_ns: int | None = None
         self._tick_ns: int | None = None
         self.from_start = False
@@ -70,17 +70,18 @@ class _Inputs:
         for clock, t_ns, ahead_ns in record.readings:
             if clock == 0:
                 self._look(t_ns, ahead_ns)
-        match record.kind:
+        kind, source = record.kind, record.source
+        if source != NO_SOURCE:
+            self._counts[source][kind] += 1
+            self._bytes[source] += len(record.payload)
+            return
+        match kind:
             case Kind.START:
                 self.from_start = bool(json.loads(record.payload).get("from_start"))
             case Kind.TICK:
                 self._tick(record)
             case Kind.COMMAND:
                 self.commands.append({"t_utc": self.utc(record.t_ns), **json.loads(record.payload)})
-            case _ if record.source != NO_SOURCE:
-                name = self._about.sources[record.source]
-                self._counts.setdefault(name, Counter())[record.kind.name.lower()] += 1
-                self._bytes[name] += len(record.payload)
 
     def _look(self, t_ns: int, ahead_ns: int) -> None:
         before, self._ahead_ns = self._ahead_ns, ahead_ns
@@ -104,9 +105,10 @@ class _Inputs:
         return (self.last_ns - self.first_ns) / SECOND_NS
 
     def sources(self) -> dict[str, Any]:
+        rows = zip(self._about.sources, self._counts, self._bytes, strict=True)
         return {
-            name: {**dict(self._counts.get(name, Counter())), "bytes": self._bytes[name]}
-            for name in self._about.sources
+            name: {**{Kind(k).name.lower(): n for k, n in enumerate(counts) if n}, "bytes": size}
+            for name, counts, size in rows
         }
 
     def utc(self, t_ns: int | None) -> str | None:

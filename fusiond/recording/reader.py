@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from fusiond.recording.channels import INPUT
 from fusiond.recording.log_file import FORMAT, METADATA
@@ -25,6 +26,14 @@ from fusiond.recording.records import DamagedRecordError, Record, unpack
 RECORD_LIMIT = 1 << 30
 """A damaged length must not ask for all the memory: a chunk has 128 KiB, an attachment a few MB."""
 _DAMAGED = (EOFError, struct.error, McapError, ValueError, zstandard.ZstdError, RuntimeError)
+
+
+_RECORD = struct.Struct("<BQ")
+"""MCAP: opcode and length of a record."""
+_MESSAGE = struct.Struct("<HIQ8x")
+"""MCAP: channel, sequence and log time of a message, before its data."""
+_CHANNEL = struct.Struct("<HHI")
+"""MCAP: channel, schema and the length of the topic that follows."""
 
 
 class LogError(Exception):
@@ -90,9 +99,7 @@ class Log:
         """The messages of these channels, of all by default, as they were written."""
         wanted = frozenset(topics)
         for path in self.paths:
-            for found in _messages(path, self._problem):
-                if not wanted or found.topic in wanted:
-                    yield found
+            yield from _messages(path, wanted, self._problem)
 
     def records(self) -> Iterator[Record]:
         """The input, record by record; a gap in it ends up in `problems`."""
@@ -135,31 +142,68 @@ def described_by(path: Path) -> About:
     return about
 
 
-def _messages(path: Path, problem: Callable[[str], None]) -> Iterator[LogMessage]:
-    topics: dict[int, str] = {}
+def _messages(
+    path: Path, wanted: Collection[str], problem: Callable[[str], None]
+) -> Iterator[LogMessage]:
+    """Those of the channels `wanted`, of all if it is empty."""
+    topics: dict[int, str | None] = {}
+
+    def name(channel: int, topic: str) -> None:
+        topics[channel] = topic if not wanted or topic in wanted else None
+
     for record in _records(path, problem):
-        for inner in _opened(record, path, problem):
-            if isinstance(inner, Channel):
-                topics[inner.id] = inner.topic
-            elif isinstance(inner, Message) and inner.channel_id in topics:
-                topic = topics[inner.channel_id]
-                yield LogMessage(topic, inner.log_time, inner.data, inner.sequence)
+        if isinstance(record, Chunk):
+            try:
+                yield from _opened(record, topics, name)
+            except _DAMAGED as error:
+                problem(f"{path.name}: a damaged chunk is left out: {error}")
+        elif isinstance(record, Channel):
+            name(record.id, record.topic)
+        elif isinstance(record, Message) and (topic := topics.get(record.channel_id)) is not None:
+            yield LogMessage(topic, record.log_time, record.data, record.sequence)
 
 
-def _opened(record: McapRecord, path: Path, problem: Callable[[str], None]) -> Iterable[McapRecord]:
-    if not isinstance(record, Chunk):
-        return (record,)
-    try:
-        return breakup_chunk(record, validate_crc=True)
-    except _DAMAGED as error:
-        problem(f"{path.name}: a damaged chunk is left out: {error}")
-        return ()
+def _opened(
+    chunk: Chunk, topics: Mapping[int, str | None], name: Callable[[int, str], None]
+) -> list[LogMessage]:
+    """The messages of a chunk whose channel has a topic; `name` is told its channels.
+
+    A chunk is read by its bytes: an object of each message, of which most are of no interest, costs
+    more than all else of reading a log. Raises one of `_DAMAGED`.
+    """
+    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+    data = stream.read(length)
+    found: list[LogMessage] = []
+    at = 0
+    while at < length:
+        opcode, size = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        end = at + size
+        if end > length:
+            raise EndOfFile
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time = _MESSAGE.unpack_from(data, at)
+            topic = topics.get(channel)
+            if topic is not None:
+                found.append(LogMessage(topic, log_time, data[at + _MESSAGE.size : end], sequence))
+        elif opcode == Opcode.CHANNEL:
+            channel, _, count = _CHANNEL.unpack_from(data, at)
+            name(channel, data[at + _CHANNEL.size : at + _CHANNEL.size + count].decode())
+        at = end
+    return found
+
+
+class _Unindexed(StreamReader):
+    """Passes over the indices behind each chunk, a pair of numbers a message: nobody seeks here."""
+
+    def _read_record(self, opcode: int, length: int) -> McapRecord | None:
+        return None if opcode == Opcode.MESSAGE_INDEX else super()._read_record(opcode, length)
 
 
 def _records(path: Path, problem: Callable[[str], None]) -> Iterator[McapRecord]:
     """Records up to the summary, chunks unopened; what is cut off goes to `problem`."""
     with path.open("rb") as file:
-        records = StreamReader(file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        records = _Unindexed(file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
         try:
             first = next(records, None)
         except _DAMAGED as error:

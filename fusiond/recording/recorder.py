@@ -25,7 +25,7 @@ from fusiond.clock.clock import Clock
 from fusiond.clock.host import SECOND_NS, ReadClock
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config
-from fusiond.estimators.base import Outcome
+from fusiond.navigator.timeline import Entry
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.status import RecordingState, RecordingStatus
@@ -239,11 +239,11 @@ class Recorder:
         if self._until_ns is not None and t_ns > self._until_ns:
             self.end(f"{self._options.after_s:.0f} s after the last event")
 
-    def innovation(self, source: str, t_ns: int, outcome: Outcome) -> None:
-        """How an aid valid at `t_ns` ended."""
-        if self.active:
+    def innovation(self, entry: Entry) -> None:
+        """How an aid ended."""
+        if self.active and entry.outcome is not None:
             t_log_ns = self._clock.now_ns() + self._epoch_ns
-            self._put(Item(INNOVATION, t_log_ns, innovation(source, t_ns, outcome)))
+            self._put(Item(INNOVATION, t_log_ns, innovation(entry, entry.outcome)))
 
     def state_due(self, t_ns: int) -> bool:
         """Whether `keep_state` should be called: now and then, and first of all in each file."""

@@ -141,12 +141,12 @@ def frame_of(record: Record) -> CanFrame:
         raise DamagedRecordError(str(error)) from error
     return CanFrame(
         can_id,
-        bool(flags & _EXTENDED),
+        flags & _EXTENDED != 0,
         record.payload[_FRAME.size :],
         record.t_ns,
         realtime_ns if flags & _STAMPED else None,
-        bool(flags & _REMOTE),
-        bool(flags & _ERROR),
+        flags & _REMOTE != 0,
+        flags & _ERROR != 0,
     )
 
 
@@ -191,16 +191,17 @@ def input_record(
 
 def input_of(record: Record) -> tuple[str, bytes | str | CanFrame | None]:
     """Kind and payload as the driver's `Inputs.take` has them."""
-    match record.kind:
-        case Kind.FRAME:
-            return "frame", frame_of(record)
+    kind = record.kind
+    if kind is Kind.FRAME:
+        return "frame", frame_of(record)
+    match kind:
         case Kind.READ | Kind.SENT:
-            return record.kind.name.lower(), record.payload
+            return kind.name.lower(), record.payload
         case Kind.TIMER:
             return record.payload.decode(), None
         case Kind.OPEN:
             return "open", None
         case Kind.CLOSE | Kind.CONTROLLER:
-            return record.kind.name.lower(), record.payload.decode()
+            return kind.name.lower(), record.payload.decode()
         case _:
-            raise DamagedRecordError(f"{record.kind.name.lower()} is no input of a driver")
+            raise DamagedRecordError(f"{kind.name.lower()} is no input of a driver")

@@ -106,13 +106,9 @@ class Replay:
         """Run; each tick as it has ended. To be called once."""
         after_ns = 0
         for record in self._log.records():
-            if record.kind is Kind.START or self.chain is None:
-                if self.chain is not None:
-                    continue
+            if self.chain is None:
                 after_ns = self._start(record)
-                if record.kind is Kind.START:
-                    continue
-            if record.t_ns <= after_ns:
+            if record.kind is Kind.START or record.t_ns <= after_ns:
                 continue
             tick = self._handle(record)
             if tick is not None:
@@ -177,21 +173,24 @@ class Replay:
     def _handle(self, record: Record) -> ReplayedTick | None:
         assert self.chain is not None
         self._time.t_ns = record.t_ns
-        self._readings.give(record.readings)
+        if record.readings:
+            self._readings.give(record.readings)
         tick = None
-        match record.kind:
-            case Kind.TICK if not self._navigate:
-                self.chain.sources.take_imu()
-            case Kind.TICK:
+        kind = record.kind
+        if kind is Kind.TICK:
+            if self._navigate:
                 tick = self._tick(record)
-            case Kind.COMMAND:
-                self._command(record)
-            case Kind.SENT:
-                self._compare_sent(record)
-            case _:
-                self._inputs += 1
-                self._take(record)
-        self._finish()
+            else:
+                self.chain.sources.take_imu()
+        elif kind is Kind.COMMAND:
+            self._command(record)
+        elif kind is Kind.SENT:
+            self._compare_sent(record)
+        else:
+            self._inputs += 1
+            self._take(record)
+        if record.readings:
+            self._finish()
         return tick
 
     def _finish(self) -> None:

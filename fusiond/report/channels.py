@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from math import isfinite, isnan, nan
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,13 +31,36 @@ def _rows(rows: list[tuple[float, ...]], width: int) -> Floats:
     return table
 
 
+def _numbers(value: object) -> list[float]:
+    return [number(v) for v in value] if isinstance(value, list) else []
+
+
+def _ragged(rows: list[list[float]]) -> Floats:
+    """Rows of different lengths as one table, NaN where there is nothing."""
+    table: Floats = np.full((len(rows), max(map(len, rows))), nan)
+    for k, row in enumerate(rows):
+        table[k, : len(row)] = row
+    return table
+
+
+class _Ended(NamedTuple):
+    delay_s: float
+    outcome: str
+    nis: float
+    degrees: float
+    whitened: list[float]
+    raw: list[float]
+    unit: str
+    axes: str
+
+
 class InnovationLists:
     """`/innovation`: a late measurement rewinds the filter and brings later aids again; the last
     word on each counts, and the first says when it came."""
 
     def __init__(self, epoch_ns: int) -> None:
         self._epoch_ns = epoch_ns
-        self._aids: dict[str, dict[int, tuple[float, str, float, float, list[float]]]] = {}
+        self._aids: dict[str, dict[int, _Ended]] = {}
 
     def take(self, t_s: float, said: dict[str, Any]) -> None:
         t_ns, source = said.get("t_ns"), said.get("source")
@@ -45,29 +68,32 @@ class InnovationLists:
             return
         aids = self._aids.setdefault(source, {})
         valid_s = (t_ns + self._epoch_ns) / SECOND_NS
-        delay_s = aids[t_ns][0] if t_ns in aids else t_s - valid_s
-        whitened = said.get("whitened")
-        values = [number(v) for v in whitened] if isinstance(whitened, list) else []
-        nis, degrees = number(said.get("nis")), number(said.get("degrees"))
-        aids[t_ns] = delay_s, str(said.get("outcome", "")), nis, degrees, values
+        aids[t_ns] = _Ended(
+            aids[t_ns].delay_s if t_ns in aids else t_s - valid_s,
+            str(said.get("outcome", "")),
+            number(said.get("nis")),
+            number(said.get("degrees")),
+            _numbers(said.get("whitened")),
+            _numbers(said.get("raw")),
+            *(str(said.get(name) or "") for name in ("unit", "axes")),
+        )
 
     def by_source(self) -> dict[str, Innovations]:
         return {source: self._of(aids) for source, aids in self._aids.items()}
 
-    def _of(self, aids: dict[int, tuple[float, str, float, float, list[float]]]) -> Innovations:
+    def _of(self, aids: dict[int, _Ended]) -> Innovations:
         times = sorted(aids)
         rows = [aids[t] for t in times]
-        width = max(len(row[4]) for row in rows)
-        whitened = np.full((len(rows), width), nan)
-        for k, row in enumerate(rows):
-            whitened[k, : len(row[4])] = row[4]
         return Innovations(
             t_s=np.array([(t + self._epoch_ns) / SECOND_NS for t in times]),
-            delay_s=np.array([row[0] for row in rows]),
-            nis=np.array([row[2] for row in rows]),
-            degrees=np.array([row[3] for row in rows]),
-            whitened=whitened,
-            outcome=[row[1] for row in rows],
+            delay_s=np.array([row.delay_s for row in rows]),
+            nis=np.array([row.nis for row in rows]),
+            degrees=np.array([row.degrees for row in rows]),
+            whitened=_ragged([row.whitened for row in rows]),
+            outcome=[row.outcome for row in rows],
+            raw=_ragged([row.raw for row in rows]),
+            unit=next((row.unit for row in rows if row.unit), ""),
+            axes=next((row.axes for row in rows if row.unit), ""),
         )
 
 

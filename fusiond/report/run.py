@@ -42,7 +42,8 @@ class Innovations:
     """The aids of one source, a row each, by instant of validity.
 
     `delay_s` is from validity until the filter first met it. `whitened` (n, k) is NaN where there
-    was no innovation.
+    was no innovation. `raw` (n, j) in `unit`, estimate minus measurement, along `axes` (of
+    `ned`; empty: of their own); j = 0: not in the log.
     """
 
     t_s: Floats
@@ -51,6 +52,9 @@ class Innovations:
     degrees: Floats
     whitened: Floats
     outcome: Sequence[str]
+    raw: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    unit: str = ""
+    axes: str = ""
 
     @property
     def fused(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
 from fusiond.report.items import Item, Plot, Section, Sentence, Series, Table
 from fusiond.report.run import Innovations, LogParts, Run
 
+_AXES = {"n": "north", "e": "east", "d": "down"}
 _MOST_ROWS = 3
 """Innovations of more rows (an epoch of pseudoranges) are shown by their NIS alone."""
 _BINS = 60
@@ -33,8 +37,9 @@ def innovations(run: Run) -> Section | None:
     if rest:
         text = f"No innovation was computed of {', '.join(rest)}: see the outcomes above."
         items.append(("rest", Sentence(text)))
-    text = "A log holds innovations whitened by their own covariance, not in metres."
-    items.append(("raw", Sentence(text)))
+    if not any(found.raw.size for found in judged.values()):
+        text = "An earlier version wrote this log: its innovations are whitened, not in metres."
+        items.append(("raw", Sentence(text)))
     return Section("Innovations", items)
 
 
@@ -63,19 +68,41 @@ def _of_source(source: str, found: Innovations, judged: bool) -> list[tuple[str,
     rows = found.whitened.shape[1]
     if not 0 < rows <= _MOST_ROWS:
         return items
-    series = []
-    for k in range(rows):
-        values = found.whitened[:, k]
-        series.append(Series(f"row {k + 1}", np.where(fused, values, np.nan), "points"))
-        left = np.where(fused, np.nan, values)
-        if np.isfinite(left).any():
-            series.append(Series(f"row {k + 1}, refused", left, "refused", like=len(series) - 1))
     good = "Good: noise around 0 without a trend: two of three points within 1, 95 % within 2."
     if not judged:
         good = _CONSTRAINT
+    series = _by_row(found.whitened, fused, [f"row {k + 1}" for k in range(rows)])
     title = f"Normalised innovation, {source}"
     plot = Plot(title, "sigma", found.t_s, series, good, levels=[-2.0, 0.0, 2.0])
-    return [(f"whitened_{source}", plot), *items]
+    return [(f"whitened_{source}", plot), *_raw(source, found), *items]
+
+
+def _raw(source: str, found: Innovations) -> list[tuple[str, Item]]:
+    """In metres or m/s, where the source measures them."""
+    count = found.raw.shape[1]
+    if not 0 < count <= _MOST_ROWS:
+        return []
+    names = [_AXES[axis] for axis in found.axes if axis in _AXES]
+    if len(names) != count:
+        names = [f"row {k + 1}" for k in range(count)]
+    series = _by_row(found.raw, found.fused, names)
+    title = f"Innovation, {source}: estimate minus measurement"
+    good = (
+        "Good: noise around 0, as large as the data sheet says. What lasts is a datum, or a delay"
+        " if it goes with the speed; what turns with the heading is a lever arm."
+    )
+    return [(f"raw_{source}", Plot(title, found.unit, found.t_s, series, good, levels=[0.0]))]
+
+
+def _by_row(values: Floats, fused: np.ndarray[Any, Any], names: Sequence[str]) -> list[Series]:
+    """What was accepted, and what was refused in the same colour."""
+    series: list[Series] = []
+    for k, name in enumerate(names):
+        series.append(Series(name, np.where(fused, values[:, k], np.nan), "points"))
+        left = np.where(fused, np.nan, values[:, k])
+        if np.isfinite(left).any():
+            series.append(Series(f"{name}, refused", left, "refused", like=len(series) - 1))
+    return series
 
 
 def _shares(judged: dict[str, Innovations]) -> Item:

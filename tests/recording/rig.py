@@ -52,10 +52,9 @@ class Rig:
             self.config,
             self.clock,
             self.events,
-            on_outcome=lambda e: (
-                e.outcome and self.recorder.innovation(e.aid.source, e.key[0], e.outcome)
-            ),
+            on_outcome=self.recorder.innovation,
         )
+        self.chain.navigator.timeline.keeps_raw = True
         self.inputs = self.chain.sources.inputs
         self._warm = WarmKeeper(self.config, self.clock, lambda code, text: None, {})
         scheduler = Scheduler(50.0, lambda t_ns: None, now=self.clock.now_ns)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -19,6 +21,7 @@ from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.commands import Inject, RequestFix
 from fusiond.recording.channels import INPUT, STATE
 from fusiond.recording.edit import recover, trim, write_log
+from fusiond.recording.export import WRITERS, Point
 from fusiond.recording.info import info
 from fusiond.recording.reader import Log, LogError
 from fusiond.recording.records import Kind
@@ -27,6 +30,7 @@ from fusiond.replay.replay import Replay
 from fusiond.replay.run import Wish, replay
 from tests.clock.host_time import S
 from tests.recording.driven import Drive
+from tests.replay.track_judges import gpsbabel_points, gpx_points
 
 LENGTH_S = 18.0
 ZSTD = bytes.fromhex("28b52ffd")
@@ -281,6 +285,14 @@ def test_other_tools_see_position_events_and_innovations(recorded: Recorded) -> 
     gnss = [e for e in ended if e["source"] == "gnss" and e["outcome"] == "fused"]
     assert gnss
     assert all(e["degrees"] == len(e["whitened"]) for e in gnss)
+    assert {(e["unit"], e["axes"]) for e in gnss} == {("m", "ned")}
+    apart = np.array([e["raw"] for e in gnss])
+    assert np.all(np.abs(apart) < 20.0)
+    # L^-1 is lower triangular: the first row is the innovation north over its own sigma.
+    judged = [e for e in gnss if e["whitened"] and abs(e["whitened"][0]) > 1e-3]
+    sigma_m = np.array([e["raw"][0] / e["whitened"][0] for e in judged])
+    assert len(judged) > 50
+    assert np.all((sigma_m > 0.05) & (sigma_m < 10.0))
 
 
 def test_measurements_come_out_as_the_tables_that_process_reads(
@@ -303,13 +315,30 @@ def test_the_track_opens_elsewhere(recorded: Recorded, tmp_path: Path) -> None:
         where = ("--to", kind, "--out", out, "--interval", "0.5")
         code, text = _run("log", "export", *recorded.paths, *where)
         assert code == 0, text
-    gpx = ElementTree.parse(tmp_path / "track.gpx").getroot()
-    points = gpx.findall(".//{http://www.topografix.com/GPX/1/1}trkpt")
+    points = gpx_points(tmp_path / "track.gpx")
     assert 10 < len(points) < 2.5 * LENGTH_S
+    last = recorded.solutions[-1]
+    assert points[-1].lat_deg == pytest.approx(math.degrees(last.lat_rad), abs=1e-4)
+    assert points[-1].lon_deg == pytest.approx(math.degrees(last.lon_rad), abs=1e-4)
+    assert points[-1].height_m == pytest.approx(last.height_m, abs=1.0)
+    for kind in ("gpx", "kml"):
+        understood = gpsbabel_points(tmp_path / f"track.{kind}", kind, tmp_path)
+        assert understood in (None, points)
     kml = ElementTree.parse(tmp_path / "track.kml").getroot()
     assert len(kml.findall(".//{http://www.google.com/kml/ext/2.2}coord")) == len(points)
     features = json.loads((tmp_path / "track.geojson").read_text())["features"]
     assert sum(len(f["properties"]["t_ms"]) for f in features) >= len(points)
+
+
+def test_a_track_over_the_date_line_is_one_that_gpx_knows(tmp_path: Path) -> None:
+    """GPX has longitudes below 180 degrees; what is next to it must not be rounded up to it."""
+    here = Point("2026-11-22T16:32:55.383Z", 0, -16.5, 179.9999999999, 12.3, "navigating", 0.5)
+    out = tmp_path / "fiji.gpx"
+    with out.open("w") as file:
+        WRITERS["gpx"](file, 'a "car" & <trailer>', [here, here._replace(lon_deg=-179.99)])
+    assert [p.lon_deg for p in gpx_points(out)] == [-180.0, -179.99]
+    understood = gpsbabel_points(out, "gpx", tmp_path)
+    assert understood is None or len(understood) == 2
 
 
 def test_a_bag_for_ros_holds_fixes_and_samples(recorded: Recorded, tmp_path: Path) -> None:

@@ -160,6 +160,12 @@ def test_each_measurement_is_counted_once(recorded: Recorded) -> None:
     plot = item(recorded.document, "Innovations", "NIS a degree of freedom, gnss")
     assert np.isfinite(series(plot, "accepted")).sum() == np.count_nonzero(gnss.fused)
     assert plot["good"].startswith("Good: around 1")
+    raw = item(recorded.document, "Innovations", "Innovation, gnss: estimate minus measurement")
+    assert raw["unit"] == "m"
+    for k, axis in enumerate(("north", "east", "down")):
+        shown = series(raw, axis)
+        assert np.isfinite(shown).sum() == np.count_nonzero(gnss.fused)
+        assert np.nanmax(np.abs(shown - gnss.raw[:, k])) < 1e-3
     constraint = item(recorded.document, "Innovations", "NIS a degree of freedom, non_holonomic")
     assert "no verdict" in constraint["good"]
     outcomes = item(recorded.document, "Summary", "What became")

@@ -7,6 +7,8 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pynmeagps.exceptions import NMEATypeError
+from pynmeagps.nmeareader import NMEAReader
 
 from drivers.measurements import (
     ArrivalStamp,
@@ -16,6 +18,7 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
+from drivers.nmea.fields import typed
 from tests.drivers.nmea.sentences import (
     GGA,
     GGA_NO_FIX,
@@ -248,6 +251,31 @@ def test_no_verified_sentence_raises(formatter: str, fields: list[str]) -> None:
         if isinstance(measurement, PositionFix):
             assert math.isfinite(measurement.lat_rad)
             assert math.isfinite(measurement.lon_rad)
+
+
+@given(
+    st.sampled_from([GGA, GGA_SW, RMC, VTG, GNS, GSA, GST, ZDA, HDT, THS]),
+    st.dictionaries(
+        st.integers(1, 14),
+        st.sampled_from(["", "021429.00", "A", "nan", "-1", "3958.1", "N", "S", "W", "7", "1e5"])
+        | st.sampled_from(["201126", "311299", "320199", "11619.54321", "x", "inf"]),
+        max_size=2,
+    ),
+    st.integers(1, 20),
+)
+def test_fields_as_pynmeagps_has_them(whole: str, other: dict[int, str], length: int) -> None:
+    address, *fields = whole[1:-3].split(",")
+    printed = [other.get(k, text) for k, text in enumerate(fields, start=1)][:length]
+    try:
+        wanted = NMEAReader.parse(made(",".join([address, *printed])), validate=0)
+    except NMEATypeError:
+        with pytest.raises(ValueError, match=r"could not convert|invalid literal"):
+            typed(address[2:], printed)
+        return
+    found = typed(address[2:], printed)
+    # Its time is an object that nobody asks for; satellites are numbered there.
+    for name in found.keys() - {"printed", "time", "svid"}:
+        assert repr(found[name]) == repr(getattr(wanted, name))
 
 
 def test_rdss_text_on_the_same_port_is_left_alone() -> None:

@@ -1,0 +1,63 @@
+"""An innovation in metres or m/s: how far estimate and measurement are apart, before the filter
+has judged it.
+
+    z = H_p dr + ...   or, where no position is measured,   z = H_v dv + ...
+
+Aids give their rows as their filter wants them, RDSS fixes whitened by their covariance. The raw
+innovation is solved for what the rows measure directly: as many axes (north, east, down) as there
+are rows; else each row along the direction of its own, z_i / |H_i|, as for a vehicle's wheels.
+Angles and pseudoranges have none: the rows of the latter are metres and m/s, but dozens an epoch.
+
+While an estimate is held back (RDSS by optimal prediction), the estimate is the navigation state
+without it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from fusiond.aiding.base import Linearised, NotApplicable, State
+from fusiond.estimators.base import Estimator
+
+PARTS: tuple[tuple[slice, Literal["m", "m/s"]], ...] = ((slice(6, 9), "m"), (slice(3, 6), "m/s"))
+"""Position and velocity in the error state."""
+
+
+class RawInnovation(NamedTuple):
+    """Estimate minus measurement. `axes` has a letter a value, of `ned`; it is empty where each
+    value is along a direction of its own."""
+
+    values: tuple[float, ...]
+    unit: Literal["m", "m/s"]
+    axes: str
+
+
+def raw_innovation(aid: Linearised, estimator: Estimator) -> RawInnovation | None:
+    """Of an aid that is about to be applied; None where it measures neither."""
+    if aid.screened or math.isfinite(aid.period):
+        return None
+    e = estimator
+    rows = aid.innovation(State(e.nav, e.xi, e.step, e.model, e.covariance))
+    if isinstance(rows, NotApplicable):
+        return None
+    for part, unit in PARTS:
+        h = rows.h[:, part].tolist()  # three columns: numpy costs more than it saves
+        axes = [k for k in range(3) if any(row[k] for row in h)]
+        if not axes:
+            continue
+        z = rows.z.tolist()
+        if len(axes) != len(h):
+            values = [value / math.hypot(*row) for value, row in zip(z, h, strict=True)]
+            return RawInnovation(tuple(values), unit, "")
+        square = [[row[k] for k in axes] for row in h]
+        if not _is_identity(square):
+            z = np.linalg.solve(square, z).tolist()
+        return RawInnovation(tuple(z), unit, "".join("ned"[k] for k in axes))
+    return None
+
+
+def _is_identity(square: list[list[float]]) -> bool:
+    return all(v == (i == k) for i, row in enumerate(square) for k, v in enumerate(row))
