@@ -31,10 +31,12 @@ RecordPath = Annotated[
 def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
     loaded = recorded(load(config), record)
+    from fusiond.configuration.load import load_config  # noqa: PLC0415
+
     with compiling():
         from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
 
-    run_daemon(loaded, config)
+    run_daemon(loaded, config, lambda: recorded(load_config(config), record))
 
 
 def recorded(config: Config, folder: Path | None) -> Config:

@@ -43,6 +43,7 @@ WARNINGS = (
     "taken",
     "protection_level",
     "injected",
+    "restart_needed",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 
