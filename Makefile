@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 RUNTIME := $(VENV)/.installed-runtime
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
-# All extras but fuzz, which `make fuzz` installs where it is to be had.
+# All extras but docs and fuzz, which `make docs` and `make fuzz` install.
 TOOLS := dashboard demo foxglove mf4 raw report ros dev
 COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
@@ -19,7 +19,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb docs lock clean \
 	dashboard-check kernels systemd test-packages
 
 help: ## this list
@@ -113,12 +113,18 @@ load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 dashboard-check: $(STAMP) ## the dashboard in Debian's Chromium beside the daemon; ARGS="--minutes 60"
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh look
 	@$(BIN)/python -c 'import playwright' 2>/dev/null || $(PIP) install --quiet 'playwright>=1.49'
+	$(BIN)/python -m benchmarks.map_check
 	$(BIN)/python benchmarks/dashboard_check.py $(ARGS)
+
+docs: $(RUNTIME) ## the documentation as a site in build/site, every link checked
+	@$(BIN)/python -c 'import material' 2>/dev/null || $(PIP) install --quiet --no-build-isolation --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m tools.docs_site
 
 man: $(RUNTIME) ## manual pages in build/man: fusiond(1), fusiond.toml(5)
 	$(BIN)/python -m tools.man_pages
 
 deb: $(RUNTIME) ## a Debian package in build/deb; ARGS="--python /usr/bin/python3"
+	@PYTHON="$(PYTHON)" tools/debian-packages.sh deb
 	$(BIN)/python -m tools.debian_package $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions
