@@ -22,6 +22,7 @@ from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
+from fusiond.live.journal import handler
 from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.process_usage import release_compiler_pages
 from fusiond.live.publishing import Publishing
@@ -255,7 +256,7 @@ async def _reload_when(again: asyncio.Event, daemon: Daemon, read: Callable[[], 
 def run(config: Config, config_path: Path, read: Callable[[], Config]) -> None:
     """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
     gives then. Exits 78 if the configuration leaves nothing to run."""
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
+    logging.basicConfig(level=logging.INFO, handlers=[handler()])
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
     log.setLevel(config.log_level.upper())
     log.info("configuration %s", config_path)
