@@ -111,7 +111,8 @@ def gathered(progress: Callable[[int, int], None]) -> Iterator[None]:
     `progress` hears how many of how many are compiled, before each and at the end.
     """
     global _gathered  # noqa: PLW0603 - imports have no other way to be told
-    outer, _gathered = _gathered, (missing := [])
+    missing: list[Callable[[], None]] = []
+    outer, _gathered = _gathered, missing
     try:
         yield
     finally:
