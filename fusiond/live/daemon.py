@@ -31,6 +31,7 @@ from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
 from fusiond.live.service_manager import ServiceManager
 from fusiond.live.serving import Serving
 from fusiond.live.state_keeper import StateKeeper
+from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
 from fusiond.navigation.compiled import load_kernels
 from fusiond.navigation.solution import Solution
@@ -127,31 +128,47 @@ class Daemon:
         for output in self.outputs.values():
             output.take(EVENT, message)
 
+    async def reload_when(self, again: asyncio.Event, read: Callable[[], Config]) -> None:
+        """`reload` whenever `again` is set, until cancelled; what is set meanwhile counts once."""
+
+        async def wait() -> None:
+            while True:
+                await again.wait()
+                again.clear()
+                await self.reload(read)
+
+        await supervise("reload", wait, partial(self._events.report, "daemon", "reload_fault"))
+
     async def reload(self, read: Callable[[], Config]) -> None:
         """Take outputs, gates and log level from the configuration that `read` gives; a mistake in
         it changes nothing. What came of it is told as events."""
         self.service.reloading()
-        tell = partial(self._events.report, "daemon")
         try:
-            found = difference(self.config, await asyncio.to_thread(read))
-            kept = {n: o for n, o in self.outputs.items() if n not in found.outputs}
-            made = self._make_outputs(found.config, kept)
+            await self._reload(await asyncio.to_thread(read))
         except ConfigError as error:
-            tell("reload_refused", "; ".join(str(error).splitlines()))
-        else:
-            self.config = found.config
-            await self._serving.stop(found.outputs)
-            self.outputs = made
-            self._publishing.serve(found.config, made)
-            self._serving.start(made)
-            log.setLevel(found.config.log_level.upper())
-            if found.gates:
-                self._carry_out(SetGates(id="reload", gates=dict(found.gates)))
-            tell("reloaded", f"changed: {', '.join(found.taken) or 'nothing'}")
-            if found.restart:
-                tell("restart_needed", f"by {', '.join(found.restart)}: they are as before")
-        if self._ready:
-            self.service.ready()
+            text = "; ".join(str(error).splitlines())
+            self._events.report("daemon", "reload_refused", text)
+        finally:
+            if self._ready:
+                self.service.ready()
+
+    async def _reload(self, read: Config) -> None:
+        found = difference(self.config, read)
+        kept = {n: o for n, o in self.outputs.items() if n not in found.outputs}
+        made = self._make_outputs(found.config, kept)
+        # Nothing is refused from here on.
+        self.config = found.config
+        await self._serving.stop(found.outputs)
+        self.outputs = made
+        self._publishing.serve(found.config, made)
+        self._serving.start(made)
+        log.setLevel(found.config.log_level.upper())
+        if found.gates:
+            self._carry_out(SetGates(id="reload", gates=dict(found.gates)))
+        tell = partial(self._events.report, "daemon")
+        tell("reloaded", f"changed: {', '.join(found.taken) or 'nothing'}")
+        if found.restart:
+            tell("restart_needed", f"by {', '.join(found.restart)}: they are as before")
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until `stop` is set."""
@@ -245,14 +262,6 @@ async def _cancel(*tasks: asyncio.Task[Any]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _reload_when(again: asyncio.Event, daemon: Daemon, read: Callable[[], Config]) -> None:
-    """Whenever `again` is set; what is set meanwhile counts once."""
-    while True:
-        await again.wait()
-        again.clear()
-        await daemon.reload(read)
-
-
 def run(config: Config, config_path: Path, read: Callable[[], Config]) -> None:
     """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
     gives then. Exits 78 if the configuration leaves nothing to run."""
@@ -271,7 +280,7 @@ def run(config: Config, config_path: Path, read: Callable[[], Config]) -> None:
             raise ConfigError("sources: there is none: add [sources.imu] with a driver")
         daemon = Daemon(config)
         release_compiler_pages()
-        reloading = asyncio.create_task(_reload_when(again, daemon, read), name="reload")
+        reloading = asyncio.create_task(daemon.reload_when(again, read), name="reload")
         await daemon.run(stop)
         await _cancel(reloading)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from fusiond.configuration.load import ConfigError, load_config
+from fusiond.configuration.schema import Config
 from fusiond.live.daemon import run
 from fusiond.live.reload import difference
 from fusiond.navigation.solution import Mode
@@ -101,6 +102,27 @@ async def test_outputs_gates_and_log_level_change_while_it_navigates(
     (log,) = (tmp_path / "logs").iterdir()
     again = replay([log], Wish())
     assert again["identical"] is True, again["first_difference"]
+
+
+async def test_a_reload_that_fails_is_told_and_the_next_one_works(
+    bench: Bench,
+) -> None:
+    daemon, again = bench.daemon(NO_MQTT), asyncio.Event()
+    broken = iter([True])
+
+    def read() -> Config:
+        if next(broken, False):
+            raise RuntimeError("no disk")
+        return daemon.config
+
+    async with running(daemon):
+        reloading = asyncio.create_task(daemon.reload_when(again, read))
+        again.set()
+        await until(lambda: bench.events("reload_fault") != [])
+        assert "no disk" in bench.events("reload_fault")[0]
+        again.set()
+        await until(lambda: bench.events("reloaded") != [])
+        reloading.cancel()
 
 
 class _Operator(logging.Handler):
