@@ -21,6 +21,7 @@ RUNS = {
     "federated": 2,
     "ukf": 2,
     "reduced-order": 2,
+    "bds-tight": 2,
 }
 COLOURS = 64
 """Of a picture in the repository: curves need no more, and it has a third of the bytes."""
