@@ -7,8 +7,9 @@ HOURS ?= 1
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+RUNTIME := $(VENV)/.installed-runtime
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
-# All extras but fuzz, which `make fuzz` installs where it is to be had.
+# All extras but docs and fuzz, which `make docs` and `make fuzz` install.
 TOOLS := dashboard demo foxglove mf4 raw report ros dev
 COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
@@ -18,13 +19,13 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb docs lock clean \
 	dashboard-check kernels systemd test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
 
-install: $(STAMP) ## locked dependencies and fusiond (editable) in .venv
+install: $(STAMP) ## .venv for developers: locked dependencies, tools of the tests, fusiond (editable)
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and f"Python 3.11 or newer needed, this is {v[0]}.{v[1]}: make PYTHON=/path/to/python3.11")'
@@ -32,14 +33,17 @@ $(BIN)/python:
 	@echo "creating $(VENV)"
 	$(PYTHON) -m venv $(VENV)
 
-# Of the packages little is ever imported: that is compiled when it is, not all of it here.
-$(STAMP): requirements-dev.lock pyproject.toml | $(BIN)/python
+# Of the packages little is ever imported: that is compiled when it is, not all of it here. The lock
+# of the tools holds all of the other in the same versions.
+$(RUNTIME) $(STAMP): pyproject.toml | $(BIN)/python
 	@echo "installing locked dependencies and fusiond into $(VENV)"
-	$(PIP) install --quiet --no-compile --require-hashes -r requirements-dev.lock
+	$(PIP) install --quiet --no-compile --require-hashes -r $(filter %.lock,$^)
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
-	@touch $@
+	@touch $(RUNTIME) $@
+$(RUNTIME): requirements.lock
+$(STAMP): requirements-dev.lock
 
-demo: $(STAMP) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 60 --headless"
+demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 60 --headless"
 	$(BIN)/fusiond demo --dashboard $(ARGS)
 
 # One core compiles while the other lints. Hardware in the loop waits for real time more than it
@@ -88,10 +92,10 @@ format: $(STAMP) ## let ruff lay out the code
 picture: $(STAMP) ## docs/house.svg, from the imports
 	$(BIN)/python tools/house.py
 
-bench: $(STAMP) ## what the kernels cost; ARGS="--json F.json" keeps the figures
+bench: $(RUNTIME) ## what the kernels cost; ARGS="--json F.json" keeps the figures
 	$(BIN)/fusiond bench $(ARGS)
 
-faults: $(STAMP) ## fault matrix as a table; ARGS="--only step_500m --phase coasting"
+faults: $(RUNTIME) ## fault matrix as a table; ARGS="--only step_500m --phase coasting"
 	$(BIN)/python -m fusiond.studies.faults $(ARGS)
 
 wires: $(STAMP) test-packages ## faults of wires, clocks and the host; ARGS="--only gnss_late_3s"
@@ -109,12 +113,18 @@ load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 dashboard-check: $(STAMP) ## the dashboard in Debian's Chromium beside the daemon; ARGS="--minutes 60"
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh look
 	@$(BIN)/python -c 'import playwright' 2>/dev/null || $(PIP) install --quiet 'playwright>=1.49'
+	$(BIN)/python -m benchmarks.map_check
 	$(BIN)/python benchmarks/dashboard_check.py $(ARGS)
 
-man: $(STAMP) ## manual pages in build/man: fusiond(1), fusiond.toml(5)
+docs: $(RUNTIME) ## the documentation as a site in build/site, every link checked
+	@$(BIN)/python -c 'import material' 2>/dev/null || $(PIP) install --quiet --no-build-isolation --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m tools.docs_site
+
+man: $(RUNTIME) ## manual pages in build/man: fusiond(1), fusiond.toml(5)
 	$(BIN)/python -m tools.man_pages
 
-deb: $(STAMP) ## a Debian package in build/deb; ARGS="--python /usr/bin/python3"
+deb: $(RUNTIME) ## a Debian package in build/deb; ARGS="--python /usr/bin/python3"
+	@PYTHON="$(PYTHON)" tools/debian-packages.sh deb
 	$(BIN)/python -m tools.debian_package $(ARGS)
 
 lock: $(STAMP) ## both lock files anew from pyproject.toml; ARGS=--upgrade for newer versions

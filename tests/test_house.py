@@ -1,4 +1,4 @@
-"""The picture of the house, and the names that CONTRIBUTING uses for what is in it."""
+"""The picture of the house, and the names that CONTRIBUTING and the architecture use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pytest
 from tests.places import REPOSITORY
 from tools.house import PICTURE, House, Room, draw, floors, main, survey
 
-CONTRIBUTING = (REPOSITORY / "CONTRIBUTING.md").read_text()
+CONTRIBUTING = "".join(
+    (REPOSITORY / name).read_text() for name in ("CONTRIBUTING.md", "docs/architecture.md")
+)
 SVG = "{http://www.w3.org/2000/svg}"
 HOUSE = House(
     (

@@ -1,7 +1,7 @@
 #!/bin/sh
-# Install the Debian packages that `make install` (argument: run), `make test` (run test) or
-# `make dashboard-check` (look) needs and that are missing. Says what it does; asks for root only if
-# something is missing.
+# Install the Debian packages that `make install` (argument: run), `make test` (run test), `make deb`
+# (deb) or `make dashboard-check` (look) needs and that are missing. Says what it does; asks for root
+# only if something is missing.
 set -eu
 
 packages=""
@@ -43,11 +43,14 @@ for purpose in "$@"; do
             fi
         fi
         ;;
+    deb)
+        need binutils "strip, for a package without what only a debugger reads"
+        ;;
     look)
         need chromium "browser that looks at the dashboard"
         ;;
     *)
-        echo "usage: $0 run|test|look ..." >&2
+        echo "usage: $0 run|test|deb|look ..." >&2
         exit 64
         ;;
     esac

@@ -3,8 +3,8 @@
     python tools/debian_package.py [--out DIR] [--python /usr/bin/python3] [--requirements FILE]
 
 `make deb` does it. The locked dependencies are installed as published, with their hashes; nothing
-is built but fusiond's own wheel. The package holds for the Python that the environment was made
-with. Nothing of this machine is changed.
+is built but fusiond's own wheel. Their own tests and what only a debugger reads are left out. The
+package holds for the Python that the environment was made with. Nothing of this machine is changed.
 """
 
 from __future__ import annotations
@@ -67,8 +67,10 @@ fi
 PRERM = """\
 #!/bin/sh
 set -e
-if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
-    systemctl disable --now fusiond.service || true
+if [ "$1" = remove ]; then
+    units="fusiond-gpsd.socket fusiond.service"
+    if [ -d /run/systemd/system ]; then systemctl stop $units || true; fi
+    systemctl --quiet disable $units || true
 fi
 """
 POSTRM = """\
@@ -104,7 +106,6 @@ fusiond: dir-or-file-in-opt
 # The daemon's user may not write there: without them every start would compile them.
 fusiond: package-installs-python-pycache-dir
 # Wheels as published on PyPI, whose hashes are locked.
-fusiond: unstripped-binary-or-object
 fusiond: embedded-library
 fusiond: custom-library-search-path
 fusiond: shared-library-is-executable
@@ -174,9 +175,24 @@ def environment(tree: Tree, python: str, requirements: Path, work: Path) -> None
     run(*pip, "wheel", *options, source)
     run(*install, "--no-deps", next(wheels.glob("*.whl")))
     shutil.rmtree(venv / "include", ignore_errors=True)
+    lighten(venv)
     _settle(venv, str(tree.root))
     stage = ("-s", tree.root, "-p", "/")
     run(venv / "bin/python", "-m", "compileall", "-q", *stage, venv / "lib")
+
+
+def lighten(venv: Path) -> None:
+    """Leave out the packages' own tests (37 MB) and the symbols that only a debugger reads (45 MB).
+
+    Libraries in `*.libs` stay as they are: their loading segments were moved when the wheels were
+    made, which strip does not always survive.
+    """
+    packages = next(venv.glob("lib/python*/site-packages"))
+    for folder in sorted(packages.rglob("tests")):
+        if folder.is_dir():
+            shutil.rmtree(folder)
+    libraries = [p for p in packages.rglob("*.so") if not p.parent.name.endswith(".libs")]
+    run("strip", "--strip-unneeded", "--preserve-dates", *libraries)
 
 
 def _settle(venv: Path, root: str) -> None:
@@ -195,7 +211,8 @@ def _settle(venv: Path, root: str) -> None:
 def system_files(tree: Tree, version: str) -> None:
     """What lies outside /opt."""
     tree.copy("config/vehicle.toml", "etc/fusiond/vehicle.toml")
-    tree.copy("systemd/fusiond.service", "lib/systemd/system/fusiond.service")
+    for unit in ("fusiond.service", "fusiond-gpsd.socket"):
+        tree.copy(f"systemd/{unit}", f"lib/systemd/system/{unit}")
     tree.copy("systemd/sysusers-fusiond.conf", "usr/lib/sysusers.d/fusiond.conf")
     tree.copy("systemd/70-fusiond.rules", "lib/udev/rules.d/70-fusiond.rules")
     tree.copy("README.md", f"{HOME}/README.md")  # Documentation= of the unit
@@ -265,7 +282,7 @@ def main() -> None:
     system_files(tree, version)
     control_files(tree, version, options.python)
     package = work / f"fusiond_{version}-1.deb"
-    run("dpkg-deb", "--root-owner-group", "-Zxz", "-z1", "--build", tree.root, package)
+    run("dpkg-deb", "--root-owner-group", "-Zxz", "-z6", "--build", tree.root, package)
     print(package)
 
 

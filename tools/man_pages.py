@@ -115,7 +115,7 @@ def _command(path: str, command: Any) -> Iterator[str]:
     context = command.context_class(command, info_name=path)
     yield ".SS " + escaped(f"{path} {' '.join(command.collect_usage_pieces(context))}")
     for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
-        yield escaped(paragraph)
+        yield from _kept(paragraph) if paragraph.startswith("\b") else [escaped(paragraph)]
         yield ".PP"
     for parameter in command.params:
         record = parameter.get_help_record(context)
@@ -123,6 +123,14 @@ def _command(path: str, command: Any) -> Iterator[str]:
             yield ".TP"
             yield rf"\fB{escaped(record[0])}\fR"
             yield escaped(re.sub(r"\s+", " ", record[1] or "as its name says")) or r"\&"
+
+
+def _kept(paragraph: str) -> Iterator[str]:
+    """Lines that stay lines, which the command line marks by a backspace."""
+    yield ".nf"
+    for line in paragraph.splitlines()[1:]:
+        yield "    " * line.startswith(" ") + escaped(line)
+    yield ".fi"
 
 
 # --------------------------------------------------------------------------- fusiond.toml(5)

@@ -32,6 +32,10 @@ def dashboard(
     speed: Annotated[
         float, typer.Option(min=0.01, max=1000.0, help="Of a recording, times real time.")
     ] = 1.0,
+    base_map: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="F.pmtiles", help="Draw this map below the track."),
+    ] = None,
     commands: Annotated[
         bool, typer.Option("--commands", help="Whoever has the token may send commands.")
     ] = False,
@@ -45,7 +49,7 @@ def dashboard(
     )
 
     token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
-    serving = Serving(host, port, token if commands and not logs else None)
+    serving = Serving(host, port, token if commands and not logs else None, base_map)
     if not serving.loopback:
         typer.echo("fusiond: everyone who reaches this address sees the vehicle", err=True)
     try:

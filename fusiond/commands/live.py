@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.shared import EXIT_UNAVAILABLE, ConfigPath, config_errors, load, plain
+from fusiond.commands.compiling import compiling
+from fusiond.commands.shared import (
+    EXIT_UNAVAILABLE,
+    ConfigPath,
+    config_errors,
+    draws,
+    load,
+    plain,
+)
 
 if TYPE_CHECKING:
     from fusiond.configuration.schema import Config
@@ -24,9 +31,12 @@ RecordPath = Annotated[
 def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
     loaded = recorded(load(config), record)
-    from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
+    from fusiond.configuration.load import load_config  # noqa: PLC0415
 
-    run_daemon(loaded, config)
+    with compiling():
+        from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
+
+    run_daemon(loaded, config, lambda: recorded(load_config(config), record))
 
 
 def recorded(config: Config, folder: Path | None) -> Config:
@@ -47,19 +57,16 @@ def demo(
 ) -> None:
     """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
     from fusiond.demo.broker import DemoError  # noqa: PLC0415
-    from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
+
+    with compiling():
+        from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
 
     try:
-        summary = run_demo(duration, headless or not draws(), record, dashboard)
+        summary = run_demo(duration, headless or not draws(sys.stdout), record, dashboard)
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
     typer.echo(json.dumps(plain(summary), allow_nan=False))
-
-
-def draws() -> bool:
-    """Whether standard output is a terminal that can be drawn on."""
-    return sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 
 def check(
@@ -77,10 +84,10 @@ def check(
     from fusiond.configuration.doubts import doubts  # noqa: PLC0415
 
     if compile_kernels:
-        import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
-        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
+        with compiling(), config_errors():
+            import fusiond.live.daemon  # noqa: F401, PLC0415 - importing it compiles, into the cache
+            from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
-        with config_errors():
             Navigator(loaded)  # and so does its filter
     typer.echo(f"{config}: ok, vehicle {loaded.vehicle}")
     for name, source in loaded.sources.items():

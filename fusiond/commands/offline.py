@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from fusiond.commands.compiling import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -76,7 +77,9 @@ def process(
         raise typer.BadParameter("--smooth: name a file to write with --out")
     loaded = load(config)
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-    from fusiond.offline.process import process as run_process  # noqa: PLC0415
+
+    with compiling():
+        from fusiond.offline.process import process as run_process  # noqa: PLC0415
 
     wanted = _systems_argument(systems)
     try:
@@ -118,7 +121,9 @@ def calibrate(
         raise typer.BadParameter("--imu or --can: the samples come of one of the two")
     loaded = load(config)
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-    from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
+
+    with compiling():
+        from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
 
     try:
         with config_errors(), data_errors(), progress_bar("calibrating") as bar:
@@ -152,9 +157,10 @@ def simulate(
     ] = None,
 ) -> None:
     """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle."""
-    from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
-    from fusiond.simulation.gnss.masks import parse_mask  # noqa: PLC0415
-    from fusiond.simulation.scenarios import SCENARIOS  # noqa: PLC0415
+    with compiling():
+        from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
+        from fusiond.simulation.gnss.masks import parse_mask  # noqa: PLC0415
+        from fusiond.simulation.scenarios import SCENARIOS  # noqa: PLC0415
 
     if scenario not in SCENARIOS:
         raise typer.BadParameter(f"{scenario!r}: there are {', '.join(SCENARIOS)}")

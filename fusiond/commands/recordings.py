@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from fusiond.commands.compiling import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
     EXIT_UNAVAILABLE,
@@ -64,8 +65,9 @@ def replay(
     json_path: JsonPath = None,
 ) -> None:
     """Run a recording through the daemon's own parts; exit 1 where the bits are not the same."""
-    from fusiond.replay.run import Wish  # noqa: PLC0415
-    from fusiond.replay.run import replay as run_replay  # noqa: PLC0415
+    with compiling():
+        from fusiond.replay.run import Wish  # noqa: PLC0415
+        from fusiond.replay.run import replay as run_replay  # noqa: PLC0415
 
     logging.getLogger("fusiond").addHandler(logging.NullHandler())  # events go into --out
     wish = Wish(config, tuple(settings or ()), out, speed)

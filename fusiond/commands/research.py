@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from fusiond.commands.compiling import compiling
 from fusiond.commands.shared import (
     EXIT_UNAVAILABLE,
     JsonPath,
@@ -18,7 +19,7 @@ from fusiond.commands.shared import (
     spinner,
     write_json,
 )
-from fusiond.studies import STUDIES
+from fusiond.studies import ABOUT, STUDIES
 
 
 def schema(
@@ -31,7 +32,7 @@ def schema(
 
 
 def study(
-    name: Annotated[str, typer.Argument(metavar="NAME", help=", ".join(STUDIES) + ".")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="One of those above.")],
     runs: Annotated[
         int | None, typer.Option(min=2, help="Monte Carlo runs; the study's own by default.")
     ] = None,
@@ -49,7 +50,8 @@ def study(
     if plot is not None and find_spec("matplotlib") is None:
         typer.echo("fusiond: --plot needs matplotlib: pip install fusiond[report]", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE)
-    module = import_module(STUDIES[name])
+    with compiling():
+        module = import_module(STUDIES[name])
     with progress_bar(name) as progress:
         result = module.run(runs, progress=progress)
     if json_path != "-":
@@ -60,6 +62,12 @@ def study(
     if plot is not None:
         with data_errors():
             module.plot(result, plot)
+
+
+# A paragraph that begins with \b keeps its lines in `--help`.
+study.__doc__ = f"{study.__doc__}\n\n\b\n" + "\n".join(
+    f"{name} ({about.runs} runs)\n    {about.text}" for name, about in ABOUT.items()
+)
 
 
 def model(
@@ -86,7 +94,8 @@ def model(
 
 def bench(json_path: JsonPath = None) -> None:
     """Time the kernels against one numpy product."""
-    from fusiond.bench.bench import bench as run_bench  # noqa: PLC0415
+    with compiling():
+        from fusiond.bench.bench import bench as run_bench  # noqa: PLC0415
     from fusiond.commands.bench_report import print_bench  # noqa: PLC0415
 
     with spinner("timing"):

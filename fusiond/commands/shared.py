@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -75,9 +76,14 @@ def data_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_IO) from error
 
 
+def draws(stream: TextIO) -> bool:
+    """Whether it is a terminal that can be drawn on."""
+    return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
+
+
 def spinner(text: str) -> AbstractContextManager[object]:
     """A moving sign on a terminal, nothing in a pipe."""
-    if not sys.stderr.isatty():
+    if not draws(sys.stderr):
         return nullcontext()
     from rich.console import Console  # noqa: PLC0415
 
@@ -87,7 +93,7 @@ def spinner(text: str) -> AbstractContextManager[object]:
 @contextmanager
 def progress_bar(text: str) -> Iterator[Callable[[int, int], None] | None]:
     """A bar on a terminal, called with (done, total); nothing in a pipe."""
-    if not sys.stderr.isatty():
+    if not draws(sys.stderr):
         yield None
         return
     from rich.console import Console  # noqa: PLC0415

@@ -273,6 +273,8 @@ class Config(Section):
     """What it is: height and speed of no measurement may exceed what its class can do."""
     state_file: Path | None = None
     """Where the last solution is kept for the next start; the unit's state directory by default."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """What the daemon writes to its log: this and what matters more."""
     imu: Imu = Imu()
     sources: dict[str, Source] = Field(default_factory=dict)
     aiding: dict[str, AnyAiding] = Field(default_factory=dict)

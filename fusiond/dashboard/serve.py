@@ -16,6 +16,8 @@ from fusiond.dashboard.broker import Access, Broker
 from fusiond.dashboard.hub import Hub
 
 INSTALL = "the dashboard's packages are not installed: pip install 'fusiond[dashboard]'"
+PMTILES = b"PMTiles\x03"
+"""What a file of version 3 begins with."""
 SEND_BUFFER = 128 * 1024
 """Bytes that the kernel holds for a browser: some frames, not minutes of them."""
 
@@ -30,11 +32,13 @@ class DashboardError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """Where to serve. `token`: whoever has it may send commands; None: nobody."""
+    """Where to serve. `token`: whoever has it may send commands; None: nobody.
+    `base_map`: a PMTiles file to draw below the track."""
 
     host: str = "127.0.0.1"
     port: int = 8770
     token: str | None = None
+    base_map: Path | None = None
 
     @property
     def loopback(self) -> bool:
@@ -79,6 +83,8 @@ def _run(
     serving: Serving,
     tell: Callable[[str], None],
 ) -> None:
+    if serving.base_map is not None:
+        check_map(serving.base_map)
     if importlib.util.find_spec("uvicorn") is None or importlib.util.find_spec("starlette") is None:
         raise DashboardError(INSTALL)
     door = listening(serving)
@@ -88,6 +94,17 @@ def _run(
 
     # A signal is the web server's: it ends in order, then lets the signal do its work.
     asyncio.run(serve(hub, source, serving, door, asyncio.Event()))
+
+
+def check_map(path: Path) -> None:
+    """Raises `DashboardError` for a file that is no map of ours."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(PMTILES))
+    except OSError as error:
+        raise DashboardError(f"{path}: {error.strerror or error}") from error
+    if head != PMTILES:
+        raise DashboardError(f"{path}: no PMTiles file of version 3")
 
 
 def listening(serving: Serving) -> socket.socket:
@@ -116,7 +133,7 @@ async def serve(
     from fusiond.dashboard.web import application  # noqa: PLC0415 - the same
 
     config = uvicorn.Config(
-        application(hub, serving.token, serving.loopback),
+        application(hub, serving.token, serving.loopback, serving.base_map),
         ws="websockets-sansio",
         ws_per_message_deflate=False,  # a core's worth of it, for a local network
         ws_max_size=65536,

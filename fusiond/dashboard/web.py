@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.resources import files
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -37,13 +38,19 @@ HEADERS = (
 """Of every answer."""
 
 
-def application(hub: Hub, token: str | None, loopback: bool) -> Starlette:
-    """The application. `loopback`: bound to it, so that no other name for us is right."""
+def application(
+    hub: Hub, token: str | None, loopback: bool, base_map: Path | None = None
+) -> Starlette:
+    """The application. `loopback`: bound to it, so that no other name for us is right; `base_map`:
+    a PMTiles file, of which the page asks ranges."""
     static = str(files("fusiond.dashboard").joinpath("static"))
     viewers: set[Viewer] = set()
 
     async def index(request: Request) -> FileResponse:
         return FileResponse(f"{static}/index.html")
+
+    async def land(request: Request) -> Response:
+        return Response(status_code=204) if base_map is None else FileResponse(base_map)
 
     async def watch(socket: WebSocket) -> None:
         if not of_our_page(socket.headers):
@@ -63,6 +70,7 @@ def application(hub: Hub, token: str | None, loopback: bool) -> Starlette:
     return Starlette(
         routes=[
             Route("/", index),
+            Route("/map.pmtiles", land),
             WebSocketRoute("/watch", watch),
             Mount("/static", StaticFiles(directory=static, follow_symlink=True)),
         ],

@@ -10,7 +10,7 @@ import asyncio
 import logging
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,11 +22,14 @@ from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events
+from fusiond.live.journal import handler
 from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.process_usage import release_compiler_pages
 from fusiond.live.publishing import Publishing
+from fusiond.live.reload import difference
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
 from fusiond.live.service_manager import ServiceManager
+from fusiond.live.serving import Serving
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
@@ -39,9 +42,11 @@ from fusiond.outputs.commands import (
     NAMES,
     Command,
     CommandRefusedError,
+    SetGates,
     StartRecording,
     StopRecording,
 )
+from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
@@ -89,23 +94,15 @@ class Daemon:
             now=self.clock.now_ns,
             on_time=self.service.feed_watchdog,
         )
-        self.outputs: dict[str, Output] = make_outputs(
+        self._serving = Serving(self._events.report)
+        self.outputs = self._make_outputs(config, {})
+        self._publishing = Publishing(
             config,
-            on_event=self._events.report,
-            on_command=self._carry_out,
-            clock=self.clock,
+            self._chain,
+            self.scheduler.status,
+            self.outputs,
+            lambda: self.recorder.recording,
         )
-        if config.recording.directory is not None:
-            self.outputs["recording"] = self.recorder
-        self._publishing: Publishing | None = None
-        if self.outputs:
-            self._publishing = Publishing(
-                config,
-                self._chain,
-                self.scheduler.status,
-                self.outputs,
-                lambda: self.recorder.recording,
-            )
         self._on_solution = on_solution
         self._started_ns = self.clock.now_ns()
         self._ready = False
@@ -115,6 +112,64 @@ class Daemon:
     def solution(self) -> Solution | None:
         """Of the last tick."""
         return self._chain.solution
+
+    def _make_outputs(self, config: Config, kept: Mapping[str, Output]) -> dict[str, Output]:
+        made = make_outputs(
+            config,
+            on_event=self._events.report,
+            on_command=self._carry_out,
+            clock=self.clock,
+            kept=kept,
+        )
+        if config.recording.directory is not None:
+            made["recording"] = self.recorder
+        return made
+
+    def _tell_outputs(self, message: EventMessage) -> None:
+        for output in self.outputs.values():
+            output.take(EVENT, message)
+
+    async def reload_when(self, again: asyncio.Event, read: Callable[[], Config]) -> None:
+        """`reload` whenever `again` is set, until cancelled; what is set meanwhile counts once."""
+
+        async def wait() -> None:
+            while True:
+                await again.wait()
+                again.clear()
+                await self.reload(read)
+
+        await supervise("reload", wait, partial(self._events.report, "daemon", "reload_fault"))
+
+    async def reload(self, read: Callable[[], Config]) -> None:
+        """Take outputs, gates and log level from the configuration that `read` gives; a mistake in
+        it changes nothing. What came of it is told as events."""
+        self.service.reloading()
+        try:
+            await self._reload(await asyncio.to_thread(read))
+        except ConfigError as error:
+            text = "; ".join(str(error).splitlines())
+            self._events.report("daemon", "reload_refused", text)
+        finally:
+            if self._ready:
+                self.service.ready()
+
+    async def _reload(self, read: Config) -> None:
+        found = difference(self.config, read)
+        kept = {n: o for n, o in self.outputs.items() if n not in found.outputs}
+        made = self._make_outputs(found.config, kept)
+        # Nothing is refused from here on.
+        self.config = found.config
+        await self._serving.stop(found.outputs)
+        self.outputs = made
+        self._publishing.serve(found.config, made)
+        self._serving.start(made)
+        log.setLevel(found.config.log_level.upper())
+        if found.gates:
+            self._carry_out(SetGates(id="reload", gates=dict(found.gates)))
+        tell = partial(self._events.report, "daemon")
+        tell("reloaded", f"changed: {', '.join(found.taken) or 'nothing'}")
+        if found.restart:
+            tell("restart_needed", f"by {', '.join(found.restart)}: they are as before")
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until `stop` is set."""
@@ -126,17 +181,8 @@ class Daemon:
         )
         self.recorder.listen(self.sources.inputs)
         self.recorder.arm(LOADED.dump_python(self._loaded, mode="json"))
-        self._events.listen(*(partial(output.take, EVENT) for output in self.outputs.values()))
-        outputs = [
-            asyncio.create_task(
-                supervise(
-                    f"output {name}",
-                    output.run,
-                    partial(self._events.report, name, "output_fault"),
-                )
-            )
-            for name, output in self.outputs.items()
-        ]
+        self._events.listen(self._tell_outputs)
+        self._serving.start(self.outputs)
         work = [
             asyncio.create_task(self.sources.run(), name="sources"),
             asyncio.create_task(self.scheduler.run(), name="scheduler"),
@@ -152,7 +198,7 @@ class Daemon:
             await self._state.close(self.solution)
             await self._warm.close(self.solution, self.navigator)
             await self._calibration.close(self.navigator)
-            await _cancel(*outputs)
+            await self._serving.stop()
             self.service.close()
             log.info(
                 "stopped after %d ticks, %d overruns", self.scheduler.ticks, self.scheduler.overruns
@@ -168,7 +214,7 @@ class Daemon:
             self._keep_in_log(t_ns, solution)
         if self._on_solution is not None:
             self._on_solution(solution)
-        if self._publishing is not None:
+        if self.outputs:
             self._publishing.tick(t_ns, solution)
         if self._second.due(t_ns) or self._chain.changed:
             self._each_second(t_ns, solution)
@@ -216,22 +262,27 @@ async def _cancel(*tasks: asyncio.Task[Any]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def run(config: Config, config_path: Path) -> None:
-    """Run until SIGTERM or SIGINT. Exits 78 if the configuration leaves nothing to run."""
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
+def run(config: Config, config_path: Path, read: Callable[[], Config]) -> None:
+    """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
+    gives then. Exits 78 if the configuration leaves nothing to run."""
+    logging.basicConfig(level=logging.INFO, handlers=[handler()])
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
+    log.setLevel(config.log_level.upper())
     log.info("configuration %s", config_path)
 
     async def main() -> None:
-        stop = asyncio.Event()
+        stop, again = asyncio.Event(), asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, stop.set)
+        loop.add_signal_handler(signal.SIGHUP, again.set)
         if not config.sources:
             raise ConfigError("sources: there is none: add [sources.imu] with a driver")
         daemon = Daemon(config)
         release_compiler_pages()
+        reloading = asyncio.create_task(daemon.reload_when(again, read), name="reload")
         await daemon.run(stop)
+        await _cancel(reloading)
 
     try:
         asyncio.run(main())

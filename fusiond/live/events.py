@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 
 from fusiond.clock.clock import Clock
+from fusiond.live.journal import fields
 from fusiond.outputs.messages.event import EventMessage, Level, event_message
 
 log = logging.getLogger("fusiond")
@@ -43,6 +44,7 @@ WARNINGS = (
     "taken",
     "protection_level",
     "injected",
+    "restart_needed",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 
@@ -78,7 +80,8 @@ class Events:
 
     def report(self, source: str, code: str, text: str) -> None:
         level = level_of(code)
-        log.log(getattr(logging, level.upper()), "%s: %s: %s", source, code, text)
+        said = source, code, text
+        log.log(getattr(logging, level.upper()), "%s: %s: %s", *said, extra=fields(source, code))
         utc_ns = self._clock.utc_ns(self._clock.now_ns())
         message = event_message(utc_ns, source=source, code=code, text=text, level=level)
         if not self._listeners:

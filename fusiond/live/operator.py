@@ -14,6 +14,7 @@ from fusiond.outputs.commands import (
     Inject,
     RequestFix,
     ResetFilter,
+    SetGates,
     SetPosition,
 )
 
@@ -50,6 +51,9 @@ class Operator:
             case ResetFilter():
                 self._navigator.reset("reset by an operator")
                 return "aligning anew"
+            case SetGates():
+                self._navigator.set_gates(command.gates)
+                return ", ".join(f"{name} {gate:g}" for name, gate in command.gates.items())
             case _:
                 raise CommandRefusedError(f"unknown command {type(command).__name__}")
 

@@ -54,19 +54,23 @@ class Publishing:
         self._sources = chain.sources
         self._injection = chain.injection
         self._scheduler = scheduler
-        self._outputs = outputs
         self._recording = recording
         self._innovations = chain.innovations
         self._usage = ProcessUsage()
         self._version = version("fusiond")
-        self._digest = config_digest(config)
         self._started_ns = self._since_ns = chain.clock.now_ns()
         self._mode: Mode | None = None
-        self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
-        self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
         self._tracking = Tracking()
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
         self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
+        self.serve(config, outputs)
+
+    def serve(self, config: Config, outputs: Mapping[str, Output]) -> None:
+        """From now on by this configuration, to these outputs."""
+        self._outputs = outputs
+        self._digest = config_digest(config)
+        self._nav = [(o, Every(round(SECOND_NS / o.nav_rate_hz))) for o in outputs.values()]
+        self._health = Every(round(SECOND_NS / config.mqtt.health_rate_hz))
         self._calibrated: tuple[CalibrationState, ...] = ()
 
     def tick(self, t_ns: int, solution: Solution) -> None:

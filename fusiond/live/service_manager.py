@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections.abc import Mapping
 
 
@@ -46,6 +47,10 @@ class ServiceManager:
     def status(self, text: str) -> None:
         """One sentence for `systemctl status`."""
         self._send(f"STATUS={_one_line(text)}")
+
+    def reloading(self) -> None:
+        """The configuration is read again, until `ready`."""
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
         """Shutdown has begun."""

@@ -3,6 +3,8 @@
 With an explicit signature numba compiles when the module is imported and never again: no
 compilation can happen inside the navigation loop. A kernel that is in the cache already is linked
 when it is first called; `load_kernels` does that for all at once, before a loop that keeps time.
+Where somebody waits for the imports, `gathered` keeps what is to be compiled until it is known how
+many there are, and tells how far it is.
 `error_model="numpy"` drops the zero-division checks that would keep loops from being vectorised;
 `fastmath` stays off because it would let results depend on the order that the compiler picks.
 
@@ -23,7 +25,8 @@ import itertools
 import os
 import secrets
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -62,6 +65,7 @@ remove_strays(FOLDER)
 _names: dict[str, int] = {}  # in the order of definition: what a kernel calls comes before it
 _in_cache = set(os.listdir(FOLDER)) if FOLDER.is_dir() else set()
 _waiting: dict[int, Callable[[], None]] = {}
+_gathered: list[Callable[[], None]] | None = None
 
 # 2^48 starts: no two processes that filled a cache count through the same numbers.
 setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48)))  # noqa: B010
@@ -88,6 +92,8 @@ def compiled(
         kernel._cache = cache = KernelCache(FOLDER, name, partial(load_kernels, place))
         if cache.file_name(signature, kernel.targetctx) in _in_cache:
             _load_when_called(kernel, signature, place)
+        elif _gathered is not None:
+            _gathered.append(_load_when_called(kernel, signature, place))
         else:
             kernel.compile(signature)
             kernel.disable_compile()
@@ -95,6 +101,27 @@ def compiled(
         return finished
 
     return compile_function
+
+
+@contextmanager
+def gathered(progress: Callable[[int, int], None]) -> Iterator[None]:
+    """Compile what is imported inside at its end, kernel after kernel; where the cache has all of
+    it nothing happens, and `progress` is not called.
+
+    `progress` hears how many of how many are compiled, before each and at the end.
+    """
+    global _gathered  # noqa: PLW0603 - imports have no other way to be told
+    missing: list[Callable[[], None]] = []
+    outer, _gathered = _gathered, missing
+    try:
+        yield
+    finally:
+        _gathered = outer
+    for done, load in enumerate(missing):
+        progress(done, len(missing))
+        load()
+    if missing:
+        progress(len(missing), len(missing))
 
 
 def load_kernels(before: int | None = None) -> None:
@@ -110,8 +137,10 @@ def load_kernels(before: int | None = None) -> None:
                 load()
 
 
-def _load_when_called(kernel: Any, signature: str, place: int) -> None:
-    """A dispatcher that knows no signature yet asks `_compile_for_args` for the one of a call."""
+def _load_when_called(kernel: Any, signature: str, place: int) -> Callable[[], None]:
+    """Link the kernel when it is first called, or compile it where the cache has none; returns what
+    does so at once. A dispatcher that knows no signature yet asks `_compile_for_args` for the one
+    of a call."""
 
     def load() -> None:
         with global_compiler_lock:
@@ -126,3 +155,4 @@ def _load_when_called(kernel: Any, signature: str, place: int) -> None:
 
     kernel._compile_for_args = first_call
     _waiting[place] = load
+    return load

@@ -7,7 +7,7 @@ filter as far as the IMU reaches, `solution` reads the state at an instant.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,11 +91,7 @@ class Navigator:
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._event)
         self.estimator = estimator(config, self.model)
-        self.verdicts = Verdicts(
-            config.consistency.window,
-            config.consistency.alpha,
-            lambda source, verdict: self._event(f"verdict_{verdict}", f"innovations of {source}"),
-        )
+        self.verdicts = self._verdicts()
         self.timeline = Timeline(
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
@@ -125,6 +121,17 @@ class Navigator:
         )
 
     # ------------------------------------------------------------------ arrivals
+
+    def _verdicts(self) -> Verdicts:
+        test = self.config.consistency
+        return Verdicts(
+            test.window, test.alpha, lambda s, v: self._event(f"verdict_{v}", f"innovations of {s}")
+        )
+
+    def set_gates(self, gates: Mapping[str, float]) -> None:
+        """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""
+        self._intake.set_gates(gates)
+        self.verdicts = self._verdicts()
 
     def add_imu(self, times: NDArray[np.int64], samples: Array) -> int:
         """IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; how many count.

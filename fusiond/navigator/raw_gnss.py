@@ -121,6 +121,7 @@ class RawGnss:
     def __init__(self, source: str, section: RawAiding) -> None:
         self.source = source
         self._section = section
+        self.gate = section.gate_probability
         self._store = EphemerisStore()
         options = RangeOptions(
             section.systems, math.radians(section.elevation_mask_deg), section.cno_mask_db_hz
@@ -140,8 +141,8 @@ class RawGnss:
 
     def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
         """The epoch as an aid, with the ephemerides that are known by now."""
-        gate = self._section.gate_probability
-        return RawEpochAid(self.source, t_ns, gate, self, epoch, self._model.pick(epoch))
+        picked = self._model.pick(epoch)
+        return RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
 
     def alone(self, aid: RawEpochAid) -> list[Offer]:
         """Position and velocity of an epoch alone, for the alignment; none without a solution."""

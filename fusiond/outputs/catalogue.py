@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from fusiond.clock.clock import Clock
@@ -44,14 +45,18 @@ def make_outputs(
     on_event: Callable[[str, str, str], None],
     on_command: Handler,
     clock: Clock,
+    kept: Mapping[str, Output] = MappingProxyType({}),
 ) -> dict[str, Output]:
     """Those that are configured, by name, MQTT first. `on_event(source, code, text)` hears them.
+    `kept` are there already, those that go out by MQTT with its own among them.
 
     Raises `ConfigError` for one that cannot be as it is configured.
     """
     made: dict[str, Output] = {}
     mqtt: MqttPublisher | None = None
-    if config.mqtt.enabled:
+    if "mqtt" in kept:
+        made["mqtt"] = kept["mqtt"]
+    elif config.mqtt.enabled:
         made["mqtt"] = mqtt = MqttPublisher(
             config.mqtt,
             config.vehicle,
@@ -60,6 +65,9 @@ def make_outputs(
             utc_now=lambda: clock.utc_ns(clock.now_ns()),
         )
     for name, section in config.outputs.served.items():
+        if name in kept:
+            made[name] = kept[name]
+            continue
         around = Surroundings(
             config.vehicle,
             partial(on_event, name),

@@ -76,6 +76,13 @@ class Inject(Command):
         return self
 
 
+class SetGates(Command):
+    """The gates of a configuration that was read again; nobody sends it."""
+
+    gates: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]]
+    """`gate_probability` by section of `aiding`."""
+
+
 COMMANDS: dict[str, type[Command]] = {
     "set_position": SetPosition,
     "request_fix": RequestFix,
@@ -84,7 +91,10 @@ COMMANDS: dict[str, type[Command]] = {
     "stop_recording": StopRecording,
     "inject": Inject,
 }
-NAMES = {command: name for name, command in COMMANDS.items()}
+"""What may be asked from outside."""
+CARRIED_OUT: dict[str, type[Command]] = {**COMMANDS, "set_gates": SetGates}
+"""What a recording holds, and a replay carries out again."""
+NAMES = {command: name for name, command in CARRIED_OUT.items()}
 
 Handler = Callable[[Command], str]
 """Carries a command out at once and says what was done, or raises `CommandRefusedError`."""

@@ -29,7 +29,7 @@ from fusiond.live.warm_keeper import KEPT_STATE
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.state_file import DamagedStateError
 from fusiond.navigator.timeline import Entry
-from fusiond.outputs.commands import COMMANDS, CommandRefusedError
+from fusiond.outputs.commands import CARRIED_OUT, CommandRefusedError
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.recording.channels import STATE
 from fusiond.recording.digest import state_digest
@@ -220,7 +220,7 @@ class Replay:
     def _command(self, record: Record) -> None:
         assert self.chain is not None
         said = json.loads(record.payload)
-        model = COMMANDS[said.pop("name")]
+        model = CARRIED_OUT[said.pop("name")]
         try:
             self.chain.operator.carry_out(model.model_validate(said), record.t_ns)
         except CommandRefusedError as error:

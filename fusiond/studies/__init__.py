@@ -6,6 +6,8 @@ A study module has `run(runs, seed, progress) -> dict` and `plot(result, path)`;
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 STUDIES = {
     "rdss-static": "fusiond.studies.rdss.static",
     "rdss-dynamic": "fusiond.studies.rdss.dynamic",
@@ -20,4 +22,67 @@ STUDIES = {
     "protection": "fusiond.studies.protection",
     "vehicle": "fusiond.studies.vehicle.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
+}
+
+
+class About(NamedTuple):
+    """What a study asks, and how many runs it makes where nobody says how many."""
+
+    text: str
+    runs: int
+
+
+ABOUT = {
+    "rdss-static": About(
+        "Paper 000 at rest: late RDSS fixes by four strategies, 55 of them.",
+        500,
+    ),
+    "rdss-dynamic": About(
+        "Paper 000 on a drive: turns, stops, slow terminals, outages.",
+        100,
+    ),
+    "rdss-correlated": About(
+        "Fixes that share an error: filters that ignore or estimate it.",
+        100,
+    ),
+    "rdss-map": About(
+        "Sigma of an RDSS fix over latitude and longitude.",
+        2000,
+    ),
+    "multiscale": About(
+        "Paper 001: a block filter on wavelets against two others.",
+        100,
+    ),
+    "federated": About(
+        "Paper 004: federated filters, and faults in one of their parts.",
+        50,
+    ),
+    "ukf": About(
+        "Paper 003: unscented against extended filter, fair and poor starts.",
+        50,
+    ),
+    "bds-tight": About(
+        "BeiDou pseudoranges in the filter against a receiver's fixes.",
+        50,
+    ),
+    "consistency": About(
+        "How often the verdict on sigma is wrong, how soon it sees a fault.",
+        20_000,
+    ),
+    "reduced-order": About(
+        "Paper 002: 23 states of INS/GNSS/SAR against 17, by covariance.",
+        40,
+    ),
+    "protection": About(
+        "Whether errors stay below the protection levels; their cost.",
+        20,
+    ),
+    "vehicle": About(
+        "Mounting, scales, lever arms that the filter finds: honest sigma?",
+        60,
+    ),
+    "ins-gnss-sar": About(
+        "Paper 002 flown: 23 states against 17, four satellites against all.",
+        50,
+    ),
 }

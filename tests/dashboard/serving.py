@@ -6,6 +6,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import websockets
@@ -39,9 +40,10 @@ async def at_work(
     hub: Hub,
     source: Callable[[], Coroutine[Any, Any, None]] = _nothing,
     token: str | None = None,
+    base_map: Path | None = None,
 ) -> AsyncIterator[str]:
     """Its address as HOST:PORT."""
-    serving = Serving(port=0, token=token)
+    serving = Serving(port=0, token=token, base_map=base_map)
     door = listening(serving)
     stop = asyncio.Event()
     task = asyncio.create_task(serve(hub, source, serving, door, stop))

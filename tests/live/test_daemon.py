@@ -268,7 +268,7 @@ def test_nothing_to_run_exits_78(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     config = tmp_path / "test.toml"
     config.write_text('vehicle = "x"\n')
     with pytest.raises(SystemExit) as ended:
-        run(load_config(config), config)
+        run(load_config(config), config, lambda: load_config(config))
     assert ended.value.code == 78
     (error,) = [r for r in caplog.records if r.levelname == "ERROR"]
     assert error.exc_info is None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,7 +20,7 @@ from typer.testing import CliRunner, Result
 from fusiond.commands.app import app
 from fusiond.integrity.consistency import LAGS, ConsistencyOptions
 from fusiond.integrity.monitor import ConsistencyMonitor
-from fusiond.studies import STUDIES
+from fusiond.studies import ABOUT, STUDIES
 from fusiond.studies.monte_carlo import nees_interval
 from fusiond.studies.rdss import correlated as rdss_correlated
 from fusiond.studies.rdss import dynamic as rdss_dynamic
@@ -229,3 +231,18 @@ def test_pictures_have_a_panel_for_each_case(tmp_path: Path) -> None:
 
 def test_studies_are_named_by_what_they_are() -> None:
     assert set(STUDIES) >= {"rdss-static", "rdss-dynamic", "rdss-map", "consistency"}
+
+
+def test_help_says_what_each_study_asks_and_how_many_runs_it_makes() -> None:
+    shown = CliRunner().invoke(app, ["study", "--help"], env={"COLUMNS": "80"}).output
+    assert set(ABOUT) == set(STUDIES)
+    for name, about in ABOUT.items():
+        assert f"{name} ({about.runs} runs)\n" in shown
+        assert f"{about.text}\n" in shown
+        source = importlib.util.find_spec(STUDIES[name])
+        assert source is not None
+        assert source.origin is not None
+        (runs,) = re.findall(
+            r"(?m)^(?:DEFAULT_RUNS|DRAWS) = ([\d_]+)$", Path(source.origin).read_text()
+        )
+        assert int(runs) == about.runs

@@ -1,5 +1,6 @@
-// The track from above on a metric grid, north up: follow or drag, wheel or keys to zoom.
-// No picture of the land: that would have to come from elsewhere.
+// The track from above on a metric grid, north up: follow or drag, wheel or keys to zoom. The land
+// below it comes from a file that the dashboard serves, or there is none: no other host is asked.
+import { BaseMap } from "./basemap.js";
 import { colour, element, known, mark, prepared } from "./text.js";
 
 const EARTH_A = 6378137,
@@ -46,6 +47,7 @@ export class TrackMap {
     const all = tools.appendChild(element("button", "", "all"));
     all.title = "all of the track (a)";
     all.onclick = () => this.all();
+    this.land = new BaseMap("/map.pmtiles", () => this.draw());
     this.listen();
   }
 
@@ -181,6 +183,7 @@ export class TrackMap {
       ctx.fillText("no position yet", this.width / 2, this.height / 2);
       return;
     }
+    this.below(ctx);
     this.grid(ctx);
     this.line(ctx);
     if (here) {
@@ -188,6 +191,20 @@ export class TrackMap {
       this.arrow(ctx, here, nav);
     }
     this.bar(ctx);
+  }
+
+  // The land, and whose it is.
+  below(ctx) {
+    const [lat0, lon0, perEast, perNorth] = this.origin;
+    const at = (x, y) => [
+      lat0 + (this.centre[1] + (this.height / 2 - y) / this.scale) / perNorth,
+      lon0 + (this.centre[0] + (x - this.width / 2) / this.scale) / perEast,
+    ];
+    const place = (lat, lon) => this.place([(lon - lon0) * perEast, (lat - lat0) * perNorth]);
+    this.land.draw(ctx, [...at(0, this.height), ...at(this.width, 0)], this.scale, place);
+    ctx.fillStyle = colour("quiet");
+    ctx.textAlign = "right";
+    ctx.fillText(this.land.attribution, this.width - 10, this.height - 28);
   }
 
   grid(ctx) {

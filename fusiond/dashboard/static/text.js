@@ -30,7 +30,13 @@ export function colour(name) {
     );
   return colours.get(name);
 }
-export const forgetColours = () => colours.clear();
+let times = 0;
+export function forgetColours() {
+  colours.clear();
+  times++;
+}
+// How often that was: what was drawn before has other colours.
+export const forgotten = () => times;
 
 export const known = (v) => typeof v === "number" && Number.isFinite(v);
 

@@ -52,6 +52,10 @@ class Intake:
         self._pace = Pace(tell)
         self.receivers = self._sections.receivers
 
+    def set_gates(self, gates: Mapping[str, float]) -> None:
+        """`gate_probability` by section."""
+        self._sections.set_gates(gates)
+
     def aids(
         self, m: Measurement | RawGnssEpoch, t_ns: int, sd_time_s: float, seen_ns: int = 0
     ) -> Sequence[Aid] | str:

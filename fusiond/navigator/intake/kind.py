@@ -35,6 +35,17 @@ class Sections:
         }
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
 
+    def set_gates(self, gates: Mapping[str, float]) -> None:
+        """`gate_probability` by section, of what comes from now on."""
+        changed = {
+            name: self.aiding[name].model_copy(update={"gate_probability": gate})
+            for name, gate in gates.items()
+        }
+        self.aiding = {**self.aiding, **changed}
+        self._found.clear()
+        for name in self.receivers.keys() & gates:
+            self.receivers[name].gate = gates[name]
+
     def of(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""
         section = self._found.get((source, kind))

@@ -9,6 +9,7 @@ import pwd
 import re
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -125,6 +126,7 @@ async def _live(heard: Heard, start: list[str]) -> None:
     assert first["NRestarts"] == "0"
     _check_process(int(first["MainPID"]))
     await _aligned(heard)
+    await _reload(int(first["MainPID"]))
 
     # Frozen: the watchdog kills it, and it comes back.
     os.kill(int(first["MainPID"]), signal.SIGSTOP)
@@ -145,6 +147,28 @@ async def _live(heard: Heard, start: list[str]) -> None:
     assert (stopped["Result"], stopped["MainPID"]) == ("success", "0"), journal()
     await heard.online(b"offline")
     _check_state(stopping_s)
+
+
+async def _reload(pid: int) -> None:
+    """Taken from the file while it runs; a mistake fails the reload and changes nothing."""
+    good = CONFIG.read_text()
+    CONFIG.write_text(good.replace("nav_rate_hz = 10.0", "nav_rate_hz = 5.0"))
+    await asyncio.to_thread(systemctl, "reload", UNIT)
+    await _told("daemon: reloaded: changed: mqtt.nav_rate_hz")
+    CONFIG.write_text(good.replace("nav_rate_hz = 10.0", 'nav_rate_hz = "fast"'))
+    asked = ["systemctl", "reload", UNIT]
+    refused = await asyncio.to_thread(subprocess.run, asked, check=False)
+    assert refused.returncode != 0
+    await _told("daemon: reload_refused: ")
+    CONFIG.write_text(good)
+    await asyncio.to_thread(systemctl, "reload", UNIT)
+    assert (await _until(_running))["MainPID"] == str(pid)
+
+
+async def _told(text: str) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while text not in await asyncio.to_thread(journal):  # noqa: ASYNC110
+            await asyncio.sleep(0.2)
 
 
 async def _aligned(heard: Heard) -> None:

@@ -1,0 +1,60 @@
+"""What is told while kernels compile: once after an installation or an update, a minute and more.
+
+with compiling():
+    from fusiond.live.daemon import run
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from fusiond.commands.shared import draws
+
+# A line of a log every so often, where a terminal's is written anew at each kernel.
+LINE_EVERY_S = 5.0
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Say how far it is while what is imported inside compiles; nothing where nothing does."""
+    from fusiond.navigation.compiled import gathered  # noqa: PLC0415 - numba
+
+    with gathered(Progress(sys.stderr)):
+        yield
+
+
+class Progress:
+    """Hears how many kernels of how many are compiled: on a terminal one line, in a pipe or a
+    journal one now and then, for systemd its STATUS=."""
+
+    def __init__(self, out: TextIO) -> None:
+        from fusiond.live.service_manager import ServiceManager  # noqa: PLC0415
+
+        self._out = out
+        self._draws = draws(out)
+        self._service = ServiceManager()
+        self._started_s = time.monotonic()
+        self._told_s = -LINE_EVERY_S
+
+    def __call__(self, done: int, total: int) -> None:
+        if not done:
+            self._started_s = time.monotonic()
+        text = f"compiling {done}/{total} kernels, once"
+        self._service.status(text)
+        spent_s = time.monotonic() - self._started_s
+        if done == total:
+            self._say(f"compiled {total} kernels in {spent_s:.0f} s", ends=True)
+        elif self._draws or spent_s - self._told_s >= LINE_EVERY_S:
+            self._told_s = spent_s
+            self._say(text, ends=False)
+
+    def _say(self, text: str, ends: bool) -> None:
+        if self._draws:
+            # Back to the line's begin, and without the rest of what stood there (ECMA-48, EL).
+            print(f"\r{text}\x1b[K", end="\n" if ends else "", file=self._out, flush=True)
+        else:
+            print(text, file=self._out, flush=True)

@@ -1,0 +1,81 @@
+"""What is logged, with level, source and code as fields of the journal.
+
+    journalctl -u fusiond -p warning
+    journalctl -u fusiond FUSIOND_SOURCE=gnss FUSIOND_CODE=device_absent
+
+Source: systemd.io/JOURNAL_NATIVE_PROTOCOL.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import struct
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+SOCKET = Path("/run/systemd/journal/socket")
+PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
+"""Of syslog(3)."""
+
+
+def fields(source: str, code: str) -> dict[str, str]:
+    """`extra` of a record that is about an event."""
+    return {"fusiond_source": source, "fusiond_code": code}
+
+
+class JournalHandler(logging.Handler):
+    """Writes to the journal and never waits for it: what it does not take is counted in `lost`."""
+
+    def __init__(self, path: Path = SOCKET) -> None:
+        super().__init__()
+        self._address = str(path)
+        kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+        self._socket = socket.socket(socket.AF_UNIX, kind)
+        self.lost = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        said = {
+            "MESSAGE": self.format(record),
+            "PRIORITY": str(PRIORITIES.get(record.levelname, 6)),
+            "SYSLOG_IDENTIFIER": "fusiond",
+        }
+        for name in fields("", ""):
+            if hasattr(record, name):
+                said[name.upper()] = str(getattr(record, name))
+        if self.lost:
+            said["FUSIOND_LOST"] = str(self.lost)
+        try:
+            self._socket.sendto(b"".join(_field(*each) for each in said.items()), self._address)
+            self.lost = 0
+        except OSError:
+            self.lost += 1
+
+    def close(self) -> None:
+        self._socket.close()
+        super().close()
+
+
+def _field(name: str, value: str) -> bytes:
+    """NAME=value; what has several lines has its length in front."""
+    data = value.encode(errors="replace")
+    if b"\n" in data:
+        return name.encode() + b"\n" + struct.pack("<Q", len(data)) + data + b"\n"
+    return name.encode() + b"=" + data + b"\n"
+
+
+def handler(environ: Mapping[str, str] = os.environ) -> logging.Handler:
+    """For the journal where standard error goes there (JOURNAL_STREAM, systemd.exec(5)), else for
+    standard error."""
+    try:
+        err = os.fstat(sys.stderr.fileno())
+        journal = environ.get("JOURNAL_STREAM") == f"{err.st_dev}:{err.st_ino}" and SOCKET.exists()
+    except (OSError, ValueError):  # standard error is closed, or no file
+        journal = False
+    if journal:
+        return JournalHandler()
+    written = logging.StreamHandler(sys.stderr)
+    written.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
+    return written

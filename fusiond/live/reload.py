@@ -1,0 +1,96 @@
+"""What a running daemon takes from a configuration that was read again, and what needs a restart.
+
+Taken are the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every aid) and
+`log_level`: what can change without the solution losing what it knows. All else goes into the
+model, the buffers or the drivers when they are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import ValidationError
+
+from fusiond.configuration.load import ConfigError
+from fusiond.configuration.schema import Config
+
+GATE = "gate_probability"
+MQTT = "mqtt"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """`config` is what holds from now on. Keys with dots: `taken`, and those of `restart`."""
+
+    config: Config
+    taken: tuple[str, ...]
+    restart: tuple[str, ...]
+    outputs: frozenset[str]
+    """Those that are made anew, are new or are no more."""
+    gates: Mapping[str, float]
+    """By section of `aiding`."""
+
+
+def difference(running: Config, read: Config) -> Difference:
+    """Between what the daemon runs by and what was read. Raises `ConfigError` where what can be
+    taken does not go with what needs a restart."""
+    before, after = dict(_flat(running.model_dump())), dict(_flat(read.model_dump()))
+    changed = sorted(
+        key
+        for key in before.keys() | after.keys()
+        if key not in before or key not in after or before[key] != after[key]
+    )
+    gates = {
+        name: section.gate_probability
+        for name, section in read.aiding.items()
+        if f"aiding.{name}.{GATE}" in changed and name in running.aiding
+    }
+    taken = tuple(key for key in changed if _can_be_taken(key, gates))
+    aiding = {
+        name: section.model_copy(update={GATE: gates.get(name, section.gate_probability)})
+        for name, section in running.aiding.items()
+    }
+    update = {
+        "mqtt": read.mqtt,
+        "outputs": read.outputs,
+        "log_level": read.log_level,
+        "aiding": aiding,
+    }
+    config = running.model_copy(update=update)
+    try:
+        Config.model_validate(config.model_dump())
+    except ValidationError as error:
+        mistakes = "; ".join(e["msg"] for e in error.errors())
+        raise ConfigError(f"only with a restart: {mistakes}") from error
+    restart = tuple(key for key in changed if key not in taken)
+    return Difference(config, taken, restart, _anew(running, read), gates)
+
+
+def _can_be_taken(key: str, gates: Mapping[str, float]) -> bool:
+    section, _, rest = key.partition(".")
+    if section == "aiding":
+        name, _, field = rest.rpartition(".")
+        return field == GATE and name in gates
+    return section in ("mqtt", "outputs", "log_level")
+
+
+def _anew(running: Config, read: Config) -> frozenset[str]:
+    """An output is made for one section and one broker: those through it go with it."""
+    before, after = running.outputs.served, read.outputs.served
+    found = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
+    if running.outputs.geoid_separation_m != read.outputs.geoid_separation_m:
+        found |= before.keys() | after.keys()
+    by_broker = {*running.outputs.through_the_broker, *read.outputs.through_the_broker}
+    if running.mqtt != read.mqtt or found & by_broker:
+        found |= {MQTT, *by_broker}
+    return frozenset(found)
+
+
+def _flat(section: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in section.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value

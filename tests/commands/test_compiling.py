@@ -1,0 +1,98 @@
+"""What is told while kernels compile: to a pipe, to systemd, on a terminal."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fusiond.commands.compiling import Progress
+from tests.patience import PATIENCE_S
+
+KERNELS = """
+from fusiond.navigation.compiled import compiled
+
+@compiled("f8(f8)")
+def halved(x):
+    return 0.5 * x
+
+@compiled("f8(f8)")
+def quartered(x):
+    return 0.5 * halved(x)
+
+USED = quartered(1.0)
+
+@compiled("f8(f8)")
+def doubled(x):
+    return 2.0 * x
+"""
+CODE = """
+import sys
+from fusiond.commands.compiling import compiling
+with compiling():
+    import kernels
+    print("imported", file=sys.stderr)
+print(kernels.USED, kernels.quartered(8.0), kernels.doubled(8.0))
+"""
+
+
+def test_a_pipe_and_systemd_hear_how_far_it_is(tmp_path: Path) -> None:
+    """All kernels are known before the first one compiles, but for one that an import calls."""
+    (tmp_path / "kernels.py").write_text(KERNELS)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        done = subprocess.run(
+            [sys.executable, "-c", CODE],
+            env=os.environ
+            | {
+                "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+                "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]),
+                "NOTIFY_SOCKET": str(tmp_path / "notify"),
+            },
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=True,
+        )
+        manager.setblocking(False)
+        told = [manager.recv(256).decode() for _ in range(4)]
+    assert done.stdout == "0.25 2.0 16.0\n"
+    first, second, *_, last = done.stderr.splitlines()
+    assert (first, second) == ("imported", "compiling 0/3 kernels, once")
+    assert re.fullmatch(r"compiled 3 kernels in \d+ s", last)
+    assert told == [f"STATUS=compiling {n}/3 kernels, once" for n in range(4)]
+    assert len(list((tmp_path / "cache").rglob("*.kernel"))) == 3
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("term", "written"),
+    [
+        (
+            "xterm",
+            "\rcompiling 0/2 kernels, once\x1b[K\rcompiling 1/2 kernels, once\x1b[K"
+            "\rcompiled 2 kernels in 0 s\x1b[K\n",
+        ),
+        ("dumb", "compiling 0/2 kernels, once\ncompiled 2 kernels in 0 s\n"),
+    ],
+)
+def test_a_terminal_has_one_line_and_a_dumb_one_lines(
+    monkeypatch: pytest.MonkeyPatch, term: str, written: str
+) -> None:
+    monkeypatch.setenv("TERM", term)
+    monkeypatch.setattr("fusiond.commands.compiling.time.monotonic", lambda: 100.0)
+    out = _Terminal()
+    told = Progress(out)
+    for done in range(3):
+        told(done, 2)
+    assert out.getvalue() == written

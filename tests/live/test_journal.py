@@ -1,0 +1,81 @@
+"""Records as the journal takes them, at a real datagram socket; and when it is not the journal."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import ClockOptions
+from fusiond.live.events import Events
+from fusiond.live.journal import JournalHandler, handler
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+        bound.bind(str(tmp_path / "socket"))
+        bound.settimeout(5.0)
+        yield bound
+
+
+@pytest.fixture
+def log(journal: socket.socket, tmp_path: Path) -> Iterator[JournalHandler]:
+    made = JournalHandler(tmp_path / "socket")
+    logging.getLogger("fusiond").addHandler(made)
+    yield made
+    logging.getLogger("fusiond").removeHandler(made)
+    made.close()
+
+
+def test_an_event_has_level_source_and_code(journal: socket.socket, log: JournalHandler) -> None:
+    Events(Clock(ClockOptions())).report("gnss", "device_absent", "/dev/gnss: gone")
+    assert journal.recv(4096).decode().splitlines() == [
+        "MESSAGE=gnss: device_absent: /dev/gnss: gone",
+        "PRIORITY=4",
+        "SYSLOG_IDENTIFIER=fusiond",
+        "FUSIOND_SOURCE=gnss",
+        "FUSIOND_CODE=device_absent",
+    ]
+
+
+def test_what_has_several_lines_stays_one_record(
+    journal: socket.socket, log: JournalHandler
+) -> None:
+    logging.getLogger("fusiond").error("one\ntwo")
+    assert journal.recv(4096) == (
+        b"MESSAGE\n" + struct.pack("<Q", 7) + b"one\ntwo\nPRIORITY=3\nSYSLOG_IDENTIFIER=fusiond\n"
+    )
+
+
+def test_a_journal_that_takes_nothing_costs_records_and_no_time(
+    journal: socket.socket, log: JournalHandler
+) -> None:
+    while not log.lost:
+        logging.getLogger("fusiond").error("x" * 1000)
+    journal.recv(4096)
+    logging.getLogger("fusiond").error("again")
+    received = [journal.recv(4096)]
+    while b"again" not in received[-1]:
+        received.append(journal.recv(4096))
+    assert b"FUSIOND_LOST=1\n" in received[-1]
+    assert log.lost == 0
+
+
+def test_standard_error_where_that_is_not_the_journal(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert isinstance(handler({}), logging.StreamHandler)
+    assert isinstance(handler({"JOURNAL_STREAM": "1:1"}), logging.StreamHandler)
+    with open(os.devnull, "w") as err:
+        found = os.fstat(err.fileno())
+        monkeypatch.setattr(sys, "stderr", err)
+        monkeypatch.setattr("fusiond.live.journal.SOCKET", Path("/"))
+        made = handler({"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"})
+        assert isinstance(made, JournalHandler)
+        made.close()
