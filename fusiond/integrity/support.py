@@ -92,7 +92,7 @@ def supported(records: Records, device: str, t_ns: int) -> bool:
 
 def velocity_sd(records: Records, device: str) -> float:
     """Sigma (m/s) of the device's velocities as a mean of many shows it; 0 without any."""
-    found = (r.sd_m_s * r.colour for r in records.values() if r.moves and r.device == device)
+    found = (r.sd_m_s * r.means.colour for r in records.values() if r.moves and r.device == device)
     return max(found, default=0.0)
 
 
@@ -117,8 +117,10 @@ def fine_enough(records: Records, record: Series, t_ns: int) -> bool:
 
 def outage(records: Records, t_ns: int) -> bool:
     """Whether there were fine positions, and none has been fused for as long as makes coasting."""
-    fine = [r.fused_ns for r in records.values() if r.locates and r.sd_m <= FINE_M]
-    latest_ns = max(fine, default=NEVER_NS)
+    latest_ns = NEVER_NS
+    for r in records.values():
+        if r.locates and r.sd_m <= FINE_M and r.fused_ns > latest_ns:
+            latest_ns = r.fused_ns
     return latest_ns > NEVER_NS and t_ns - latest_ns > OTHERS_NS
 
 

@@ -33,15 +33,18 @@ LIMIT = 27.6
 
 
 class Attitude(NamedTuple):
-    """Attitude quaternion (4,), body to navigation axes, and P (2, 2) of the tilt, rad^2."""
+    """Attitude quaternion (4), body to navigation axes, and P of the tilt north and east, rad^2."""
 
-    q: Array
-    p: Array
+    q: list[float]
+    nn: float
+    ne: float
+    ee: float
 
     @staticmethod
     def of(q: Array, covariance: Array) -> Attitude:
-        """A copy of what a filter holds."""
-        return Attitude(q.copy(), covariance[:2, :2].copy())
+        """Of what a filter holds: a quaternion (4,) and P, whose first two rows are the tilt's."""
+        element = covariance.item
+        return Attitude(q.tolist(), element(0, 0), element(0, 1), element(1, 1))
 
 
 class Tilting(NamedTuple):
@@ -57,18 +60,17 @@ class Tilting(NamedTuple):
     def with_one(self, t_ns: int, before: Attitude, after: Attitude) -> Tilting:
         """With one update more: the attitude before and after it."""
         f = math.exp(-max(0, t_ns - self.t_ns) * 1e-9 / LASTS_S)
-        w, x, y, z = before.q.tolist()
-        to_w, to_x, to_y, to_z = after.q.tolist()
+        w, x, y, z = before.q
+        to_w, to_x, to_y, to_z = after.q
         # Vector part of after times before's conjugate: half of the small turn.
         way = math.copysign(2.0, w * to_w + x * to_x + y * to_y + z * to_z)
-        gained = before.p - after.p
         return Tilting(
             t_ns,
             f * self.north + way * (to_x * w - to_w * x - to_y * z + to_z * y),
             f * self.east + way * (to_y * w - to_w * y + to_x * z - to_z * x),
-            f * f * self.nn + float(gained[0, 0]),
-            f * f * self.ne + float(gained[0, 1]),
-            f * f * self.ee + float(gained[1, 1]),
+            f * f * self.nn + (before.nn - after.nn),
+            f * f * self.ne + (before.ne - after.ne),
+            f * f * self.ee + (before.ee - after.ee),
         )
 
     @property

@@ -167,4 +167,5 @@ def _turned(imu: ImuBuffer, begin_ns: int, end_ns: int) -> float:
     rows = slice(imu.index_after(begin_ns), imu.index_after(end_ns))
     if rows.start == rows.stop:
         return math.nan
-    return float(imu.samples[rows, 2].mean()) * (end_ns - begin_ns) * 1e-9
+    mean = float(np.add.reduce(imu.samples[rows, 2])) / (rows.stop - rows.start)
+    return mean * (end_ns - begin_ns) * 1e-9

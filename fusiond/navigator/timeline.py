@@ -279,11 +279,9 @@ class Timeline:
             del self._checkpoints[:drop]
         oldest = self._checkpoints[0]
         self.imu.needed = oldest.snapshot.sample
-        stale = 0
-        while stale < self._next and (
-            oldest.last_key is not None and self._keys[stale] < oldest.last_key
-        ):
-            stale += 1
+        if oldest.last_key is None:
+            return
+        stale = bisect_left(self._keys, oldest.last_key, 0, self._next)
         if stale:
             del self._entries[:stale]
             del self._keys[:stale]
