@@ -63,7 +63,7 @@ class Witnesses:
         """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
         alone is an effort, and it has the rates of all satellites."""
         for aid in aids:
-            if aid.screened:
+            if aid.screened or aid.locates:
                 continue
             for offer in aid.offers():
                 match offer:

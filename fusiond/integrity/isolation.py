@@ -51,7 +51,7 @@ from fusiond.integrity import support
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart
 from fusiond.integrity.series import DRIFTS, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
-from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
+from fusiond.integrity.tilt import NOT_TILTING, Tilting
 
 Array = NDArray[np.float64]
 
@@ -204,8 +204,9 @@ class Isolation:
             return Action.NONE
         return self._doubted(self._blame(record, aid), t_ns)
 
-    def corrected(self, t_ns: int, before: Attitude, after: Attitude) -> Action:
-        """A position or velocity was fused; what the filter shall do about the attitude."""
+    def corrected(self, t_ns: int, before: Array, after: Array) -> Action:
+        """A position or velocity was fused; what the filter shall do about the attitude (7,), as
+        fusiond.integrity.tilt has it."""
         self._tilting = self._tilting.with_one(t_ns, before, after)
         if not self._tilting.too_far:
             return Action.NONE

@@ -211,7 +211,9 @@ class ImuBuffer:
             return
         intervals = np.concatenate(self._intervals)
         while len(intervals) >= PERIOD_WINDOW:
-            seen = float(np.median(intervals[:PERIOD_WINDOW]))
+            half = PERIOD_WINDOW // 2
+            middle = np.partition(intervals[:PERIOD_WINDOW], (half - 1, half))
+            seen = 0.5 * float(middle[half - 1] + middle[half])
             if abs(seen - self._period_ns) > PERIOD_CHANGE * self._period_ns:
                 self._period_ns = seen
                 self.hold_ns = self._hold()

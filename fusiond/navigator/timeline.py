@@ -19,7 +19,7 @@ from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
-from fusiond.integrity.tilt import Attitude
+from fusiond.integrity.tilt import attitude
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import Q0
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
@@ -202,7 +202,7 @@ class Timeline:
         believed = isolation.believes(entry.aid.source)
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
         tilts = (entry.aid.locates or entry.aid.moves) and estimator.model.sensor_errors
-        before = Attitude.of(estimator.nav[Q0:], estimator.covariance) if tilts else None
+        before = attitude(estimator.nav[Q0:], estimator.covariance) if tilts else None
         try:
             aid = entry.aid.at(estimator.nav)
             outcome = self._update(aid) if believed else estimator.look(aid)
@@ -212,7 +212,7 @@ class Timeline:
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
             if action is Action.NONE and outcome.name == "fused" and before is not None:
-                after = Attitude.of(estimator.nav[Q0:], estimator.covariance)
+                after = attitude(estimator.nav[Q0:], estimator.covariance)
                 action = isolation.corrected(aid.t_ns, before, after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
