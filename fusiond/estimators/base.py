@@ -315,7 +315,8 @@ class ErrorStateFilter:
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
-        return self._weighed(aid, aid.innovation(self.state))
+        rows = aid.innovation(self.state)
+        return self._weighed(aid, rows) if aid.robust else rows
 
     def _weighed(
         self, aid: Linearised, rows: Innovation | NotApplicable

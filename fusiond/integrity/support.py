@@ -42,8 +42,13 @@ class Lost(NamedTuple):
 
 def lost(records: Records, t_ns: int) -> Lost | None:
     """Set while positions come and none is believed."""
-    heard = [r for r in records.values() if r.locates and t_ns - r.heard_ns <= FORGET_NS]
-    if not heard or any(r.believed for r in heard):
+    heard = []
+    for r in records.values():
+        if r.locates and t_ns - r.heard_ns <= FORGET_NS:
+            if r.believed:
+                return None
+            heard.append(r)
+    if not heard:
         return None
     first = min(heard, key=lambda r: r.refused_ns)
     source = all(r.jumped or supported(records, r.device, t_ns) for r in heard)
