@@ -116,9 +116,11 @@ class Rest:
         error = _rate_error(state, mean_rate)
         free = (self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2) / count
         for axis in range(3):
-            slots = state.model.parameters(9 + axis)
-            variance = float(p[np.ix_(slots, slots)].sum()) + free
-            if error[axis] ** 2 > sigmas**2 * variance:
+            slots, variance = state.model.parameters(9 + axis), 0.0
+            for i in slots:
+                for j in slots:
+                    variance += float(p[i, j])
+            if error[axis] ** 2 > sigmas**2 * (variance + free):
                 return True
         return False
 

@@ -63,7 +63,7 @@ class Witnesses:
         """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
         alone is an effort, and it has the rates of all satellites."""
         for aid in aids:
-            if aid.screened:
+            if aid.screened or aid.locates:
                 continue
             for offer in aid.offers():
                 match offer:
@@ -78,7 +78,11 @@ class Witnesses:
     ) -> None:
         self._told.clear()
         speeds = self._speeds[source]
-        insort(speeds, _Speed(t_ns, v, sd, rounding))
+        speed = _Speed(t_ns, v, sd, rounding)
+        if speeds and speed < speeds[-1]:
+            insort(speeds, speed)
+        else:
+            speeds.append(speed)
         if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
             del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 

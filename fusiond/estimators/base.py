@@ -177,6 +177,8 @@ class ErrorStateFilter:
         self.step: Array
         self.nav, self.xi, self.step, self._scratch = parts
         self._covs: Array = np.zeros((count, width, width))
+        self._covariance = self._covs[0, : model.size, : model.size]
+        self._view = State(self.nav, self.xi, self.step, model, self._covariance)
         self._dxs: Array = np.zeros((count, model.size))
         self._shares: Array = np.array(shares)
         self._phi: Array = np.zeros((0, 0))
@@ -188,7 +190,7 @@ class ErrorStateFilter:
     @property
     def covariance(self) -> Array:
         """P (n, n) of the published error state, a view."""
-        return self._covs[0, : self.model.size, : self.model.size]
+        return self._covariance
 
     @property
     def isolates(self) -> bool:
@@ -242,7 +244,7 @@ class ErrorStateFilter:
     @property
     def state(self) -> State:
         """What an aid may look at."""
-        return State(self.nav, self.xi, self.step, self.model, self.covariance)
+        return self._view
 
     @property
     def sensor_errors(self) -> Array:
@@ -313,7 +315,8 @@ class ErrorStateFilter:
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
-        return self._weighed(aid, aid.innovation(self.state))
+        rows = aid.innovation(self.state)
+        return self._weighed(aid, rows) if aid.robust else rows
 
     def _weighed(
         self, aid: Linearised, rows: Innovation | NotApplicable

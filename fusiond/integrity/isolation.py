@@ -49,10 +49,9 @@ from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffe
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart
-from fusiond.integrity.series import DRIFTS, NEVER_NS, PACES, Series
+from fusiond.integrity.series import DRIFTS, NEVER_NS, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
-from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
-from fusiond.navigation.strapdown import LAT, LON, VE, VN
+from fusiond.integrity.tilt import NOT_TILTING, Tilting
 
 Array = NDArray[np.float64]
 
@@ -64,8 +63,6 @@ REFUSED_IN_A_ROW = 3
 READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 # Probability of a false alarm of one mean test.
 FALSE_ALARM = 1e-6
-# A mean over fewer innovations than this is left to the gate.
-FEWEST = 4
 # Faster than this (m/s) the vehicle moves: what is measured of it changes.
 MOVING_M_S = 1.0
 # Beyond what gravity on the wrong axis can do to a position in the time (m/s^2).
@@ -179,15 +176,15 @@ class Isolation:
         t_ns = aid.t_ns
         record = self._record(aid)
         passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-        offers = aid.offers()
-        offer = next((o for o in offers if isinstance(o, PositionOffer)), None)
-        offset = offer and apart(offer, float(nav[LAT]), float(nav[LON]), nav)
-        if offer is not None and offset is not None:
-            record.sd_m, record.away_m = max(offer.sd[:2]), math.hypot(offset.north, offset.east)
+        lat, lon, _, v_n, v_e, *_ = nav.tolist()
+        offer, velocity, value = _said(aid.offers())
+        offset = None
+        if offer is not None:
+            offset = apart(offer, lat, lon, nav)
+            record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
         elif record.moves:
-            record.sd_m_s = _velocity_sd(offers)
-        moving = math.hypot(nav[VN], nav[VE]) > MOVING_M_S
-        value = _value(offers)
+            record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
+        moving = math.hypot(v_n, v_e) > MOVING_M_S
         repeats = value is not None and record.repeats_itself(value, moving)
         if record.excluded:
             self._look(record, t_ns, passed and not repeats, outcome.whitened, offset)
@@ -201,20 +198,22 @@ class Isolation:
                 return Action.NONE
             if passed:
                 return Action.NONE
-            away = record.away_m if aid.locates else _velocity_away(offers, nav)
+            away = record.away_m if aid.locates else _velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
         runs = offer is not None and self._prove(record, offer, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
-        self._average(record, outcome.whitened)
+        if outcome.whitened:
+            record.means.add(outcome.whitened)
         if not self._biased(record, t_ns):
             return Action.NONE
         return self._doubted(self._blame(record, aid), t_ns)
 
-    def corrected(self, t_ns: int, before: Attitude, after: Attitude) -> Action:
-        """A position or velocity was fused; what the filter shall do about the attitude."""
+    def corrected(self, t_ns: int, before: Array, after: Array) -> Action:
+        """A position or velocity was fused; what the filter shall do about the attitude (7,), as
+        fusiond.integrity.tilt has it."""
         self._tilting = self._tilting.with_one(t_ns, before, after)
         if not self._tilting.too_far:
             return Action.NONE
@@ -229,7 +228,8 @@ class Isolation:
             record = Series(aid.device, aid.locates, aid.moves, t_ns, aid.no_slip)
             self._records[aid.source] = record
         elif t_ns - record.heard_ns > FORGET_NS:
-            record.count = record.repeats = record.passes = 0
+            record.repeats = record.passes = 0
+            record.means.restart()
             if not record.excluded:
                 record.refused, record.jumped = 0, False
         record.heard_ns = t_ns
@@ -240,7 +240,7 @@ class Isolation:
         velocity of the same device supports."""
         suspect = self._contradicted and record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
         if suspect or support.outage(self._records, offer.t_ns):
-            record.proof = Proof.begun(offer, nav, record.colour, suspect)
+            record.proof = Proof.begun(offer, nav, record.means.colour, suspect)
         elif record.proof is not None:
             sd_m_s = support.velocity_sd(self._records, record.device)
             proof = record.proof.with_one(offer, nav, sd_m_s)
@@ -295,7 +295,8 @@ class Isolation:
     @staticmethod
     def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
         record.excluded, record.refused_ns, record.jumped = reason, since_ns, jumped
-        record.passes, record.count, record.ran = 0, 0, False
+        record.passes, record.ran = 0, False
+        record.means.restart()
 
     def _look(
         self,
@@ -307,12 +308,14 @@ class Isolation:
     ) -> None:
         """An innovation of a series that is left out: what may bring it back."""
         if not passed:
-            record.passes = record.count = 0
+            record.passes = 0
+            record.means.restart()
             return
         if not record.passes:
             record.passing_ns, record.trend = t_ns, NO_TREND
         record.passes += 1
-        self._average(record, whitened)
+        if whitened:
+            record.means.add(whitened)
         if offset is not None:
             record.trend = record.trend.with_one(offset, (t_ns - record.passing_ns) * 1e-9)
             record.ran = record.ran or record.trend.runs_away
@@ -323,8 +326,8 @@ class Isolation:
             and not self._biased(record, t_ns)
         ):
             record.excluded, record.fused_ns = "", t_ns
-            record.refused, record.jumped, record.count = 0, False, 0
-            record.proof = None
+            record.refused, record.jumped, record.proof = 0, False, None
+            record.means.restart()
 
     def _supported(self, device: str, t_ns: int) -> bool:
         """Whether a velocity of the device agrees with the filter still."""
@@ -332,37 +335,14 @@ class Isolation:
 
     # ------------------------------------------------------------------ the mean test
 
-    @staticmethod
-    def _average(record: Series, whitened: tuple[float, ...]) -> None:
-        if not whitened:
-            return
-        if not record.count or len(record.slow) != len(whitened):
-            record.fast = record.slow = (0.0,) * len(whitened)
-            record.count = 0
-        a, b = PACES
-        record.fast = tuple([m + a * (y - m) for m, y in zip(record.fast, whitened, strict=True)])
-        record.slow = tuple([m + b * (y - m) for m, y in zip(record.slow, whitened, strict=True)])
-        record.count += 1
-
     def _biased(self, record: Series, t_ns: int) -> bool:
-        count = record.count
-        if count < FEWEST:
-            return False
-        degrees = len(record.slow)
-        fast = slow = 0.0
-        for f, s in zip(record.fast, record.slow, strict=True):
-            fast += f * f
-            slow += s * s
-        limit = gate_threshold(self._pass, degrees)
-        if fast > limit * record.fast_spread or slow > limit * record.slow_spread:
-            record.forget_shown()
-            return True
-        record.learn(t_ns, fast / degrees, slow / degrees)
-        return False
+        means = record.means
+        degrees = means.degrees
+        return degrees > 0 and means.biased(t_ns, gate_threshold(self._pass, degrees))
 
     def _blame(self, record: Series, aid: Aid) -> Action:
         """A bias inside the gate: the series', where something else supports the filter."""
-        record.count = 0
+        record.means.restart()
         sd_m = 0.5 * record.away_m if aid.locates else FINE_M
         source = support.others(self._records, record, aid.t_ns, sd_m)
         if not source and aid.locates:
@@ -373,28 +353,28 @@ class Isolation:
         return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
 
 
-def _value(offers: Sequence[Offer]) -> tuple[float, ...] | None:
-    """What a sensor that hangs repeats to the bit."""
+def _said(
+    offers: Sequence[Offer],
+) -> tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]:
+    """What an aid says of position and velocity, and what a sensor that hangs repeats to the
+    bit."""
+    position = velocity = value = None
     for offer in offers:
-        match offer:
-            case PositionOffer():
-                return offer.lat_rad, offer.lon_rad
-            case VelocityOffer():
-                return offer.v_ned
-            case SpeedOffer():
-                return (offer.speed_m_s,)
-    return None
+        said: tuple[float, ...] | None = None
+        if isinstance(offer, PositionOffer):
+            position, said = offer, (offer.lat_rad, offer.lon_rad)
+        elif isinstance(offer, VelocityOffer):
+            velocity, said = offer, offer.v_ned
+        elif isinstance(offer, SpeedOffer):
+            said = (offer.speed_m_s,)
+        if value is None:
+            value = said
+    return position, velocity, value
 
 
-def _velocity_sd(offers: Sequence[Offer]) -> float:
-    """Sigma (m/s) of a measured velocity, horizontally; 0 where none was measured."""
-    return max((max(o.sd[:2]) for o in offers if isinstance(o, VelocityOffer)), default=0.0)
-
-
-def _velocity_away(offers: Sequence[Offer], nav: Array) -> float:
+def _velocity_away(velocity: VelocityOffer | None, north: float, east: float) -> float:
     """How far a measured velocity is from the filter's (m/s); a lever arm that turns is left to the
     sigma. 0 where none was measured."""
-    velocity = next((o for o in offers if isinstance(o, VelocityOffer)), None)
     if velocity is None:
         return 0.0
-    return math.hypot(velocity.v_ned[0] - float(nav[VN]), velocity.v_ned[1] - float(nav[VE]))
+    return math.hypot(velocity.v_ned[0] - north, velocity.v_ned[1] - east)

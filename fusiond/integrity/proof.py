@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import PositionOffer
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VE, VN
@@ -194,13 +195,21 @@ def metres_a_radian(nav: Array) -> tuple[float, float]:
 
 def apart(offer: PositionOffer, lat: float, lon: float, nav: Array) -> Offset:
     """From the body's origin as measured to a place (rad, rad); `nav` (10,) turns the lever arm."""
+    north, east = _apart(nav, lat - offer.lat_rad, lon - offer.lon_rad, *offer.lever)
+    return Offset(north, east, max(offer.sd[:2]))
+
+
+@compiled("UniTuple(f8, 2)(f8[::1], f8, f8, f8, f8, f8)")
+def _apart(
+    nav: Array, north: float, east: float, x: float, y: float, z: float
+) -> tuple[float, float]:
+    """Latitude and longitude (rad) and a lever arm (m, body axes) in metres north and east, where
+    the filter with the state `nav` (10,) is."""
     c = dcm_elements(nav[Q0:])
-    x, y, z = offer.lever
-    to_m = metres_a_radian(nav)
-    east = lon - offer.lon_rad
+    lat, height = nav[LAT], nav[HEIGHT]
     east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
-    return Offset(
-        (lat - offer.lat_rad) * to_m[0] + c[0] * x + c[1] * y + c[2] * z,
-        east * to_m[1] + c[3] * x + c[4] * y + c[5] * z,
-        max(offer.sd[:2]),
+    to_east = (transverse_radius(lat) + height) * math.cos(lat)
+    return (
+        north * (meridian_radius(lat) + height) + c[0] * x + c[1] * y + c[2] * z,
+        east * to_east + c[3] * x + c[4] * y + c[5] * z,
     )

@@ -42,8 +42,13 @@ class Lost(NamedTuple):
 
 def lost(records: Records, t_ns: int) -> Lost | None:
     """Set while positions come and none is believed."""
-    heard = [r for r in records.values() if r.locates and t_ns - r.heard_ns <= FORGET_NS]
-    if not heard or any(r.believed for r in heard):
+    heard = []
+    for r in records.values():
+        if r.locates and t_ns - r.heard_ns <= FORGET_NS:
+            if r.believed:
+                return None
+            heard.append(r)
+    if not heard:
         return None
     first = min(heard, key=lambda r: r.refused_ns)
     source = all(r.jumped or supported(records, r.device, t_ns) for r in heard)
@@ -97,7 +102,7 @@ def velocity_left_out(records: Records, t_ns: int) -> bool:
 
 def velocity_sd(records: Records, device: str) -> float:
     """Sigma (m/s) of the device's velocities as a mean of many shows it; 0 without any."""
-    found = (r.sd_m_s * r.colour for r in records.values() if r.moves and r.device == device)
+    found = (r.sd_m_s * r.means.colour for r in records.values() if r.moves and r.device == device)
     return max(found, default=0.0)
 
 
@@ -122,8 +127,10 @@ def fine_enough(records: Records, record: Series, t_ns: int) -> bool:
 
 def outage(records: Records, t_ns: int) -> bool:
     """Whether there were fine positions, and none has been fused for as long as makes coasting."""
-    fine = [r.fused_ns for r in records.values() if r.locates and r.sd_m <= FINE_M]
-    latest_ns = max(fine, default=NEVER_NS)
+    latest_ns = NEVER_NS
+    for r in records.values():
+        if r.locates and r.sd_m <= FINE_M and r.fused_ns > latest_ns:
+            latest_ns = r.fused_ns
     return latest_ns > NEVER_NS and t_ns - latest_ns > OTHERS_NS
 
 

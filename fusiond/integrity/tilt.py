@@ -17,10 +17,11 @@ Automatica 7 (1971), section 3.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -32,54 +33,68 @@ LASTS_S = 2.0
 LIMIT = 27.6
 
 
-class Attitude(NamedTuple):
-    """Attitude quaternion (4,), body to navigation axes, and P (2, 2) of the tilt, rad^2."""
-
-    q: Array
-    p: Array
-
-    @staticmethod
-    def of(q: Array, covariance: Array) -> Attitude:
-        """A copy of what a filter holds."""
-        return Attitude(q.copy(), covariance[:2, :2].copy())
+# Of the sums: the instant (ns, an integer), c (rad) north and east, V (rad^2) nn, ne, ee.
+_SINCE, _C, _V, _SIZE = 0, 1, 3, 6
 
 
-class Tilting(NamedTuple):
-    """The sums c (rad) and V (rad^2) at an instant (ns)."""
+@compiled("void(f8[::1], f8[:, :], f8[::1])")
+def _write(q: Array, covariance: Array, out: Array) -> None:
+    for i in range(4):
+        out[i] = q[i]
+    out[4], out[5], out[6] = covariance[0, 0], covariance[0, 1], covariance[1, 1]
 
-    t_ns: int = 0
-    north: float = 0.0
-    east: float = 0.0
-    nn: float = 0.0
-    ne: float = 0.0
-    ee: float = 0.0
 
-    def with_one(self, t_ns: int, before: Attitude, after: Attitude) -> Tilting:
-        """With one update more: the attitude before and after it."""
-        f = math.exp(-max(0, t_ns - self.t_ns) * 1e-9 / LASTS_S)
-        w, x, y, z = before.q.tolist()
-        to_w, to_x, to_y, to_z = after.q.tolist()
-        # Vector part of after times before's conjugate: half of the small turn.
-        way = math.copysign(2.0, w * to_w + x * to_x + y * to_y + z * to_z)
-        gained = before.p - after.p
-        return Tilting(
-            t_ns,
-            f * self.north + way * (to_x * w - to_w * x - to_y * z + to_z * y),
-            f * self.east + way * (to_y * w - to_w * y + to_x * z - to_z * x),
-            f * f * self.nn + float(gained[0, 0]),
-            f * f * self.ne + float(gained[0, 1]),
-            f * f * self.ee + float(gained[1, 1]),
-        )
+def attitude(q: Array, covariance: Array) -> Array:
+    """What a filter holds (7,): its quaternion `q` (4,), body to navigation axes, and of P (n, n)
+    the tilt's nn, ne and ee (rad^2)."""
+    out = np.empty(7)
+    _write(q, covariance, out)
+    return out
 
-    @property
-    def too_far(self) -> bool:
-        """Whether the corrections do not fit the covariance that they were made with."""
-        determinant = self.nn * self.ee - self.ne * self.ne
-        if self.nn <= 0.0 or determinant <= 1e-9 * self.nn * self.ee:
-            return False
-        square = self.ee * self.north**2 + self.nn * self.east**2
-        square -= 2.0 * self.ne * self.north * self.east
-        return square > LIMIT * determinant
+
+@compiled("b1(f8[::1], i8, f8[::1], f8[::1])")
+def _add(sums: Array, t_ns: int, before: Array, after: Array) -> bool:
+    """Add an update to `sums`; whether they do not fit the covariance that they were made with."""
+    since_ns = sums[:1].view(np.int64)
+    f = math.exp(-max(0, t_ns - since_ns[0]) * 1e-9 / LASTS_S)
+    since_ns[0] = t_ns
+    w, x, y, z = before[0], before[1], before[2], before[3]
+    to_w, to_x, to_y, to_z = after[0], after[1], after[2], after[3]
+    # Vector part of after times before's conjugate: half of the small turn.
+    way = math.copysign(2.0, w * to_w + x * to_x + y * to_y + z * to_z)
+    north = f * sums[_C] + way * (to_x * w - to_w * x - to_y * z + to_z * y)
+    east = f * sums[_C + 1] + way * (to_y * w - to_w * y + to_x * z - to_z * x)
+    sums[_C], sums[_C + 1] = north, east
+    for k in range(3):
+        sums[_V + k] = f * f * sums[_V + k] + (before[4 + k] - after[4 + k])
+    nn, ne, ee = sums[_V], sums[_V + 1], sums[_V + 2]
+    determinant = nn * ee - ne * ne
+    if nn <= 0.0 or determinant <= 1e-9 * nn * ee:
+        return False
+    square = ee * north * north + nn * east * east - 2.0 * ne * north * east
+    return square > LIMIT * determinant
+
+
+class Tilting:
+    """The sums at an instant. `too_far`: the corrections do not fit the covariance that they were
+    made with."""
+
+    __slots__ = ("_sums", "too_far")
+
+    def __init__(self, sums: Array | None = None) -> None:
+        self._sums = np.zeros(_SIZE) if sums is None else sums
+        self.too_far = False
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tilting) and self._sums.tobytes() == other._sums.tobytes()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def with_one(self, t_ns: int, before: Array, after: Array) -> Tilting:
+        """With one update more: the attitude (7,) before and after it."""
+        tilting = Tilting(self._sums.copy())
+        tilting.too_far = _add(tilting._sums, t_ns, before, after)
+        return tilting
 
 
 NOT_TILTING = Tilting()

@@ -3,7 +3,7 @@ sigma."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,14 @@ from fusiond.integrity.consistency import (
 from fusiond.integrity.monitor import ConsistencyMonitor
 
 Array = NDArray[np.float64]
+
+
+_WHOLE: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+
+
+def _kept(codes: Sequence[int]) -> NDArray[np.bool_]:
+    """Which rows of a screened aid were used (m,); empty of one that is used as a whole."""
+    return np.array(codes) == KEPT if codes else _WHOLE
 
 
 class Verdicts:
@@ -40,8 +48,7 @@ class Verdicts:
         """An aid has been fused; to be called once for each, though a rewind brings it again."""
         if aid.constraint or not outcome.whitened:
             return
-        kept = np.array(outcome.rows) == KEPT
-        for name, row in aid.series(outcome.whitened, kept).items():
+        for name, row in aid.series(outcome.whitened, _kept(outcome.rows)).items():
             if name:
                 self._add(f"{aid.source}_{name}", aid, row, float(row @ row))
             else:

@@ -151,4 +151,11 @@ class Model:
 
     def parameters(self, column: int) -> list[int]:
         """Slots of the parameters of one column (constant and Markov gyro drift share one)."""
-        return [int(i) for i in np.flatnonzero(self.column_of == column)]
+        return self._slots_by_column.get(column, [])
+
+    @cached_property
+    def _slots_by_column(self) -> dict[int, list[int]]:
+        found: dict[int, list[int]] = {}
+        for slot, column in enumerate(self.column_of.tolist()):
+            found.setdefault(column, []).append(slot)
+        return found

@@ -98,6 +98,8 @@ class ImuBuffer:
         self._vibration, self._crosstalk = vibration, crosstalk
         self.start = 0
         self.end = 0
+        self.latest_ns = 0
+        """Time of the newest sample; 0 before the first."""
         self.needed: int | None = None
         """Absolute number of the oldest sample that a rewind would use; nobody needs any: None."""
         self.backward_in_a_row = 0
@@ -139,11 +141,6 @@ class ImuBuffer:
         return min(self._gap_ns, round(HOLD_PERIODS * slower))
 
     @property
-    def latest_ns(self) -> int:
-        """Time of the newest sample; 0 before the first."""
-        return int(self.times[self.end - 1]) if self.end else 0
-
-    @property
     def oldest_ns(self) -> int:
         """Time of the oldest sample still held; 0 before the first."""
         return int(self.times[0]) if self.end else 0
@@ -155,6 +152,7 @@ class ImuBuffer:
     def restart(self) -> None:
         """Forget all samples: the next may have any stamp."""
         self.start, self.end, self.needed = self.next_sample, 0, None
+        self.latest_ns = 0
         self.backward_in_a_row = 0
 
     def refuse(self, bad: Array) -> dict[str, int]:
@@ -211,7 +209,9 @@ class ImuBuffer:
             return
         intervals = np.concatenate(self._intervals)
         while len(intervals) >= PERIOD_WINDOW:
-            seen = float(np.median(intervals[:PERIOD_WINDOW]))
+            half = PERIOD_WINDOW // 2
+            middle = np.partition(intervals[:PERIOD_WINDOW], (half - 1, half))
+            seen = 0.5 * float(middle[half - 1] + middle[half])
             if abs(seen - self._period_ns) > PERIOD_CHANGE * self._period_ns:
                 self._period_ns = seen
                 self.hold_ns = self._hold()
@@ -243,6 +243,7 @@ class ImuBuffer:
             self._crosstalk.follow(self.samples[rows], self.densities[rows])
         self.nav[rows] = np.nan
         self.end += count
+        self.latest_ns = int(times[-1])
 
     def _grow(self, capacity: int) -> None:
         """More rows: the IMU is faster than configured, or the filter has not run for long."""

@@ -135,7 +135,7 @@ class RateUnits:
         newest_ns = imu.latest_ns
         if not self._count:
             self._since_ns = int(imu.times[new])
-        self._squares += float(np.einsum("ij,ij->", rates, rates))
+        self._squares += float(np.vdot(rates, rates))
         self._count += len(rates)
         if newest_ns - self._since_ns >= RMS_S * 1e9:
             self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
@@ -145,7 +145,9 @@ class RateUnits:
         """A receiver's fix, valid at `t_ns`."""
         if m.v_ned_m_s is None or not all(math.isfinite(v) for v in m.v_ned_m_s if v is not None):
             return
-        turns = self._turns.setdefault(m.source, CourseTurns())
+        turns = self._turns.get(m.source)
+        if turns is None:
+            turns = self._turns[m.source] = CourseTurns()
         turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
         if turns.decided:
             self._tell(turns.said())
@@ -167,4 +169,5 @@ def _turned(imu: ImuBuffer, begin_ns: int, end_ns: int) -> float:
     rows = slice(imu.index_after(begin_ns), imu.index_after(end_ns))
     if rows.start == rows.stop:
         return math.nan
-    return float(imu.samples[rows, 2].mean()) * (end_ns - begin_ns) * 1e-9
+    mean = float(np.add.reduce(imu.samples[rows, 2])) / (rows.stop - rows.start)
+    return mean * (end_ns - begin_ns) * 1e-9

@@ -19,7 +19,7 @@ from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
-from fusiond.integrity.tilt import Attitude
+from fusiond.integrity.tilt import attitude
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import Q0
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
@@ -207,7 +207,7 @@ class Timeline:
         believed = isolation.believes(entry.aid.source)
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
         tilts = (entry.aid.locates or entry.aid.moves) and estimator.model.sensor_errors
-        before = Attitude.of(estimator.nav[Q0:], estimator.covariance) if tilts else None
+        before = attitude(estimator.nav[Q0:], estimator.covariance) if tilts else None
         try:
             aid = entry.aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
@@ -218,7 +218,7 @@ class Timeline:
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
             if action is Action.NONE and outcome.name == "fused" and before is not None:
-                after = Attitude.of(estimator.nav[Q0:], estimator.covariance)
+                after = attitude(estimator.nav[Q0:], estimator.covariance)
                 action = isolation.corrected(aid.t_ns, before, after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
@@ -285,11 +285,9 @@ class Timeline:
             del self._checkpoints[:drop]
         oldest = self._checkpoints[0]
         self.imu.needed = oldest.snapshot.sample
-        stale = 0
-        while stale < self._next and (
-            oldest.last_key is not None and self._keys[stale] < oldest.last_key
-        ):
-            stale += 1
+        if oldest.last_key is None:
+            return
+        stale = bisect_left(self._keys, oldest.last_key, 0, self._next)
         if stale:
             del self._entries[:stale]
             del self._keys[:stale]

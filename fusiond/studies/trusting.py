@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Outcome
 from fusiond.integrity.isolation import Action, Isolation
-from fusiond.integrity.tilt import Attitude
 
 Array = NDArray[np.float64]
 
@@ -20,6 +19,6 @@ class Trusting(Isolation):
         """Nobody is ever suspected."""
         return Action.NONE
 
-    def corrected(self, t_ns: int, before: Attitude, after: Attitude) -> Action:
+    def corrected(self, t_ns: int, before: Array, after: Array) -> Action:
         """Nor is the IMU."""
         return Action.NONE

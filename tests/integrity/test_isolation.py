@@ -9,7 +9,7 @@ import pytest
 from fusiond.aiding.position import PositionAid
 from fusiond.estimators.base import Outcome
 from fusiond.integrity.isolation import MOTION, Action
-from fusiond.integrity.series import ASSUMED, Series
+from fusiond.integrity.means import ASSUMED, WHITE_SLOW, Means
 from tests.integrity.series_bench import GATE, LEVER, NAV, SD_M, Bench, S
 
 
@@ -69,22 +69,27 @@ def test_a_drift_inside_the_gate_is_found_and_does_not_return_while_it_runs() ->
     assert bench.isolation.excluded == {"gnss": "drifts"}
 
 
+def show(means: Means, square: float, seconds: range) -> None:
+    """The means settle where their square is that, and are looked at once a second."""
+    for _ in range(1000):
+        means.add((math.sqrt(square),))
+    for t in seconds:
+        assert not means.biased(t * S, math.inf)
+
+
 def test_what_a_series_shows_lately_does_not_excuse_it() -> None:
     """Means that grow are ordinary once nothing has come of them, not while they grow."""
-    series = Series("gnss", locates=True, moves=False, heard_ns=0)
-    for t in range(30):
-        series.learn(t * S, ASSUMED[0], 4.0)
-    assert series.slow_spread == ASSUMED[1]
-    series.forget_shown()  # they were a fault's
-    for t in range(30, 60):
-        series.learn(t * S, ASSUMED[0], ASSUMED[1])
-    assert series.slow_spread == ASSUMED[1]
-    for t in range(60, 90):
-        series.learn(t * S, ASSUMED[0], 4.0)
-    assert series.slow_spread == pytest.approx(ASSUMED[1])
-    for t in range(90, 95):
-        series.learn(t * S, ASSUMED[0], 4.0)
-    assert series.slow_spread > 1.0
+    means, ordinary = Means(), WHITE_SLOW + ASSUMED
+    assumed = math.sqrt(ordinary / WHITE_SLOW)
+    show(means, 4.0, range(30))
+    assert means.colour == assumed
+    assert means.biased(30 * S, 0.0)  # they were a fault's
+    show(means, ordinary, range(30, 60))
+    assert means.colour == assumed
+    show(means, 4.0, range(60, 90))
+    assert means.colour == pytest.approx(assumed)
+    show(means, 4.0, range(90, 95))
+    assert means.colour > math.sqrt(1.0 / WHITE_SLOW)
 
 
 def test_a_frozen_fix_while_moving_is_told_by_its_bits() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.integrity.tilt import NOT_TILTING, Attitude, Tilting
+from fusiond.integrity.tilt import NOT_TILTING, Tilting, attitude
 from fusiond.navigation.rotation import quaternion_from_rpy, rotation_vector_to_quaternion
 
 Array = NDArray[np.float64]
@@ -41,14 +41,14 @@ class Level:
             self.t_ns += round(EVERY_S * S)
             self.error += WALK_RAD * self.rng.standard_normal(2) + EVERY_S * np.array(rate)
             self.p = self.p + np.eye(2) * WALK_RAD**2
-            before = Attitude(self.q.copy(), self.p.copy())
+            before = attitude(self.q, self.p)
             gain = self.p @ np.linalg.inv(self.p + np.eye(2) * MEASURED_RAD**2)
             d = -gain @ (self.error + MEASURED_RAD * self.rng.standard_normal(2))
             self.error += d
             turn = np.array(rotation_vector_to_quaternion(float(d[0]), float(d[1]), 0.0))
             self.q = multiplied(turn, self.q)
             self.p = (np.eye(2) - gain) @ self.p
-            self.tilting = self.tilting.with_one(self.t_ns, before, Attitude(self.q, self.p))
+            self.tilting = self.tilting.with_one(self.t_ns, before, attitude(self.q, self.p))
             if self.tilting.too_far:
                 return (k + 1) * EVERY_S
         return None

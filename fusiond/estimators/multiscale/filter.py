@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable
+from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.multiscale.block import (
     Block,
@@ -90,6 +90,11 @@ class MultiscaleEstimator(ErrorStateFilter):
         p: Array = phi @ self._posterior @ phi.T
         p += self._covs[0, :n, :n]
         return 0.5 * (p + p.T)
+
+    @property
+    def state(self) -> State:
+        """What an aid may look at."""
+        return State(self.nav, self.xi, self.step, self.model, self.covariance)
 
     @property
     def length(self) -> int:

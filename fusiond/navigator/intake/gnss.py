@@ -56,9 +56,11 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     least = o.min_position_sd_m
     if least is None:
         least = FLOOR_M.get(m.quality, CODE_FLOOR_M)
-    n, e, d = (
-        math.hypot(max(s * o.sigma_scale, least), rounding)
-        for s, rounding in zip(_position_sd(m, o), m.rounding_sd_ned_m, strict=True)
+    (n, e, d), rounding, scale = _position_sd(m, o), m.rounding_sd_ned_m, o.sigma_scale
+    sd = (
+        math.hypot(max(n * scale, least), rounding[0]),
+        math.hypot(max(e * scale, least), rounding[1]),
+        math.hypot(max(d * scale, least), rounding[2]),
     )
     found: list[Aid] = [
         PositionAid(
@@ -68,7 +70,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
             m.lat_rad,
             m.lon_rad,
             m.height_m,
-            (n, e, d),
+            sd,
             o.lever_arm_m,
             math.hypot(when.sd_time_s, o.time_sd_s),
             () if by_phase(m) else _fix_bias(m.source, o, sections),
@@ -104,12 +106,16 @@ def _velocity(
     north, east, down = m.v_ned_m_s
     sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
     horizontal = o.velocity_sd_m_s
+    rounding = m.rounding_sd_v_m_s
     v: tuple[float, ...] = (north, east)
-    sd_v = [_speed_sd(sd_n, horizontal, o), _speed_sd(sd_e, horizontal, o)]
+    sds: tuple[float, ...] = (
+        math.hypot(_speed_sd(sd_n, horizontal, o), rounding),
+        math.hypot(_speed_sd(sd_e, horizontal, o), rounding),
+    )
     if down is not None:
         v = (north, east, down)
-        sd_v.append(_speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o))
-    sds = tuple(math.hypot(s, m.rounding_sd_v_m_s) for s in sd_v)
+        sd_down = _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o)
+        sds = (*sds, math.hypot(sd_down, rounding))
     t_ns = when.t_ns - round(o.velocity_delay_s * 1e9)
     return VelocityAid(
         f"{m.source}{SUFFIX}",

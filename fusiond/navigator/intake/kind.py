@@ -34,6 +34,7 @@ class Sections:
             if isinstance(section, RawAiding)
         }
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
+        self._names: dict[tuple[str, str, type[Aiding]], str] = {}
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section, of what comes from now on."""
@@ -68,9 +69,13 @@ class Sections:
     def own(self, block: str, source: str, section: Aiding) -> str:
         """The block's name: with the source's, where that has a section of its own that is not
         simply named after its kind."""
-        kind = type(section).model_fields["kind"].default
-        own = self.aiding.get(source) is section and source != kind
-        return f"{block}_{source}" if own else block
+        key = block, source, type(section)
+        name = self._names.get(key)
+        if name is None:
+            kind = type(section).model_fields["kind"].default
+            own = self.aiding.get(source) is section and source != kind
+            name = self._names[key] = f"{block}_{source}" if own else block
+        return name
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,14 +105,17 @@ def _height(height_m: float, limits: Plausibility) -> str | None:
 
 def _speed(velocity: Iterable[float | None], limits: Plausibility) -> str | None:
     known = [v for v in velocity if v is not None]
-    if _finite(known):
-        return "not_finite"
-    return None if math.hypot(*known) <= limits.max_speed_m_s else "speed_implausible"
+    if math.hypot(*known) <= limits.max_speed_m_s:  # which what is not finite is not
+        return None
+    return _finite(known) or "speed_implausible"
 
 
 def _sigma(stated: Iterable[float | None], limits: tuple[float, float]) -> str | None:
     """0 is what devices print that know none."""
-    known = [s for s in stated if s is not None and s != 0.0]
-    if any(map(math.isnan, known)):
-        return "not_finite"
-    return None if all(within(s, limits) for s in known) else "sigma_implausible"
+    refused, (least, most) = None, limits
+    for s in stated:
+        if s is not None and s != 0.0 and not least <= s <= most:
+            if math.isnan(s):
+                return "not_finite"
+            refused = "sigma_implausible"
+    return refused

@@ -1,0 +1,150 @@
+r"""The means of a series' whitened innovations, and what they have shown to be ordinary.
+
+    m <- (1 - a) m + a y,   a bias if |m|^2 > chi2(d) s,   s -> the mean of |m|^2 / d
+
+at two paces a, for innovations y (d,) that are N(0, I) while series and filter agree. The variance
+s of a mean is a / (2 - a) for white ones; errors that last (orbits, slip of a tyre) add to it, so
+it is learned from what the means show themselves, `LEARN_NS` after they have shown it: lately it
+may be the beginning of a fault.
+
+Source: Lowry, Woodall, Champ, Rigdon, A multivariate exponentially weighted moving average control
+chart, Technometrics 34 (1992), eq. 2.2.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+
+# Paces of the mean: some 11 and some 59 innovations deep, (2 - a) / a.
+FAST, SLOW = 1.0 / 6.0, 1.0 / 30.0
+# The variance of a mean at each pace, for white innovations of variance one; and what is assumed of
+# a series before it has shown its own: successive innovations share a fifth of their variance.
+WHITE_FAST, WHITE_SLOW = FAST / (2.0 - FAST), SLOW / (2.0 - SLOW)
+ASSUMED = 0.2
+# The variance that a series' means show by themselves is averaged over so many innovations: errors
+# that last (orbits, slip of a tyre) are ordinary, and a fault is what stands out of them. What is
+# assumed at first weighs as much as half the time that the slow mean looks back.
+LEARN_COUNT, ASSUMED_COUNT = 300.0, 15.0
+# What the means show lately may be the beginning of a fault: it counts once a period as long as it
+# has gone by without one. A drift of 0.1 m/s is found within twice this; longer ones hide nothing.
+LEARN_NS = 15_000_000_000
+# A mean over fewer innovations than this is left to the gate.
+FEWEST = 4
+
+# Rows of the array that the kernels read; after `_HEAD` of them the d means of each pace. `_SHOWN`
+# begins the sums of both means' squares, by degree of freedom, and their number, since the instant
+# `_SINCE` (ns, an integer), `_WAITING` the same of the period before. `_LEARNED` counts what the
+# variances have been learned from.
+_SINCE, _COUNT, _SPREAD, _LEARNED, _SHOWN, _WAITING, _HEAD = 0, 1, 2, 4, 5, 8, 11
+_LONG_AGO_NS = -(2**62)
+
+
+@compiled("void(f8[::1], f8[::1])")
+def _add(packed: Array, y: Array) -> None:
+    """Take in an innovation (d,)."""
+    d = y.shape[0]
+    for i in range(d):
+        fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
+        packed[_HEAD + i] = fast + FAST * (y[i] - fast)
+        packed[_HEAD + d + i] = slow + SLOW * (y[i] - slow)
+    packed[_COUNT] += 1.0
+
+
+@compiled("void(f8[::1])")
+def _believe(packed: Array) -> None:
+    """No fault has followed what waits."""
+    n = packed[_WAITING + 2]
+    if n == 0.0:
+        return
+    share = min(1.0, n / min(ASSUMED_COUNT + packed[_LEARNED] + n, LEARN_COUNT))
+    for k in range(2):
+        packed[_SPREAD + k] += share * (packed[_WAITING + k] / n - packed[_SPREAD + k])
+    packed[_LEARNED] = min(packed[_LEARNED] + n, LEARN_COUNT)
+
+
+@compiled("b1(f8[::1], i8, f8)")
+def _biased(packed: Array, t_ns: int, limit: float) -> bool:
+    """Whether a mean is beyond `limit`, the quantile of chi-square of d; learn from it if not."""
+    d = (packed.shape[0] - _HEAD) // 2
+    fast = slow = 0.0
+    for i in range(d):
+        fast += packed[_HEAD + i] * packed[_HEAD + i]
+        slow += packed[_HEAD + d + i] * packed[_HEAD + d + i]
+    if fast > limit * packed[_SPREAD] or slow > limit * packed[_SPREAD + 1]:
+        for k in range(_SHOWN, _HEAD):
+            packed[k] = 0.0
+        packed[:1].view(np.int64)[0] = _LONG_AGO_NS
+        return True
+    if t_ns - packed[:1].view(np.int64)[0] >= LEARN_NS:
+        _believe(packed)
+        for k in range(3):
+            packed[_WAITING + k] = packed[_SHOWN + k]
+            packed[_SHOWN + k] = 0.0
+        packed[:1].view(np.int64)[0] = t_ns
+    packed[_SHOWN] += max(fast / d, WHITE_FAST)
+    packed[_SHOWN + 1] += max(slow / d, WHITE_SLOW)
+    packed[_SHOWN + 2] += 1.0
+    return False
+
+
+def _begun(degrees: int) -> Array:
+    packed = np.zeros(_HEAD + 2 * degrees)
+    packed[:1].view(np.int64)[0] = _LONG_AGO_NS
+    packed[_SPREAD : _SPREAD + 2] = WHITE_FAST + ASSUMED, WHITE_SLOW + ASSUMED
+    return packed
+
+
+class Means:
+    """Of one series. A changed dimension d begins the means anew, not what they have shown."""
+
+    __slots__ = ("_packed",)
+
+    def __init__(self, packed: Array | None = None) -> None:
+        self._packed = _begun(0) if packed is None else packed
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Means) and self._packed.tobytes() == other._packed.tobytes()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def copied(self) -> Means:
+        """A copy for a checkpoint."""
+        return Means(self._packed.copy())
+
+    def restart(self) -> None:
+        """The means begin anew."""
+        self._packed[_COUNT] = 0.0
+
+    def add(self, whitened: tuple[float, ...]) -> None:
+        """Take in an innovation (d,), whitened."""
+        packed, width = self._packed, _HEAD + 2 * len(whitened)
+        if packed.shape[0] != width:
+            packed = self._packed = np.concatenate((packed[:_HEAD], np.zeros(width - _HEAD)))
+            packed[_COUNT] = 0.0
+        elif packed[_COUNT] == 0.0:
+            packed[_HEAD:] = 0.0
+        _add(packed, np.array(whitened))
+
+    @property
+    def degrees(self) -> int:
+        """d; 0 while there are too few for a mean."""
+        packed = self._packed
+        return (packed.shape[0] - _HEAD) // 2 if packed[_COUNT] >= FEWEST else 0
+
+    def biased(self, t_ns: int, limit: float) -> bool:
+        """Whether a mean of the innovations until `t_ns` is beyond chance: `limit` is the quantile
+        of chi-square of `degrees`. If not, what it shows is learned from."""
+        return _biased(self._packed, t_ns, limit)
+
+    @property
+    def colour(self) -> float:
+        """By how much (1) the sigma of a mean over many errors is more than if they were white, as
+        the series has shown."""
+        return math.sqrt(max(1.0, float(self._packed[_SPREAD + 1]) / WHITE_SLOW))
