@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.position import PositionAid
 from fusiond.aiding.standstill import TURNS_AT_REST
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
@@ -37,6 +36,7 @@ from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
+from fusiond.navigator.intake.gnss import told_by_operator
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
 from fusiond.navigator.readout import solution_of
@@ -208,16 +208,7 @@ class Navigator:
     def set_position(self, lat_rad: float, lon_rad: float, height_m: float, sd_m: float) -> str:
         """An operator's position, now: the fix to align by (`aligning`), or a fix like any other,
         whose outcome is returned."""
-        aid = PositionAid(
-            "operator",
-            self.imu.latest_ns,
-            1.0 - 1e-9,
-            lat_rad,
-            lon_rad,
-            height_m,
-            (sd_m, sd_m, sd_m),
-            (0.0, 0.0, 0.0),
-        )
+        aid = told_by_operator(self.imu.latest_ns, (lat_rad, lon_rad, height_m), sd_m)
         if self.started is None:
             self._aligner.aids([aid])
         entry = self.timeline.insert(aid)

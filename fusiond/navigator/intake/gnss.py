@@ -41,6 +41,8 @@ PHASE_SD_M = 0.1
 FIX_BIAS = "gnss_bias"
 # Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
+# An operator who errs by six sigma is wrong.
+OPERATOR_GATE = 1.0 - 1e-9
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -163,6 +165,11 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
         found.append(position_bias(level, section.bias_sd_m, lasts_s))
         found.append(position_bias(down, section.bias_down_sd_m, lasts_s, "d"))
     return found
+
+
+def told_by_operator(t_ns: int, where: tuple[float, float, float], sd_m: float) -> PositionAid:
+    """Where (rad, rad, m) an operator says that the vehicle is, one sigma (m) of each axis."""
+    return PositionAid("operator", t_ns, OPERATOR_GATE, *where, (sd_m,) * 3, (0.0, 0.0, 0.0))
 
 
 KIND = Kind(PositionFix, aids, {GnssAiding: blocks})
