@@ -82,6 +82,8 @@ if [ "$1" = purge ]; then
     rmdir /etc/fusiond 2>/dev/null || true
     if getent passwd fusiond >/dev/null; then userdel fusiond || true; fi
 fi
+# No package owns it, so that dpkg takes it away with the last that has files there.
+[ -d /opt ] || mkdir -m 755 /opt
 """
 COPYRIGHT = """\
 Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/
@@ -282,7 +284,7 @@ def main() -> None:
     system_files(tree, version)
     control_files(tree, version, options.python)
     package = work / f"fusiond_{version}-1.deb"
-    run("dpkg-deb", "--root-owner-group", "-Zxz", "-z6", "--build", tree.root, package)
+    run("dpkg-deb", "--root-owner-group", "-Zxz", "-z1", "--build", tree.root, package)
     print(package)
 
 
