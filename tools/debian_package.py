@@ -82,6 +82,8 @@ if [ "$1" = purge ]; then
     rmdir /etc/fusiond 2>/dev/null || true
     if getent passwd fusiond >/dev/null; then userdel fusiond || true; fi
 fi
+# No package owns it, so that dpkg takes it away with the last that has files there.
+[ -d /opt ] || mkdir -m 755 /opt
 """
 COPYRIGHT = """\
 Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/
@@ -106,6 +108,7 @@ fusiond: dir-or-file-in-opt
 # The daemon's user may not write there: without them every start would compile them.
 fusiond: package-installs-python-pycache-dir
 # Wheels as published on PyPI, whose hashes are locked.
+fusiond: unstripped-binary-or-object [opt/fusiond/.venv/lib/python3.*/site-packages/*.libs/*]
 fusiond: embedded-library
 fusiond: custom-library-search-path
 fusiond: shared-library-is-executable
@@ -182,11 +185,15 @@ def environment(tree: Tree, python: str, requirements: Path, work: Path) -> None
 
 
 def lighten(venv: Path) -> None:
-    """Leave out the packages' own tests (37 MB) and the symbols that only a debugger reads (45 MB).
+    """Leave out the packages' own tests (37 MB) and the symbols that only a debugger reads (45 MB),
+    and their programs, which nobody calls.
 
     Libraries in `*.libs` stay as they are: their loading segments were moved when the wheels were
     made, which strip does not always survive.
     """
+    for path in (venv / "bin").iterdir():
+        if path.name != "fusiond" and not path.name.startswith("python"):
+            path.unlink()
     packages = next(venv.glob("lib/python*/site-packages"))
     for folder in sorted(packages.rglob("tests")):
         if folder.is_dir():
@@ -282,7 +289,7 @@ def main() -> None:
     system_files(tree, version)
     control_files(tree, version, options.python)
     package = work / f"fusiond_{version}-1.deb"
-    run("dpkg-deb", "--root-owner-group", "-Zxz", "-z6", "--build", tree.root, package)
+    run("dpkg-deb", "--root-owner-group", "-Zxz", "-z1", "--build", tree.root, package)
     print(package)
 
 

@@ -18,6 +18,7 @@ FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 RUNS = {
     "rdss-static": 60,
     "rdss-map": 200,
+    "rdss-correlated": 3,
     "federated": 2,
     "ukf": 2,
     "reduced-order": 2,
