@@ -9,6 +9,9 @@ from fusiond.navigation.solution import Solution
 from fusiond.navigator.navigator import Navigator
 
 DIGEST_BYTES = 8
+_SLICE = 2032
+"""Bytes hashed at a time. From 2048 on hashlib lets another thread run meanwhile: the log writer,
+which then keeps the tick waiting for up to 5 ms (sys.getswitchinterval)."""
 _SOLUTION = struct.Struct("<q26d")
 
 
@@ -33,4 +36,7 @@ def state_digest(navigator: Navigator, solution: Solution) -> bytes:
         e = navigator.estimator
         parts.append(struct.pack("<q", e.t_ns))
         parts += [array.tobytes() for array in (e.nav, e.xi, e.covariance)]
-    return blake2b(b"".join(parts), digest_size=DIGEST_BYTES).digest()
+    found, data = blake2b(digest_size=DIGEST_BYTES), memoryview(b"".join(parts))
+    for at in range(0, len(data), _SLICE):
+        found.update(data[at : at + _SLICE])
+    return found.digest()

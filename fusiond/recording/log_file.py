@@ -57,13 +57,14 @@ class LogFile:
             self._writer.add_attachment(t_log_ns, t_log_ns, each.name, each.media_type, each.data)
         self._channels: dict[str, int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
+        self._synced = self._file.tell()
         self._unflushed = 0
         self.messages = 0
 
     @property
     def size(self) -> int:
-        """Bytes so far, those of the chunk under way before compression."""
-        return self._file.tell() + self._unflushed
+        """Bytes so far, those since the last sync before compression."""
+        return self._synced + self._unflushed
 
     def write(self, channel: Channel, t_log_ns: int, data: bytes, sequence: int = 0) -> None:
         """Append a message."""
@@ -90,7 +91,7 @@ class LogFile:
     def sync(self) -> None:
         """Everything so far is on the disk when this returns."""
         self._writer.flush()
-        self._unflushed = 0
+        self._synced, self._unflushed = self._file.tell(), 0
         os.fsync(self._file.fileno())
 
     def finish(self) -> None:
