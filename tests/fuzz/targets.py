@@ -7,6 +7,7 @@ first, so that a fuzzer reaches what stands behind them.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import tempfile
@@ -15,7 +16,9 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+from drivers.can import decoder as can_decoder
 from drivers.can.bus import CanFrame
 from drivers.can.imu import CanImuDecoder, CanImuOptions
 from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
@@ -247,13 +250,16 @@ _RACELOGIC = CanImuOptions(
     gyro=("IMU_602.ROLL_RATE", "IMU_602.PITCH_RATE", "IMU_600.YAW_RATE"),
     accel=("IMU_600.ACCEL_X", "IMU_601.ACCEL_Y", "IMU_603.ACCEL_Z"),
 )
+# Reading a DBC takes a hundred times as long as the frames of one input.
+_load_dbc = functools.cache(can_decoder.load_dbc)
 _REFUSED = ("other_frames", "wrong_length", "undecodable", "not_finite", "out_of_range")
 
 
 def can(data: bytes) -> None:
     """Frames of an IMU, ten bytes each: identifier, time and data; every frame accounted for."""
     choice, data = _input(data)
-    decoder = CanImuDecoder("imu", _SBG if choice & 1 else _RACELOGIC)
+    with patch.object(can_decoder, "load_dbc", _load_dbc):
+        decoder = CanImuDecoder("imu", _SBG if choice & 1 else _RACELOGIC)
     ids = [plan.message.frame_id for plan in decoder.plans]
     t_ns, frames, samples = 1_000_000_000, 0, 0
     last: dict[str, int] = {}

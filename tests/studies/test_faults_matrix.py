@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.studies.faults.power import SIZES, alarms_of, power_of
+from fusiond.studies.faults.hours import hour_of, rates
+from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
 from fusiond.studies.faults.runs import Row, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
 
@@ -41,17 +42,27 @@ def test_it_is_told_and_never_lied_about(
         assert found["recovered_s"] <= within_s
 
 
-def test_a_step_is_seen_and_quiet_minutes_raise_no_alarm() -> None:
-    assert ("step", 50.0) in SIZES
-    found = power_of(("step", 50.0), [0])
-    assert found["noticed"] == found["runs"] == 1
-    assert found["median_s"] < 2.0
-    quiet = alarms_of(0, 240.0)
+def test_a_step_is_seen_and_a_small_one_may_not_be() -> None:
+    assert {kind for kind, _, _ in jobs(2, seed=5)} == set(SWEEPS)
+    assert {seed for _, _, seed in jobs(2, seed=5)} == {5, 6}
+    found = [power_run(("position steps", size, 0)) for size in (2.0, 50.0)]
+    small, large = powers(found)
+    assert (large["noticed"], large["runs"], large["lies"]) == (1, 1, 0)
+    assert large["median_s"] < 2.0
+    assert 1.0 < small["largest_horizontal_m"] < 3.0
+    assert "| position steps | 50 m | 1 of 1 |" in TABLES["power"](found)
+
+
+def test_quiet_minutes_raise_no_alarm() -> None:
+    quiet = hour_of(0, 240.0)
     assert quiet["crash"] is None
-    assert "isolated" not in quiet["events"]
+    assert quiet["told"] == {}
+    assert quiet["doubts"] == 0
     assert quiet["longest_lie_s"] == 0.0
-    assert "| step 50 m | 1 | 1 of 1 |" in TABLES["power"]([found])
-    assert "0.0666667 hours simulated" in TABLES["alarms"]([quiet])
+    [isolated] = [row for row in rates([quiet]) if row["what"] == "isolated"]
+    assert isolated["times"] == 0
+    assert isolated["interval"][0] == 0.0 < isolated["stated_per_24_h"] < isolated["interval"][1]
+    assert "| town | 0.06667 | isolated | 0 | 0 |" in TABLES["alarms"]([quiet])
 
 
 def test_a_table_goes_between_its_marks(tmp_path: Path) -> None:

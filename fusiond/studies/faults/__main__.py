@@ -11,8 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fusiond.studies.faults.hours import hour_of
 from fusiond.studies.faults.library import ALL, FAULTS
-from fusiond.studies.faults.power import SIZES, alarms_of, power_of
+from fusiond.studies.faults.power import jobs, power_run
 from fusiond.studies.faults.runs import rows, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
 
@@ -31,11 +32,11 @@ def main() -> int:
     parser.add_argument("--page", type=Path, metavar="F.md", help="put the table into this page")
     asked = parser.parse_args()
     if asked.power is not None:
-        kind, seeds = "power", range(asked.seed, asked.seed + asked.power)
-        found = _run(partial(power_of, seeds=seeds), SIZES, asked.workers)
+        kind = "power"
+        found = _run(power_run, jobs(asked.power, asked.seed), asked.workers)
     elif asked.alarms is not None:
         kind = "alarms"
-        found = _run(alarms_of, range(asked.seed, asked.seed + asked.alarms), asked.workers)
+        found = _run(hour_of, range(asked.seed, asked.seed + asked.alarms), asked.workers)
     else:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
         if not wanted:

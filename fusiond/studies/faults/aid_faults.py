@@ -105,6 +105,17 @@ def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIF
     )
 
 
+def velocity_bias(r: Recording, begin_s: float, length_s: float, north_m_s: float) -> Recording:
+    """Velocities too fast to the north, position honest."""
+
+    def faster(fix: PositionFix, _: float) -> PositionFix:
+        assert fix.v_ned_m_s is not None
+        north, east, down = fix.v_ned_m_s
+        return replace(fix, v_ned_m_s=(north + north_m_s, east, down))
+
+    return _changed(r, begin_s, length_s, PositionFix, faster)
+
+
 def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
     """Velocity to the north that grows by 0.1 m/s^2, position honest."""
 
@@ -116,11 +127,11 @@ def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _changed(r, begin_s, length_s, PositionFix, grown)
 
 
-def late(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Fixes that are 0.8 s older than their stamps, as of a line that is slow from its first byte
-    on and a receiver whose time nobody knows."""
+def late(r: Recording, begin_s: float, length_s: float, late_s: float = LATE_S) -> Recording:
+    """Fixes that are older than their stamps, as of a line that is slow from its first byte on and
+    a receiver whose time nobody knows."""
     moved = set(_fixes(r, begin_s, begin_s + length_s))
-    ns = round(LATE_S * 1e9)
+    ns = round(late_s * 1e9)
     return r.with_received(
         [
             replace(item, t_ns=item.t_ns + ns, seen_ns=item.seen_ns + ns) if item in moved else item
@@ -145,6 +156,24 @@ def tiny_sigma(r: Recording, begin_s: float, length_s: float) -> Recording:
     return _changed(
         r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(TINY_SD_M,) * 3)
     )
+
+
+def small_sigma(r: Recording, begin_s: float, length_s: float, factor: float) -> Recording:
+    """Errors as always, and stated sigmas, of position and velocity, too small by a factor."""
+
+    def smaller(fix: PositionFix, _: float) -> PositionFix:
+        assert fix.sd_ned_m is not None
+        assert fix.sd_v_ned_m_s is not None
+        n, e, d = fix.sd_ned_m
+        vn, ve, vd = fix.sd_v_ned_m_s
+        assert vd is not None
+        return replace(
+            fix,
+            sd_ned_m=(n / factor, e / factor, d / factor),
+            sd_v_ned_m_s=(vn / factor, ve / factor, vd / factor),
+        )
+
+    return _changed(r, begin_s, length_s, PositionFix, smaller)
 
 
 def infinite_sigma(r: Recording, begin_s: float, length_s: float) -> Recording:

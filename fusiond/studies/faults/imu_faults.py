@@ -50,10 +50,17 @@ def dead_axis(r: Recording, begin_s: float, length_s: float) -> Recording:
     return replace(r, samples=samples)
 
 
-def bias_step(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The gyro of the yaw axis is off by another 1 deg/s."""
+def bias_step(
+    r: Recording,
+    begin_s: float,
+    length_s: float,
+    size: float = BIAS_STEP_RAD_S,
+    axis: int = YAW_AXIS,
+) -> Recording:
+    """A gyro (axis 0 to 2, rad/s) or an accelerometer (3 to 5, m/s^2) is off by another `size`: by
+    1 deg/s that of the yaw axis."""
     samples = r.samples.copy()
-    samples[r.window(begin_s, length_s), YAW_AXIS] += BIAS_STEP_RAD_S
+    samples[r.window(begin_s, length_s), axis] += size
     return replace(r, samples=samples)
 
 

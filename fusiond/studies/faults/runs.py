@@ -7,7 +7,7 @@ measurements in order of arrival, then the filter as far as the IMU reaches.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -103,8 +103,14 @@ def _driven(fault: Fault, phase: PhaseName, seed: int) -> Course:
     return navigate(config, recording, truth)
 
 
-def navigate(config: Config, recording: Recording, truth: Truth) -> Course:
-    """Feed a navigator with a recording; compare it with the truth at every second."""
+def navigate(
+    config: Config,
+    recording: Recording,
+    truth: Truth,
+    watch: Callable[[Navigator], None] | None = None,
+) -> Course:
+    """Feed a navigator with a recording; compare it with the truth at every second, when `watch`
+    may look at it."""
     samples: list[Sample] = []
     events: list[Event] = []
     now_s = 0.0
@@ -132,6 +138,8 @@ def navigate(config: Config, recording: Recording, truth: Truth) -> Course:
             navigator.advance()
             if tick % TICKS_PER_S == 0:
                 samples.append(compared(navigator.solution(now_ns), track, tick // TICKS_PER_S - 1))
+                if watch is not None:
+                    watch(navigator)
         except Exception as error:  # whatever leaves the navigator ends the daemon: a finding
             return Course(samples, events, f"{type(error).__name__} at {now_s:g} s: {error}")
     return Course(samples, events)

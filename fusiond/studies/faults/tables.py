@@ -8,6 +8,9 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from fusiond.studies.faults.hours import rates
+from fusiond.studies.faults.power import powers
+
 Rows = list[dict[str, Any]]
 
 MATRIX = (
@@ -24,15 +27,17 @@ MATRIX = (
     "recovered, s",
 )
 POWER = (
-    "fault of position",
-    "runs",
+    "fault",
+    "size",
     "noticed",
-    "noticed after, s (median)",
+    "after, s (median)",
     "at most",
     "largest error, m",
-    "longest lie, s",
+    "largest error/sigma",
+    "lies",
+    "longest, s",
 )
-ALARMS = ("hours", "event", "times", "in 24 h")
+ALARMS = ("vehicle", "hours", "alarm", "times", "in 24 h", "99 % interval", "stated in 24 h")
 
 
 def matrix(found: Rows) -> str:
@@ -61,41 +66,47 @@ def matrix(found: Rows) -> str:
 
 
 def power(found: Rows) -> str:
-    """A line a size."""
-    return (
-        _table(
-            POWER,
-            (
-                (
-                    row["fault"],
-                    str(row["runs"]),
-                    f"{row['noticed']} of {row['runs']}",
-                    _number(row["median_s"], "-"),
-                    _number(row["slowest_s"], "-"),
-                    _number(row["largest_horizontal_m"], "inf"),
-                    _number(row["longest_lie_s"], "-"),
-                )
-                for row in found
-            ),
+    """A line a kind and size of fault."""
+    lines = [
+        (
+            row["fault"],
+            row["size"],
+            f"{row['noticed']} of {row['runs']}",
+            _number(row["median_s"], "-"),
+            _number(row["slowest_s"], "-"),
+            _number(row["largest_horizontal_m"], "inf"),
+            _number(row["largest_ratio"], "inf"),
+            str(row["lies"]),
+            _number(row["longest_lie_s"], "-"),
         )
-        + "\n"
-    )
+        for row in powers(found)
+    ]
+    return _table(POWER, lines) + "\n"
 
 
 def alarms(found: Rows) -> str:
-    """A line an event that came with nothing wrong, and how long the mode was another."""
-    hours = sum(row["hours"] for row in found)
-    events: Counter[str] = Counter()
-    for row in found:
-        events.update(row["events"])
+    """A line a vehicle and alarm, and how long an error was beyond what the mode vouched for."""
     lines = [
-        (f"{hours:g}", code, str(n), f"{24.0 * n / hours:.3g}") for code, n in events.most_common()
+        (
+            row["kind"],
+            f"{row['hours']:.4g}",
+            row["what"],
+            str(row["times"]),
+            f"{row['per_24_h']:.3g}",
+            f"{row['interval'][0]:.3g} to {row['interval'][1]:.3g}",
+            f"{row['stated_per_24_h']:.2g}",
+        )
+        for row in rates(found)
     ]
-    other_s = sum(row["not_navigating_s"] for row in found)
+    hours = sum(row["hours"] for row in found)
+    beyond: Counter[str] = sum((Counter(row["beyond_s"]) for row in found), Counter())
+    counted = ", ".join(f"{q} {s} s" for q, s in beyond.items()) or "none"
     lie_s = max(row["longest_lie_s"] for row in found)
+    other_s = sum(row["not_navigating_s"] for row in found)
     return (
-        f"{_table(ALARMS, lines)}\n\n{hours:g} hours simulated; of them {other_s:g} s in another "
-        f"mode than `navigating` after the start; longest time beyond five sigma {lie_s:g} s.\n"
+        f"{_table(ALARMS, lines)}\n\n{hours:.4g} hours simulated; of them {other_s:g} s in another "
+        f"mode than `navigating` after the start. Beyond five sigma in mode `navigating`: "
+        f"{counted}; at most {lie_s:g} s together.\n"
     )
 
 

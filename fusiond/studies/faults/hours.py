@@ -1,0 +1,275 @@
+"""Hours in which nothing is wrong: how often something is told all the same.
+
+Vehicles of `KINDS`, each hour with its own noise of the configuration: IMU at 50 Hz, receivers at
+1 Hz, RDSS every 11 s. What is told once the mode has been `navigating` is a false alarm, and stands
+beside what the test's own statement allows in so many tests:
+
+isolated              0.9999 of innovations pass a gate, and three in a row must fail it; a mean
+                      test gives one false alarm in a million (`isolation.FALSE_ALARM`): the two of
+                      them, at each innovation, at most
+doubt of the filter   a mean test with nothing to compare with, of the above, or the test of the
+                      tilt, one in a million (`tilt.LIMIT`) at each position and velocity
+verdict               alpha, begun: `BEGUN`, as study `consistency` counts them
+protection            `false_alarm_per_hour` of `[integrity]`
+
+Tests at successive innovations share most of what they look at, so their false alarms come in
+clusters: the bounds are loose. Wheels have the drift that the filter allows for. RDSS is no matched
+source: it is simulated with less than its configured bias and height error, so that `pessimistic`
+is true of it; what is told of its innovations is not counted as an alarm.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path as File
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from drivers.measurements import PositionFix, WheelSpeed
+from fusiond.configuration.aiding import WheelAiding
+from fusiond.configuration.schema import Config
+from fusiond.integrity.isolation import FALSE_ALARM
+from fusiond.navigator.navigator import Navigator
+from fusiond.simulation.gnss.receiver import GnssReceiver
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.markov import gauss_markov
+from fusiond.simulation.scenarios import SCENARIOS
+from fusiond.simulation.trajectories import Leg, Path, follow
+from fusiond.studies.faults.judge import NAVIGATING, QUANTITIES, longest_lie_s
+from fusiond.studies.faults.library import with_wheels
+from fusiond.studies.faults.recording import (
+    REST_S,
+    TOWN_LEGS,
+    WHEEL_EVERY_S,
+    Drive,
+    Recording,
+    gnss_fixes,
+)
+from fusiond.studies.faults.runs import VEHICLE, navigate
+
+HOUR_S = 3600.0
+RATE_HZ, GNSS_HZ = 50.0, 1.0
+LIMITS_M = (40.0, 40.0)
+"""As of study `protection`."""
+BEGUN = 0.015e-3
+"""False verdicts begun an innovation with a window of 100 (docs/consistency.md)."""
+TILT = 1e-6
+CONFIDENCE = 0.99
+USUAL = ("aligned", "calibrated", "readmitted", "protection_restored", "verdict_consistent")
+"""Events that say nothing is wrong, or no more."""
+MOTORWAY_LEGS = (
+    Leg(60),
+    Leg(20, turn_deg=25.0),
+    Leg(90),
+    Leg(15, speed_m_s=24.0),
+    Leg(30, turn_deg=-40.0),
+    Leg(15, speed_m_s=33.0),
+    Leg(60),
+    Leg(25, turn_deg=15.0),
+)
+
+
+def around(legs: tuple[Leg, ...], duration_s: float) -> Path:
+    """The legs, over and over."""
+    rounds = int(duration_s / sum(leg.duration_s for leg in legs)) + 1
+    return follow((Leg(REST_S), *legs * rounds), duration_s, course_deg=40.0, bank_ratio=-0.08)
+
+
+def around_town(duration_s: float) -> Path:
+    """The town of the matrix."""
+    return around(TOWN_LEGS, duration_s)
+
+
+def on_motorway(duration_s: float) -> Path:
+    """A bend to find the heading by, and then 24 to 33 m/s for ever."""
+    off = (Leg(8, speed_m_s=14.0), Leg(12), Leg(8, turn_deg=90.0), Leg(15, speed_m_s=33.0))
+    rounds = int(duration_s / sum(leg.duration_s for leg in MOTORWAY_LEGS)) + 1
+    legs = (Leg(REST_S), *off, *MOTORWAY_LEGS * rounds)
+    return follow(legs, duration_s, course_deg=40.0, bank_ratio=-0.08)
+
+
+def parked(duration_s: float) -> Path:
+    """Once around the town, and then at rest, the engine off."""
+    legs = (Leg(REST_S), *TOWN_LEGS, Leg(8, speed_m_s=0.0), Leg(duration_s))
+    return follow(legs, duration_s, course_deg=40.0, bank_ratio=-0.08)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A vehicle and what it does for an hour; `twice`: two receivers and alert limits."""
+
+    drive: Drive
+    twice: bool = False
+
+    def config(self) -> Config:
+        """What the navigator gets."""
+        settings = VEHICLE.model_dump(exclude_unset=True)
+        settings["imu"]["rate_hz"] = RATE_HZ
+        if self.twice:
+            settings["aiding"]["second"] = {**settings["aiding"]["gnss"], "kind": "gnss"}
+            settings["integrity"] = {
+                "horizontal_alert_limit_m": LIMITS_M[0],
+                "vertical_alert_limit_m": LIMITS_M[1],
+            }
+        config = Config.model_validate(settings)
+        return with_wheels(config) if self.drive.wheels else config
+
+    def recorded(self, config: Config, seed: int, duration_s: float) -> tuple[Truth, Recording]:
+        """The truth and what the sensors say of it."""
+        truth, recording = replace(self.drive, duration_s=duration_s).recorded(config, seed)
+        if self.drive.wheels:
+            return truth, _drifting(recording, config, np.random.default_rng([seed, 2]))
+        if not self.twice:
+            return truth, recording
+        options = replace(SCENARIOS["drive"].fitted(config).gnss, rate_hz=GNSS_HZ)
+        second = GnssReceiver(truth, options, np.random.default_rng([seed, 1]))
+        received = [
+            replace(item, measurement=replace(item.measurement, source="second"))
+            for item in gnss_fixes(second)
+        ]
+        return truth, recording.with_received([*recording.received, *received])
+
+
+def _drifting(recording: Recording, config: Config, rng: np.random.Generator) -> Recording:
+    """With the drift of wheel speeds that the filter has as a state."""
+    section = config.aiding["wheel"]
+    assert isinstance(section, WheelAiding)
+    speeds = [r for r in recording.received if isinstance(r.measurement, WheelSpeed)]
+    drift = gauss_markov(
+        rng,
+        (len(speeds), 1),
+        step_s=WHEEL_EVERY_S,
+        correlation_s=section.drift_s,
+        sigma=section.drift_sd_m_s,
+    )
+    others = [r for r in recording.received if not isinstance(r.measurement, WheelSpeed)]
+    for item, off in zip(speeds, drift[:, 0].tolist(), strict=True):
+        m = item.measurement
+        assert isinstance(m, WheelSpeed)
+        others.append(replace(item, measurement=replace(m, speed_m_s=m.speed_m_s + off)))
+    return recording.with_received(others)
+
+
+KINDS = {
+    "town": Kind(Drive(around_town, gnss_rate_hz=GNSS_HZ)),
+    "wheels": Kind(Drive(around_town, wheels=True, gnss_rate_hz=GNSS_HZ)),
+    "motorway": Kind(Drive(on_motorway, gnss_rate_hz=GNSS_HZ)),
+    "parked": Kind(Drive(parked, gnss_rate_hz=GNSS_HZ)),
+    "two receivers": Kind(Drive(around_town, gnss_rate_hz=GNSS_HZ), twice=True),
+}
+
+
+def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
+    """An hour of the kind that is the seed's turn: what was told, by event and source, how often
+    the filter was doubted, tests, seconds beyond five sigma by quantity, resident memory."""
+    name = tuple(KINDS)[seed % len(KINDS)]
+    kind = KINDS[name]
+    config = kind.config()
+    truth, recording = kind.recorded(config, seed, duration_s)
+    doubts: set[int] = set()
+
+    def watch(navigator: Navigator) -> None:
+        doubts.update(navigator.timeline.isolation.doubts)
+
+    course = navigate(config, recording, truth, watch)
+    since_s = next((s.t_s for s in course.samples if s.mode == NAVIGATING), duration_s)
+    told = Counter(
+        _named(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
+    )
+    after = [s for s in course.samples if s.t_s > since_s]
+    vouched = [s.ratios for s in after if s.mode == NAVIGATING]
+    return {
+        "kind": name,
+        "seed": seed,
+        "hours": duration_s / 3600.0,
+        "told": dict(told),
+        "doubts": len(doubts),
+        "tests": _tests(recording),
+        "limits": kind.twice,
+        "not_navigating_s": len(after) - len(vouched),
+        "beyond_s": {q: sum(not r[k] <= 5.0 for r in vouched) for k, q in enumerate(QUANTITIES)},
+        "rms": np.sqrt(np.mean(np.square(vouched), axis=0)).round(3).tolist() if vouched else [],
+        "longest_lie_s": longest_lie_s(course.samples),
+        "resident_mb": int(File("/proc/self/statm").read_text().split()[1])
+        * os.sysconf("SC_PAGESIZE")
+        / 1e6,
+        "crash": course.crash,
+    }
+
+
+def _named(code: str, text: str) -> str:
+    """An event with the source that it is about."""
+    if code.startswith("verdict_"):
+        return f"{code} {text.rpartition(' ')[2]}"
+    return f"{code} {text.partition(' ')[0]}" if code == "isolated" else code
+
+
+def _tests(recording: Recording) -> dict[str, int]:
+    """Innovations by series; those of constraints are not counted."""
+    found: Counter[str] = Counter()
+    for item in recording.received:
+        m = item.measurement
+        match m:
+            case PositionFix():
+                found[m.source] += 1
+                found[f"{m.source}_velocity"] += 1
+            case WheelSpeed():
+                found[m.source] += 1
+    return dict(found)
+
+
+def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """By kind and alarm: how often it was told, in 24 hours with the exact interval of a Poisson
+    count at 99 %, and what is stated for so many tests."""
+    lines = []
+    for name in dict.fromkeys(row["kind"] for row in found):
+        rows = [row for row in found if row["kind"] == name]
+        hours = sum(row["hours"] for row in rows)
+        told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
+        tests: Counter[str] = sum((Counter(row["tests"]) for row in rows), Counter())
+        n = sum(tests.values())
+        alarms = {
+            "isolated": (_starting(told, "isolated"), 2.0 * FALSE_ALARM * n),
+            "doubt of the filter": (sum(row["doubts"] for row in rows), TILT * n),
+            **{
+                f"verdict of {series}": (
+                    sum(k for what, k in told.items() if _verdict_of(what) == series),
+                    BEGUN * count,
+                )
+                for series, count in tests.items()
+            },
+        }
+        if rows[0]["limits"]:
+            limit = Config().integrity.false_alarm_per_hour * hours
+            alarms["protection"] = _starting(told, "protection"), limit
+        known = ("isolated", "verdict_", "protection")
+        other = sum(k for what, k in told.items() if not what.startswith(known))
+        alarms["anything else"] = other, 0.0
+        for what, (times, stated) in alarms.items():
+            low = chi2.ppf(0.5 - CONFIDENCE / 2, 2 * times) / 2 if times else 0.0
+            high = chi2.ppf(0.5 + CONFIDENCE / 2, 2 * times + 2) / 2
+            a_day = 24.0 / hours
+            lines.append(
+                {
+                    "kind": name,
+                    "hours": hours,
+                    "what": what,
+                    "times": times,
+                    "per_24_h": times * a_day,
+                    "interval": (float(low) * a_day, float(high) * a_day),
+                    "stated_per_24_h": stated * a_day,
+                }
+            )
+    return lines
+
+
+def _starting(told: Counter[str], word: str) -> int:
+    return sum(k for what, k in told.items() if what.startswith(word))
+
+
+def _verdict_of(what: str) -> str:
+    return what.partition(" ")[2] if what.startswith("verdict_") else ""
