@@ -72,8 +72,8 @@ def _add(sums: Array, t_ns: int, before: Array, after: Array) -> bool:
     if nn <= 0.0 or determinant <= 1e-9 * nn * ee:
         return False
     square = ee * north * north + nn * east * east - 2.0 * ne * north * east
-    beyond: bool = square > LIMIT * determinant
-    return beyond
+    too_far: bool = square > LIMIT * determinant
+    return too_far
 
 
 class Tilting:
