@@ -42,6 +42,17 @@ def test_it_is_told_and_never_lied_about(
         assert found["recovered_s"] <= within_s
 
 
+def test_a_drawn_drive_meets_the_same_fault_elsewhere() -> None:
+    """Of the same number it is the same drive; of another, another."""
+    town, first, again, second = (
+        run_row(Row("speed_1e300", "navigating"), seed=0, drive=number)
+        for number in (None, 1, 1, 2)
+    )
+    assert first == again
+    assert len({row["largest_horizontal_m"] for row in (town, first, second)}) == 3
+    assert {row["verdict"] for row in (town, first, second)} <= {"degraded and said so", "survived"}
+
+
 def test_a_step_is_seen_and_a_small_one_may_not_be() -> None:
     assert {kind for kind, _, _ in jobs(2, seed=5)} == set(SWEEPS)
     assert {seed for _, _, seed in jobs(2, seed=5)} == {5, 6}

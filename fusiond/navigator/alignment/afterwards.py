@@ -33,7 +33,8 @@ class Afterwards:
         self._options = options
         self._claim = start.how if start.how in CLAIMS else ""
         self._sd_yaw = math.sqrt(start.covariance[2, 2])
-        self._backward = start.backward and math.isfinite(options.max_reverse_m_s)
+        on_wheels = options.no_slip_m is not None and math.isfinite(options.max_reverse_m_s)
+        self._backward = start.backward and on_wheels
         self._configured = start.how == CONFIGURED
         self._since_ns: int | None = None
 
@@ -42,7 +43,7 @@ class Afterwards:
         """What the heading hangs on and no motion has shown, in words; empty where there is no such
         thing. A configured heading is a hypothesis until the first motion; one that was saved was
         measured, before the vehicle was parked. And what looks like driving backward is driving
-        forward with an IMU that is mounted the other way, until it is faster than one reverses."""
+        forward with an IMU that is mounted the other way, until it goes forward as well."""
         if self._backward:
             return "the vehicle drives backward, or the IMU is mounted backwards"
         return "no motion has confirmed it yet" if self._configured else ""
@@ -62,7 +63,7 @@ class Afterwards:
                     f"driving backward at {backward:.0f} m/s, faster than the vehicle can: is the "
                     "IMU mounted backwards? Correct [imu] axes"
                 )
-        if -backward > self._options.max_reverse_m_s:
+        if -backward > self._options.course_speed_m_s:
             self._backward = False
         if not self._claim:
             return None

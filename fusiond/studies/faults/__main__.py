@@ -26,6 +26,7 @@ def main() -> int:
     parser.add_argument("--power", type=int, metavar="RUNS", help="detection, so many runs a size")
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--json", type=Path, metavar="F.json")
     parser.add_argument("--table", type=Path, metavar="F.md")
@@ -41,7 +42,7 @@ def main() -> int:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
         if not wanted:
             parser.error(f"{asked.only} has the phases {', '.join(FAULTS[asked.only].phases)}")
-        found = _run(partial(run_row, seed=asked.seed), wanted, asked.workers)
+        found = _run(partial(run_row, seed=asked.seed, drive=asked.drive), wanted, asked.workers)
     if asked.json is not None:
         document = {"seed": asked.seed, "rows": found}
         asked.json.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,9 +19,10 @@ from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
+from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.judge import Course, Event, Sample, axis_ratio, judge
 from fusiond.studies.faults.library import FAULTS, PHASES, Fault, PhaseName, with_wheels
-from fusiond.studies.faults.recording import DURATION_S, Drive, Recording
+from fusiond.studies.faults.recording import DURATION_S, Drive, Recording, town
 
 Array = NDArray[np.float64]
 
@@ -70,9 +71,14 @@ def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
     ]
 
 
-def run_row(row: Row, seed: int) -> dict[str, Any]:
-    """The figures of a row; the same seed gives the same."""
-    return {"fault": row.fault, "phase": row.phase, **run(FAULTS[row.fault], row.phase, seed)}
+def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
+    """The figures of a row; the same seed gives the same. `drive`: the number of a drawn one in
+    place of the town, for the faults that happen there."""
+    fault = FAULTS[row.fault]
+    if drive is not None and fault.drive.path is town:
+        found = drawn(drive)
+        fault = replace(fault, drive=replace(found, wheels=fault.drive.wheels))
+    return {"fault": row.fault, "phase": row.phase, **run(fault, row.phase, seed)}
 
 
 def run(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
