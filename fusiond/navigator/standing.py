@@ -12,8 +12,9 @@ what follows for the operator:
     given up   the filter is wrong, or cannot be told from wrong any more: alignment begins anew
 
 A filter that was given up and aligned anew is on trial for a while: its mode stays `invalid` until
-it has gone on without a doubt. What made it fail may be there still, and driving straight on at one
-speed shows neither a wrong IMU nor stamps that are late: it coasts until its velocity has changed.
+it has gone on without a doubt. What made it fail may be there still, and driving on at one speed
+shows neither a wrong IMU nor stamps that are late: on a straight they are late by a way, in a
+bend of rate w by a heading of w times as much. It coasts until its speed has changed.
 """
 
 from __future__ import annotations
@@ -56,6 +57,9 @@ LASTED = 10
 # By so much (m/s) since the last doubt: at 1 m/s^2 stamps that are half a second late are off by
 # ten sigma of a receiver's velocity meanwhile.
 PROVING_M_S = 5.0
+# A robot that never drives as fast stops and goes: by most of the speed that it had before the
+# first failure, once that was more than a walk's.
+MOST_OF_SPEED, SLOW_M_S = 0.8, 0.8
 # A mounting found so many of its configured sigmas from what was configured is not the one that was
 # configured: chance does that once in 16,000 vehicles.
 ASKEW_SIGMAS = 4.0
@@ -71,7 +75,7 @@ class Standing:
         self._trial_ns = 0
         self._started_ns = 0
         self._since_ns = 0
-        self._from = 0.0, 0.0
+        self._from = self._fastest = 0.0
         self._changed = 0.0
 
     def started(self, t_ns: int) -> None:
@@ -110,13 +114,21 @@ class Standing:
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
     def _watch(self, t_ns: int, isolation: Isolation, nav: Array) -> None:
-        """How far the velocity has changed since the start or the last doubt, and since measured
-        velocities go along: a bend in which one is left out proves nothing."""
+        """How far the speed has changed since the start or the last doubt, and since measured
+        velocities go along: while one is left out nothing is proven."""
         since_ns = max((self._started_ns, self._turned_ns, *isolation.doubts))
-        velocity = float(nav[VN]), float(nav[VE])
+        speed = math.hypot(nav[VN], nav[VE])
         if since_ns != self._since_ns or isolation.velocity_left_out(t_ns):
-            self._since_ns, self._from, self._changed = since_ns, velocity, 0.0
-        self._changed = max(self._changed, math.dist(velocity, self._from))
+            self._since_ns, self._from, self._changed = since_ns, speed, 0.0
+        self._changed = max(self._changed, abs(speed - self._from))
+        if not self._trial_ns:
+            self._fastest = max(self._fastest, speed)
+
+    @property
+    def _proven(self) -> bool:
+        """Whether the speed has changed by `PROVING_M_S`, or by most of what this vehicle does."""
+        most = MOST_OF_SPEED * self._fastest
+        return self._changed >= (min(most, PROVING_M_S) if most > SLOW_M_S else PROVING_M_S)
 
     def unproven(self, t_ns: int) -> str | None:
         """Why a solution is not to be called valid yet: it is on trial."""
@@ -134,9 +146,9 @@ class Standing:
         left_ns = _doubted_until(isolation.doubts) - t_ns
         if left_ns > 0:
             return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
-        if self._trial_ns and self._changed < PROVING_M_S:
-            return "after a failure, and no bend or change of speed has proven it since"
-        if self._turned_ns > NEVER_NS and self._changed < PROVING_M_S:
+        if self._trial_ns and not self._proven:
+            return "after a failure, and no change of speed has proven it since"
+        if self._turned_ns > NEVER_NS and not self._proven:
             return "a turn was felt at rest: a gyro is wrong, or the ground has turned"
         return isolation.contested(t_ns) or _askew(estimator)
 

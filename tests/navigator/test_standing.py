@@ -130,20 +130,38 @@ def test_after_a_failure_driving_straight_on_proves_nothing() -> None:
     assert standing.unproven(90 * S) is None
     why = standing.shaken(at(90.0), isolation)
     assert why is not None
-    assert "no bend" in why
-    nav[VN], nav[VE] = 19.0, 6.0
+    assert "no change of speed" in why
+    nav[VN], nav[VE] = 12.0, 16.0  # nor does a bend: late stamps are a heading there
     assert standing.failure(91 * S, isolation, nav) is None
-    assert standing.shaken(at(91.0), isolation) is None
-    isolation = WithoutVelocity()  # a bend that its velocity does not go along with
+    assert standing.shaken(at(91.0), isolation) is not None
+    nav[VN], nav[VE] = 9.0, 12.0
+    assert standing.failure(92 * S, isolation, nav) is None
+    assert standing.shaken(at(92.0), isolation) is None
+    isolation = WithoutVelocity()  # braking that its velocity does not go along with
     standing.given_up(100 * S)
     standing.started(101 * S)
     assert standing.failure(102 * S, isolation, nav) is None
-    nav[VN], nav[VE] = 6.0, 19.0
+    nav[VN], nav[VE] = 0.0, 9.0
     assert standing.failure(190 * S, isolation, nav) is None
     assert standing.shaken(at(190.0), isolation) is not None
-    nav[VN], nav[VE] = 19.0, 6.0
+    nav[VN], nav[VE] = 0.0, 15.0
     assert standing.failure(191 * S, Isolation(), nav) is None
     assert standing.shaken(at(191.0), Isolation()) is None
     again = Doubted(192)  # what was proven before a doubt is not after it
     assert standing.failure(193 * S, again, nav) is None
     assert standing.shaken(at(210.0), again) is not None
+
+
+def test_what_never_drives_fast_proves_itself_by_most_of_its_speed() -> None:
+    standing, isolation, nav = Standing(150.0), Isolation(), np.zeros(10)
+    standing.started(0)
+    for t, speed in ((1, 0.0), (2, 2.0)):
+        nav[VN] = speed
+        assert standing.failure(t * S, isolation, nav) is None
+    standing.given_up(3 * S)
+    standing.started(4 * S)
+    assert standing.failure(30 * S, isolation, nav) is None
+    assert standing.shaken(at(30.0), isolation) is not None
+    nav[VN] = 0.3
+    assert standing.failure(31 * S, isolation, nav) is None
+    assert standing.shaken(at(31.0), isolation) is None
