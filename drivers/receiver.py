@@ -1,4 +1,4 @@
-"""What the drivers `nmea` and `gnss` share: one receiver on one serial line, read and judged.
+"""What the drivers `nmea` and `gnss` share: one receiver on one line, read and judged.
 
 A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
 silent, and says in `status` whether the device is there and intelligible.
@@ -16,6 +16,7 @@ from typing import Protocol
 from drivers.base import DriverStatus, Emit, Now, State, state_event
 from drivers.inputs import Inputs
 from drivers.measurements import Measurement, TimeReport
+from drivers.network_port import on_network, open_port
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent
 from drivers.serial_line import SerialLine
 
@@ -62,7 +63,7 @@ class ReceiverDriver:
         self.inputs.on("silence", self._on_silence)
         self.inputs.on("watch", self._on_watch)
         self._now_ns = self.inputs.now_ns
-        self._line = SerialLine(port, baud, now_ns)
+        self._line = SerialLine(port, baud, now_ns, open_port=open_port)
         self._open = False
         self._why_closed = ""
         self.counters: Counter[str] = self._line.counters
@@ -86,6 +87,12 @@ class ReceiverDriver:
     def _unintelligible_detail(self) -> str:
         """Why the bytes that arrive are not what this driver reads."""
         raise NotImplementedError
+
+    def _where_to_look(self) -> str:
+        """Ends a sentence on bytes that nothing can be made of."""
+        if on_network(self._port):
+            return f" from {self._port}: does it serve what the receiver sends?"
+        return f" at {self._baud} baud: is that the receiver's rate?"
 
     async def run(self) -> None:
         """Serve the receiver until cancelled."""

@@ -1,45 +1,39 @@
-"""A serial line under asyncio that is there when the device is, and comes back when it comes back.
+"""A line under asyncio that is there when the device is, and comes back when it comes back.
 
-8 data bits, no parity, 1 stop bit, no flow control, raw bytes. pyserial opens and configures the
-port; reading and writing go straight to its descriptor, so that every read is bounded, stamped, and
-an end of file is seen as what it is.
+Every read is bounded, stamped, and an end is seen as what it is.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
-import termios
 from collections import Counter
 from collections.abc import Callable
 
-import serial
-
 from drivers.base import Backoff, Now, monotonic_ns
+from drivers.port import OPEN_ERRORS, READ_BYTES, OpenPort, Port, open_serial
 
-READ_BYTES = 1024
-"""Most bytes handed over in one turn of the loop: 11 ms of a line at 921600 baud, and less than a
-millisecond of parsing, so that a device that floods leaves every other task its turn."""
+__all__ = ["PENDING_WRITE_BYTES", "READ_BYTES", "SerialLine"]
+
 PENDING_WRITE_BYTES = 4096
 """Most bytes that may wait for a slow line: 2 s of 19200 baud, the slowest terminal."""
 PATH_CHECK_S = 1.0
 """How often the path is compared with the open device, for replugs the descriptor cannot see."""
 
-OPEN_ERRORS = (OSError, ValueError, OverflowError, termios.error)
-"""What pyserial raises for a port that is absent, locked, no terminal, or refuses the baud rate
-(SerialException is an OSError)."""
-
 
 class SerialLine:
-    """One serial port, reopened with `backoff` for ever.
+    """One port, reopened with `backoff` for ever: a serial one, but for another `open_port`.
 
     `counters`: `opened`, `closed`, `open_failed`, `bytes_in`, `bytes_out`, `write_refused`,
     `baud_refused`. `detail` is the last trouble in words; empty once bytes arrive.
     """
 
     def __init__(
-        self, port: str, baud: int, now_ns: Now = monotonic_ns, backoff: Backoff | None = None
+        self,
+        port: str,
+        baud: int,
+        now_ns: Now = monotonic_ns,
+        backoff: Backoff | None = None,
+        open_port: OpenPort = open_serial,
     ) -> None:
         self.port = port
         self.baud = baud
@@ -47,13 +41,14 @@ class SerialLine:
         self.detail = ""
         self._now_ns = now_ns
         self._backoff = backoff or Backoff()
-        self._serial: serial.Serial | None = None
+        self._open_port = open_port
+        self._opened: Port | None = None
         self._gone: asyncio.Future[str] | None = None
         self._pending = bytearray()
 
     @property
     def is_open(self) -> bool:
-        return self._serial is not None
+        return self._opened is not None
 
     async def run(
         self,
@@ -76,7 +71,7 @@ class SerialLine:
                 await asyncio.sleep(self._backoff.next())
                 continue
             self.counters["opened"] += 1
-            self._serial = port
+            self._opened = port
             why = "closed by this side"
             try:
                 if on_open is not None:
@@ -90,9 +85,10 @@ class SerialLine:
             await asyncio.sleep(self._backoff.next())
 
     def write(self, data: bytes) -> bool:
-        """Send `data` without ever blocking; False when the line is closed or congested."""
-        port, gone = self._serial, self._gone
-        if port is None or gone is None or gone.done():
+        """Send `data` without ever blocking; False when the line is closed or congested, or has
+        nobody at its other end who could read."""
+        port, gone = self._opened, self._gone
+        if port is None or gone is None or gone.done() or not port.writable:
             self.counters["write_refused"] += 1
             return False
         if len(self._pending) + len(data) > PENDING_WRITE_BYTES:
@@ -109,24 +105,26 @@ class SerialLine:
     def set_baud(self, baud: int) -> None:
         """Change the rate, at once when the line is open, and for every later opening."""
         self.baud = baud
-        if self._serial is None:
+        if self._opened is None:
             return
         try:
-            self._serial.baudrate = baud
+            self._opened.set_baud(baud)
         except OPEN_ERRORS as error:
             self.counters["baud_refused"] += 1
             self._end(f"{self.port}: {baud} baud refused: {error}")
 
-    async def _open(self) -> serial.Serial:
-        """Open in a thread: a USB adapter in trouble holds `open` for seconds."""
-        opening = asyncio.ensure_future(asyncio.to_thread(_open_port, self.port, self.baud))
+    async def _open(self) -> Port:
+        """Open in a thread: a USB adapter in trouble holds `open` for seconds, a network too."""
+        opening = asyncio.ensure_future(
+            asyncio.to_thread(self._open_port, self.port, self.baud, self.counters)
+        )
         try:
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
             opening.add_done_callback(_close_late)
             raise
 
-    async def _serve(self, port: serial.Serial, on_bytes: Callable[[bytes, int], None]) -> str:
+    async def _serve(self, port: Port, on_bytes: Callable[[bytes, int], None]) -> str:
         """Read until the device is gone; why, in words."""
         loop = asyncio.get_running_loop()
         gone: asyncio.Future[str] = loop.create_future()
@@ -136,12 +134,12 @@ class SerialLine:
             done, _ = await asyncio.wait({gone}, timeout=PATH_CHECK_S)
             if done:
                 return gone.result()
-            if not _still_names(self.port, port.fileno()):
-                return f"{self.port} no longer names the device that was opened"
+            if changed := port.changed():
+                return changed
 
     def _read(
         self,
-        port: serial.Serial,
+        port: Port,
         gone: asyncio.Future[str],
         on_bytes: Callable[[bytes, int], None],
     ) -> None:
@@ -149,28 +147,28 @@ class SerialLine:
             return
         t_seen_ns = self._now_ns()
         try:
-            data = os.read(port.fileno(), READ_BYTES)
+            data = port.read()
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
             self._end(f"{self.port}: {error.strerror}")
             return
         if not data:
-            # VMIN is 1, so an idle line says EAGAIN: no bytes is a hang-up, and would be for ever.
-            self._end(f"{self.port}: end of file, the device went away")
+            self._end(f"{self.port}: {port.at_end}")
             return
         self.counters["bytes_in"] += len(data)
         self._backoff.reset()
         self.detail = ""
         try:
-            on_bytes(data, t_seen_ns)
+            for at in range(0, len(data), READ_BYTES):  # a datagram comes as a whole
+                on_bytes(data[at : at + READ_BYTES], t_seen_ns)
         except Exception as error:
             if not gone.done():
                 gone.set_exception(error)
 
-    def _flush(self, port: serial.Serial, gone: asyncio.Future[str]) -> None:
+    def _flush(self, port: Port, gone: asyncio.Future[str]) -> None:
         try:
-            sent = os.write(port.fileno(), self._pending)
+            sent = port.write(self._pending)
         except (BlockingIOError, InterruptedError):
             return
         except OSError as error:
@@ -186,37 +184,18 @@ class SerialLine:
         if self._gone is not None and not self._gone.done():
             self._gone.set_result(why)
 
-    def _close(self, port: serial.Serial) -> None:
+    def _close(self, port: Port) -> None:
         loop = asyncio.get_running_loop()
         fd = port.fileno()
         loop.remove_reader(fd)
         loop.remove_writer(fd)
-        with contextlib.suppress(*OPEN_ERRORS):
-            port.reset_output_buffer()  # else close waits for a dead line to drain, up to 30 s
         port.close()
-        self._serial = None
+        self._opened = None
         self._gone = None
         self._pending.clear()
         self.counters["closed"] += 1
 
 
-def _open_port(path: str, baud: int) -> serial.Serial:
-    # exclusive is flock, not TIOCEXCL: the latter outlives a killed daemon while anybody else
-    # (a simulator on a pty) holds the terminal open. inter_byte_timeout 0 makes pyserial set
-    # VMIN 1, VTIME 0 (its default VMIN 0 gives no bytes both for idle and for end of file).
-    port = serial.Serial(path, baud, timeout=0, exclusive=True, inter_byte_timeout=0)
-    with contextlib.suppress(ValueError):  # a pty or an adapter without the flag
-        port.set_low_latency_mode(True)
-    return port
-
-
-def _close_late(opening: asyncio.Future[serial.Serial]) -> None:
+def _close_late(opening: asyncio.Future[Port]) -> None:
     if not opening.cancelled() and opening.exception() is None:
         opening.result().close()
-
-
-def _still_names(path: str, fd: int) -> bool:
-    try:
-        return os.stat(path).st_rdev == os.fstat(fd).st_rdev
-    except OSError:
-        return False

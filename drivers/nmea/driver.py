@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, PositiveFloat
 
 from drivers.base import Emit, Now, monotonic_ns
+from drivers.network_port import PortName
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.receiver import ReceiverDriver
 
@@ -28,7 +29,8 @@ REFUSALS = {
 class NmeaOptions(NmeaDecoding):
     """Options of a `driver = "nmea"` source."""
 
-    port: str
+    port: PortName
+    """A serial device, or an address of a network: see `docs/network.md`."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
     timeout_s: PositiveFloat = 5.0
     """Without a verified sentence for this long the device is `silent`; five epochs at 1 Hz."""
@@ -57,7 +59,4 @@ class NmeaDriver(ReceiverDriver):
     def _unintelligible_detail(self) -> str:
         if self._since_alive("ubx_frames") or self._since_alive("rtcm_frames"):
             return "UBX or RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port"
-        return (
-            f"bytes arrive, but no NMEA sentence verifies at {self._baud} baud:"
-            " is that the receiver's rate?"
-        )
+        return f"bytes arrive, but no NMEA sentence verifies{self._where_to_look()}"

@@ -189,7 +189,5 @@ class GnssDriver(ReceiverDriver):
         return "neither observations nor epochs of NMEA arrive"
 
     def _unintelligible_detail(self) -> str:
-        return (
-            f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies at {self._baud} baud:"
-            " is that the receiver's rate?"
-        )
+        where = self._where_to_look()
+        return f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies{where}"

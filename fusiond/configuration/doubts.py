@@ -75,11 +75,11 @@ def _imu(config: Config) -> Iterator[str]:
 
 
 def _ports(config: Config) -> Iterator[str]:
-    """A serial line read by two gives each of them a part of the bytes."""
+    """A serial line read by two gives each of them a part of the bytes; a UDP port, all to one."""
     users = defaultdict(list)
     for name, source in config.sources.items():
         port = source.options.get("port")
-        if isinstance(port, str) and "://" not in port:
+        if isinstance(port, str) and ("://" not in port or port.startswith("udp://")):
             users[Path(port).resolve()].append((name, port))
     for sources in users.values():
         for (one, port), (other, same) in combinations(sources, 2):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.base import Driver
+from drivers.network_port import on_network
 
 SERIAL_PATTERNS = (
     "/dev/serial/by-id/*",
@@ -59,6 +60,8 @@ def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> li
             f"{detail}: check bit rate (ip -d link show {options.channel}), wiring and power; "
             f"`candump {options.channel}` shows what is on the bus, [sources.{name}] what is wanted"
         ]
+    if on_network(str(port)):
+        return [f"{detail}: see what {port} says with `nc` or `gpspipe`, and who may connect there"]
     if not driver.counters["bytes_in"]:
         return [f"nothing arrives in {seconds:g} s: check power, and that its TX goes to our RX"]
     baud = getattr(options, "baud", None)
@@ -74,7 +77,9 @@ def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> li
 
 
 def absent_port(name: str, path: str, detail: str) -> str:
-    """A serial port that cannot be opened: it is not there, not allowed, or taken."""
+    """A port that cannot be opened: it is not there, not allowed, or taken."""
+    if on_network(path):
+        return f"{detail}: start what serves it, or correct port in [sources.{name}]"
     try:
         mode = os.stat(path)
     except OSError:

@@ -81,6 +81,14 @@ def test_one_line_by_two_names(tmp_path: Path) -> None:
     assert "(that is /dev/ttyUSB0 of gnss): gnss has it already" in doubt
 
 
+def test_addresses_that_two_sources_name(tmp_path: Path) -> None:
+    """A UDP port gives its datagrams to one; a server serves both."""
+    for address, doubts_found in (("udp://:5000", 1), ("tcp://10.0.0.1:5000", 0)):
+        both = SOUND.replace("/dev/ttyUSB0", address)
+        other = GNSS.replace("/dev/ttyUSB0", address)
+        assert len(found(tmp_path, f"{both}[sources.other]\n{other}")) == doubts_found
+
+
 def test_no_doubt_about_what_may_well_be(tmp_path: Path) -> None:
     """A ship's lever arm, an aid for `process` alone, a start from a known place."""
     text = 'vehicle_class = "marine"\n' + SOUND

@@ -1,0 +1,188 @@
+"""A receiver behind a network, read as if it hung on a serial line; see `docs/network.md`.
+
+    tcp://HOST:PORT            a serial server, or a receiver's own socket: this side connects
+    udp://:PORT                datagrams to this port; udp://ADDRESS:PORT of one interface alone
+    gpsd://HOST:PORT[/DEVICE]  the bytes of a gpsd's device, as they come (its WATCH with raw = 2)
+
+A line over TCP ends when the other side closes, resets, or no longer answers the kernel: a cable
+that was pulled sends neither. UDP has no end; it falls silent.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections import Counter
+from time import monotonic
+from typing import Annotated, Any
+from urllib.parse import SplitResult, urlsplit
+
+from pydantic import AfterValidator
+
+from drivers.port import READ_BYTES, Port, SerialPort
+
+CONNECT_S = 5.0
+"""For name and connection together a few round trips of a mobile network; the first packet is sent
+again after 1 s and 3 s (RFC 6298, section 2)."""
+KEEPALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
+"""A host that is gone is known after 5 + 3 * 2 = 11 s without a byte, of which a receiver that
+works leaves none; three probes, since mobile links lose one now and then."""
+UNANSWERED_MS = 11_000
+"""The same for bytes of ours that are not acknowledged (RFC 5482)."""
+SENDER_HELD_S = 5.0
+"""A port hears the sender that spoke first until it was silent for this long: the sentences of two
+receivers would be mixed. Five epochs at 1 Hz, the time-out of the drivers."""
+DATAGRAM_BYTES = 65_535
+
+_DEFAULT_PORTS = {"tcp": None, "udp": None, "gpsd": 2947}
+_EXAMPLES = "tcp://HOST:PORT, udp://:PORT or gpsd://HOST:2947"
+
+
+def on_network(port: str) -> bool:
+    """Whether a `port` is no serial device but an address."""
+    return "://" in port
+
+
+def _split(port: str) -> tuple[SplitResult, int]:
+    """The address and its port number; ValueError where it is none of `_EXAMPLES`."""
+    parts = urlsplit(port)
+    if parts.scheme not in _DEFAULT_PORTS:
+        raise ValueError(f"no such kind of address: {_EXAMPLES}")
+    try:
+        number = parts.port or _DEFAULT_PORTS[parts.scheme]
+    except ValueError as error:
+        raise ValueError(f"{error}: {_EXAMPLES}") from None
+    if number is None:
+        raise ValueError(f"an address needs its port: {_EXAMPLES}")
+    if parts.scheme != "udp" and not parts.hostname:
+        raise ValueError(f"an address needs its host: {_EXAMPLES}")
+    if parts.query or parts.fragment or (parts.path.strip("/") and parts.scheme != "gpsd"):
+        raise ValueError(f"nothing may follow the port: {_EXAMPLES}")
+    return parts, number
+
+
+def _checked(port: str) -> str:
+    if on_network(port):
+        _split(port)
+    return port
+
+
+PortName = Annotated[str, AfterValidator(_checked)]
+"""A serial device's path or an address."""
+
+
+def open_port(name: str, baud: int, counters: Counter[str]) -> Port:
+    """Open a serial device, or reach an address. Raises `OPEN_ERRORS`.
+
+    `counters`: `other_sender`, datagrams of a second sender.
+    """
+    if not on_network(name):
+        return SerialPort(name, baud)
+    parts, number = _split(name)
+    try:
+        if parts.scheme == "udp":
+            return UdpPort(parts.hostname, number, counters)
+        connection = _connect(str(parts.hostname), number)
+        if parts.scheme == "tcp":
+            return TcpPort(connection)
+        return GpsdPort(connection, parts.path.rstrip("/"))
+    except OSError as error:
+        raise OSError(f"{name}: {error.strerror or error}") from error
+
+
+def _connect(host: str, number: int) -> socket.socket:
+    connection = socket.create_connection((host, number), CONNECT_S)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in KEEPALIVE.items():
+        connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNANSWERED_MS)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
+class _SocketPort:
+    """What TCP and UDP have in common: no rate, and a name that stands for nothing else."""
+
+    def __init__(self, opened: socket.socket) -> None:
+        opened.setblocking(False)
+        self._socket = opened
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def changed(self) -> str:
+        return ""
+
+    def set_baud(self, baud: int) -> None:
+        """The far end has the rate."""
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class TcpPort(_SocketPort):
+    """A stream over TCP, both ways."""
+
+    at_end = "the other side closed the connection"
+    writable = True
+
+    def read(self) -> bytes:
+        return self._socket.recv(READ_BYTES)
+
+    def write(self, data: bytes | bytearray) -> int:
+        return self._socket.send(data)
+
+
+class GpsdPort(TcpPort):
+    """The bytes of a device that a gpsd reads. What is written would be taken for commands."""
+
+    at_end = "gpsd closed the connection"
+    writable = False
+
+    def __init__(self, connection: socket.socket, device: str) -> None:
+        watch = {"enable": True, "raw": 2} | ({"device": device} if device else {})
+        connection.sendall(f"?WATCH={json.dumps(watch, separators=(',', ':'))};\n".encode())
+        super().__init__(connection)
+
+
+class UdpPort(_SocketPort):
+    """Datagrams of one sender; what is written goes back to it."""
+
+    at_end = ""
+    """There is none."""
+
+    def __init__(self, address: str | None, number: int, counters: Counter[str]) -> None:
+        found = socket.getaddrinfo(address, number, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, where = found[0]
+        opened = socket.socket(family, kind, protocol)
+        try:
+            opened.bind(where)
+        except OSError:
+            opened.close()
+            raise
+        super().__init__(opened)
+        self._counters = counters
+        self._sender: tuple[Any, ...] | None = None
+        self._heard_s = 0.0
+
+    @property
+    def writable(self) -> bool:
+        return self._sender is not None
+
+    def read(self) -> bytes:
+        data, sender = self._socket.recvfrom(DATAGRAM_BYTES)
+        now_s = monotonic()
+        # By host alone: some send each datagram from a fresh port.
+        foreign = self._sender is not None and self._sender[0] != sender[0]
+        if foreign and now_s - self._heard_s < SENDER_HELD_S:
+            self._counters["other_sender"] += 1
+            raise BlockingIOError
+        self._sender, self._heard_s = sender, now_s
+        if not data:
+            raise BlockingIOError  # a datagram without a byte is no end of anything
+        return data
+
+    def write(self, data: bytes | bytearray) -> int:
+        if self._sender is None:
+            raise BlockingIOError
+        return self._socket.sendto(data, self._sender)

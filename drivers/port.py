@@ -1,0 +1,106 @@
+"""What a line is read from and written to: an open port that never blocks, and the serial one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import termios
+from collections import Counter
+from collections.abc import Callable
+from typing import Protocol
+
+import serial
+
+READ_BYTES = 1024
+"""Most bytes handed over at a time: 11 ms of a line at 921600 baud, and less than a millisecond of
+parsing, so that a device that floods leaves every other task its turn."""
+
+OPEN_ERRORS = (OSError, ValueError, OverflowError, termios.error)
+"""What opening raises for a port that is absent, locked, no terminal, or refuses the baud rate
+(SerialException is an OSError), and for a host that cannot be reached."""
+
+
+class Port(Protocol):
+    """An open port. BlockingIOError where nothing can be read or written now, another OSError where
+    it is broken."""
+
+    at_end: str
+    """What it means that `read` gave no bytes, in words."""
+
+    @property
+    def writable(self) -> bool:
+        """Whether there is anybody to write to."""
+
+    def fileno(self) -> int:
+        """The descriptor that a loop waits for."""
+
+    def read(self) -> bytes:
+        """What is waiting; no bytes at the end of the stream."""
+
+    def write(self, data: bytes | bytearray) -> int:
+        """How many bytes were taken."""
+
+    def changed(self) -> str:
+        """Why this is no longer what its name stands for; empty while it is."""
+
+    def set_baud(self, baud: int) -> None:
+        """Change the rate, where there is one."""
+
+    def close(self) -> None:
+        """Give it back, at once."""
+
+
+OpenPort = Callable[[str, int, Counter[str]], Port]
+"""Opens the port of a name at a baud rate, with the counters of its line; may take seconds, raises
+`OPEN_ERRORS`."""
+
+
+def open_serial(path: str, baud: int, counters: Counter[str]) -> Port:
+    """A serial device, and nothing else. Raises `OPEN_ERRORS`."""
+    return SerialPort(path, baud)
+
+
+class SerialPort:
+    """8 data bits, no parity, 1 stop bit, no flow control, raw bytes.
+
+    pyserial opens and configures it; reading and writing go straight to its descriptor, so that
+    every read is bounded and an end of file is seen as what it is.
+    """
+
+    at_end = "end of file, the device went away"
+    """VMIN is 1, so an idle line says EAGAIN: no bytes is a hang-up, and would be for ever."""
+    writable = True
+
+    def __init__(self, path: str, baud: int) -> None:
+        # exclusive is flock, not TIOCEXCL: the latter outlives a killed daemon while anybody else
+        # (a simulator on a pty) holds the terminal open. inter_byte_timeout 0 makes pyserial set
+        # VMIN 1, VTIME 0 (its default VMIN 0 gives no bytes both for idle and for end of file).
+        self._path = path
+        self._serial = serial.Serial(path, baud, timeout=0, exclusive=True, inter_byte_timeout=0)
+        with contextlib.suppress(ValueError):  # a pty or an adapter without the flag
+            self._serial.set_low_latency_mode(True)
+
+    def fileno(self) -> int:
+        return int(self._serial.fileno())
+
+    def read(self) -> bytes:
+        return os.read(self.fileno(), READ_BYTES)
+
+    def write(self, data: bytes | bytearray) -> int:
+        return os.write(self.fileno(), data)
+
+    def changed(self) -> str:
+        try:
+            if os.stat(self._path).st_rdev == os.fstat(self.fileno()).st_rdev:
+                return ""
+        except OSError:
+            pass
+        return f"{self._path} no longer names the device that was opened"
+
+    def set_baud(self, baud: int) -> None:
+        self._serial.baudrate = baud
+
+    def close(self) -> None:
+        with contextlib.suppress(*OPEN_ERRORS):
+            self._serial.reset_output_buffer()  # else close waits for a dead line, up to 30 s
+        self._serial.close()
