@@ -7,16 +7,18 @@ silent, and says in `status` whether the device is there and intelligible.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import Protocol
+from typing import Annotated, Protocol, Self
 
-from drivers.base import DriverStatus, Emit, Now, State, state_event
+from pydantic import Field, PositiveFloat, model_validator
+
+from drivers.base import DriverOptions, DriverStatus, Emit, Now, State, state_event
 from drivers.inputs import Inputs
-from drivers.measurements import Measurement, TimeReport
-from drivers.network_port import on_network, open_port
+from drivers.measurements import DeviceEvent, Measurement, TimeReport
+from drivers.network_port import PortName, on_network, open_port
+from drivers.ntrip.client import NtripClient, NtripOptions
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent
 from drivers.serial_line import SerialLine
 
@@ -31,6 +33,10 @@ class ReceiverDecoder(Protocol):
     """Bytes in, measurements out."""
 
     @property
+    def gga(self) -> bytes:
+        """The last GGA with a position, without its line end; empty before one."""
+
+    @property
     def epoch_open(self) -> bool:
         """Whether `silence` would close an epoch."""
 
@@ -41,20 +47,36 @@ class ReceiverDecoder(Protocol):
     def flush(self) -> Sequence[Measurement | RawEvent]: ...
 
 
+class ReceiverOptions(DriverOptions):
+    """Where the receiver is, and what is written to it."""
+
+    port: PortName
+    """A serial device, or an address of a network: see `docs/network.md`."""
+    baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
+    timeout_s: PositiveFloat = 5.0
+    """Without anything verified for this long the device is `silent`; five epochs at 1 Hz."""
+    ntrip: NtripOptions | None = None
+    """Corrections of a caster, written to the receiver."""
+
+    @model_validator(mode="after")
+    def _receiver_can_be_written_to(self) -> Self:
+        if self.ntrip is not None and self.port.startswith("gpsd://"):
+            raise ValueError("ntrip: nothing can be written to a receiver behind a gpsd")
+        return self
+
+
 class ReceiverDriver:
     """Reads the line. Who derives from it gives the decoder and the words of `status.detail`."""
 
     alive_by: tuple[str, ...] = ("sentences",)
     """Counters of which one must grow for the device to be `running`."""
 
-    def __init__(
-        self, name: str, port: str, baud: int, timeout_s: float, emit: Emit, now_ns: Now
-    ) -> None:
+    def __init__(self, name: str, options: ReceiverOptions, emit: Emit, now_ns: Now) -> None:
         self.name = name
         self.status = DriverStatus()
-        self._port = port
-        self._baud = baud
-        self._timeout_s = timeout_s
+        self._port = options.port
+        self._baud = options.baud
+        self._timeout_s = options.timeout_s
         self._emit = emit
         self.inputs = Inputs(now_ns)
         self.inputs.on("read", self._on_bytes)
@@ -63,11 +85,20 @@ class ReceiverDriver:
         self.inputs.on("silence", self._on_silence)
         self.inputs.on("watch", self._on_watch)
         self._now_ns = self.inputs.now_ns
-        self._line = SerialLine(port, baud, now_ns, open_port=open_port)
+        self._line = SerialLine(options.port, options.baud, now_ns, open_port=open_port)
         self._open = False
         self._why_closed = ""
         self.counters: Counter[str] = self._line.counters
         self._decoder = self._make_decoder()
+        self._ntrip: NtripClient | None = None
+        if options.ntrip is not None:
+            self._ntrip = NtripClient(
+                options.ntrip,
+                self.counters,
+                self._line.write,
+                lambda: self._decoder.gga,
+                self._corrections_changed,
+            )
         self._silence: asyncio.TimerHandle | None = None
         self._alive_ns = now_ns()
         """When the line opened or something on it last verified."""
@@ -96,13 +127,15 @@ class ReceiverDriver:
 
     async def run(self) -> None:
         """Serve the receiver until cancelled."""
-        watch = asyncio.create_task(self._watch())
-        try:
-            await self._line.run(self._read, partial(self.inputs.take, "open"), self._closed)
-        finally:
-            watch.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await watch
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._watch())
+            if self._ntrip is not None:
+                tasks.create_task(self._ntrip.run())
+            opened = partial(self.inputs.take, "open")
+            tasks.create_task(self._line.run(self._read, opened, self._closed))
+
+    def _corrections_changed(self, state: str, text: str) -> None:
+        self._emit(DeviceEvent(self.name, self._now_ns(), f"ntrip_{state}", text))
 
     # ------------------------------------------------------------------ the line and the timer
 
@@ -188,7 +221,7 @@ class ReceiverDriver:
 
     def _running_detail(self) -> str:
         if self._now_ns() - self._useful_ns < self._timeout_s * 1e9:
-            return ""
+            return self._ntrip.detail if self._ntrip is not None else ""
         return self._useless_detail()
 
     def _silent_detail(self) -> str:

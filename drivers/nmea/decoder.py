@@ -76,6 +76,8 @@ class NmeaDecoder:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self.refusal = ""
         """Why the last epoch was refused, by counter name; empty when it was not."""
+        self.gga = b""
+        """The last GGA with a position, without its line end; empty before one."""
         self._source = source
         self._decoding = decoding or NmeaDecoding()
         self._splitter = NmeaSplitter(self.counters)
@@ -140,6 +142,9 @@ class NmeaDecoder:
             self._group(sentence, t_seen_ns, found)
         except BadFieldError:
             self.counters["bad_field"] += 1
+            return
+        if sentence.formatter == "GGA" and sentence.fields[5:6] not in ((), ("",), ("0",)):
+            self.gga = sentence.raw
 
     def _group(self, sentence: Sentence, t_seen_ns: int, found: list[Measurement]) -> None:
         formatter, time_ns = sentence.formatter, time_of_day_ns(sentence)

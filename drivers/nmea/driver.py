@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
-
-from pydantic import Field, PositiveFloat
+from typing import ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
-from drivers.network_port import PortName
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.receiver import ReceiverDriver
+from drivers.receiver import ReceiverDriver, ReceiverOptions
 
 __all__ = ["NmeaDecoder", "NmeaDecoding", "NmeaDriver", "NmeaOptions"]
 
@@ -26,14 +23,8 @@ REFUSALS = {
 }
 
 
-class NmeaOptions(NmeaDecoding):
+class NmeaOptions(ReceiverOptions, NmeaDecoding):
     """Options of a `driver = "nmea"` source."""
-
-    port: PortName
-    """A serial device, or an address of a network: see `docs/network.md`."""
-    baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115200
-    timeout_s: PositiveFloat = 5.0
-    """Without a verified sentence for this long the device is `silent`; five epochs at 1 Hz."""
 
 
 class NmeaDriver(ReceiverDriver):
@@ -45,7 +36,7 @@ class NmeaDriver(ReceiverDriver):
         self, name: str, options: NmeaOptions, emit: Emit, now_ns: Now = monotonic_ns
     ) -> None:
         self._options = options
-        super().__init__(name, options.port, options.baud, options.timeout_s, emit, now_ns)
+        super().__init__(name, options, emit, now_ns)
 
     def _make_decoder(self) -> NmeaDecoder:
         self._nmea = NmeaDecoder(self.name, self._options, self.counters)

@@ -69,6 +69,11 @@ class GnssDecoder:
         return self._nmea.refusal
 
     @property
+    def gga(self) -> bytes:
+        """The last GGA with a position; empty before one."""
+        return self._nmea.gga
+
+    @property
     def epoch_open(self) -> bool:
         """Whether `silence` would close an epoch."""
         return self._nmea.epoch_open or (self._raw is not None and self._raw.epoch_open)
@@ -152,7 +157,7 @@ class GnssDriver(ReceiverDriver):
         if options.use_raw and options.rtcm:
             load_pyrtcm()
         self._options = options
-        super().__init__(name, options.port, options.baud, options.timeout_s, emit, now_ns)
+        super().__init__(name, options, emit, now_ns)
 
     def _make_decoder(self) -> GnssDecoder:
         options = self._options

@@ -37,7 +37,7 @@ def test_configuration_is_accepted_with_every_option() -> None:
     commented_in = re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE)
     options = Config.model_validate(tomllib.loads(commented_in)).sources["gnss"].options
     assert set(options) == set(NmeaOptions.model_fields)
-    defaults = NmeaOptions(port=options["port"], last_sentence="GST")
+    defaults = NmeaOptions(port=options["port"], last_sentence="GST", ntrip=options["ntrip"])
     assert NmeaOptions.model_validate(options) == defaults
 
 

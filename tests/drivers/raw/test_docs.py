@@ -42,7 +42,9 @@ def test_configuration_is_accepted_with_every_option() -> None:
     options = tomllib.loads(commented_in)["sources"]["gnss"]
     del options["driver"]
     assert set(options) == set(GnssOptions.model_fields)
-    defaults = GnssOptions(port=options["port"], baud=460_800, last_sentence="GST")
+    defaults = GnssOptions(
+        port=options["port"], baud=460_800, last_sentence="GST", ntrip=options["ntrip"]
+    )
     assert GnssOptions.model_validate(options) == defaults
 
 

@@ -1,0 +1,1 @@
+"""Corrections of an NTRIP caster, written to the receiver: see `docs/network.md`."""

@@ -1,0 +1,192 @@
+"""The client of an NTRIP caster: keeps the corrections coming, and hands on what is whole.
+
+Of what the caster sends only RTCM 3 frames whose checksum is right go on, each as a whole, so that
+nothing that was torn or means something else to the receiver gets to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections import Counter
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from drivers.base import Backoff, DriverOptions
+from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.ntrip.reply import CasterRefusedError, CasterReply, request
+
+PASSWORD_VARIABLE = "FUSIOND_NTRIP_PASSWORD"
+DEFAULT_PORT = 2101
+"""IANA's for ntrip-caster."""
+CONNECT_S = 10.0
+SILENT_S = 20.0
+"""A caster sends every second. Receivers use a correction for 60 s (u-blox
+CFG-NAVSPG-CONSTR_DGNSSTO): time for two more attempts before RTK is lost."""
+GGA_S = 10.0
+"""Network casters ask for a position every 5 to 60 s; ten seconds at 30 m/s are 300 m of a
+network's 30 km."""
+READ_BYTES = 4096
+FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0
+"""Casters lock out whom they see too often: most allow an attempt a minute for ever."""
+
+NtripState = Literal["starting", "waiting", "running", "lost", "refused"]
+
+
+class NtripOptions(DriverOptions):
+    """Section `ntrip` of a receiver: whose corrections it gets."""
+
+    caster: Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]+(:\d{1,5})?$")]
+    """HOST or HOST:PORT."""
+    mountpoint: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.+-]{1,100}$")]
+    user: str = ""
+    """Its password is in the environment, FUSIOND_NTRIP_PASSWORD."""
+    send_gga: bool = False
+    """Send the receiver's own position up: for mountpoints that make corrections for a place."""
+
+    @field_validator("user")
+    @classmethod
+    def _one_line(cls, user: str) -> str:
+        if ":" in user or not user.isprintable():
+            raise ValueError("a user has no colon and no line end (RFC 7617)")
+        return user
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port."""
+        host, _, port = self.caster.partition(":")
+        return host, int(port or DEFAULT_PORT)
+
+
+class _Frames:
+    """The RTCM 3 frames of a stream, and counters of what else it holds."""
+
+    def __init__(self, counters: Counter[str]) -> None:
+        self._counters = counters
+        self._of_stream: Counter[str] = Counter()
+        self._splitter = StreamSplitter(self._of_stream)
+
+    def feed(self, data: bytes) -> list[bytes]:
+        items = self._splitter.feed(data)
+        frames = [i.raw for i in items if isinstance(i, Frame) and i.kind == "rtcm"]
+        self._counters["ntrip_frames"] += len(frames)
+        self._counters["ntrip_not_rtcm"] += len(items) - len(frames)
+        self._counters["ntrip_damaged"] += self._of_stream.pop("rtcm_damaged", 0)
+        self._counters["ntrip_garbage_bytes"] += self._of_stream.pop("garbage_bytes", 0)
+        return frames
+
+
+class NtripClient:
+    """Runs until cancelled. `write(frame)` takes a frame to the receiver, False where it cannot;
+    `gga()` gives the receiver's last position as a sentence, empty without one; `on_state(state,
+    text)` hears when the state has changed.
+
+    `counters`: `ntrip_connected`, `ntrip_failed` (attempts that brought no corrections, and
+    connections that ended), `ntrip_bytes`, `ntrip_frames`, `ntrip_damaged` (frames whose checksum
+    is wrong), `ntrip_not_rtcm` (other sound messages), `ntrip_garbage_bytes`,
+    `ntrip_write_refused` (the receiver's line was closed or congested), `ntrip_gga_sent`.
+    """
+
+    def __init__(
+        self,
+        options: NtripOptions,
+        counters: Counter[str],
+        write: Callable[[bytes], bool],
+        gga: Callable[[], bytes],
+        on_state: Callable[[NtripState, str], None],
+        backoff: Backoff | None = None,
+    ) -> None:
+        self.state: NtripState = "starting"
+        self.detail = ""
+        """Why there are no corrections; empty while they come."""
+        self._options = options
+        self._counters = counters
+        self._write = write
+        self._gga = gga
+        self._on_state = on_state
+        self._backoff = backoff or Backoff(FIRST_WAIT_S, LONGEST_WAIT_S)
+        self._where = f"{options.caster}/{options.mountpoint}"
+
+    async def run(self) -> None:
+        """Fetch corrections for ever, with longer and longer waits where there are none."""
+        while True:
+            try:
+                await self._position_known()
+                await self._fetch()
+            except CasterRefusedError as error:
+                self._set_state("refused", str(error))
+            except OSError as error:
+                self._set_state("lost", error.strerror or str(error))
+            except EOFError:
+                self._set_state("lost", "the caster closed the connection")
+            self._counters["ntrip_failed"] += 1
+            await asyncio.sleep(self._backoff.next())
+
+    async def _position_known(self) -> None:
+        """A caster that makes corrections for a place closes, or is silent, until it knows it."""
+        while self._options.send_gga and not self._gga():
+            self._set_state("waiting", "the receiver has no position to send to the caster yet")
+            await asyncio.sleep(FIRST_WAIT_S)
+
+    async def _fetch(self) -> None:
+        """One connection, to its end, which is an exception."""
+        host, port = self._options.address
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                reader, writer = await asyncio.open_connection(host, port)
+        except TimeoutError:
+            raise OSError(f"no connection in {CONNECT_S:g} s") from None
+        upward: asyncio.Task[None] | None = None
+        try:
+            password = os.environ.get(PASSWORD_VARIABLE, "")
+            o = self._options
+            writer.write(request(host, port, o.mountpoint, o.user, password))
+            self._counters["ntrip_connected"] += 1
+            if o.send_gga:
+                upward = asyncio.create_task(self._send_positions(writer))
+            await self._read(reader)
+        finally:
+            if upward is not None:
+                upward.cancel()
+                await asyncio.gather(upward, return_exceptions=True)
+            writer.transport.abort()  # nothing of ours is worth waiting for
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        reply, stream = CasterReply(), _Frames(self._counters)
+        loop = asyncio.get_running_loop()
+        began_s: float | None = None
+        try:
+            async with asyncio.timeout(SILENT_S) as silence:
+                while data := await reader.read(READ_BYTES):
+                    self._counters["ntrip_bytes"] += len(data)
+                    frames = stream.feed(reply.feed(data))
+                    if not frames:
+                        continue
+                    now_s = loop.time()
+                    silence.reschedule(now_s + SILENT_S)
+                    began_s = now_s if began_s is None else began_s
+                    if now_s - began_s > LONGEST_WAIT_S:  # else one that closes at once is hammered
+                        self._backoff.reset()
+                    self._set_state("running", "")
+                    for frame in frames:
+                        self._counters["ntrip_write_refused"] += not self._write(frame)
+                raise EOFError
+        except TimeoutError:
+            if not silence.expired():
+                raise
+            raise OSError(f"nothing for {SILENT_S:g} s") from None
+
+    async def _send_positions(self, writer: asyncio.StreamWriter) -> None:
+        while True:
+            writer.write(self._gga() + b"\r\n")
+            self._counters["ntrip_gga_sent"] += 1
+            await asyncio.sleep(GGA_S)
+
+    def _set_state(self, state: NtripState, why: str) -> None:
+        changed = state != self.state
+        self.state = state
+        self.detail = f"no corrections of {self._where}: {why}" if why else ""
+        if changed:
+            self._on_state(state, self.detail or f"corrections of {self._where}")

@@ -1,0 +1,120 @@
+"""NTRIP on the wire: the request, and the caster's answer taken apart. No I/O, no clock.
+
+NTRIP 1.0 (RTCM 10410.0) answers `ICY 200 OK`, and the corrections follow; NTRIP 2.0 (RTCM 10410.1)
+is HTTP/1.1, as a rule in chunks (RFC 9112, section 7.1). A mountpoint that the caster lacks is
+answered by 1.0 with the table of those it has, by 2.0 with 404.
+"""
+
+from __future__ import annotations
+
+import base64
+
+HEADER_BYTES = 8192
+"""A longer head is none: the limit of most HTTP servers."""
+_SIZE_LINE_BYTES = 64
+_SOURCE_TABLE = "gnss/sourcetable"
+
+
+class CasterRefusedError(Exception):
+    """The caster gives no corrections: why, in words."""
+
+
+def request(host: str, port: int, mountpoint: str, user: str, password: str) -> bytes:
+    """What asks for a mountpoint; a caster that knows 1.0 alone overlooks what it does not know."""
+    lines = [
+        f"GET /{mountpoint} HTTP/1.1",
+        f"Host: {host}:{port}",
+        "Ntrip-Version: Ntrip/2.0",
+        "User-Agent: NTRIP fusiond",  # 1.0 serves only those whose name begins so
+        "Connection: close",
+    ]
+    if user:
+        secret = base64.b64encode(f"{user}:{password}".encode()).decode("ascii")
+        lines.append(f"Authorization: Basic {secret}")
+    return "\r\n".join((*lines, "", "")).encode("utf-8")
+
+
+class CasterReply:
+    """`feed` bytes off the connection, get the corrections among them.
+
+    Raises CasterRefusedError where the answer is another than corrections, EOFError where the
+    caster says that they have ended.
+    """
+
+    def __init__(self) -> None:
+        self.accepted = False
+        self._buffer = bytearray()
+        self._chunked = False
+        self._left = 0
+        """Bytes of the chunk that have not come, its closing CR LF included."""
+
+    def feed(self, data: bytes) -> bytes:
+        """The corrections that `data` brings."""
+        self._buffer += data
+        if not self.accepted and not self._head():
+            return b""
+        if self._chunked:
+            return self._chunks()
+        found = bytes(self._buffer)
+        self._buffer.clear()
+        return found
+
+    def _head(self) -> bool:
+        """Take the head off the buffer; whether it is whole."""
+        ends = b"\r\n" if self._buffer.startswith(b"ICY ") else b"\r\n\r\n"
+        head, found, rest = bytes(self._buffer).partition(ends)
+        if len(head) > HEADER_BYTES:
+            raise CasterRefusedError("no answer of a caster: its head does not end")
+        first = head.partition(b"\r\n")[0].decode("latin-1")
+        if first.startswith("SOURCETABLE"):
+            raise CasterRefusedError("no such mountpoint: the caster answers with its table")
+        if not found:
+            return False
+        _judge(first, head)
+        self._chunked = b"transfer-encoding: chunked" in head.lower()
+        self.accepted = True
+        self._buffer = bytearray(rest)
+        return True
+
+    def _chunks(self) -> bytes:
+        found = bytearray()
+        while self._buffer:
+            if self._left:
+                taken = self._buffer[: self._left]
+                del self._buffer[: len(taken)]
+                payload = max(0, self._left - 2)
+                found += taken[:payload]
+                self._left -= len(taken)
+                continue
+            line, ends, rest = bytes(self._buffer).partition(b"\r\n")
+            if not ends:
+                if len(line) > _SIZE_LINE_BYTES:
+                    raise CasterRefusedError("a chunk of the answer has no size")
+                break
+            try:
+                size = int(line.partition(b";")[0], 16)
+            except ValueError:
+                size = -1
+            if size < 0:
+                raise CasterRefusedError("a chunk of the answer has no size")
+            if size == 0:
+                raise EOFError
+            self._left = size + 2
+            self._buffer = bytearray(rest)
+        return bytes(found)
+
+
+def _judge(first: str, head: bytes) -> None:
+    """Whether corrections follow on a head that begins with the line `first`."""
+    protocol, _, status = first.partition(" ")
+    code = status.partition(" ")[0]
+    if protocol != "ICY" and not protocol.startswith("HTTP/1."):
+        raise CasterRefusedError(f"no answer of a caster: {first[:80]!r}")
+    if code == "401":
+        raise CasterRefusedError("user or password is wrong (401)")
+    if code == "404":
+        raise CasterRefusedError("no such mountpoint (404)")
+    if code != "200":
+        raise CasterRefusedError(f"the caster says {status[:80]!r}")
+    if _SOURCE_TABLE in head.decode("latin-1").lower():
+        raise CasterRefusedError("no such mountpoint: the caster answers with its table")
