@@ -116,7 +116,9 @@ class NtripClient:
                 await self._position_known()
                 await self._fetch()
             except CasterRefusedError as error:
-                self._set_state("refused", str(error))
+                asked = self._options.user and PASSWORD_VARIABLE not in os.environ
+                hint = f"; {PASSWORD_VARIABLE} is not set" if asked else ""
+                self._set_state("refused", f"{error}{hint}")
             except OSError as error:
                 self._set_state("lost", error.strerror or str(error))
             except EOFError:

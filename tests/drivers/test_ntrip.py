@@ -203,7 +203,10 @@ async def test_corrections_reach_the_receiver_whole_and_nothing_else_does(
     assert vehicle.counters["rtcm_frames"] == 0  # the receiver's own frames are another matter
 
 
-async def test_why_there_are_none_is_said_and_it_is_tried_again(device: Device) -> None:
+async def test_why_there_are_none_is_said_and_it_is_tried_again(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FUSIOND_NTRIP_PASSWORD", raising=False)
     caster = Caster(b"HTTP/1.1 401 Unauthorized\r\n\r\n")
     vehicle = Vehicle(device, caster.options(user="vehicle"))
     async with caster.up(), at_work(vehicle.driver.run()):
@@ -212,7 +215,8 @@ async def test_why_there_are_none_is_said_and_it_is_tried_again(device: Device) 
         await until(lambda: vehicle.driver.status.state == "running")
         where = f"no corrections of localhost:{caster.port}/VRS3"
         await until(lambda: bool(vehicle.driver.status.detail))
-        assert vehicle.driver.status.detail == f"{where}: user or password is wrong (401)"
+        why = "user or password is wrong (401); FUSIOND_NTRIP_PASSWORD is not set"
+        assert vehicle.driver.status.detail == f"{where}: {why}"
         caster.answer = ICY + FRAMES[0]
         await until(lambda: vehicle.got(FRAMES[0]))
     assert [code for code, _ in vehicle.events] == ["ntrip_refused", "ntrip_running"]
