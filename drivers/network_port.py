@@ -82,7 +82,7 @@ def open_port(name: str, baud: int, counters: Counter[str]) -> Port:
     try:
         if parts.scheme == "udp":
             return UdpPort(parts.hostname, number, counters)
-        connection = _connect(str(parts.hostname), number)
+        connection = connect(str(parts.hostname), number)
         if parts.scheme == "tcp":
             return TcpPort(connection)
         return GpsdPort(connection, parts.path.rstrip("/"))
@@ -90,7 +90,8 @@ def open_port(name: str, baud: int, counters: Counter[str]) -> Port:
         raise OSError(f"{name}: {error.strerror or error}") from error
 
 
-def _connect(host: str, number: int) -> socket.socket:
+def connect(host: str, number: int) -> socket.socket:
+    """A TCP connection that notices when its far end is gone. Blocks; OSError."""
     connection = socket.create_connection((host, number), CONNECT_S)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in KEEPALIVE.items():

@@ -8,7 +8,9 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 
+from drivers.aside import aside
 from drivers.base import Backoff, Now, monotonic_ns
 from drivers.port import OPEN_ERRORS, READ_BYTES, OpenPort, Port, open_serial
 
@@ -115,14 +117,8 @@ class SerialLine:
 
     async def _open(self) -> Port:
         """Open in a thread: a USB adapter in trouble holds `open` for seconds, a network too."""
-        opening = asyncio.ensure_future(
-            asyncio.to_thread(self._open_port, self.port, self.baud, self.counters)
-        )
-        try:
-            return await asyncio.shield(opening)
-        except asyncio.CancelledError:
-            opening.add_done_callback(_close_late)
-            raise
+        opening = partial(self._open_port, self.port, self.baud, self.counters)
+        return await aside(opening, lambda port: port.close())
 
     async def _serve(self, port: Port, on_bytes: Callable[[bytes, int], None]) -> str:
         """Read until the device is gone; why, in words."""
@@ -194,8 +190,3 @@ class SerialLine:
         self._gone = None
         self._pending.clear()
         self.counters["closed"] += 1
-
-
-def _close_late(opening: asyncio.Future[Port]) -> None:
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()

@@ -10,18 +10,20 @@ import asyncio
 import os
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
+from drivers.aside import aside
 from drivers.base import Backoff, DriverOptions
+from drivers.network_port import connect
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.ntrip.reply import CasterRefusedError, CasterReply, request
 
 PASSWORD_VARIABLE = "FUSIOND_NTRIP_PASSWORD"
 DEFAULT_PORT = 2101
 """IANA's for ntrip-caster."""
-CONNECT_S = 10.0
 SILENT_S = 20.0
 """A caster sends every second. Receivers use a correction for 60 s (u-blox
 CFG-NAVSPG-CONSTR_DGNSSTO): time for two more attempts before RTK is lost."""
@@ -135,11 +137,8 @@ class NtripClient:
     async def _fetch(self) -> None:
         """One connection, to its end, which is an exception."""
         host, port = self._options.address
-        try:
-            async with asyncio.timeout(CONNECT_S):
-                reader, writer = await asyncio.open_connection(host, port)
-        except TimeoutError:
-            raise OSError(f"no connection in {CONNECT_S:g} s") from None
+        connected = await aside(partial(connect, host, port), lambda late: late.close())
+        reader, writer = await asyncio.open_connection(sock=connected)
         upward: asyncio.Task[None] | None = None
         try:
             password = os.environ.get(PASSWORD_VARIABLE, "")
@@ -164,16 +163,17 @@ class NtripClient:
                 while data := await reader.read(READ_BYTES):
                     self._counters["ntrip_bytes"] += len(data)
                     frames = stream.feed(reply.feed(data))
-                    if not frames:
-                        continue
-                    now_s = loop.time()
-                    silence.reschedule(now_s + SILENT_S)
-                    began_s = now_s if began_s is None else began_s
-                    if now_s - began_s > LONGEST_WAIT_S:  # else one that closes at once is hammered
-                        self._backoff.reset()
-                    self._set_state("running", "")
+                    if frames:
+                        now_s = loop.time()
+                        silence.reschedule(now_s + SILENT_S)
+                        began_s = now_s if began_s is None else began_s
+                        if now_s - began_s > LONGEST_WAIT_S:  # else who closes at once is hammered
+                            self._backoff.reset()
+                        self._set_state("running", "")
                     for frame in frames:
                         self._counters["ntrip_write_refused"] += not self._write(frame)
+                    if reply.over is not None:
+                        raise reply.over
                 raise EOFError
         except TimeoutError:
             if not silence.expired():

@@ -8,10 +8,12 @@ answered by 1.0 with the table of those it has, by 2.0 with 404.
 from __future__ import annotations
 
 import base64
+import re
 
 HEADER_BYTES = 8192
 """A longer head is none: the limit of most HTTP servers."""
 _SIZE_LINE_BYTES = 64
+_HEXADECIMAL = re.compile(rb"[0-9A-Fa-f]{1,8}")
 _SOURCE_TABLE = "gnss/sourcetable"
 
 
@@ -37,12 +39,14 @@ def request(host: str, port: int, mountpoint: str, user: str, password: str) -> 
 class CasterReply:
     """`feed` bytes off the connection, get the corrections among them.
 
-    Raises CasterRefusedError where the answer is another than corrections, EOFError where the
-    caster says that they have ended.
+    Raises CasterRefusedError where the answer is another than corrections.
     """
 
     def __init__(self) -> None:
         self.accepted = False
+        self.over: EOFError | CasterRefusedError | None = None
+        """Why no more corrections follow on those that came: the caster ended them, or its chunks
+        make no sense."""
         self._buffer = bytearray()
         self._chunked = False
         self._left = 0
@@ -63,7 +67,7 @@ class CasterReply:
         """Take the head off the buffer; whether it is whole."""
         ends = b"\r\n" if self._buffer.startswith(b"ICY ") else b"\r\n\r\n"
         head, found, rest = bytes(self._buffer).partition(ends)
-        if len(head) > HEADER_BYTES:
+        if len(head) > HEADER_BYTES + (0 if found else len(ends) - 1):
             raise CasterRefusedError("no answer of a caster: its head does not end")
         first = head.partition(b"\r\n")[0].decode("latin-1")
         if first.startswith("SOURCETABLE"):
@@ -78,7 +82,7 @@ class CasterReply:
 
     def _chunks(self) -> bytes:
         found = bytearray()
-        while self._buffer:
+        while self._buffer and self.over is None:
             if self._left:
                 taken = self._buffer[: self._left]
                 del self._buffer[: len(taken)]
@@ -88,20 +92,26 @@ class CasterReply:
                 continue
             line, ends, rest = bytes(self._buffer).partition(b"\r\n")
             if not ends:
-                if len(line) > _SIZE_LINE_BYTES:
-                    raise CasterRefusedError("a chunk of the answer has no size")
+                if len(line) <= _SIZE_LINE_BYTES:
+                    break
+                size = None
+            else:
+                size = _size(line)
+            if not size:
+                no_size = CasterRefusedError("a chunk of the answer has no size")
+                self.over = no_size if size is None else EOFError()
                 break
-            try:
-                size = int(line.partition(b";")[0], 16)
-            except ValueError:
-                size = -1
-            if size < 0:
-                raise CasterRefusedError("a chunk of the answer has no size")
-            if size == 0:
-                raise EOFError
             self._left = size + 2
             self._buffer = bytearray(rest)
         return bytes(found)
+
+
+def _size(line: bytes) -> int | None:
+    """What a chunk's first line says; None where that is no size."""
+    digits = line.partition(b";")[0].strip()
+    if len(line) > _SIZE_LINE_BYTES or not _HEXADECIMAL.fullmatch(digits):
+        return None
+    return int(digits, 16)
 
 
 def _judge(first: str, head: bytes) -> None:

@@ -25,6 +25,7 @@ from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.nmea.running_checks import crc24q
+from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawGnssEpoch
@@ -181,6 +182,27 @@ def words(data: bytes) -> None:
         _check_raw(events)
 
 
+# --------------------------------------------------------------------------- NTRIP
+
+
+def _answer(pieces: Iterator[bytes]) -> tuple[bytes, type[Exception] | None]:
+    reply, found = CasterReply(), bytearray()
+    try:
+        for piece in pieces:
+            found += reply.feed(piece)
+    except CasterRefusedError:
+        return bytes(found), CasterRefusedError
+    return bytes(found), None if reply.over is None else type(reply.over)
+
+
+def ntrip(data: bytes) -> None:
+    """A caster's answer: the same corrections and the same end for any split."""
+    choice, stream = _input(data)
+    whole = _answer(iter((stream,)))
+    assert whole == _answer(_pieces(choice, stream))
+    assert len(whole[0]) <= len(stream)
+
+
 # --------------------------------------------------------------------------- RDSS
 
 
@@ -333,5 +355,5 @@ def csv(data: bytes) -> None:
 
 TARGETS: dict[str, Callable[[bytes], None]] = {
     one.__name__: one
-    for one in (splitter, nmea, raw, words, rdss_binary, rdss_text, can, commands, csv)
+    for one in (splitter, nmea, raw, words, rdss_binary, rdss_text, can, commands, csv, ntrip)
 }
