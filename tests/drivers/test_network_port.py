@@ -24,7 +24,7 @@ from drivers.serial_line import SerialLine
 from fusiond.doctor.devices import open_findings
 from tests.broker import free_port
 from tests.drivers.nmea.sentences import gga, rmc
-from tests.patience import until
+from tests.patience import PATIENCE_S, until
 from tests.pty_device import Device
 
 
@@ -243,7 +243,7 @@ async def test_the_bytes_of_a_real_gpsd(tmp_path: Path) -> None:
     second = 0
     try:
         async with running(f"gpsd://127.0.0.1:{port}{terminal}") as receiver:
-            async with asyncio.timeout(60.0):
+            async with asyncio.timeout(PATIENCE_S):
                 while receiver.fixes < 3:
                     second += 1
                     device.send(gga(second % 60) + rmc(second % 60))
