@@ -14,7 +14,16 @@ from typing import Annotated
 
 import typer
 
-from fusiond.commands import configure, dashboard, live, offline, recordings, reporting, research
+from fusiond.commands import (
+    batch,
+    configure,
+    dashboard,
+    live,
+    offline,
+    recordings,
+    reporting,
+    research,
+)
 from fusiond.commands.status import status
 
 app = typer.Typer(
@@ -58,6 +67,7 @@ for command in (
     *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor, status),
     *(recordings.replay, reporting.report),
     *(offline.process, offline.calibrate, offline.simulate, offline.compare),
+    batch.batch,
     *(research.schema, research.study, research.model, research.bench),
 ):
     app.command()(command)

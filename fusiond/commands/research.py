@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fusiond.commands.batch import ClusterAddress, Timeout, Workers, runner_of
 from fusiond.commands.compiling import compiling
 from fusiond.commands.shared import (
+    EXIT_DATA,
     EXIT_UNAVAILABLE,
     JsonPath,
     config_errors,
@@ -20,6 +25,12 @@ from fusiond.commands.shared import (
     write_json,
 )
 from fusiond.studies import ABOUT, STUDIES
+
+if TYPE_CHECKING:
+    from fusiond.studies.monte_carlo import Lost
+
+FEWEST_RUNS = 8
+"""A worker loads its kernels for some two seconds, in which a study makes several runs."""
 
 
 def schema(
@@ -36,6 +47,9 @@ def study(
     runs: Annotated[
         int | None, typer.Option(min=2, help="Monte Carlo runs; the study's own by default.")
     ] = None,
+    workers: Workers = None,
+    cluster: ClusterAddress = None,
+    timeout: Timeout = None,
     json_path: JsonPath = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="F.png", help="Draw the result (needs matplotlib).")
@@ -52,8 +66,15 @@ def study(
         raise typer.Exit(EXIT_UNAVAILABLE)
     with compiling():
         module = import_module(STUDIES[name])
-    with progress_bar(name) as progress:
+    with (
+        _runs(runs or ABOUT[name].runs, workers, cluster, timeout) as lost,
+        progress_bar(name) as progress,
+    ):
         result = module.run(runs, progress=progress)
+    if lost:
+        result["lost_runs"] = [asdict(run) for run in lost]
+        for run in lost:
+            typer.echo(f"fusiond: run {run.number} {run.ended}: {run.reason}", err=True)
     if json_path != "-":
         from fusiond.commands.study_report import print_study  # noqa: PLC0415
 
@@ -68,6 +89,25 @@ def study(
 study.__doc__ = f"{study.__doc__}\n\n\b\n" + "\n".join(
     f"{name} ({about.runs} runs)\n    {about.text}" for name, about in ABOUT.items()
 )
+
+
+@contextmanager
+def _runs(
+    runs: int, workers: int | None, cluster: str | None, timeout_s: float | None
+) -> Iterator[Sequence[Lost]]:
+    """Where runs are made: here, if they are so few that workers would not be warm before their
+    end, and nobody asked for any."""
+    if runs < FEWEST_RUNS and workers is None and cluster is None and timeout_s is None:
+        yield ()
+        return
+    from fusiond.studies.monte_carlo import RunsLostError, runs_on  # noqa: PLC0415
+
+    try:
+        with runner_of(workers, cluster, timeout_s) as runner, runs_on(runner) as lost:
+            yield lost
+    except RunsLostError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_DATA) from error
 
 
 def model(

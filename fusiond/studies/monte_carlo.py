@@ -1,21 +1,65 @@
-"""Monte Carlo runs: on processes, with their progress, and what NEES may be on average."""
+"""Monte Carlo runs: on processes, with their progress, and what NEES may be on average.
+
+A run draws from a generator of its own, made of the study's seed and the run's number, so that no
+result depends on who ran what, in which order, and on how many processes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from os import cpu_count
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 from scipy.stats import chi2
 
-WORKERS = 2
+from fusiond.workers.outcome import Runner
+
 TAIL = (1.0 - 0.95) / 2.0
 """Share of either side outside a 95 % interval."""
+MOST_AT_ONCE = 100
+"""Runs handed to a worker together: their hand-over is then no share of the time."""
+SHARES = 4
+"""Chunks a worker gets at least, where there are runs enough, so that all end at about one time."""
 
 Progress = Callable[[int, int], None]
 """Hears how many steps are done, and of how many."""
 R = TypeVar("R")
+T = TypeVar("T")
+
+
+class RunsLostError(Exception):
+    """So many runs gave no result that there is nothing to average."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A run without a result: its number, how it ended and why (`fusiond.workers.outcome`)."""
+
+    number: int
+    ended: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    runner: Runner
+    lost: list[Lost] = field(default_factory=list)
+
+
+_GIVEN: ContextVar[_Given | None] = ContextVar("runner of Monte Carlo runs", default=None)
+
+
+@contextmanager
+def runs_on(runner: Runner) -> Iterator[list[Lost]]:
+    """Have the runs of what is inside made by `runner`; the runs that it lost."""
+    given = _Given(runner)
+    token = _GIVEN.set(given)
+    try:
+        yield given.lost
+    finally:
+        _GIVEN.reset(token)
 
 
 def step_counter(progress: Progress | None, total: int) -> Callable[[], None]:
@@ -34,14 +78,41 @@ def step_counter(progress: Progress | None, total: int) -> Callable[[], None]:
 def on_processes(
     work: Callable[[int], R], runs: int, progress: Callable[[], None] | None = None
 ) -> list[R]:
-    """`work` of 0 to `runs` - 1, in order, on two processes where there are two processors."""
-    found = []
-    with ProcessPoolExecutor(min(WORKERS, cpu_count() or 1, runs)) as pool:
-        for result in pool.map(work, range(runs)):
-            found.append(result)
+    """`work` of 0 to `runs` - 1, in order: by the workers of `runs_on`, else in this process.
+
+    Workers leave out the runs that they lost. Raises `RunsLostError` if fewer than two are left.
+    """
+    return over(work, range(runs), progress)
+
+
+def over(
+    work: Callable[[T], R], items: Sequence[T], progress: Callable[[], None] | None = None
+) -> list[R]:
+    """`work` of each item, as `on_processes`."""
+    given = _GIVEN.get()
+    found: dict[int, R] = {}
+    if given is None:
+        for number, item in enumerate(items):
+            found[number] = work(item)
             if progress is not None:
                 progress()
-    return found
+        return list(found.values())
+    chunk = max(1, min(MOST_AT_ONCE, len(items) // (SHARES * given.runner.workers)))
+    before = len(given.lost)
+    for outcome in given.runner.outcomes(work, items, chunk):
+        if outcome.ended == "done":
+            found[outcome.index] = outcome.result  # type: ignore[assignment]  # None may be an R
+        else:
+            given.lost.append(Lost(outcome.index, outcome.ended, outcome.reason))
+        if progress is not None:
+            progress()
+    if len(found) < min(2, len(items)):
+        last = given.lost[-1]
+        raise RunsLostError(
+            f"{len(given.lost) - before} of {len(items)} runs lost; run {last.number}: "
+            f"{last.ended}: {last.reason}"
+        )
+    return [found[number] for number in sorted(found)]
 
 
 def nees_interval(runs: int, dof: int, tail: float = TAIL) -> list[float]:

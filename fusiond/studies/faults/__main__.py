@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from fusiond.studies.faults.library import ALL, FAULTS
 from fusiond.studies.faults.power import jobs, power_run
 from fusiond.studies.faults.runs import rows, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
+from fusiond.studies.monte_carlo import over, runs_on, step_counter
+from fusiond.workers.pool import Pool, processors
 
 
 def main() -> int:
@@ -27,7 +28,7 @@ def main() -> int:
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--workers", type=int, default=processors(), help="processes")
     parser.add_argument("--json", type=Path, metavar="F.json")
     parser.add_argument("--table", type=Path, metavar="F.md")
     parser.add_argument("--page", type=Path, metavar="F.md", help="put the table into this page")
@@ -58,13 +59,16 @@ def main() -> int:
 def _run(
     one: Callable[[Any], dict[str, Any]], wanted: Sequence[Any], workers: int
 ) -> list[dict[str, Any]]:
-    """`one` of each that is wanted."""
-    found = []
-    with ProcessPoolExecutor(min(workers, len(wanted))) as pool:
-        for k, row in enumerate(pool.map(one, wanted), 1):
-            found.append(row)
-            if sys.stderr.isatty():
-                print(f"\r{k}/{len(wanted)}", end="", file=sys.stderr, flush=True)
+    """`one` of each that is wanted; a row that is lost is said on standard error."""
+
+    def tell(done: int, total: int) -> None:
+        if sys.stderr.isatty():
+            print(f"\r{done}/{total}", end="", file=sys.stderr, flush=True)
+
+    with Pool(workers) as pool, runs_on(pool) as lost:
+        found = over(one, wanted, step_counter(tell, len(wanted)))
+    for run in lost:
+        print(f"row {run.number} {run.ended}: {run.reason}", file=sys.stderr)
     return found
 
 

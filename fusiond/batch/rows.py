@@ -1,0 +1,89 @@
+"""Rows of figures in a Parquet file that an interruption does not cost.
+
+A Parquet file is written whole. Until then each row is a line of JSON in `F.parquet.journal`, put
+there as soon as it is known; `RowFile` finds rows in both, so that a batch that was killed goes on
+where it was. The journal is removed once its rows are in the file.
+
+A row is flat: numbers, texts and truth values by name; rows need not have the same names. Nan and
+infinities, which JSON does not have, are no values here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from fusiond.files.csv_tables import MissingPackageError, TableError
+
+Row = dict[str, Any]
+COMPRESSION = "zstd"
+
+
+class RowFile:
+    """The rows of `path`, and those that are added. Close writes the file.
+
+    Raises `MissingPackageError` without pyarrow, `TableError` for what is no file of rows, OSError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._journal_path = path.with_name(f"{path.name}.journal")
+        _arrow()
+        self.rows = read_rows(path) if path.exists() else []
+        self.rows += _journal(self._journal_path)
+        self._journal = self._journal_path.open("a", encoding="utf-8")
+
+    def __enter__(self) -> RowFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._journal.close()
+        write_rows(self._path, self.rows)
+        self._journal_path.unlink()
+
+    def add(self, row: Row) -> None:
+        self._journal.write(json.dumps(row, allow_nan=False) + "\n")
+        self._journal.flush()
+        self.rows.append(row)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a Parquet file, without the names for which a row has nothing."""
+    arrow, parquet = _arrow()
+    try:
+        found = parquet.read_table(path).to_pylist()
+    except arrow.ArrowInvalid as error:
+        raise TableError(f"{path}: no Parquet file: {error}") from error
+    return [{name: value for name, value in row.items() if value is not None} for row in found]
+
+
+def write_rows(path: Path, rows: list[Row]) -> None:
+    """All rows, in place of what is there; a reader sees the old file or the new one."""
+    arrow, parquet = _arrow()
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    columns = {name: arrow.array([row.get(name) for row in rows]) for name in names}
+    unfinished = path.with_name(f"{path.name}.part")
+    parquet.write_table(arrow.table(columns), unfinished, compression=COMPRESSION)
+    os.replace(unfinished, path)
+
+
+def _journal(path: Path) -> list[Row]:
+    """Its rows but for a last line that was cut short, which is taken off the file."""
+    if not path.exists():
+        return []
+    data = path.read_bytes()
+    whole = data.rfind(b"\n") + 1
+    if whole < len(data):
+        os.truncate(path, whole)
+    return [json.loads(line) for line in data[:whole].splitlines()]
+
+
+def _arrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow  # noqa: PLC0415  (extra `[batch]`)
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError as error:
+        raise MissingPackageError("rows need pyarrow: pip install fusiond[batch]") from error
+    return pyarrow, parquet

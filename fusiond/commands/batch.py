@@ -1,0 +1,90 @@
+"""Command batch, and the workers that it shares with study."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fusiond.commands.compiling import compiling
+from fusiond.commands.shared import (
+    EXIT_DATA,
+    EXIT_UNAVAILABLE,
+    ConfigPath,
+    config_errors,
+    data_errors,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from fusiond.workers.outcome import Runner
+
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Processes; as many as there are processors by default.")
+]
+ClusterAddress = Annotated[
+    str | None,
+    typer.Option("--cluster", metavar="ADDRESS", help="Of a Dask scheduler, such as tcp://h:8786."),
+]
+Timeout = Annotated[
+    float | None, typer.Option(metavar="S", min=0.001, help="Longest time that a run may take.")
+]
+
+
+@contextmanager
+def runner_of(
+    workers: int | None, cluster: str | None, timeout_s: float | None
+) -> Iterator[Runner]:
+    """Processes here, or those of a cluster; exit 69 where there are none to be had."""
+    from fusiond.workers.cluster import Cluster, ClusterError  # noqa: PLC0415
+    from fusiond.workers.pool import Pool, PoolError, processors  # noqa: PLC0415
+
+    if workers is not None and cluster is not None:
+        raise typer.BadParameter("--workers or --cluster: a cluster has its own workers")
+    try:
+        if cluster is None:
+            with Pool(workers or processors(), timeout_s) as pool:
+                yield pool
+            return
+        with Cluster(cluster, timeout_s) as dask:
+            yield dask
+    except (PoolError, ClusterError) as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+
+
+def batch(
+    config: ConfigPath,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG...", help="A drive each: recording, CAN log or folder."),
+    ],
+    out: Annotated[Path, typer.Option(metavar="F.parquet", help="Where the rows are kept.")],
+    workers: Workers = None,
+    cluster: ClusterAddress = None,
+    timeout: Timeout = None,
+) -> None:
+    """Navigate through many drives, a row of figures each; goes on where it was stopped."""
+    with compiling():
+        from fusiond.batch.batch import run_batch  # noqa: PLC0415
+
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+
+    try:
+        with (
+            runner_of(workers, cluster, timeout) as runner,
+            config_errors(),
+            data_errors(),
+            progress_bar("drives") as bar,
+        ):
+            ended = run_batch(config, logs, out, runner, bar or (lambda done, total: None))
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    counts = ", ".join(f"{count} {how}" for how, count in ended.items() if count)
+    typer.echo(f"{out}: {counts}")
+    if not ended.get("done") and not ended["there"]:
+        raise typer.Exit(EXIT_DATA)

@@ -1,0 +1,42 @@
+"""What became of one run, and what runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Generic, Literal, Protocol, TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+Ended = Literal["done", "error", "died", "timeout"]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome(Generic[R]):
+    """Of item `index`: its result, or why there is none.
+
+    `error`: an exception left the run; `died`: its process ended; `timeout`: it took too long.
+    `reason` says more, and is empty for what is done.
+    """
+
+    index: int
+    ended: Ended
+    reason: str = ""
+    result: R | None = None
+
+
+class Runner(Protocol):
+    """Runs a function of each item on other processes. `workers` run at a time."""
+
+    @property
+    def workers(self) -> int: ...
+
+    def outcomes(
+        self, work: Callable[[T], R], items: Sequence[T], chunk: int = 1
+    ) -> Iterator[Outcome[R]]:
+        """One outcome an item, in the order in which they come.
+
+        `work` is a function of a module, or a partial of one; `chunk` items are handed over at
+        once. No failure of a run is raised.
+        """
+        ...
