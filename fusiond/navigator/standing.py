@@ -71,7 +71,7 @@ class Standing:
 
     def __init__(self, max_speed_m_s: float, wheeled: bool = False) -> None:
         self._max_speed, self._wheeled = max_speed_m_s, wheeled
-        self._turned_ns = NEVER_NS
+        self._turned_ns, self._turned = NEVER_NS, False
         self._trial_ns = 0
         self._started_ns = 0
         self._since_ns = 0
@@ -80,12 +80,12 @@ class Standing:
 
     def started(self, t_ns: int) -> None:
         """A navigation has begun."""
-        self._started_ns, self._turned_ns = t_ns, NEVER_NS
+        self._started_ns, self._turned_ns, self._turned = t_ns, NEVER_NS, False
 
     def turned(self, t_ns: int) -> None:
         """The gyros have felt a turn of a vehicle that stands."""
         if self._wheeled:
-            self._turned_ns = max(self._turned_ns, t_ns)
+            self._turned_ns, self._turned = max(self._turned_ns, t_ns), True
 
     def given_up(self, t_ns: int) -> None:
         """It was wrong: the next one is on trial."""
@@ -123,6 +123,8 @@ class Standing:
         self._changed = max(self._changed, abs(speed - self._from))
         if not self._trial_ns:
             self._fastest = max(self._fastest, speed)
+        if self._proven:  # a velocity that is left out an hour later says nothing of that turn
+            self._turned = False
 
     @property
     def _proven(self) -> bool:
@@ -148,7 +150,7 @@ class Standing:
             return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
         if self._trial_ns and not self._proven:
             return "after a failure, and no change of speed has proven it since"
-        if self._turned_ns > NEVER_NS and not self._proven:
+        if self._turned:
             return "a turn was felt at rest: a gyro is wrong, or the ground has turned"
         return isolation.contested(t_ns) or _askew(estimator)
 

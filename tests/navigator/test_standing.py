@@ -110,6 +110,8 @@ def test_a_turn_felt_at_rest_is_believed_once_the_vehicle_has_moved() -> None:
     nav[VN] = 0.0
     assert car.failure(11 * S, Isolation(), nav) is None
     assert car.shaken(at(11.0), Isolation()) is None
+    assert car.failure(12 * S, WithoutVelocity(), nav) is None
+    assert car.shaken(at(12.0), Isolation()) is None  # that turn is over
     car.turned(12 * S)
     car.started(13 * S)
     assert car.failure(13 * S, Isolation(), nav) is None
