@@ -23,6 +23,7 @@ from drivers.port import READ_BYTES
 from drivers.serial_line import SerialLine
 from fusiond.doctor.devices import open_findings
 from tests.broker import free_port
+from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import gga, rmc
 from tests.patience import PATIENCE_S, until
 from tests.pty_device import Device
@@ -56,14 +57,8 @@ class Receiver:
 @asynccontextmanager
 async def running(port: str, **options: Any) -> AsyncIterator[Receiver]:
     receiver = Receiver(port, **options)
-    task = asyncio.create_task(receiver.driver.run())
-    try:
+    async with at_work(receiver.driver.run()):
         yield receiver
-        assert not task.done()
-    finally:
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
 
 
 class SerialServer:

@@ -25,6 +25,7 @@ from drivers.ntrip.client import NtripClient, NtripOptions
 from drivers.ntrip.reply import HEADER_BYTES, CasterRefusedError, CasterReply
 from drivers.raw.driver import GnssOptions
 from tests.broker import free_port
+from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import gga, rmc
 from tests.drivers.raw.frames import rtcm
 from tests.patience import until
@@ -154,18 +155,6 @@ class Vehicle:
         with suppress(BlockingIOError):
             self.written += os.read(self.device.master, 65536)
         return bytes(self.written) == data
-
-
-@asynccontextmanager
-async def at_work(work: Any) -> AsyncIterator[None]:
-    task = asyncio.ensure_future(work)
-    try:
-        yield
-        assert not task.done()
-    finally:
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
 
 
 @pytest.fixture

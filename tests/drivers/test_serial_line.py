@@ -13,6 +13,7 @@ import pytest
 
 from drivers.base import Backoff
 from drivers.serial_line import PENDING_WRITE_BYTES, READ_BYTES, SerialLine
+from tests.drivers.at_work import at_work
 from tests.patience import until
 from tests.pty_device import Device
 
@@ -35,13 +36,8 @@ class Host:
 
 @asynccontextmanager
 async def running(host: Host) -> AsyncIterator[Host]:
-    task = asyncio.create_task(host.line.run(host.on_bytes, host.on_open, host.reasons.append))
-    try:
+    async with at_work(host.line.run(host.on_bytes, host.on_open, host.reasons.append)):
         yield host
-    finally:
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.driver import NmeaDriver, NmeaOptions
+from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import gga, made, rmc, wire
 from tests.patience import PATIENCE_S, until
 from tests.pty_device import Device
@@ -49,14 +50,8 @@ class Vehicle:
 
 @asynccontextmanager
 async def running(vehicle: Vehicle) -> AsyncIterator[Vehicle]:
-    task = asyncio.create_task(vehicle.driver.run())
-    try:
+    async with at_work(vehicle.driver.run()):
         yield vehicle
-        assert not task.done()
-    finally:
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
 
 
 @pytest.fixture

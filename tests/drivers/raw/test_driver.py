@@ -20,6 +20,7 @@ from drivers.nmea.decoder import NmeaDecoding
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.driver import GnssDecoder, GnssDriver, GnssOptions
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import gga, rmc
 from tests.drivers.raw.frames import d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
 from tests.patience import until
@@ -49,15 +50,9 @@ class Vehicle:
 
 @asynccontextmanager
 async def running(vehicle: Vehicle) -> AsyncIterator[Vehicle]:
-    task = asyncio.create_task(vehicle.driver.run())
-    try:
+    async with at_work(vehicle.driver.run()):
         await until(lambda: vehicle.driver.counters["opened"] == 1)
         yield vehicle
-        assert not task.done()
-    finally:
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
 
 
 @pytest.fixture
