@@ -38,6 +38,7 @@ from fusiond.clock import dates
 from fusiond.clock.answers import ClockStatus, Instant, TimeSample
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import (
+    KERNEL_FUTURE_NS,
     MILLISECOND_NS,
     SECOND_NS,
     HostTime,
@@ -50,7 +51,6 @@ from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown
 from fusiond.configuration.schema import ClockOptions
 
 _KERNEL_MAX_AGE_NS = SECOND_NS
-_KERNEL_FUTURE_NS = MILLISECOND_NS
 _UTC_MAX_AGE_NS = 10 * SECOND_NS
 """The timeline's least history: a UTC stamp older than that by another's UTC says that one of the
 two is wrong."""
@@ -183,19 +183,10 @@ class Clock:
 
     def _from_kernel(self, stamp: KernelStamp, t_seen_ns: int) -> Instant:
         latency_ns = round(stamp.latency_s * SECOND_NS)
-        t_ns = stamp.realtime_ns - self.look()
-        # After a step, frames stamped before it are still queued: of the two readings that one
-        # is right which is the younger without lying in the future.
-        before = self._system.before_step_ns
-        if before is not None:
-            other = stamp.realtime_ns - before
-            ages = [(t_seen_ns - t, t) for t in (t_ns, other)]
-            possible = [age for age in ages if age[0] >= -_KERNEL_FUTURE_NS]
-            chosen = min(possible)[1] if possible else t_ns
-            self.counters["kernel_stamp_remapped"] += chosen != t_ns
-            t_ns = chosen
+        self.look()
+        t_ns = self._system.monotonic_of(stamp.realtime_ns, t_seen_ns)
         age_ns = t_seen_ns - t_ns
-        if age_ns < -_KERNEL_FUTURE_NS:
+        if age_ns < -KERNEL_FUTURE_NS:
             self.counters["kernel_stamp_future"] += 1
         elif age_ns > _KERNEL_MAX_AGE_NS:
             self.counters["kernel_stamp_old"] += 1

@@ -17,6 +17,9 @@ from typing import Literal, Protocol
 
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
+KERNEL_FUTURE_NS = MILLISECOND_NS
+"""What the kernel stamps has happened: no stamp lies further ahead than the two clocks' readings
+are apart."""
 
 _STEP_NS = MILLISECOND_NS
 """NTP slews at 500 ppm at most (adjtimex(2)); with 1000 ppm and 1 ms allowed the rest are steps."""
@@ -147,6 +150,21 @@ class SystemClock:
             self.held_ns = offset
         self._sampled_ns, self.offset_ns = now, offset
         return offset
+
+    def monotonic_of(self, realtime_ns: int, t_seen_ns: int) -> int:
+        """The monotonic instant (ns) of a frame that the kernel stamped, seen at `t_seen_ns`.
+
+        After a step, frames stamped before it are still queued: of the two readings that one is
+        right which is the younger without lying in the future. Counter: `kernel_stamp_remapped`.
+        """
+        t_ns = realtime_ns - self.offset_ns
+        if self.before_step_ns is None:
+            return t_ns
+        ages = [(t_seen_ns - t, t) for t in (t_ns, realtime_ns - self.before_step_ns)]
+        possible = [age for age in ages if age[0] >= -KERNEL_FUTURE_NS]
+        chosen = min(possible)[1] if possible else t_ns
+        self._counters["kernel_stamp_remapped"] += chosen != t_ns
+        return chosen
 
     def state(self) -> dict[str, int | None]:
         """All that it knows, for `restore`."""
