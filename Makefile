@@ -34,21 +34,24 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 # Of the packages little is ever imported: that is compiled when it is, not all of it here. The lock
-# of the tools holds all of the other in the same versions.
-$(RUNTIME) $(STAMP): pyproject.toml | $(BIN)/python
+# of the tools holds all of the other in the same versions, and leaves what is there alone.
+$(RUNTIME): pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing locked dependencies and fusiond into $(VENV)"
-	$(PIP) install --quiet --no-compile --require-hashes -r $(filter %.lock,$^)
+	$(PIP) install --quiet --no-compile --require-hashes -r requirements.lock
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
-	@touch $(RUNTIME) $@
-$(RUNTIME): requirements.lock
-$(STAMP): requirements-dev.lock
+	@touch $@
+
+$(STAMP): requirements-dev.lock $(RUNTIME)
+	@echo "installing the tools of developers into $(VENV)"
+	$(PIP) install --quiet --no-compile --require-hashes -r requirements-dev.lock
+	@touch $@
 
 demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 60 --headless"
 	$(BIN)/fusiond demo --dashboard $(ARGS)
 
-# One core compiles while the other lints. Hardware in the loop waits for real time more than it
-# computes: the unit tests take what it leaves, and are the first to yield.
-test: $(STAMP) ## everything that CI checks
+# One core compiles while the other installs the tools and lints. Hardware in the loop waits for real
+# time more than it computes: the unit tests take what it leaves, and are the first to yield.
+test: $(RUNTIME) ## everything that CI checks
 	$(MAKE) --jobs=2 --output-sync lint kernels
 	$(MAKE) --jobs=2 --output-sync=line hil unit YIELDING="nice -n 19"
 
@@ -59,7 +62,7 @@ lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python tools/house.py --check
 
-kernels: $(STAMP)
+kernels: $(RUNTIME)
 	@echo "compiling the kernels once, before the tests share them"
 	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle, \
 	fusiond.estimators.federated.standing, fusiond.estimators.multiscale.filter, \
