@@ -1,6 +1,7 @@
 """What the daemon takes of a machine, as JSON:
 
     python benchmarks/daemon_load.py [--seconds S] [--filter kalman] [--raw] [--record]
+                                      [--clients N]
 
 The daemon's own process serves a simulated vehicle in another: IMU 200 Hz, ticks 100 Hz, GNSS
 10 Hz (`--raw`: UBX of two systems as well, 10 Hz, fused tightly), RDSS, `nav` 20 Hz to a Mosquitto
@@ -11,7 +12,11 @@ on a primed cache of compiled kernels.
 The IMU is on `vcan0` where that interface is up, else on python-can's `udp_multicast`, whose frames
 cost more: UDP, msgpack and a Python object for each.
 
-`--record` records all of it: what that costs is the difference to a run without.
+`--record` records all of it: what that costs is the difference to a run without. `--clients` has N
+clients of MQTT, gpsd and NMEA each listen, at 10 Hz. `age_ms` is the time from the instant of a
+solution, that of its newest CAN frame, to the arrival of its `nav` at a client of the broker:
+median, 99 % and most. With many clients that is a matter of the machine, of which they and the
+broker take most.
 """
 
 from __future__ import annotations
@@ -25,9 +30,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+
+import aiomqtt
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -35,9 +45,10 @@ from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import drive
 from fusiond.simulation.vehicle import SimulatedVehicle
-from tests.broker import Broker, listening
+from tests.broker import Broker, free_port, listening
 from tests.hil.heard import Heard
 from tests.hil.processes import SIM_IMU, DaemonProcess
+from tests.live.rig import bus_here, network_of_its_own
 
 IMU_HZ, TICK_HZ, GNSS_HZ, NAV_HZ = 200.0, 100.0, 10.0, 20.0
 SETTLE_S = 5.0
@@ -65,12 +76,22 @@ enabled = true
 lever_arm_m = [-1.0, 0.0, 0.5]
 [estimator]
 filter = "{filter}"
+[clock]
+utc = "system"
 [scheduler]
 rate_hz = {tick_hz}
 [mqtt]
 host = "127.0.0.1"
 port = {port}
 nav_rate_hz = {nav_hz}
+"""
+OUTPUTS = """
+[outputs.gpsd]
+port = {gpsd}
+rate_hz = 10.0
+[outputs.nmea]
+port = {nmea}
+rate_hz = 10.0
 """
 RECORDING = """
 [recording]
@@ -112,17 +133,52 @@ def _recorded_mb(folder: Path) -> float:
     return round(sum(path.stat().st_size for path in folder.glob("logs/*")) * 1e-6, 2)
 
 
-def _bus() -> tuple[str, str]:
-    up = subprocess.run(["ip", "link", "show", "vcan0", "up"], capture_output=True, check=False)
-    return ("socketcan", "vcan0") if up.stdout else ("udp_multicast", "239.74.163.2")
+@asynccontextmanager
+async def _ages_ms(broker: Broker) -> AsyncIterator[list[float]]:
+    """How old each `nav` is when a client has it, up to 1 ms too old: `t_ms` is cut to it."""
+    ages: list[float] = []
+
+    async def listen() -> None:
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.subscribe("fusiond/load/nav")
+            async for message in client.messages:
+                now_ms = time.time_ns() * 1e-6
+                ages.append(now_ms - json.loads(bytes(message.payload))["t_ms"])
+
+    task = asyncio.create_task(listen())
+    try:
+        yield ages
+    finally:
+        task.cancel()
+
+
+@asynccontextmanager
+async def _clients(count: int, *ports: int) -> AsyncIterator[dict[str, list[int]]]:
+    """That many of each kind, in a process of their own; what they heard is there afterwards."""
+    heard: dict[str, list[int]] = {}
+    if not count:
+        yield heard
+        return
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, str(Path(__file__).with_name("clients.py"))),
+        *map(str, (count, *ports)),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    await process.stdout.readline()
+    yield heard
+    told, _ = await process.communicate(b"\n")  # and the end of its input
+    heard |= json.loads(told)
 
 
 async def measure(
-    folder: Path, seconds: float, name: str, raw: bool, record: bool
+    folder: Path, seconds: float, name: str, raw: bool, record: bool, clients: int
 ) -> dict[str, object]:
     """Run both processes for `seconds` after alignment; the figures."""
-    interface, channel = _bus()
-    broker = Broker(folder)
+    bus = bus_here(0)
+    interface, channel = bus["interface"], bus["channel"]
+    broker, gpsd, nmea = Broker(folder), free_port(), free_port()
     config = folder / "load.toml"
     config.write_text(
         CONFIG.format(
@@ -136,6 +192,7 @@ async def measure(
             kind="raw" if raw else "gnss",
         )
         + (RECORDING.format(folder=folder) if record else "")
+        + (OUTPUTS.format(gpsd=gpsd, nmea=nmea) if clients else "")
     )
     vehicle = multiprocessing.get_context("spawn").Process(
         target=_vehicle, args=(str(folder), interface, channel, raw), daemon=True
@@ -153,13 +210,17 @@ async def measure(
                     heard = Heard(listener, "load")
                     await heard.until("nav", lambda m: m["mode"] == "navigating")
                     await asyncio.sleep(SETTLE_S)
-                    since, before = heard.count, await heard.until("health")
-                    start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
-                    await asyncio.sleep(seconds)
-                    elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
-                    resident_mb = _resident_mb(daemon.pid)
-                    after = await heard.until("health")
-                    nav = len(heard.all("nav", since))
+                    async with (
+                        _clients(clients, broker.port, gpsd, nmea) as served,
+                        _ages_ms(broker) as ages_ms,
+                    ):
+                        since, before = heard.count, await heard.until("health")
+                        start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
+                        await asyncio.sleep(seconds)
+                        elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
+                        resident_mb = _resident_mb(daemon.pid)
+                        after = await heard.until("health")
+                        nav = len(heard.all("nav", since))
                 await daemon.terminate()
     finally:
         vehicle.kill()
@@ -178,6 +239,9 @@ async def measure(
         "ticks": after["ticks"] - before["ticks"],
         "overruns": after["overruns"] - before["overruns"],
         "lateness_p99_ms": after["lateness_p99_ms"],
+        "age_ms": [round(float(np.percentile(ages_ms, q)), 1) for q in (50, 99, 100)],
+        "clients": clients,
+        "received_least_and_most": served,
     }
 
 
@@ -187,10 +251,12 @@ def main() -> None:
     parser.add_argument("--filter", default="kalman")
     parser.add_argument("--raw", action="store_true")
     parser.add_argument("--record", action="store_true")
+    parser.add_argument("--clients", type=int, default=0)
     args = parser.parse_args()
+    network_of_its_own()
     subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
     with tempfile.TemporaryDirectory(prefix="fusiond-load-") as folder:
-        wish = args.seconds, args.filter, args.raw, args.record
+        wish = args.seconds, args.filter, args.raw, args.record, args.clients
         figures = asyncio.run(measure(Path(folder), *wish))
         print(json.dumps(figures, indent=2))
 
