@@ -31,7 +31,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from fusiond.aiding.base import (
     Aid,
@@ -42,6 +41,7 @@ from fusiond.aiding.base import (
     rate_columns,
 )
 from fusiond.aiding.witnesses import Witnesses
+from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.standstill import Window
 from fusiond.navigation.strapdown import LAT, VN
@@ -95,7 +95,7 @@ class Rest:
         square = float(v @ np.linalg.solve(p_v + least * np.eye(rows), v))
         begin_ns = w.end_ns - w.run * WITNESSED_NS
         measured = self.witnesses.measured(begin_ns, w.end_ns)
-        if square > chdtri(rows, VELOCITY_PROBABILITY) or measured.contradicts:
+        if square > quantile(rows, VELOCITY_PROBABILITY) or measured.contradicts:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
         if self._turns(state, p, w.mean_rate, 1) or self._turns(state, p, w.run_rate, w.run):

@@ -45,6 +45,9 @@ COLLECT_AFTER = 50_000
 def main() -> None:
     """Entry point of the console script."""
     gc.set_threshold(COLLECT_AFTER)
+    # fusiond has no use for plugins of pydantic; to look for some reads the metadata of every
+    # installed package. (https://docs.pydantic.dev/latest/concepts/plugins)
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         app()
     except KeyboardInterrupt:

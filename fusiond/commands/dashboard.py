@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,6 +40,8 @@ def dashboard(
     ] = False,
 ) -> None:
     """Show a vehicle in the browser: from its broker, or from a recording."""
+    import secrets  # noqa: PLC0415
+
     from fusiond.dashboard.serve import (  # noqa: PLC0415
         DashboardError,
         Serving,

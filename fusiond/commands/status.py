@@ -6,7 +6,6 @@ works. So one that is `online` and says nothing has stopped, or hangs.
 
 from __future__ import annotations
 
-import asyncio
 import json
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -75,6 +74,8 @@ def status(
     json_path: JsonPath = None,
 ) -> None:
     """Ask the running daemon over MQTT: 0 with a usable solution, 1 without, 69 no answer."""
+    import asyncio  # noqa: PLC0415
+
     access = None
     if config is not None:
         loaded = load(config)
@@ -111,6 +112,8 @@ async def ask(
 
     `access`: user, password and TLS. Raises `UnansweredError` where no broker lets us in.
     """
+    import asyncio  # noqa: PLC0415
+
     import aiomqtt  # noqa: PLC0415
 
     vehicles: dict[str, Heard] = {}

@@ -9,9 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
@@ -30,19 +29,22 @@ from fusiond.configuration.aiding import (
 from fusiond.configuration.mistakes import Location, did_you_mean, mistake, validate
 from fusiond.configuration.schema import Config, Source
 
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
 EXIT_CONFIG = 78
 """EX_CONFIG of sysexits.h; systemd's RestartPreventExitStatus knows it."""
 
-_DEFAULT_AIDING: dict[str, AnyAiding] = {
-    "nmea": GnssAiding(),
-    "gnss": RawAiding(),
-    "rdss": RdssAiding(),
-    "can_attitude": StarTrackerAiding(),
-    "can_bearing": SarAiding(),
-    "can_gnss": GnssAiding(),
-    "can_height": HeightAiding(),
-    "can_wheel": WheelAiding(),
-    "obd_speed": WheelAiding(),
+_DEFAULT_AIDING: dict[str, type[AnyAiding]] = {
+    "nmea": GnssAiding,
+    "gnss": RawAiding,
+    "rdss": RdssAiding,
+    "can_attitude": StarTrackerAiding,
+    "can_bearing": SarAiding,
+    "can_gnss": GnssAiding,
+    "can_height": HeightAiding,
+    "can_wheel": WheelAiding,
+    "obd_speed": WheelAiding,
 }
 
 
@@ -92,7 +94,7 @@ def _default_aiding(source: Source) -> AnyAiding:
     o = source.options
     if source.driver == "can_height" and ("pressure" in o or o.get("barometric")):
         return BarometerAiding()
-    return _DEFAULT_AIDING[source.driver]
+    return _DEFAULT_AIDING[source.driver]()
 
 
 def config_digest(config: Config) -> str:
@@ -106,12 +108,14 @@ def config_digest(config: Config) -> str:
 
 def driver_entry_points() -> dict[str, EntryPoint]:
     """The installed drivers by name (entry-point group `fusiond.drivers`)."""
+    from importlib.metadata import entry_points  # noqa: PLC0415 - a file without devices needs none
+
     return {entry.name: entry for entry in entry_points(group="fusiond.drivers")}
 
 
 def _driver_options(sources: object, found: list[str], base: Path) -> dict[str, dict[str, Any]]:
     """Each source's path options made absolute; mistakes in any option are added to `found`."""
-    drivers = driver_entry_points()
+    drivers = driver_entry_points() if isinstance(sources, dict) else {}
     paths: dict[str, dict[str, Any]] = {}
     for name, source in sources.items() if isinstance(sources, dict) else ():
         driver = source.get("driver") if isinstance(source, dict) else None

@@ -155,8 +155,8 @@ class NonHolonomic(Section):
 
 
 class Constraints(Section):
-    zero_velocity: ZeroVelocity = ZeroVelocity()
-    non_holonomic: NonHolonomic = NonHolonomic()
+    zero_velocity: ZeroVelocity = Field(default_factory=ZeroVelocity)
+    non_holonomic: NonHolonomic = Field(default_factory=NonHolonomic)
 
 
 class Alignment(Section):
@@ -275,19 +275,19 @@ class Config(Section):
     """Where the last solution is kept for the next start; the unit's state directory by default."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """What the daemon writes to its log: this and what matters more."""
-    imu: Imu = Imu()
+    imu: Imu = Field(default_factory=Imu)
     sources: dict[str, Source] = Field(default_factory=dict)
     aiding: dict[str, AnyAiding] = Field(default_factory=dict)
-    constraints: Constraints = Constraints()
-    alignment: Alignment = Alignment()
-    estimator: Estimator = Estimator()
-    consistency: ConsistencyTest = ConsistencyTest()
-    integrity: Integrity = Integrity()
-    scheduler: Scheduler = Scheduler()
-    clock: ClockOptions = ClockOptions()
-    mqtt: Mqtt = Mqtt()
-    recording: Recording = Recording()
-    outputs: Outputs = Outputs()
+    constraints: Constraints = Field(default_factory=Constraints)
+    alignment: Alignment = Field(default_factory=Alignment)
+    estimator: Estimator = Field(default_factory=Estimator)
+    consistency: ConsistencyTest = Field(default_factory=ConsistencyTest)
+    integrity: Integrity = Field(default_factory=Integrity)
+    scheduler: Scheduler = Field(default_factory=Scheduler)
+    clock: ClockOptions = Field(default_factory=ClockOptions)
+    mqtt: Mqtt = Field(default_factory=Mqtt)
+    recording: Recording = Field(default_factory=Recording)
+    outputs: Outputs = Field(default_factory=Outputs)
 
     @property
     def plausibility(self) -> Plausibility:

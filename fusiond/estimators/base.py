@@ -14,12 +14,10 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.propagation import (
@@ -36,6 +34,7 @@ from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
+from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, STEP_SMOOTH_N
@@ -50,10 +49,9 @@ DOUBTED_RATE_RAD_S = math.radians(1.0)
 DOUBTED_FORCE_M_S2 = 0.5
 
 
-@lru_cache(maxsize=256)
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
-    return float(chdtri(degrees, 1.0 - probability))
+    return quantile(degrees, 1.0 - probability)
 
 
 # Ranges that must fail together before a jump of the receiver's clock is a better explanation than

@@ -31,11 +31,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from drivers.raw.messages import SYSTEMS, RawGnssEpoch
 from fusiond.gnss.ecef import ned_axes, to_geodetic
 from fusiond.gnss.ranges import Picked, RangeModel, Rows
+from fusiond.navigation.chi_square import quantile
 
 Array = npt.NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def single_point(
         position, rows = fit.position, fit.rows
         n, m = len(fit.h), fit.h.shape[1] - 1
         statistic = float(fit.residual**2 @ (1.0 / rows.variance)) + fit.ionosphere**2
-        bound = float(chdtri(n - m, FALSE_ALARM)) if n > m else 0.0
+        bound = quantile(n - m, FALSE_ALARM) if n > m else 0.0
         if n - m < 2 or statistic <= bound:
             break
         spread = rows.variance - np.einsum("ij,jk,ik->i", fit.h, fit.covariance, fit.h)

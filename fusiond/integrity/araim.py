@@ -53,7 +53,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, ndtri
+
+from fusiond.navigation.chi_square import quantile
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -209,6 +210,8 @@ def _risk_of(terms: list[tuple[float, float, float]], level: float) -> float:
 
 def _level_of(term: tuple[float, float, float], risk: float) -> float:
     """Where one term alone has `risk`; minus infinity where it never has as much."""
+    from scipy.special import ndtri  # noqa: PLC0415 - slow to load
+
     weight, offset, sigma = term
     return offset - float(ndtri(min(1.0, risk / weight))) * sigma
 
@@ -245,6 +248,8 @@ def _most_events(priors: Sequence[float], risk: float) -> int:
 
 def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
     """Protection levels of the epoch, before any measurement; None without a solution."""
+    from scipy.special import ndtri  # noqa: PLC0415 - slow to load
+
     design, everything = epoch.design, np.zeros(len(epoch.constellation), dtype=bool)
     variance = epoch.integrity_sigma_m**2
     first = _solve(design, variance, everything)
@@ -324,7 +329,7 @@ def detect(epoch: Epoch, protection: Protection, y: Array, requirement: Requirem
     ratio = np.divide(apart, threshold[1:], out=np.zeros_like(apart), where=threshold[1:] > 0.0)
     residual, degrees = _residual(epoch, y)
     false_alarm = requirement.residual_false_alarm / requirement.samples
-    bound = float(chdtri(degrees, false_alarm)) if degrees else math.inf
+    bound = quantile(degrees, false_alarm) if degrees else math.inf
     return Detection(float(ratio.max(initial=0.0)), residual, bound)
 
 

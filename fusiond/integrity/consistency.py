@@ -41,16 +41,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import (
-    chndtrinc,
-    fdtrc,
-    fdtri,
-    gammainc,
-    gammaincc,
-    gammainccinv,
-    gammaincinv,
-    ndtri,
-)
 
 Array = NDArray[np.float64]
 Verdict = Literal["consistent", "optimistic", "pessimistic", "coloured", "too_few"]
@@ -177,6 +167,8 @@ NO_LIMITS = Limits(
 
 @lru_cache(maxsize=2048)
 def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Limits:
+    from scipy.special import fdtri, gammainccinv, gammaincinv, ndtri  # noqa: PLC0415
+
     shape, scale = _average_law(k, dof, gate)
     level = 1.0 - math.sqrt(1.0 - alpha)
     n = dof if whitened else k
@@ -206,6 +198,8 @@ def _average_law(k: int, dof: int, gate: float) -> tuple[float, float]:
 
     E[x^j; x < g] of a chi-square with m degrees: m (m + 2) .. (m + 2j - 2) F_{m+2j}(g).
     """
+    from scipy.special import gammainc, gammaincinv  # noqa: PLC0415
+
     m = dof / k
     g = 2.0 * float(gammaincinv(m / 2.0, gate))
     mean = m * float(gammainc(m / 2.0 + 1.0, g / 2.0)) / gate
@@ -218,6 +212,8 @@ def _detectable(
     k: int, dof: int, alpha: float, gate: float, whitened: bool
 ) -> tuple[Interval, float]:
     """NIS ratios and a single lag's rho that are noticed with POWER."""
+    from scipy.special import chndtrinc, gammainccinv, gammaincinv  # noqa: PLC0415
+
     limits = limits_of(k, dof, alpha, gate, whitened)
     low, high = limits.nis_limits
     ratio = (
@@ -243,6 +239,8 @@ def judge(
     Raises ValueError when they cannot be figures of a window: not 8 lags, K below 1 or above K m.
     With fewer than FEWEST epochs the verdict is `too_few` and no figure is given.
     """
+    from scipy.special import fdtrc, gammainc, gammaincc  # noqa: PLC0415
+
     if len(rho) != LAGS or not 1 <= k <= dof:
         raise ValueError(f"K = {k}, {dof} degrees of freedom, {len(rho)} lags; needs {LAGS} lags")
     if k < FEWEST:

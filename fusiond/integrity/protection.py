@@ -38,7 +38,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from fusiond.integrity.araim import protection_level
 
@@ -76,6 +75,8 @@ class Level(NamedTuple):
 def axis_level(variance: Array, separation: Array, share: float, limits: IntegrityRisk) -> Level:
     """The level of an axis: `variance` (1 + k,) m^2 of all aids and of the subsets, `separation`
     (k,) m of the subsets, `share` of the risk. Infinite where there is no bound."""
+    from scipy.special import ndtri  # noqa: PLC0415 - slow to load
+
     sigma = np.sqrt(variance)
     k_fa = -float(
         ndtri(

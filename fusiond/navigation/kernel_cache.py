@@ -21,12 +21,15 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import os
 import pickle
 import secrets
 import shutil
+import sys
 import warnings
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,7 @@ from llvmlite.binding import parse_bitcode
 from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
+from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
@@ -42,6 +46,8 @@ _dumps: Any = dumps
 _result: Any = CompileResult
 _Library: Any = JITCodeLibrary
 _parse_bitcode: Any = parse_bitcode
+_Environment: Any = Environment
+_known_environment: Any = lookup_environment
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
 
@@ -90,7 +96,7 @@ class KernelCache(NullCache):
         if hashlib.sha256(payload).digest() != data[:_DIGEST_SIZE]:
             _discard(path, "its checksum is wrong")
             return None
-        return _linked(target, *pickle.loads(payload))
+        return _linked(target, *_Unpickler(io.BytesIO(payload)).load())
 
     def save_overload(self, signature: object, data: Any) -> None:
         """Write what was compiled; where that fails it is compiled again at the next start."""
@@ -111,8 +117,40 @@ class KernelCache(NullCache):
 
     def _path(self, signature: object, codegen: Any) -> Path:
         """Native code differs by signature, system, processor and its features."""
-        made_for = hashlib.sha256(repr((str(signature), codegen.magic_tuple())).encode())
+        made_for = hashlib.sha256(repr((str(signature), _processor(codegen))).encode())
         return self._folder / f"{self._name}-{made_for.hexdigest()[:16]}.kernel"
+
+
+@lru_cache
+def _processor(codegen: Any) -> tuple[str, str, str]:
+    """System, processor and features, which LLVM is asked for once."""
+    made_for: tuple[str, str, str] = codegen.magic_tuple()
+    return made_for
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads a kernel and imports none of numba's own modules that a piece of it came from.
+
+    Their environments hold the constants that the native code takes. Their globals, for which
+    numba imports a dozen modules of its implementations, are asked for by object mode alone, which
+    no kernel here is compiled in.
+    """
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("numba.core.environment", "_rebuild_env"):
+            return _environment
+        return super().find_class(module, name)
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Any:
+    known = _known_environment(name)
+    if known is None:
+        loaded = sys.modules.get(module)
+        known = _Environment({"__name__": module} if loaded is None else loaded.__dict__)
+        known.consts[:] = constants
+        known.env_name = name
+        _Environment._memo[name] = known
+    return known
 
 
 class _Linked(_Library):  # type: ignore[misc]

@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from fusiond.aiding.base import NotApplicable, State
 from fusiond.aiding.pseudorange import RANGE_BIAS
@@ -92,6 +91,8 @@ class EpochProtection:
     """Levels from raw epochs, at a `risk` and a rate of `false_alarm`s, each an hour."""
 
     def __init__(self, risk: float, false_alarm: float) -> None:
+        from scipy.special import ndtri  # noqa: PLC0415 - slow to load
+
         self._requirement = requirement(risk, false_alarm)
         self._quantile = -float(ndtri(0.5 * risk / INDEPENDENT_PER_HOUR))
         self._heard: dict[str, _Heard] = {}

@@ -12,10 +12,13 @@ Source: paper 001, eq. 12 to 18; Mallat, A Wavelet Tour of Signal Processing, 3r
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pywt
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pywt
 
 Array = NDArray[np.float64]
 
@@ -31,6 +34,8 @@ def wavelet_matrix(name: str, scales: int) -> Array:
 
     ValueError for a name that is unknown or not an orthonormal wavelet's. Read-only.
     """
+    import pywt  # noqa: PLC0415 - for whoever filters by scales
+
     if not 1 <= scales <= MOST_SCALES:
         raise ValueError(f"scales = {scales}: 1 to {MOST_SCALES}")
     if name not in pywt.wavelist(kind="discrete"):
@@ -47,6 +52,8 @@ def wavelet_matrix(name: str, scales: int) -> Array:
 
 def families() -> list[str]:
     """The families of orthonormal wavelets, as `db1 to db38`."""
+    import pywt  # noqa: PLC0415
+
     found = []
     for family in pywt.families():
         try:
@@ -59,6 +66,8 @@ def families() -> list[str]:
 
 
 def _transform(wavelet: pywt.Wavelet, scales: int) -> Array:
+    import pywt  # noqa: PLC0415
+
     smooth, rows = np.eye(2 ** (scales - 1)), []
     for _ in range(scales - 1):
         smooth, detail = pywt.dwt(smooth, wavelet, mode="periodization", axis=0)
@@ -68,6 +77,8 @@ def _transform(wavelet: pywt.Wavelet, scales: int) -> Array:
 
 @lru_cache(maxsize=256)
 def _is_orthonormal(name: str) -> bool:
+    import pywt  # noqa: PLC0415
+
     wavelet = pywt.Wavelet(name)
     if not wavelet.orthogonal:
         return False
