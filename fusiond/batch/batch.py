@@ -15,8 +15,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from fusiond.batch.drives import drive_row
-from fusiond.batch.rows import Row, RowFile
 from fusiond.configuration.load import config_digest, load_config
+from fusiond.files.rows import Row, RowFile
 from fusiond.workers.outcome import Outcome, Runner
 
 _NAME = ("log", "config_digest", "version")

@@ -8,16 +8,15 @@ or a folder with the tables of `fusiond process`: `imu.csv` and, as far as they 
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from fusiond.batch.rows import Row
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError
+from fusiond.files.rows import Row, flat
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.offline.aid_files import READERS
 from fusiond.offline.compare import NothingToCompareError, compare
@@ -106,17 +105,3 @@ def _processed(result: dict[str, Any]) -> Row:
             "rewinds": result["rewinds"],
         }
     )
-
-
-def flat(values: dict[str, Any], before: str = "") -> Row:
-    """Nested names joined by dots; left out is what is None, not finite, or no plain value."""
-    row: Row = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            row |= flat(value, f"{before}{name}.")
-        elif isinstance(value, float):
-            if math.isfinite(value):
-                row[before + name] = float(value)
-        elif isinstance(value, str | bool | int):
-            row[before + name] = str(value) if isinstance(value, str) else value
-    return row

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -56,6 +56,24 @@ def runner_of(
         raise typer.Exit(EXIT_UNAVAILABLE) from error
 
 
+@contextmanager
+def row_errors() -> Iterator[None]:
+    """As `data_errors`; exit 69 where the package for rows is missing."""
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+
+    try:
+        with data_errors():
+            yield
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+
+
+def counted(ended: Mapping[str, int]) -> str:
+    """How many rows ended in which way."""
+    return ", ".join(f"{count} {how}" for how, count in ended.items() if count) or "no rows"
+
+
 def batch(
     config: ConfigPath,
     logs: Annotated[
@@ -71,20 +89,13 @@ def batch(
     with compiling():
         from fusiond.batch.batch import run_batch  # noqa: PLC0415
 
-    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
-
-    try:
-        with (
-            runner_of(workers, cluster, timeout) as runner,
-            config_errors(),
-            data_errors(),
-            progress_bar("drives") as bar,
-        ):
-            ended = run_batch(config, logs, out, runner, bar or (lambda done, total: None))
-    except MissingPackageError as error:
-        typer.echo(f"fusiond: {error}", err=True)
-        raise typer.Exit(EXIT_UNAVAILABLE) from error
-    counts = ", ".join(f"{count} {how}" for how, count in ended.items() if count)
-    typer.echo(f"{out}: {counts}")
+    with (
+        runner_of(workers, cluster, timeout) as runner,
+        config_errors(),
+        row_errors(),
+        progress_bar("drives") as bar,
+    ):
+        ended = run_batch(config, logs, out, runner, bar or (lambda done, total: None))
+    typer.echo(f"{out}: {counted(ended)}")
     if not ended.get("done") and not ended["there"]:
         raise typer.Exit(EXIT_DATA)

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.batch import ClusterAddress, Timeout, Workers, runner_of
+from fusiond.commands.batch import (
+    ClusterAddress,
+    Timeout,
+    Workers,
+    counted,
+    row_errors,
+    runner_of,
+)
 from fusiond.commands.compiling import compiling
 from fusiond.commands.shared import (
     EXIT_DATA,
@@ -27,6 +34,7 @@ from fusiond.commands.shared import (
 from fusiond.studies import ABOUT, STUDIES
 
 if TYPE_CHECKING:
+    from fusiond.studies.kept import KeptRuns
     from fusiond.studies.monte_carlo import Lost
 
 FEWEST_RUNS = 8
@@ -50,6 +58,11 @@ def study(
     workers: Workers = None,
     cluster: ClusterAddress = None,
     timeout: Timeout = None,
+    seed: Annotated[int, typer.Option(min=0, help="What the runs are drawn from.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="F.parquet", help="A row a run; those that are there are not made."),
+    ] = None,
     json_path: JsonPath = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="F.png", help="Draw the result (needs matplotlib).")
@@ -58,6 +71,8 @@ def study(
     """Repeat a paper's experiment, or one that a default stands on."""
     if name not in STUDIES:
         raise typer.BadParameter(f"{name!r}: there are {', '.join(STUDIES)}")
+    if out is not None and not ABOUT[name].rows:
+        raise typer.BadParameter(f"--out: {name} draws all its runs at once, none is a row")
     from importlib import import_module  # noqa: PLC0415
     from importlib.util import find_spec  # noqa: PLC0415
 
@@ -67,10 +82,11 @@ def study(
     with compiling():
         module = import_module(STUDIES[name])
     with (
-        _runs(runs or ABOUT[name].runs, workers, cluster, timeout) as lost,
+        rows_kept(out, name, seed) as kept,
+        _runs(runs or ABOUT[name].runs, workers, cluster, timeout, kept) as lost,
         progress_bar(name) as progress,
     ):
-        result = module.run(runs, progress=progress)
+        result = module.run(runs, seed, progress=progress)
     if lost:
         result["lost_runs"] = [asdict(run) for run in lost]
         for run in lost:
@@ -92,18 +108,40 @@ study.__doc__ = f"{study.__doc__}\n\n\b\n" + "\n".join(
 
 
 @contextmanager
+def rows_kept(out: Path | None, name: str, seed: int) -> Iterator[KeptRuns | None]:
+    """The rows of a study in `out`; says in the end how many there are."""
+    if out is None:
+        yield None
+        return
+    from fusiond.files.rows import RowFile  # noqa: PLC0415
+    from fusiond.studies.kept import KeptRuns  # noqa: PLC0415
+
+    with row_errors(), RowFile(out) as file:
+        kept = KeptRuns(file, name, seed)
+        try:
+            yield kept
+        finally:
+            typer.echo(f"{out}: {counted({'there': kept.there, **kept.ended})}", err=True)
+
+
+@contextmanager
 def _runs(
-    runs: int, workers: int | None, cluster: str | None, timeout_s: float | None
+    runs: int,
+    workers: int | None,
+    cluster: str | None,
+    timeout_s: float | None,
+    kept: KeptRuns | None,
 ) -> Iterator[Sequence[Lost]]:
     """Where runs are made: here, if they are so few that workers would not be warm before their
     end, and nobody asked for any."""
-    if runs < FEWEST_RUNS and workers is None and cluster is None and timeout_s is None:
+    few = runs < FEWEST_RUNS and kept is None
+    if few and workers is None and cluster is None and timeout_s is None:
         yield ()
         return
     from fusiond.studies.monte_carlo import RunsLostError, runs_on  # noqa: PLC0415
 
     try:
-        with runner_of(workers, cluster, timeout_s) as runner, runs_on(runner) as lost:
+        with runner_of(workers, cluster, timeout_s) as runner, runs_on(runner, kept) as lost:
             yield lost
     except RunsLostError as error:
         typer.echo(f"fusiond: {error}", err=True)

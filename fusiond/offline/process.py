@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import gc
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -179,7 +179,7 @@ def _process(
     return {
         **({} if smoothed is None else {"smoothed": smoothed.counts()}),
         "files": {name: _account(file) for name, file in read.files.items()},
-        "sources": _outcomes(navigator, read.withheld),
+        "sources": outcomes_of(navigator, read.withheld),
         "events": events,
         "solution_rows": recorder.rows,
         "solution_modes": dict(recorder.modes),
@@ -211,7 +211,7 @@ def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
     return SmoothedRows(navigator, writer)
 
 
-def _outcomes(navigator: Navigator, withheld: Counter[str]) -> dict[str, dict[str, int]]:
+def outcomes_of(navigator: Navigator, withheld: Mapping[str, int]) -> dict[str, dict[str, int]]:
     """Of each source's measurements, by name."""
     sources: dict[str, dict[str, int]] = {}
     for source, outcomes in navigator.timeline.counters.outcomes.items():

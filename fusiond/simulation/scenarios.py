@@ -133,8 +133,8 @@ SCENARIOS = {
 }
 
 
-def random_streams(seed: int) -> tuple[np.random.Generator, ...]:
+def random_streams(seed: int | np.random.SeedSequence) -> tuple[np.random.Generator, ...]:
     """Independent generators for IMU, GNSS fixes, RDSS and raw GNSS: changing one device leaves
     the others."""
-    children = np.random.SeedSequence(seed).spawn(4)
-    return tuple(np.random.default_rng(child) for child in children)
+    sequence = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
+    return tuple(np.random.default_rng(child) for child in sequence.spawn(4))

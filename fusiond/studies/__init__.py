@@ -22,6 +22,7 @@ STUDIES = {
     "protection": "fusiond.studies.protection",
     "vehicle": "fusiond.studies.vehicle.study",
     "ins-gnss-sar": "fusiond.studies.ins_gnss_sar",
+    "drives": "fusiond.studies.drives",
 }
 
 
@@ -30,6 +31,8 @@ class About(NamedTuple):
 
     text: str
     runs: int
+    rows: bool = True
+    """Whether a run can be a row: not where all are drawn at once."""
 
 
 ABOUT = {
@@ -48,6 +51,7 @@ ABOUT = {
     "rdss-map": About(
         "Sigma of an RDSS fix over latitude and longitude.",
         2000,
+        rows=False,
     ),
     "multiscale": About(
         "Paper 001: a block filter on wavelets against two others.",
@@ -68,6 +72,7 @@ ABOUT = {
     "consistency": About(
         "How often the verdict on sigma is wrong, how soon it sees a fault.",
         20_000,
+        rows=False,
     ),
     "reduced-order": About(
         "Paper 002: 23 states of INS/GNSS/SAR against 17, by covariance.",
@@ -84,5 +89,9 @@ ABOUT = {
     "ins-gnss-sar": About(
         "Paper 002 flown: 23 states against 17, four satellites against all.",
         50,
+    ),
+    "drives": About(
+        "Drives of a minute drawn at random, a row of figures each.",
+        200,
     ),
 }

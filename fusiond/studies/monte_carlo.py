@@ -1,7 +1,10 @@
 """Monte Carlo runs: on processes, with their progress, and what NEES may be on average.
 
 A run draws from a generator of its own, made of the study's seed and the run's number, so that no
-result depends on who ran what, in which order, and on how many processes.
+result depends on who ran what, in which order, and on how many processes. `of_run` makes it by a
+spawn key, as numpy means it. The papers' studies mix [seed, number] instead, which keeps runs as
+far apart (numpy hashes both into the same pool of 128 bits) but pads with zeros: [5] and [5, 0]
+are one stream. None of them has two such lists, and their printed figures stand.
 """
 
 from __future__ import annotations
@@ -9,12 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
-from typing import TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 from scipy.stats import chi2
 
-from fusiond.workers.outcome import Runner
+from fusiond.workers.outcome import Outcome, Runner
+
+if TYPE_CHECKING:
+    from fusiond.studies.kept import KeptRuns
 
 TAIL = (1.0 - 0.95) / 2.0
 """Share of either side outside a 95 % interval."""
@@ -45,6 +52,7 @@ class Lost:
 @dataclass(frozen=True, slots=True)
 class _Given:
     runner: Runner
+    kept: KeptRuns | None
     lost: list[Lost] = field(default_factory=list)
 
 
@@ -52,9 +60,10 @@ _GIVEN: ContextVar[_Given | None] = ContextVar("runner of Monte Carlo runs", def
 
 
 @contextmanager
-def runs_on(runner: Runner) -> Iterator[list[Lost]]:
-    """Have the runs of what is inside made by `runner`; the runs that it lost."""
-    given = _Given(runner)
+def runs_on(runner: Runner, kept: KeptRuns | None = None) -> Iterator[list[Lost]]:
+    """Have the runs of what is inside made by `runner`, but for those that are in `kept`, where the
+    others are added; the runs that were lost."""
+    given = _Given(runner, kept)
     token = _GIVEN.set(given)
     try:
         yield given.lost
@@ -97,9 +106,8 @@ def over(
             if progress is not None:
                 progress()
         return list(found.values())
-    chunk = max(1, min(MOST_AT_ONCE, len(items) // (SHARES * given.runner.workers)))
-    before = len(given.lost)
-    for outcome in given.runner.outcomes(work, items, chunk):
+    lost_before = len(given.lost)
+    for outcome in _outcomes(given, work, items):
         if outcome.ended == "done":
             found[outcome.index] = outcome.result  # type: ignore[assignment]  # None may be an R
         else:
@@ -109,10 +117,30 @@ def over(
     if len(found) < min(2, len(items)):
         last = given.lost[-1]
         raise RunsLostError(
-            f"{len(given.lost) - before} of {len(items)} runs lost; run {last.number}: "
+            f"{len(given.lost) - lost_before} of {len(items)} runs lost; run {last.number}: "
             f"{last.ended}: {last.reason}"
         )
     return [found[number] for number in sorted(found)]
+
+
+def _outcomes(given: _Given, work: Callable[[T], R], items: Sequence[T]) -> Iterator[Outcome[R]]:
+    """Those that are kept, then the others, which are."""
+    part = None if given.kept is None else given.kept.of(work)
+    known = {} if part is None else part.known(len(items))
+    yield from known.values()
+    todo = [number for number in range(len(items)) if number not in known]
+    chunk = max(1, min(MOST_AT_ONCE, len(todo) // (SHARES * given.runner.workers)))
+    for outcome in given.runner.outcomes(work, [items[number] for number in todo], chunk):
+        numbered = replace(outcome, index=todo[outcome.index])
+        if part is not None:
+            part.add(numbered.index, numbered)
+        yield numbered
+
+
+def of_run(seed: int, number: int) -> np.random.SeedSequence:
+    """What run `number` of a study draws from: child `number` of the seed's sequence, without the
+    others having been made."""
+    return np.random.SeedSequence(seed, spawn_key=(number,))
 
 
 def nees_interval(runs: int, dof: int, tail: float = TAIL) -> list[float]:

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from fusiond.batch.drives import drive_row
-from fusiond.batch.rows import Row, read_rows
 from fusiond.commands.app import app
+from fusiond.files.rows import Row, read_rows
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
 

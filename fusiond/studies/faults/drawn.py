@@ -23,7 +23,11 @@ RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 @lru_cache(maxsize=8)
 def drawn(number: int) -> Drive:
     """The drive of a number."""
-    rng = np.random.default_rng([2026, number])
+    return drawn_by(np.random.default_rng([2026, number]))
+
+
+def drawn_by(rng: np.random.Generator) -> Drive:
+    """The drive that a generator draws."""
     legs = _legs(rng)
     course_deg, bank_ratio = rng.uniform(0.0, 360.0), rng.uniform(-0.1, 0.02)
 

@@ -121,7 +121,9 @@ class Drive:
     gnss_rate_hz: float = 5.0
     duration_s: float = DURATION_S
 
-    def recorded(self, config: Config, seed: int) -> tuple[Truth, Recording]:
+    def recorded(
+        self, config: Config, seed: int | np.random.SeedSequence
+    ) -> tuple[Truth, Recording]:
         """The truth, and what the sensors of the car of `fusiond simulate` say of it, mounted as
         the configuration has them; the same seed says the same."""
         car = replace(SCENARIOS["drive"], path=self.path).fitted(config)

@@ -64,10 +64,12 @@ class Run:
     outcomes: Counter[str]
 
 
-def run_once(config: Config, path: str, seed: int, known: bool = True) -> Run:
-    """Draw a car and drive it, from an error of `START_SD` on; `known`: whether the filter has the
-    noise of axes that are out of square."""
-    rng = np.random.default_rng([seed, sorted(PATHS).index(path)])
+def run_once(config: Config, path: str, seed: int, number: int, known: bool = True) -> Run:
+    """Draw car `number` of a seed and drive it, from an error of `START_SD` on; `known`: whether
+    the filter has the noise of axes that are out of square."""
+    # A seed's thousand cars, then others: no two seeds share any.
+    thousand, left = divmod(number, 1000)
+    rng = np.random.default_rng([1000 * seed + left, sorted(PATHS).index(path), thousand])
     make, seconds = PATHS[path]
     model = model_of(config)
     car = draw_car(config, make(seconds), seconds, rng)

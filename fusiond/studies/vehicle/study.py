@@ -40,7 +40,7 @@ CASES: dict[str, tuple[str, dict[str, float], bool]] = {
 
 def _one(case: str, seed: int, number: int) -> Run:
     path, imu, known = CASES[case]
-    return run_once(configuration(**imu), path, 1000 * seed + number, known)
+    return run_once(configuration(**imu), path, seed, number, known)
 
 
 def rows_of(case: str, runs: list[Run]) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ infinities, which JSON does not have, are no values here.
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,20 @@ def write_rows(path: Path, rows: list[Row]) -> None:
     unfinished = path.with_name(f"{path.name}.part")
     parquet.write_table(arrow.table(columns), unfinished, compression=COMPRESSION)
     os.replace(unfinished, path)
+
+
+def flat(values: dict[str, Any], before: str = "") -> Row:
+    """Nested names joined by dots; left out is what is None, not finite, or no plain value."""
+    row: Row = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            row |= flat(value, f"{before}{name}.")
+        elif isinstance(value, float):
+            if math.isfinite(value):
+                row[before + name] = float(value)
+        elif isinstance(value, str | bool | int):
+            row[before + name] = str(value) if isinstance(value, str) else value
+    return row
 
 
 def _journal(path: Path) -> list[Row]:

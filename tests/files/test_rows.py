@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.batch.rows import RowFile, read_rows
 from fusiond.files.csv_tables import TableError
+from fusiond.files.rows import RowFile, read_rows
 
 ROWS = [{"log": "a", "fused": 3, "rms_m": 0.5}, {"log": "b", "ended": "died", "honest": True}]
 
