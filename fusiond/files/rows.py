@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +51,12 @@ class RowFile:
         self.rows.append(row)
 
 
-def read_rows(path: Path) -> list[Row]:
-    """The rows of a Parquet file, without the names for which a row has nothing."""
+def read_rows(path: Path, without: Collection[str] = ()) -> list[Row]:
+    """The rows of a Parquet file, but for some names and those for which a row has nothing."""
     arrow, parquet = _arrow()
     try:
-        found = parquet.read_table(path).to_pylist()
+        wanted = [name for name in parquet.read_schema(path).names if name not in without]
+        found = parquet.read_table(path, columns=wanted).to_pylist()
     except arrow.ArrowInvalid as error:
         raise TableError(f"{path}: no Parquet file: {error}") from error
     return [{name: value for name, value in row.items() if value is not None} for row in found]

@@ -87,6 +87,31 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
+class Grid:
+    """Rows of texts and numbers that a reader sorts and searches; the first cell leads to `links`
+    where there is one. There may be a hundred thousand."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str | float | None]]
+    links: Sequence[str]
+    wrong: frozenset[int] = frozenset()
+
+    def as_json(self, zero_s: float) -> dict[str, Any]:
+        rows = [
+            [float(f"{v:.5g}") if isinstance(v, float) else v for v in row] for row in self.rows
+        ]
+        return {
+            "kind": "grid",
+            "title": self.title,
+            "head": list(self.head),
+            "rows": rows,
+            "links": list(self.links) if any(self.links) else [],
+            "wrong": sorted(self.wrong),
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class Track:
     """The way from above: metres north and east of its beginning, (n,) each.
 
@@ -132,7 +157,7 @@ class Sentence:
         return {"kind": "sentence", "text": self.text}
 
 
-Item = Plot | Table | Track | Sentence
+Item = Plot | Table | Grid | Track | Sentence
 
 
 @dataclass(frozen=True, slots=True)

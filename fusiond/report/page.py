@@ -14,7 +14,7 @@ from string import Template
 from typing import Any
 
 _STYLES = ("uplot/uPlot.min.css", "report.css")
-_SCRIPTS = ("uplot/uPlot.iife.min.js", "base.js", "plots.js", "track.js", "page.js")
+_SCRIPTS = ("uplot/uPlot.iife.min.js", "base.js", "plots.js", "track.js", "grid.js", "page.js")
 
 
 def page(title: str, document: Mapping[str, Any]) -> str:

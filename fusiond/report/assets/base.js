@@ -2,6 +2,7 @@
 "use strict";
 const doc = JSON.parse(document.getElementById("data").textContent);
 const two = doc.runs.length > 1;
+const timed = !doc.drives; // a page of many drives has no axis of time
 
 function element(tag, className, text) {
   const e = document.createElement(tag);

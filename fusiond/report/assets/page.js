@@ -37,6 +37,7 @@ function cell(item, run, pair, parent) {
     return;
   }
   if (item.kind === "table") table(item, box);
+  else if (item.kind === "grid") grid(item, box);
   else {
     box.appendChild(element("h3", "", item.title));
     const holder = box.appendChild(element("div", item.kind));
@@ -51,7 +52,7 @@ function banner(run, parent) {
   const worst = wrong.some((p) => p[0] === "error") ? "error" : wrong.length ? "warning" : "fine";
   const box = parent.appendChild(element("div", "banner " + worst));
   if (!wrong.length) {
-    box.textContent = "Nothing is wrong with this file.";
+    box.textContent = timed ? "Nothing is wrong with this file." : "Every one has its figures.";
     return;
   }
   box.appendChild(element("b", "", `What is wrong with ${run.name}`));
@@ -67,7 +68,7 @@ function heading(parent) {
     const box = runs.appendChild(element("div"));
     if (two) box.appendChild(element("h3", "", run.name));
     banner(run, box);
-    box.appendChild(element("p", "quiet", run.zero));
+    if (run.zero) box.appendChild(element("p", "quiet", run.zero));
   }
   if (doc.note) parent.appendChild(element("p", "quiet", doc.note));
   const chips = parent.appendChild(element("div", "chips"));
@@ -79,6 +80,7 @@ function heading(parent) {
 
 function build() {
   if (two) document.body.classList.add("two");
+  if (!timed) document.body.classList.add("many");
   const main = document.querySelector("main"), nav = document.querySelector("nav");
   heading(document.querySelector("header"));
   doc.sections.forEach((section, number) => {
@@ -87,11 +89,13 @@ function build() {
     nav.appendChild(element("a", "", section.title)).setAttribute("href", "#section-" + number);
     for (const row of section.rows) {
       const line = main.appendChild(element("div", row.length > 1 ? "row pair" : "row"));
+      if (!timed && row[0].kind === "plot") line.classList.add("half");
       const pair = row.filter((item) => item && item.kind === "plot");
       row.forEach((item, k) => cell(item, doc.runs[row.length > 1 ? k : doc.runs.length - 1], pair, line));
     }
   });
-  nav.appendChild(element("button", "", "all of the time")).onclick = () => view.all();
+  if (timed) nav.appendChild(element("button", "", "all of the time")).onclick = () => view.all();
+  hover.hidden = !timed;
 }
 
 function redraw() {

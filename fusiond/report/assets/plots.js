@@ -133,14 +133,14 @@ function lines(u, levels) {
 
 // One plot; `pair` are the plots of the same thing in both runs, which share their vertical range.
 function plot(item, run, pair, parent) {
-  const timed = item.x_label === null;
+  const overTime = item.x_label === null;
   const ink = colour("quiet"), grid = { stroke: colour("grid"), width: 1 };
   const axis = { stroke: ink, grid, ticks: grid, font: "12px system-ui, sans-serif" };
   const bars = item.series.some((s) => s.role === "bars");
   const stretch = (u, low, high) => {
     const [x] = columnsOf(item);
     // uPlot asks with the ends of the data when nobody has chosen a stretch.
-    if (timed) return low === x[0] && high === x[x.length - 1] ? [view.from, view.to] : [low, high];
+    if (overTime) return low === x[0] && high === x[x.length - 1] ? [view.from, view.to] : [low, high];
     const half = bars && x.length > 1 ? 0.5 * (x[1] - x[0]) : 0;
     return high > low ? [low - half, high + half] : [low - 1, low + 1];
   };
@@ -155,7 +155,7 @@ function plot(item, run, pair, parent) {
       },
     },
     axes: [
-      timed
+      overTime
         ? { ...axis, space: 70, size: 32, values: (u, ticks) => ticks.map(clock) }
         : { ...axis, label: item.x_label, labelSize: 18, size: 32, labelFont: axis.font },
       {
@@ -168,13 +168,13 @@ function plot(item, run, pair, parent) {
       },
     ],
     series: [
-      { label: timed ? "t" : item.x_label, value: (u, v) => (v === null ? "–" : timed ? clock(v) : figure(v)) },
+      { label: overTime ? "t" : item.x_label, value: (u, v) => (v === null ? "–" : overTime ? clock(v) : figure(v)) },
       ...seriesOf(item),
     ],
     cursor: { drag: { x: true, y: false } },
     hooks: {},
   };
-  if (timed) {
+  if (overTime) {
     options.cursor.sync = { key: "time" };
     options.cursor.bind = { dblclick: () => () => view.all() };
     options.hooks = {
@@ -192,7 +192,7 @@ function plot(item, run, pair, parent) {
     };
   }
   const u = new uPlot(options, columnsOf(item), parent);
-  if (timed) timePlots.push(u);
+  if (overTime) timePlots.push(u);
   return u;
 }
 
