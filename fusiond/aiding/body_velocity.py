@@ -56,10 +56,8 @@ SIGN_SIGMAS = 3.0
 
 def _slots(model: Model, drift: str, scale: str = "", latency: str = "") -> Indices:
     """Slots (6,) of the parameters, by the names of the blocks of drift, scale and latency."""
-    found = [*(model.slots_of(MOUNTING) or (-1, -1))]
-    for block in (AXLE_LEVER, drift, scale, latency):
-        found += model.slots_of(block) or (-1,)
-    return np.array(found, dtype=np.int64)
+    own = (AXLE_LEVER, 1), (drift, 1), (scale, 1), (latency, 1)
+    return model.slots_or_missing((MOUNTING, 2), *own)
 
 
 @compiled("f8(f8[::1], i8)", forceinline=True)
@@ -192,7 +190,8 @@ class NonHolonomicAid(Aid):
             return NotApplicable("too_slow")
         count = 1 if state.model.hold_height else 2  # right, down
         z, h = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model, SIDE_DRIFT))
-        return Innovation(z, h, np.square((self.sd_m_s, self.sd_down_m_s)[:count]))
+        sds = (self.sd_m_s, self.sd_down_m_s)[:count]
+        return Innovation(z, h, np.array([sd * sd for sd in sds]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,13 +225,13 @@ class WheelSpeedAid(Aid):
             if abs(forward) <= SIGN_SIGMAS * sd:
                 return NotApplicable("direction_unknown")
             speed = math.copysign(speed, forward)
-        z -= speed
+        z[0] -= speed
         variance = self.sd_m_s**2
         rounding = state.model.slots_of(self.rounding)
         if rounding and self.shared_step_m_s:
             (slot,) = rounding
             step = math.copysign(self.shared_step_m_s, speed)
-            z -= step * state.xi[slot]
+            z[0] -= step * state.xi[slot]
             h[0, slot] = step
             variance -= (step * state.model.initial[slot]) ** 2
         return Innovation(z, h, np.array([variance]))

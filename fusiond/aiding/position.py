@@ -50,7 +50,7 @@ _UNKNOWN = np.zeros((0, 0))
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8, f8,"
-    "f8[:, :], f8[::1], f8[:, ::1], f8[::1])"
+    "f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])"
 )
 def _position(
     nav: Array,
@@ -66,15 +66,22 @@ def _position(
     l0: float,
     l1: float,
     l2: float,
+    sd0: float,
+    sd1: float,
+    sd2: float,
+    sd_time: float,
     p: Array,
     z: Array,
     h: Array,
     r: Array,
 ) -> None:
-    """Write z (m,) and H (m, n), zero before, for the first m of north, east, down; add to r (m,)
-    what the offset in time leaves out, by P (n, n), or (0, 0) where none is known. `bias` (up to
+    """Write z (m,), H (m, n), zero before, and r (m,) for the first m of north, east, down, with
+    what the offset in time leaves out by P (n, n), or (0, 0) where none is known. `bias` (up to
     3,), `time` (0 or 1,), `rest` (0 or 3,): slots in `xi`."""
     m, n = h.shape
+    r[0], r[1] = sd0 * sd0, sd1 * sd1
+    if m > 2:
+        r[2] = sd2 * sd2
     c = dcm_elements(nav[Q0:])
     if rest.size:
         l0, l1, l2 = l0 + xi[rest[0]], l1 + xi[rest[1]], l2 + xi[rest[2]]
@@ -122,6 +129,9 @@ def _position(
                 square = a[i] * p[slot, slot]
                 left = variance * p[slot, slot] + across * across
                 r[i] += max(left - 2.0 * square * across + 0.5 * square * square, 0.0)
+    if sd_time > 0.0:
+        for i in range(m):
+            r[i] += (nav[VN + i] * sd_time) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,18 +155,15 @@ class PositionAid(Aid):
     rest: str = ""
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, model, p = state.nav, state.model, state.covariance
+        nav, xi, step, model, p = state
         rows = 2 if self.height_m is None or model.hold_height else 3
         height = 0.0 if self.height_m is None else self.height_m
-        z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.square(self.sd[:rows])
-        bias = model.slots_of_all(self.bias)
-        time, rest = model.slots_of_all((self.time,)), model.slots_of_all((self.rest,))
-        slots = model.column_of, bias, time, rest
+        z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
+        slots = model.slots_of_each(self.bias, (self.time,), (self.rest,))
         fix = self.lat_rad, self.lon_rad, height
+        where = *self.lever, *self.sd, self.sd_time_s
         of_time = _UNKNOWN if p is None else p
-        _position(nav, state.xi, state.step, *slots, *fix, *self.lever, of_time, z, h, r)
-        if self.sd_time_s:
-            r += np.square(nav[VN : VN + rows] * self.sd_time_s)
+        _position(nav, xi, step, model.column_of, *slots, *fix, *where, of_time, z, h, r)
         return Innovation(z, h, r)
 
     def coarser(self, factor: float) -> PositionAid:

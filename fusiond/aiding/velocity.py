@@ -37,7 +37,8 @@ Indices = NDArray[np.int64]
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])"
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8, f8, f8, f8,"
+    "f8, f8, f8[::1], f8[:, ::1], f8[::1])"
 )
 def _velocity(
     nav: Array,
@@ -46,19 +47,28 @@ def _velocity(
     column_of: Indices,
     time: Indices,
     rest: Indices,
+    v0: float,
+    v1: float,
+    v2: float,
+    sd0: float,
+    sd1: float,
+    sd2: float,
     l0: float,
     l1: float,
     l2: float,
+    sd_time: float,
     z: Array,
     h: Array,
+    r: Array,
 ) -> None:
-    """Write the antenna's velocity z (m,) and H (m, n), zero before: the first m of n, e, d.
+    """Write z (m,), H (m, n), zero before, and r (m,) for the first m of north, east, down.
     `time` (0 or 1,), `rest` (0 or 3,): slots in `xi`."""
     if rest.size:
         l0, l1, l2 = l0 + xi[rest[0]], l1 + xi[rest[1]], l2 + xi[rest[2]]
     c = dcm_elements(nav[Q0:])
     antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, z, h)
     f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
+    down = f2 + gravity(nav[LAT], nav[HEIGHT])
     for slot in time:
         late_s = xi[slot]
         z[0] += f0 * late_s
@@ -69,11 +79,21 @@ def _velocity(
         h[1, 0] += late_s * f2
         h[1, 2] -= late_s * f0
         if z.shape[0] > 2:
-            down = f2 + gravity(nav[LAT], nav[HEIGHT])
             z[2] += down * late_s
             h[2, slot] = -down
             h[2, 0] -= late_s * f1
             h[2, 1] += late_s * f0
+    z[0] -= v0
+    z[1] -= v1
+    r[0], r[1] = sd0 * sd0, sd1 * sd1
+    if z.shape[0] > 2:
+        z[2] -= v2
+        r[2] = sd2 * sd2
+    if sd_time > 0.0:
+        r[0] += (f0 * sd_time) ** 2
+        r[1] += (f1 * sd_time) ** 2
+        if z.shape[0] > 2:
+            r[2] += (down * sd_time) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,15 +115,13 @@ class VelocityAid(Aid):
         return self.source.removesuffix(SUFFIX)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        model = state.model
+        nav, xi, step, model, _ = state
         rows = 2 if model.hold_height else len(self.v_ned)
-        z, h = np.empty(rows), np.zeros((rows, model.size))
-        slots = model.column_of, model.slots_of_all((self.time,)), model.slots_of_all((self.rest,))
-        _velocity(state.nav, state.xi, state.step, *slots, *self.lever, z, h)
-        z -= self.v_ned[:rows]
-        r = np.square(self.sd[:rows])
-        if self.sd_time_s:
-            r += np.square(state.acceleration[:rows] * self.sd_time_s)
+        z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
+        slots = model.slots_of_each((self.time,), (self.rest,))
+        v, sd = (*self.v_ned, 0.0)[:3], (*self.sd, 0.0)[:3]
+        where = *self.lever, self.sd_time_s
+        _velocity(nav, xi, step, model.column_of, *slots, *v, *sd, *where, z, h, r)
         return Innovation(z, h, r)
 
     def offers(self) -> tuple[VelocityOffer, ...]:

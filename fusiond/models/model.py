@@ -114,6 +114,30 @@ class Model:
             found = self._joined[blocks] = np.array(slots, dtype=np.int64)
         return found
 
+    def slots_of_each(self, *lists: tuple[str, ...]) -> tuple[Indices, ...]:
+        """`slots_of_all` of several lists of blocks: what an aid asks at each of its instants."""
+        found = self._each.get(lists)
+        if found is None:
+            found = self._each[lists] = tuple(self.slots_of_all(blocks) for blocks in lists)
+        return found
+
+    def slots_or_missing(self, *blocks: tuple[str, int]) -> Indices:
+        """The slots of blocks (name, states) one after another (k,), as kernels take them; -1 for
+        each state of a block that the model has not."""
+        found = self._or_missing.get(blocks)
+        if found is None:
+            slots = [slot for name, n in blocks for slot in self.slots_of(name) or [-1] * n]
+            found = self._or_missing[blocks] = np.array(slots, dtype=np.int64)
+        return found
+
+    @cached_property
+    def _or_missing(self) -> dict[tuple[tuple[str, int], ...], Indices]:
+        return {}
+
+    @cached_property
+    def _each(self) -> dict[tuple[tuple[str, ...], ...], tuple[Indices, ...]]:
+        return {}
+
     @cached_property
     def _joined(self) -> dict[tuple[str, ...], Indices]:
         return {}
