@@ -51,7 +51,7 @@ from fusiond.integrity import support
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart
 from fusiond.integrity.series import DRIFTS, NEVER_NS, Series
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
-from fusiond.integrity.tilt import NOT_TILTING, Tilting
+from fusiond.integrity.tilt import Tilting
 
 Array = NDArray[np.float64]
 
@@ -108,8 +108,10 @@ class Isolation:
 
     def __init__(self, false_alarm: float = FALSE_ALARM) -> None:
         self._records: dict[str, Series] = {}
+        self._shared: set[str] = set()
+        """Series whose record a checkpoint has too: copied before it is changed."""
         self._doubts: tuple[int, ...] = ()
-        self._tilting = NOT_TILTING
+        self._tilting = Tilting()
         self._contradicted = False
         self._pass = 1.0 - false_alarm
 
@@ -151,20 +153,20 @@ class Isolation:
 
     def snapshot(self) -> Memory:
         """A copy of everything."""
-        records = {name: r.copied() for name, r in self._records.items()}
-        return Memory(records, self._doubts, self._tilting)
+        self._shared = set(self._records)
+        return Memory(self._records.copy(), self._doubts, self._tilting.copied())
 
     def restore(self, memory: Memory) -> None:
         """Back to a snapshot."""
-        self._records = {name: r.copied() for name, r in memory.records.items()}
-        self._doubts, self._tilting = memory.doubts, memory.tilting
+        self._records, self._shared = memory.records.copy(), set(memory.records)
+        self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
 
     def reset(self, contradicted: bool = False) -> None:
         """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
         their velocities are to prove themselves, as after an outage."""
         self._contradicted = contradicted
-        self._records.clear()
-        self._doubts, self._tilting = (), NOT_TILTING
+        self._records, self._shared = {}, set()
+        self._doubts, self._tilting = (), Tilting()
 
     # ------------------------------------------------------------------ judgement
 
@@ -211,13 +213,17 @@ class Isolation:
             return Action.NONE
         return self._doubted(self._blame(record, aid), t_ns)
 
-    def corrected(self, t_ns: int, before: Array, after: Array) -> Action:
-        """A position or velocity was fused; what the filter shall do about the attitude (7,), as
+    def correcting(self, nav: Array, covariance: Array) -> None:
+        """A position or velocity is about to be fused into a filter with the state `nav` (10,) and
+        P (n, n)."""
+        self._tilting.before(nav, covariance)
+
+    def corrected(self, t_ns: int, nav: Array, covariance: Array) -> Action:
+        """It was, and these are what came of it; what the filter shall do about the attitude, as
         fusiond.integrity.tilt has it."""
-        self._tilting = self._tilting.with_one(t_ns, before, after)
-        if not self._tilting.too_far:
+        if not self._tilting.after(t_ns, nav, covariance):
             return Action.NONE
-        self._tilting = NOT_TILTING
+        self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
     def _record(self, aid: Aid) -> Series:
@@ -227,7 +233,11 @@ class Isolation:
         if record is None:
             record = Series(aid.device, aid.locates, aid.moves, t_ns, aid.no_slip)
             self._records[aid.source] = record
-        elif t_ns - record.heard_ns > FORGET_NS:
+            return record
+        if aid.source in self._shared:
+            self._shared.discard(aid.source)
+            record = self._records[aid.source] = record.copied()
+        if t_ns - record.heard_ns > FORGET_NS:
             record.repeats = record.passes = 0
             record.means.restart()
             if not record.excluded:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.strapdown import Q0
 
 Array = NDArray[np.float64]
 
@@ -38,35 +39,28 @@ _SINCE, _C, _V, _SIZE = 0, 1, 3, 6
 
 
 @compiled("void(f8[::1], f8[:, :], f8[::1])")
-def _write(q: Array, covariance: Array, out: Array) -> None:
+def _remember(nav: Array, covariance: Array, before: Array) -> None:
     for i in range(4):
-        out[i] = q[i]
-    out[4], out[5], out[6] = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+        before[i] = nav[Q0 + i]
+    before[4], before[5], before[6] = covariance[0, 0], covariance[0, 1], covariance[1, 1]
 
 
-def attitude(q: Array, covariance: Array) -> Array:
-    """What a filter holds (7,): its quaternion `q` (4,), body to navigation axes, and of P (n, n)
-    the tilt's nn, ne and ee (rad^2)."""
-    out = np.empty(7)
-    _write(q, covariance, out)
-    return out
-
-
-@compiled("b1(f8[::1], i8, f8[::1], f8[::1])")
-def _add(sums: Array, t_ns: int, before: Array, after: Array) -> bool:
+@compiled("b1(f8[::1], i8, f8[::1], f8[::1], f8[:, :])")
+def _add(sums: Array, t_ns: int, before: Array, nav: Array, covariance: Array) -> bool:
     """Add an update to `sums`; whether they do not fit the covariance that they were made with."""
     since_ns = sums[:1].view(np.int64)
     f = math.exp(-max(0, t_ns - since_ns[0]) * 1e-9 / LASTS_S)
     since_ns[0] = t_ns
     w, x, y, z = before[0], before[1], before[2], before[3]
-    to_w, to_x, to_y, to_z = after[0], after[1], after[2], after[3]
+    to_w, to_x, to_y, to_z = nav[Q0], nav[Q0 + 1], nav[Q0 + 2], nav[Q0 + 3]
     # Vector part of after times before's conjugate: half of the small turn.
     way = math.copysign(2.0, w * to_w + x * to_x + y * to_y + z * to_z)
     north = f * sums[_C] + way * (to_x * w - to_w * x - to_y * z + to_z * y)
     east = f * sums[_C + 1] + way * (to_y * w - to_w * y + to_x * z - to_z * x)
     sums[_C], sums[_C + 1] = north, east
+    after = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     for k in range(3):
-        sums[_V + k] = f * f * sums[_V + k] + (before[4 + k] - after[4 + k])
+        sums[_V + k] = f * f * sums[_V + k] + (before[4 + k] - after[k])
     nn, ne, ee = sums[_V], sums[_V + 1], sums[_V + 2]
     determinant = nn * ee - ne * ne
     if nn <= 0.0 or determinant <= 1e-9 * nn * ee:
@@ -77,25 +71,28 @@ def _add(sums: Array, t_ns: int, before: Array, after: Array) -> bool:
 
 
 class Tilting:
-    """The sums at an instant. `too_far`: the corrections do not fit the covariance that they were
-    made with."""
+    """The sums at an instant, and what a filter held before the update that comes next."""
 
-    __slots__ = ("_sums", "too_far")
+    __slots__ = ("_before", "_sums")
 
     def __init__(self, sums: Array | None = None) -> None:
         self._sums = np.zeros(_SIZE) if sums is None else sums
-        self.too_far = False
+        self._before = np.empty(7)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Tilting) and self._sums.tobytes() == other._sums.tobytes()
 
     __hash__ = None  # type: ignore[assignment]
 
-    def with_one(self, t_ns: int, before: Array, after: Array) -> Tilting:
-        """With one update more: the attitude (7,) before and after it."""
-        tilting = Tilting(self._sums.copy())
-        tilting.too_far = _add(tilting._sums, t_ns, before, after)
-        return tilting
+    def copied(self) -> Tilting:
+        """A copy for a checkpoint."""
+        return Tilting(self._sums.copy())
 
+    def before(self, nav: Array, covariance: Array) -> None:
+        """What a filter holds before an update: the state `nav` (10,) and P (n, n)."""
+        _remember(nav, covariance, self._before)
 
-NOT_TILTING = Tilting()
+    def after(self, t_ns: int, nav: Array, covariance: Array) -> bool:
+        """Add that update, after which it holds these; whether the corrections do not fit the
+        covariance that they were made with."""
+        return _add(self._sums, t_ns, self._before, nav, covariance)

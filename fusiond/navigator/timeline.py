@@ -19,9 +19,7 @@ from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
-from fusiond.integrity.tilt import attitude
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.strapdown import Q0
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
 
@@ -207,7 +205,8 @@ class Timeline:
         believed = isolation.believes(entry.aid.source)
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
         tilts = (entry.aid.locates or entry.aid.moves) and estimator.model.sensor_errors
-        before = attitude(estimator.nav[Q0:], estimator.covariance) if tilts else None
+        if tilts:
+            isolation.correcting(estimator.nav, estimator.covariance)
         try:
             aid = entry.aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
@@ -217,9 +216,8 @@ class Timeline:
             return Outcome("failed")
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav)
-            if action is Action.NONE and outcome.name == "fused" and before is not None:
-                after = attitude(estimator.nav[Q0:], estimator.covariance)
-                action = isolation.corrected(aid.t_ns, before, after)
+            if action is Action.NONE and outcome.name == "fused" and tilts:
+                action = isolation.corrected(aid.t_ns, estimator.nav, estimator.covariance)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome

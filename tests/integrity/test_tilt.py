@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.integrity.tilt import NOT_TILTING, Tilting, attitude
+from fusiond.integrity.tilt import Tilting
 from fusiond.navigation.rotation import quaternion_from_rpy, rotation_vector_to_quaternion
+from fusiond.navigation.strapdown import Q0
 
 Array = NDArray[np.float64]
 
@@ -33,7 +34,12 @@ class Level:
         self.error = MEASURED_RAD * self.rng.standard_normal(2)
         self.q = quaternion_from_rpy(0.05, -0.1, 2.0)
         self.t_ns = 0
-        self.tilting: Tilting = NOT_TILTING
+        self.tilting = Tilting()
+
+    @property
+    def nav(self) -> Array:
+        """Navigation state (10,), of which the attitude alone counts."""
+        return np.concatenate((np.zeros(Q0), self.q))
 
     def run(self, seconds: float, rate: tuple[float, float] = (0.0, 0.0)) -> float | None:
         """Seconds until the corrections go too far; None if they do not."""
@@ -41,15 +47,14 @@ class Level:
             self.t_ns += round(EVERY_S * S)
             self.error += WALK_RAD * self.rng.standard_normal(2) + EVERY_S * np.array(rate)
             self.p = self.p + np.eye(2) * WALK_RAD**2
-            before = attitude(self.q, self.p)
+            self.tilting.before(self.nav, self.p)
             gain = self.p @ np.linalg.inv(self.p + np.eye(2) * MEASURED_RAD**2)
             d = -gain @ (self.error + MEASURED_RAD * self.rng.standard_normal(2))
             self.error += d
             turn = np.array(rotation_vector_to_quaternion(float(d[0]), float(d[1]), 0.0))
             self.q = multiplied(turn, self.q)
             self.p = (np.eye(2) - gain) @ self.p
-            self.tilting = self.tilting.with_one(self.t_ns, before, attitude(self.q, self.p))
-            if self.tilting.too_far:
+            if self.tilting.after(self.t_ns, self.nav, self.p):
                 return (k + 1) * EVERY_S
         return None
 
