@@ -139,12 +139,12 @@ class Aid:
         return ()
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
-        """The series of innovations that a verdict judges: of each by name this epoch's row (m,).
+        """Of a screened aid, the series of innovations that a verdict judges: of each by name this
+        epoch's row (m,). Other aids are one series, under their source's name.
 
-        `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows of a screened
-        aid were used. The series without a name is the source's own.
+        `whitened` (m,) the innovation as the filter found it, `kept` (m,) which rows were used.
         """
-        return {"": np.array(whitened)}
+        return {}
 
 
 class Linearised(Protocol):

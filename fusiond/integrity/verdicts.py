@@ -3,7 +3,7 @@ sigma."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +20,6 @@ from fusiond.integrity.consistency import (
 from fusiond.integrity.monitor import ConsistencyMonitor
 
 Array = NDArray[np.float64]
-
-
-_WHOLE: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
-
-
-def _kept(codes: Sequence[int]) -> NDArray[np.bool_]:
-    """Which rows of a screened aid were used (m,); empty of one that is used as a whole."""
-    return np.array(codes) == KEPT if codes else _WHOLE
 
 
 class Verdicts:
@@ -48,11 +40,12 @@ class Verdicts:
         """An aid has been fused; to be called once for each, though a rewind brings it again."""
         if aid.constraint or not outcome.whitened:
             return
-        for name, row in aid.series(outcome.whitened, _kept(outcome.rows)).items():
-            if name:
-                self._add(f"{aid.source}_{name}", aid, row, float(row @ row))
-            else:
-                self._add(aid.source, aid, row, outcome.nis)
+        if not aid.screened:
+            self._add(aid.source, aid, np.array(outcome.whitened), outcome.nis)
+            return
+        kept = np.array(outcome.rows) == KEPT
+        for name, row in aid.series(outcome.whitened, kept).items():
+            self._add(f"{aid.source}_{name}", aid, row, float(row @ row))
 
     def _add(self, source: str, aid: Aid, row: Array, nis: float) -> None:
         monitor = self._monitors.get(source)

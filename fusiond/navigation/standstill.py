@@ -126,25 +126,23 @@ class StandstillDetector:
             row = stop
             first = self._first - start
             if 0 <= first < stop:
-                window = judge(times, samples, first, stop, self.limits)
-                windows.append(self._in_a_row(self._same_force(window)))
+                windows.append(self._judged(judge(times, samples, first, stop, self.limits)))
             self._first = start + stop
         return windows
 
-    def _same_force(self, w: Window) -> Window:
-        """Not quiet if the mean force has left that of the first window of this rest."""
+    def _judged(self, w: Window) -> Window:
+        """With the quiet windows before it: none itself if the mean force has left that of the
+        first window of this rest."""
         if not w.quiet:
-            self._reference = None
-        elif self._reference is None:
+            self._reference, self._run = None, []
+            return w
+        if self._reference is None:
             self._reference = w.mean_force
         elif np.abs(w.mean_force - self._reference).max() > self.limits.force_sd:
-            self._reference = None
+            self._reference, self._run = None, []
             return replace(w, quiet=False)
-        return w
-
-    def _in_a_row(self, w: Window) -> Window:
-        self._run = [*self._run, w.mean_rate][-LONGEST_RUN:] if w.quiet else []
-        if not w.quiet:
+        self._run = [*self._run, w.mean_rate][-LONGEST_RUN:]
+        if len(self._run) == 1:
             return w
-        rate: Array = np.mean(self._run, axis=0)
+        rate: Array = np.add.reduce(self._run) / len(self._run)
         return replace(w, run=len(self._run), run_rate=rate)

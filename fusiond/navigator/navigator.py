@@ -370,24 +370,25 @@ class Navigator:
         return name
 
     def _outcome(self, entry: Entry) -> None:
-        outcome = entry.outcome
-        if outcome is not None and self.warm is not None and entry.aid.locates:
-            self.warm.judge(entry.aid.source, outcome.name)
-        if outcome is not None and outcome.name == "fused":
+        outcome, aid, t_ns = entry.outcome, entry.aid, entry.key[0]
+        if outcome is None:
+            return
+        name = outcome.name
+        if self.warm is not None and aid.locates:
+            self.warm.judge(aid.source, name)
+        if name == "fused":
             if outcome.whitened and not entry.judged:
                 entry.judged = True
-                self.verdicts.judge(entry.aid, outcome)
-            source, t_ns = entry.aid.source, entry.key[0]
-            self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
-            if entry.aid.locates:
+                self.verdicts.judge(aid, outcome)
+            self.last_fused_ns[aid.source] = max(t_ns, self.last_fused_ns.get(aid.source, 0))
+            if aid.locates:
                 self._last_position_ns = max(t_ns, self._last_position_ns)
-        if outcome is not None and outcome.name == TURNS_AT_REST:
-            self._standing.turned(entry.key[0])
-        if outcome is not None:
-            entry.aid.judged(outcome.rows, outcome.whitened)
-            if outcome.name in JUDGED:
-                self._protection.look(entry.aid)
+        elif name == TURNS_AT_REST:
+            self._standing.turned(t_ns)
+        aid.judged(outcome.rows, outcome.whitened)
+        if name in JUDGED:
+            self._protection.look(aid)
         if entry.error:
-            self._failed.tell(entry.aid.source, entry.error)
+            self._failed.tell(aid.source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)
