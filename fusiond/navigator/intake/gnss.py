@@ -43,6 +43,7 @@ FIX_BIAS = "gnss_bias"
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
 # An operator who errs by six sigma is wrong.
 OPERATOR_GATE = 1.0 - 1e-9
+_SHARED = FIX_TIME, VELOCITY_TIME, ANTENNA_LEVER
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -64,24 +65,37 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         math.hypot(max(e * scale, least), rounding[1]),
         math.hypot(max(d * scale, least), rounding[2]),
     )
-    found: list[Aid] = [
-        PositionAid(
-            m.source,
-            when.t_ns,
-            o.gate_probability,
-            m.lat_rad,
-            m.lon_rad,
-            m.height_m,
-            sd,
-            o.lever_arm_m,
-            math.hypot(when.sd_time_s, o.time_sd_s),
-            () if by_phase(m) else _fix_bias(m.source, o, sections),
-            sections.own(FIX_TIME, m.source, o),
-            rest=sections.own(ANTENNA_LEVER, m.source, o),
-        )
-    ]
-    velocity = _velocity(m, o, when, sections) if o.use_velocity else None
-    return found if velocity is None else [*found, velocity]
+    time, velocity_time, rest = sections.each_own(_SHARED, m.source, o)
+    sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
+    position = PositionAid(
+        m.source,
+        when.t_ns,
+        o.gate_probability,
+        m.lat_rad,
+        m.lon_rad,
+        m.height_m,
+        sd,
+        o.lever_arm_m,
+        sd_time_s,
+        () if by_phase(m) else _fix_bias(m.source, o, sections),
+        time,
+        rest,
+    )
+    if m.v_ned_m_s is None or not o.use_velocity:
+        return [position]
+    v, sd_v = _velocity(m, m.v_ned_m_s, o)
+    velocity = VelocityAid(
+        f"{m.source}{SUFFIX}",
+        when.t_ns - round(o.velocity_delay_s * 1e9),
+        o.gate_probability,
+        v,
+        sd_v,
+        o.lever_arm_m,
+        velocity_time,
+        rest,
+        sd_time_s,
+    )
+    return [position, velocity]
 
 
 def by_phase(m: PositionFix) -> bool:
@@ -101,35 +115,20 @@ def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:
 
 
 def _velocity(
-    m: PositionFix, o: GnssAiding, when: Instants, sections: Sections
-) -> VelocityAid | None:
-    if m.v_ned_m_s is None:
-        return None
-    north, east, down = m.v_ned_m_s
+    m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssAiding
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """North, east, and down where it is measured, and one sigma of each."""
+    north, east, down = v_ned
     sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
-    horizontal = o.velocity_sd_m_s
-    rounding = m.rounding_sd_v_m_s
-    v: tuple[float, ...] = (north, east)
-    sds: tuple[float, ...] = (
+    horizontal, rounding = o.velocity_sd_m_s, m.rounding_sd_v_m_s
+    sds = (
         math.hypot(_speed_sd(sd_n, horizontal, o), rounding),
         math.hypot(_speed_sd(sd_e, horizontal, o), rounding),
     )
-    if down is not None:
-        v = (north, east, down)
-        sd_down = _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o)
-        sds = (*sds, math.hypot(sd_down, rounding))
-    t_ns = when.t_ns - round(o.velocity_delay_s * 1e9)
-    return VelocityAid(
-        f"{m.source}{SUFFIX}",
-        t_ns,
-        o.gate_probability,
-        v,
-        sds,
-        o.lever_arm_m,
-        sections.own(VELOCITY_TIME, m.source, o),
-        rest=sections.own(ANTENNA_LEVER, m.source, o),
-        sd_time_s=math.hypot(when.sd_time_s, o.time_sd_s),
-    )
+    if down is None:
+        return (north, east), sds
+    sd_down = _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o)
+    return (north, east, down), (*sds, math.hypot(sd_down, rounding))
 
 
 def _speed_sd(stated: float | None, default: float, o: GnssAiding) -> float:

@@ -34,7 +34,7 @@ class Sections:
             if isinstance(section, RawAiding)
         }
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
-        self._names: dict[tuple[str, str, type[Aiding]], str] = {}
+        self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section, of what comes from now on."""
@@ -69,13 +69,18 @@ class Sections:
     def own(self, block: str, source: str, section: Aiding) -> str:
         """The block's name: with the source's, where that has a section of its own that is not
         simply named after its kind."""
-        key = block, source, type(section)
-        name = self._names.get(key)
-        if name is None:
+        return self.each_own((block,), source, section)[0]
+
+    def each_own(self, blocks: tuple[str, ...], source: str, section: Aiding) -> tuple[str, ...]:
+        """`own` of several blocks: what each measurement asks anew."""
+        key = source, type(section), blocks
+        names = self._names.get(key)
+        if names is None:
             kind = type(section).model_fields["kind"].default
             own = self.aiding.get(source) is section and source != kind
-            name = self._names[key] = f"{block}_{source}" if own else block
-        return name
+            names = tuple(f"{block}_{source}" if own else block for block in blocks)
+            self._names[key] = names
+        return names
 
 
 @dataclass(frozen=True, slots=True)

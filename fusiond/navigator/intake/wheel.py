@@ -22,6 +22,9 @@ from fusiond.models.vehicle import (
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 
+# What a wheel errs by, in the order of `WheelSpeedAid`.
+_ERRORS = WHEEL_DRIFT, WHEEL_SCALE, WHEEL_LATENCY, WHEEL_ROUNDING
+
 
 def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
     """The speed, with the section's sigma where the device states none, and what rounding adds."""
@@ -37,10 +40,7 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
             o.lever_arm_m,
             m.signed,
             m.rounding_sd_m_s,
-            sections.own(WHEEL_DRIFT, m.source, o),
-            sections.own(WHEEL_SCALE, m.source, o),
-            sections.own(WHEEL_LATENCY, m.source, o),
-            sections.own(WHEEL_ROUNDING, m.source, o),
+            *sections.each_own(_ERRORS, m.source, o),
             m.shared_step_m_s,
         )
     ]
