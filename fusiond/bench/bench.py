@@ -31,7 +31,9 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
+from fusiond.bench.late_fix import late_fix
 from fusiond.bench.raw_epoch import raw_epoch
+from fusiond.bench.start import start
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator
@@ -79,7 +81,10 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     again to the present, with a position fix five times a second and a checkpoint every 0.5 s;
     `process_epoch_ratio`, `fusiond process` by IMU row: 100 Hz IMU, 4 Hz GNSS position and
     velocity in order of validity, files read and the solution written at every row;
-    `raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`).
+    `raw_epoch_40_ratio`, an epoch of 40 satellites (`fusiond.bench.raw_epoch`);
+    `late_tick_ratio`, the tick in which a fix comes that is 10 s late (`fusiond.bench.late_fix`).
+
+    Seconds: `process_start_s`, `fusiond process` before its first row (`fusiond.bench.start`).
 
     As ratio to the same with the centralised filter: `multiscale_step_ratio`, a second of a
     multi-scale filter with M = 2 (IMU at 100 Hz, one position and one velocity);
@@ -114,6 +119,7 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     figures["single_step_ratio"] = ratio(_single, repetitions)
     figures["rewind_2s_ratio"] = ratio(_rewind, repetitions)
     figures["raw_epoch_40_ratio"] = ratio(raw_epoch, repetitions)
+    figures["late_tick_ratio"] = ratio(late_fix(repetitions), repetitions)
     figures["multiscale_step_ratio"] = _step_ratio(
         lambda model, gap_s: MultiscaleEstimator(model, gap_s, 2), _one_source(), repetitions
     )
@@ -131,6 +137,9 @@ def bench(repetitions: int = REPETITIONS, process_s: float = PROCESS_S) -> dict[
     with tempfile.TemporaryDirectory(prefix="fusiond-bench-") as folder:
         make = _process(Path(folder), process_s)
         figures["process_epoch_ratio"] = ratio(make, max(2, repetitions // 3))
+        timed = start(Path(folder) / "start")
+        runs = [timed() for _ in range(max(1, repetitions // 3))]
+        figures["process_start_s"] = statistics.median(runs)
     figures["reduced_order_step_ratio"] = reduced_cost.step_ratio(3 * repetitions)
     return {
         "numpy_product_us": round(statistics.median(products) * 1e6, 3),

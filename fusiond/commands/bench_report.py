@@ -21,7 +21,9 @@ _ROWS = {
     "unscented_step_ratio": ("second of `unscented`", _KALMAN),
     "unscented_propagation_step_ratio": ("second of it, propagation too", _KALMAN),
     "process_epoch_ratio": ("IMU row of `process`", _PRODUCT),
+    "late_tick_ratio": ("tick with a fix that is 10 s late", _PRODUCT),
     "reduced_order_step_ratio": ("step of 17 states", "step of 23 states"),
+    "process_start_s": ("`process` before its first row", "a second"),
 }
 
 

@@ -1,0 +1,93 @@
+"""The worst tick: a fix that is 10 s late, on a vehicle with much to do again.
+
+IMU at 200 Hz, a receiver's position and velocity and a wheel's speed at 10 Hz each, ticks at
+100 Hz. The tick in which the late fix comes takes it in, runs the last 10 s again with 2000 samples
+and 300 aids, and reads the solution. It has 10 ms for that and all else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+
+from drivers.measurements import DelayedFix, MonotonicStamp, PositionFix, WheelSpeed
+from fusiond.configuration.schema import Config
+from fusiond.navigator.navigator import Navigator
+from fusiond.simulation.gnss.receiver import GnssReceiver
+from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
+
+RATE_HZ, AIDS_HZ = 200.0, 10.0
+LATE_S = 10.0
+AT_S, EVERY_S = 110.0, 1.0
+"""When the first fix comes late, well after the start, and how long the drive then goes on until
+the next does."""
+SAMPLES, TICK_SAMPLES = round(RATE_HZ / AIDS_HZ), round(RATE_HZ / 100.0)
+
+
+class Drive:
+    """A navigator that is driven on, aid by aid, and told of late fixes."""
+
+    def __init__(self, repetitions: int) -> None:
+        scenario = SCENARIOS["drive"]
+        imu = CAR_IMU.model_copy(update={"rate_hz": RATE_HZ})
+        scenario = replace(scenario, imu=imu, gnss=replace(scenario.gnss, rate_hz=AIDS_HZ))
+        self._truth = scenario.truth(AT_S + (repetitions + 1) * EVERY_S)
+        rng = np.random.default_rng(1)
+        output = scenario.imu_output(self._truth, rng)
+        self._times = np.rint(self._truth.t_s[1:] * 1e9).astype(np.int64)
+        self._samples = np.hstack((output.gyro, output.accel))
+        self._receiver = GnssReceiver(self._truth, scenario.gnss, rng)
+        lever = {"lever_arm_m": scenario.gnss.lever_arm_m}
+        aiding = {"gnss": lever, "wheel": {"lever_arm_m": scenario.no_slip_m}, "rdss": lever}
+        self._navigator = Navigator(Config.model_validate({"imu": imu, "aiding": aiding}))
+        self._row = 0
+
+    def late(self, number: int) -> Callable[[], int]:
+        """Drive on to the next late fix; the work is the tick in which it comes."""
+        until = round((AT_S + number * EVERY_S) * RATE_HZ)
+        while self._row < until:
+            self._aids(self._row // SAMPLES)
+            self._feed(SAMPLES)
+        assert self._navigator.started is not None
+        row = self._row - round(LATE_S * RATE_HZ)
+        lat, lon, height = self._truth.at(self._truth.t_s[1 + row : 2 + row]).position[0].tolist()
+        at, now = int(self._times[row]), int(self._times[self._row - 1])
+        fix = DelayedFix("rdss", now, MonotonicStamp(at), lat, lon, height, 20.0)
+
+        def work() -> int:
+            rewinds = self._navigator.timeline.counters.rewinds
+            assert self._navigator.add(fix, at, seen_ns=now) == "accepted"
+            self._feed(TICK_SAMPLES)
+            self._navigator.solution(int(self._times[self._row - 1]))
+            assert self._navigator.timeline.counters.rewinds > rewinds
+            return 1
+
+        return work
+
+    def _feed(self, samples: int) -> None:
+        rows = slice(self._row, self._row + samples)
+        self._navigator.add_imu(self._times[rows], self._samples[rows])
+        self._navigator.advance()
+        self._row = rows.stop
+
+    def _aids(self, epoch: int) -> None:
+        """What receiver and wheel say at an instant that comes next."""
+        r = self._receiver
+        t_ns = round(float(r.t_s[epoch]) * 1e9)
+        stamp = MonotonicStamp(t_ns)
+        lat, lon, height = r.position[epoch].tolist()
+        n, e, d = r.v_ned[epoch].tolist()
+        fix = PositionFix("gnss", t_ns, stamp, lat, lon, height, sd_ned_m=r.sd_ned_m)
+        fix = replace(fix, v_ned_m_s=(n, e, d), sd_v_ned_m_s=r.sd_v_ned_m_s)
+        self._navigator.add(fix, t_ns)
+        self._navigator.add(WheelSpeed("wheel", t_ns, stamp, math.hypot(n, e)), t_ns)
+
+
+def late_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:
+    """Works of one drive, each the tick of a late fix; asked for in turn."""
+    drive, numbers = Drive(repetitions), count()
+    return lambda _: drive.late(next(numbers))
