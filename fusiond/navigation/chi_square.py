@@ -8,8 +8,9 @@ For n degrees of freedom and h = x / 2 the tail has a closed form,
 and its slope is -h^{n/2-1} e^-h / (2 Gamma(n/2)). Newton's steps on ln Q, which is concave from
 n = 2 on and nearly a line far out, begin at the approximation of Wilson and Hilferty.
 
-scipy.special has it too, and takes an eighth of the processor time of a start to load; what needs
-more of it than gates do loads it when it is first asked.
+scipy.special has it too, and takes an eighth of the processor time of a start to load. It is asked
+where gates seldom are: beyond `_MOST_DEGREES` and below `_LEAST_TAIL` the sums above lose their
+digits or their range.
 
 Source: Abramowitz and Stegun, 26.4.4, 26.4.5 (tail) and 26.4.17 (beginning).
 """
@@ -26,6 +27,7 @@ _STEP = 1e-9
 _ROUNDING = 4.0 * sys.float_info.epsilon
 # Tails from 1e-15 to 0.99 need eight steps at most up to 300 degrees of freedom; nearer to one the
 # last digits of the tail decide, and more of them change nothing.
+_MOST_DEGREES, _LEAST_TAIL = 300, 1e-15
 _STEPS = 40
 
 
@@ -33,10 +35,17 @@ _STEPS = 40
 def quantile(degrees: int, tail: float) -> float:
     """What a chi-square variable of `degrees` degrees of freedom exceeds with probability `tail`.
 
-    Raises ValueError for degrees below one or a tail that is no probability between 0 and 1.
+    Infinite for none, which is what is left of one less 1e-17. Raises ValueError for degrees below
+    one or a tail that is no probability below 1.
     """
-    if degrees < 1 or not 0.0 < tail < 1.0:
+    if degrees < 1 or not 0.0 <= tail < 1.0:
         raise ValueError(f"{degrees} degrees of freedom, tail {tail}")
+    if tail == 0.0:
+        return math.inf
+    if degrees > _MOST_DEGREES or tail < _LEAST_TAIL:
+        from scipy.special import chdtri  # noqa: PLC0415 - slow to load
+
+        return float(chdtri(degrees, tail))
     x = _near(degrees, tail)
     for _ in range(_STEPS):
         q, slope = _tail(degrees, x)

@@ -100,7 +100,7 @@ def test_no_doubt_about_what_may_well_be(tmp_path: Path) -> None:
 
 def test_what_drivers_give_holds_the_defaults() -> None:
     assert {
-        driver: section.kind in GIVES[driver] for driver, section in _DEFAULT_AIDING.items()
+        driver: section().kind in GIVES[driver] for driver, section in _DEFAULT_AIDING.items()
     } == (dict.fromkeys(_DEFAULT_AIDING, True))
 
 
