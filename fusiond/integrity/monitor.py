@@ -106,6 +106,8 @@ class ConsistencyMonitor:
         """Innovations not taken: `not_finite`, `not_positive_definite`."""
         self.restarts = 0
         """Windows started over because m changed."""
+        self.k = 0
+        """Epochs in the window."""
         self._m = 0
         self.reset()
 
@@ -116,17 +118,12 @@ class ConsistencyMonitor:
         self._figures = np.zeros((2, size))
         self._products = np.zeros((size, LAGS))
         self._sums = np.zeros(2 + LAGS)
-        self._count = 0
+        self._count = self.k = 0
         self._average, self._rho = math.nan, np.full(LAGS, math.nan)
         self.verdict: Verdict = "too_few"
         self.window_verdict: Verdict = "too_few"
         self._contradicted = 0
         self._limits_k, self._limits = 0, NO_LIMITS
-
-    @property
-    def k(self) -> int:
-        """Epochs in the window."""
-        return max(0, min(self._count - LAGS, self.options.window))
 
     def add(self, nu: Array, s: Array | None = None) -> None:
         """Take an innovation (m,): whitened, or as it is together with its covariance `s` (m, m).
@@ -163,6 +160,8 @@ class ConsistencyMonitor:
         """Take the epoch in; the window's verdict, and the verdict contradicted long enough."""
         o = self.options
         self._count += 1
+        if self._count > LAGS and self.k < o.window:
+            self.k += 1
         k = self.k
         if k != self._limits_k and k >= FEWEST:
             self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
