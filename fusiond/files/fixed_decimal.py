@@ -25,19 +25,22 @@ _COMMA, _NEWLINE, _POINT, _MINUS, _ZERO = 44, 10, 46, 45, 48
 _LIMIT = 1e18
 
 
-@compiled("i8(u1[::1], i8, u8)")
-def _write_digits(out: NDArray[np.uint8], at: int, number: np.uint64) -> int:
-    """Write `number` at `out[at:]`; returns the next position."""
-    rest = number
-    digits = 1
-    while rest >= np.uint64(10):
-        rest //= np.uint64(10)
-        digits += 1
-    rest = number
-    for k in range(at + digits - 1, at - 1, -1):
-        out[k] = _ZERO + rest % np.uint64(10)
-        rest //= np.uint64(10)
-    return at + digits
+_UNITS = np.array([10**k for k in range(19)], dtype=np.uint64)
+_PAIRS = np.array([_ZERO + digit for k in range(100) for digit in divmod(k, 10)], dtype=np.uint8)
+"""The digits of 00 to 99: two at a time are half as many divisions."""
+
+
+@compiled("void(u1[::1], i8, i8, u8)", forceinline=True)
+def _write_digits(out: NDArray[np.uint8], at: int, count: int, number: np.uint64) -> None:
+    """Write the last `count` digits of `number` at `out[at:]`."""
+    k = at + count - 1
+    while k > at:
+        pair = np.uint64(2) * (number % np.uint64(100))
+        number //= np.uint64(100)
+        out[k - 1], out[k] = _PAIRS[pair], _PAIRS[pair + np.uint64(1)]
+        k -= 2
+    if k == at:
+        out[k] = _ZERO + number % np.uint64(10)
 
 
 @compiled("i8(f8[:, ::1], i8[::1], i8[::1], u1[:, ::1], u1[::1])", nogil=True)
@@ -62,9 +65,7 @@ def format_rows(
             magnitude = abs(v)
             if magnitude < _LIMIT:
                 d = decimals[j]
-                unit = np.uint64(1)
-                for _ in range(d):
-                    unit *= np.uint64(10)
+                unit = _UNITS[d]
                 whole = np.uint64(magnitude)
                 part = np.uint64(np.rint((magnitude - np.float64(whole)) * np.float64(unit)))
                 if part >= unit:
@@ -73,14 +74,15 @@ def format_rows(
                 if v < 0.0 and (whole > np.uint64(0) or part > np.uint64(0)):
                     out[at] = _MINUS
                     at += 1
-                at = _write_digits(out, at, whole)
+                digits = 1
+                while digits < _UNITS.shape[0] and whole >= _UNITS[digits]:
+                    digits += 1
+                _write_digits(out, at, digits, whole)
+                at += digits
                 if d > 0:
                     out[at] = _POINT
-                    at += 1
-                    for k in range(at + d - 1, at - 1, -1):
-                        out[k] = _ZERO + part % np.uint64(10)
-                        part //= np.uint64(10)
-                    at += d
+                    _write_digits(out, at + 1, d, part)
+                    at += 1 + d
             elif magnitude >= _LIMIT:
                 if v < 0.0:
                     out[at] = _MINUS
