@@ -116,6 +116,17 @@ def rpy_from_dcm(dcm: Array) -> tuple[float, float, float]:
     )
 
 
+@compiled("void(f8[:, :], f8[:, ::1])")
+def rpy_from_quaternions(q: Array, rpy: Array) -> None:
+    """Write roll, pitch and yaw (m, 3), rad, of quaternions (m, 4)."""
+    for i in range(q.shape[0]):
+        w, x, y, z = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+        rpy[i, 0] = math.atan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
+        sine = 2.0 * (w * y - x * z)
+        rpy[i, 1] = math.asin(math.copysign(1.0, sine) if abs(sine) > 1.0 else sine)
+        rpy[i, 2] = math.atan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z)
+
+
 def rotation_vector_from_dcm(dcm: Array) -> Array:
     """Rotation vector (3,) in rad of a rotation matrix, for angles below pi."""
     w = 0.5 * np.array([dcm[2, 1] - dcm[1, 2], dcm[0, 2] - dcm[2, 0], dcm[1, 0] - dcm[0, 1]])

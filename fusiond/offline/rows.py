@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.files.solution_csv import SolutionWriter
+from fusiond.navigation.rotation import rpy_from_quaternions
+from fusiond.navigation.strapdown import Q0
 
 Array = NDArray[np.float64]
 
@@ -38,13 +40,15 @@ class RowsWriter:
     def write(self, rows: Rows) -> None:
         """Append rows."""
         nav = rows.nav
+        rpy = np.empty((len(nav), 3))
+        rpy_from_quaternions(nav[:, Q0:], rpy)
         self._writer.rows(
             np.asarray(rows.times * 1e-9, dtype=np.float64),
             nav[:, 0],
             (nav[:, 1] + np.pi) % (2.0 * np.pi) - np.pi,
             nav[:, 2],
             nav[:, 3:6],
-            _rpy(nav[:, 6:]),
+            rpy,
             np.where(self._stated, rows.sigmas, np.nan),
             rows.status,
         )
@@ -52,12 +56,3 @@ class RowsWriter:
     def close(self) -> None:
         """Write out what is left."""
         self._writer.close()
-
-
-def _rpy(q: Array) -> Array:
-    """Roll, pitch, yaw (n, 3) of quaternions (n, 4)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
-    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z)
-    return np.column_stack([roll, pitch, yaw])
