@@ -198,13 +198,13 @@ class PseudorangeAid(Aid):
         _keep(self, "clock", np.ascontiguousarray(self.clock, dtype=np.int64), (n,))
         ranges, rates = np.isfinite(self.ranges), np.isfinite(self.rates)
         r = np.concatenate([self.range_variance[ranges], self.rate_variance[rates]])
-        if not bool(np.all((r > 0.0) & np.isfinite(r))):
+        if np.count_nonzero((r > 0.0) & np.isfinite(r)) < len(r):
             raise ValueError("variances must be positive and finite")
         timed = self.clock[rates] >= 0
-        if timed.any() and not timed.all():
+        if 0 < np.count_nonzero(timed) < len(timed):
             raise ValueError("rates of satellites with and without a clock in one epoch")
         object.__setattr__(self, "_r", r)
-        object.__setattr__(self, "_ranges", int(ranges.sum()))
+        object.__setattr__(self, "_ranges", int(np.count_nonzero(ranges)))
 
     @property
     def labels(self) -> list[tuple[str, str]]:
@@ -262,11 +262,11 @@ class PseudorangeAid(Aid):
             return NotApplicable("no_satellites")
         offsets = model.slots_of(CLOCK_OFFSET) or [NO_CLOCK]
         drifts = model.slots_of(CLOCK_DRIFT)
-        clocks = self.clock.tolist()
-        greatest = max(clocks)
+        greatest = int(self.clock.max())
         if greatest >= len(offsets) or (greatest >= 0 and not drifts):
             return NotApplicable("no_clock_state")
-        slots = np.array([offsets[k] if k >= 0 else NO_CLOCK for k in clocks], dtype=np.int64)
+        # NO_CLOCK, which is -1, is the place of the last, too.
+        slots = np.array([*offsets, NO_CLOCK], dtype=np.int64)[self.clock]
         rows = self._r.size
         z, h = np.empty(rows), np.zeros((rows, model.size))
         _rows(

@@ -155,6 +155,17 @@ class Estimator(Protocol):
         """Back to a snapshot, bit for bit."""
 
 
+def _jumped(codes: Codes, of_clock: Array) -> bool:
+    """Whether the better half of the ranges fails; of the rows, `codes` (m,) and what they have of
+    the clock's offsets (m, k)."""
+    if np.count_nonzero(codes != KEPT) < FEWEST_JUMPING:
+        return False
+    # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
+    ranges = (np.abs(of_clock) > 0.5).any(axis=1)
+    lost = np.count_nonzero(codes[ranges] != KEPT)
+    return lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges)
+
+
 class ErrorStateFilter:
     """What the estimators share: the state, its propagation, feedback and snapshots.
 
@@ -272,8 +283,6 @@ class ErrorStateFilter:
         z, h, r = rows
         threshold = gate_threshold(aid.gate, 1)
         offsets = self.model.slots_of(CLOCK_OFFSET)
-        # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
-        ranges = (np.abs(h[:, offsets]) > 0.5).any(axis=1)
         renew = bool(offsets) and bool(getattr(aid, "clock_reset", False))
         while True:
             if renew:
@@ -283,8 +292,7 @@ class ErrorStateFilter:
             codes, y = np.zeros(z.shape[0], dtype=np.int64), np.zeros(z.shape[0])
             cov_out, dx_out = np.empty_like(cov), np.empty_like(dx)
             nis = screened_update(cov, dx, z, h, r, threshold, codes, y, cov_out, dx_out)
-            lost = int((codes[ranges] != KEPT).sum())
-            if renew or not offsets or lost < FEWEST_JUMPING or 2 * lost <= int(ranges.sum()):
+            if renew or not offsets or not _jumped(codes, h[:, offsets]):
                 return Screened(codes, y, nis, cov_out, dx_out)
             renew = True
 
@@ -298,7 +306,7 @@ class ErrorStateFilter:
         if aid.screened:
             s = self._screen(aid, rows, cov, dx)
             codes = tuple(s.codes.tolist())
-            return Outcome("isolated", s.nis, int((s.codes == KEPT).sum()), (), codes)
+            return Outcome("isolated", s.nis, codes.count(KEPT), (), codes)
         y = np.zeros(z.shape[0])
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))

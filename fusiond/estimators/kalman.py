@@ -47,16 +47,16 @@ class KalmanEstimator(ErrorStateFilter):
         """Rows that pass are folded in, or none."""
         cov, dx = self._covs[0], self._dxs[0]
         s = self._screen(aid, rows, cov, dx)
-        kept = s.codes == KEPT
         codes = tuple(s.codes.tolist())
-        if not kept.any():
+        kept = codes.count(KEPT)
+        if not kept:
             return Outcome("gated", s.nis, 0, (), codes)
         cov[:] = s.cov
         dx[:] = s.dx
         if not self._holding:
             self._feed_back(dx)
             dx[:] = 0.0
-        return Outcome("fused", s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
+        return Outcome("fused", s.nis, kept, tuple(s.y.tolist()), codes)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""
