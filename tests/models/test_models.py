@@ -41,6 +41,13 @@ def test_a_further_block_takes_the_place_of_its_namesake() -> None:
     assert model.rate_terms.tolist() == [[18, 19], [20, 20]]
 
 
+def test_slots_of_blocks_that_a_model_has_not() -> None:
+    model = make_model("ins23", imu_noise(IMU), *clock_blocks(("G", "C")))
+    assert model.slots_or_missing(("clock_offset", 2), ("elsewhere", 1)).tolist() == [18, 19, -1]
+    offset, nothing = model.slots_of_each(("clock_offset",), ("elsewhere", ""))
+    assert (offset.tolist(), nothing.tolist()) == ([18, 19], [])
+
+
 def test_more_states_than_the_kernels_hold() -> None:
     with pytest.raises(ValueError, match="at most 40 fit"):
         make_model("ins23", imu_noise(IMU), *(misalignment(f"m{k}", 1e-3) for k in range(6)))
