@@ -46,7 +46,8 @@ class Inputs:
         self, kind: str, payload: bytes | str | CanFrame | None = None, t_ns: int | None = None
     ) -> None:
         """Handle an input that came at `t_ns`, now by default. KeyError for an unknown kind."""
-        t_ns = self._host_now_ns() if t_ns is None else t_ns
+        if t_ns is None:
+            t_ns = self._host_now_ns()
         handler = self._handlers[kind]
         if self.heard is not None:
             self.heard(kind, t_ns, payload)

@@ -9,6 +9,8 @@ shift = start for Intel, whose start is the least significant bit. Motorola's is
 significant one, counted as bit s of byte b: 8 b + s; in L bytes shift = 8 (L - 1 - b) + s - n + 1.
 A signal under multiplexers is there while each of them has one of the values that select it.
 
+Signals that fill whole bytes of one byte order, as those of most devices do, are one `struct`.
+
 Source: Vector Informatik, DBC File Format Documentation 1.0.5, signal definitions.
 """
 
@@ -16,12 +18,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Container, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 
 _FLOATS = {16: struct.Struct(">e"), 32: struct.Struct(">f"), 64: struct.Struct(">d")}
+_CODES = {8: "B", 16: "H", 32: "I", 64: "Q"}
 
 
 class AbsentSignalError(Exception):
@@ -58,10 +62,13 @@ class Layout:
                 signal = parent
         used = (*self._wanted, *(bits for bits, _ in self._selectors))
         self._little, self._big = any(not b.big for b in used), any(b.big for b in used)
+        self._struct = None if self._selectors or not self._readable else self._as_struct()
 
     def raw(self, data: bytes) -> list[Any]:
         """The signals' raw numbers, in their order, out of a frame's data of the message's length
         or more. Raises `AbsentSignalError`."""
+        if self._struct is not None:
+            return list(self._struct.unpack_from(data))
         if not self._readable:
             raise AbsentSignalError
         little = int.from_bytes(data, "little") if self._little else 0
@@ -78,6 +85,30 @@ class Layout:
                 number = (number ^ sign) - sign
             numbers.append(number)
         return numbers
+
+    def _as_struct(self) -> struct.Struct | None:
+        """What takes the wanted signals out at once; None where they are not whole bytes of one
+        byte order, one after the other."""
+        places = [self._place(bits) for bits in self._wanted]
+        apart = all(before[1] <= after[0] for before, after in pairwise(places))
+        whole = all(b.shift % 8 == 0 and b.mask.bit_length() in _CODES for b in self._wanted)
+        if not places or not apart or not whole or (self._little and self._big):
+            return None
+        codes, at = [">" if self._big else "<"], 0
+        for bits, (begin, end) in zip(self._wanted, places, strict=True):
+            code = _CODES[bits.mask.bit_length()]
+            if bits.floating is not None:
+                code = bits.floating.format[-1:]
+            codes.append(f"{begin - at}x{code.lower() if bits.sign else code}")
+            at = end
+        return struct.Struct("".join(codes))
+
+    def _place(self, bits: _Bits) -> tuple[int, int]:
+        """First byte and the one after the last, of a signal of whole bytes."""
+        begin, size = bits.shift // 8, bits.mask.bit_length() // 8
+        if bits.big:
+            begin = self._length - begin - size
+        return begin, begin + size
 
     def _bits(self, signal: Signal) -> _Bits:
         shift = signal.start

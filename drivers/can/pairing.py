@@ -118,12 +118,14 @@ class Pairing:
         if index == self._lead:
             self._learn_interval(index, part.ticks, arrival_ns)
         last.data, last.arrival_ns, last.ticks, last.seen = data, arrival_ns, part.ticks, True
-        group = self._group(1 << index, key, arrival_ns)
+        alone = self._all == 1  # one message is a whole sample: none is open
+        group = None if alone else self._group(1 << index, key, arrival_ns)
         if group is None:
             values = self._constants.copy()
             group = Group(realtime_ns, arrival_ns, arrival_ns, t_seen_ns, values, self._all)
-            self._make_room(OPEN_GROUPS - 1 if key is not None else 0)
-            self._open.append(group)
+            if not alone:
+                self._make_room(OPEN_GROUPS - 1 if key is not None else 0)
+                self._open.append(group)
         group.key = key if key is not None else group.key
         for slot, value in part.values:
             group.values[slot] = value
@@ -132,7 +134,11 @@ class Pairing:
         group.missing &= ~(1 << index)
         group.last_ns, group.t_seen_ns = arrival_ns, t_seen_ns
         group.frames += 1
-        return self._finish(group) if not group.missing else None
+        if group.missing:
+            return None
+        if not alone:
+            self._close(group)
+        return self._finish(group)
 
     # ----------------------------------------------------------------- which group
 
@@ -195,11 +201,14 @@ class Pairing:
 
     # ----------------------------------------------------------------- complete
 
-    def _finish(self, group: Group) -> Group | None:
+    def _close(self, group: Group) -> None:
+        """It is complete; frames of those before it wait no longer."""
         position = self._open.index(group)
         for older in self._open[:position]:
             self._counters["unpaired"] += older.frames
         del self._open[: position + 1]
+
+    def _finish(self, group: Group) -> Group | None:
         at_ns = group.first_ns
         if self.device_time is not None and group.ticks is not None:
             restarts = self.device_time.restarts

@@ -16,8 +16,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import scipy.special  # noqa: F401 - verdicts load it when first judged: not inside a tick
-
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config

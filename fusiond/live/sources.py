@@ -106,16 +106,17 @@ class Sources:
             self._take(item)
 
     def _take(self, item: Emitted) -> None:
-        if isinstance(item, DeviceEvent):
-            self._on_event(item.source, item.code, item.text)
-            return
+        if not isinstance(item, ImuSample):  # of which there are most
+            if isinstance(item, DeviceEvent):
+                self._on_event(item.source, item.code, item.text)
+                return
+            if isinstance(item, TimeReport):
+                self._clock.report(item)
+                return
+            if isinstance(item, Ephemeris | Klobuchar):
+                self._navigator.learn(item)
+                return
         source = self.all[item.source]
-        if isinstance(item, TimeReport):
-            self._clock.report(item)
-            return
-        if isinstance(item, Ephemeris | Klobuchar):
-            self._navigator.learn(item)
-            return
         source.received += 1
         source.last_seen_ns = item.t_seen_ns
         instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
@@ -136,10 +137,9 @@ class Sources:
         """The samples since the last call, (m,) ns and (m, 6); None if there are none."""
         if not self._imu:
             return None
-        times = np.array([t for t, _ in self._imu], dtype=np.int64)
-        samples = np.array([s for _, s in self._imu], dtype=np.float64)
+        times, samples = zip(*self._imu, strict=True)
         self._imu.clear()
-        return times, samples
+        return np.array(times, dtype=np.int64), np.array(samples, dtype=np.float64)
 
     # ------------------------------------------------------------------ state
 

@@ -13,6 +13,7 @@ _SLICE = 2032
 """Bytes hashed at a time. From 2048 on hashlib lets another thread run meanwhile: the log writer,
 which then keeps the tick waiting for up to 5 ms (sys.getswitchinterval)."""
 _SOLUTION = struct.Struct("<q26d")
+_T_NS = struct.Struct("<q")
 
 
 def state_digest(navigator: Navigator, solution: Solution) -> bytes:
@@ -22,21 +23,20 @@ def state_digest(navigator: Navigator, solution: Solution) -> bytes:
     bits. 10 us a tick.
     """
     s = solution
-    parts = [
-        s.mode.encode(),
+    found = blake2b(s.mode.encode(), digest_size=DIGEST_BYTES)
+    found.update(
         _SOLUTION.pack(
             s.t_ns,
             *(s.lat_rad, s.lon_rad, s.height_m),
             *(*s.v_ned_m_s, *s.rpy_rad, *s.sd_ned_m, *s.sd_v_ned_m_s, *s.sd_rpy_rad),
             *(*s.gyro_bias_rad_s, *s.accel_bias_m_s2),
             *(s.bound.hpl_m, s.bound.vpl_m),
-        ),
-    ]
+        )
+    )
     if navigator.started is not None:
         e = navigator.estimator
-        parts.append(struct.pack("<q", e.t_ns))
-        parts += [array.tobytes() for array in (e.nav, e.xi, e.covariance)]
-    found, data = blake2b(digest_size=DIGEST_BYTES), memoryview(b"".join(parts))
-    for at in range(0, len(data), _SLICE):
-        found.update(data[at : at + _SLICE])
+        found.update(_T_NS.pack(e.t_ns) + e.nav.tobytes() + e.xi.tobytes())
+        covariance = e.covariance.tobytes()
+        for at in range(0, len(covariance), _SLICE):
+            found.update(covariance[at : at + _SLICE])
     return found.digest()

@@ -142,9 +142,10 @@ class Replay:
         except DamagedStateError as error:
             self.began = f"an alignment: the log's state is of another filter ({error})"
         self.chain.sources.on_arrival = self._on_arrival
-        self._doors = self.chain.sources.inputs
-        for name, inputs in self._doors.items():
+        doors = self.chain.sources.inputs
+        for name, inputs in doors.items():
             inputs.heard = self._listener(name)
+        self._doors = [doors.get(name) for name in self._sources]
         self.exact = self._same and from_start and self._log.first_part
         self._finish()
         return after_ns
@@ -200,17 +201,16 @@ class Replay:
             self.chain.clock.look()
 
     def _take(self, record: Record) -> None:
-        name = self._sources[record.source]
-        door = self._doors.get(name)
+        door = self._doors[record.source]
         if door is None:  # another configuration, without it
             return
         kind, payload = input_of(record)
         try:
             door.take(kind, payload, record.t_ns)
         except KeyError:
-            self._fault(f"{name}: its driver knows no input {kind!r}")
+            self._fault(f"{self._sources[record.source]}: its driver knows no input {kind!r}")
         except Exception as error:  # the daemon restarts a driver that raises
-            self._fault(f"{name}: {error!r}")
+            self._fault(f"{self._sources[record.source]}: {error!r}")
 
     def _fault(self, text: str) -> None:
         if text not in self.comparison.faults:
