@@ -6,8 +6,8 @@ In between the state files are spoilt in every way of `tests.live.conditions`, a
 cannot write any. A line of JSON for each restart (`tests.live.kill_nine.Restart`), and last a
 summary: how many were warm, how long it took from the start of the process to the first output, on
 the clock and of processor (median, one in twenty and greatest), and from the first data to the
-solution, and how many first errors, and errors of the two seconds after them, were beyond three
-sigma.
+solution, how many first errors, and errors of the two seconds after them, were beyond three sigma,
+and why starts were cold whose warm state nobody had touched.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ def summary(found: list[Restart]) -> dict[str, object]:
         "kills": len(found),
         "warm": len(warm),
         "warm_states_untouched": len(expected),
+        "cold_though_untouched": dict(Counter(r.cold for r in expected if r.cold)),
         "conditions": dict(Counter(r.warm for r in found)),
         "first_beyond_3_sigma": sum(r.first_ratio > 3.0 for r in found),
         "first_greatest_ratio": round(max(r.first_ratio for r in found), 2),

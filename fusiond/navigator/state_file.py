@@ -99,8 +99,15 @@ def write_state(path: Path, text: bytes, durable: bool) -> None:
 
 
 def set_aside(path: Path) -> str:
-    """Rename what lies at `path`, so that the next start does not meet it; what became of it."""
+    """Rename what lies at `path`, so that the next start does not meet it; what became of it.
+
+    What was put aside before gives way.
+    """
     aside = path.with_name(path.name + ".bad")
+    if path.is_dir():
+        # It is not renamed over a file, and while it stays no state can be written here.
+        with contextlib.suppress(OSError):
+            aside.unlink()
     try:
         path.rename(aside)
     except OSError as error:

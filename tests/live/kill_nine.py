@@ -14,6 +14,7 @@ import json
 import math
 import os
 import random
+import re
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -62,8 +63,8 @@ class Restart:
     """What came of one kill. `load_s` from the new process's start to its code being loaded, on the
     clock and of processor; `first_output_s` from when it may begin, likewise; `solution_s` from
     the first data to the first solution, `first_ratio` its error north or east in sigmas, `ratio`
-    the greatest until `WATCHED_S` later. `gap_s` is NaN if the restart was not a warm one. `warm`
-    and `saved` are the conditions of the two state files."""
+    the greatest until `WATCHED_S` later. `gap_s` is NaN if the restart was not a warm one, and
+    `cold` says why. `warm` and `saved` are the conditions of the two state files."""
 
     load_s: float
     load_cpu_s: float
@@ -78,6 +79,7 @@ class Restart:
     ratio: float
     warm: str = "untouched"
     saved: str = "untouched"
+    cold: str = ""
 
 
 @asynccontextmanager
@@ -143,6 +145,7 @@ async def killed(
                 load_cpu_s=load_cpu_s,
                 warm=warm,
                 saved=saved,
+                cold="" if restart.gap_s >= 0.0 else _why_cold(daemon, elsewhere),
             )
     finally:
         await daemon.kill()
@@ -157,6 +160,18 @@ def _spoil(folder: Path, dice: random.Random) -> tuple[str, str]:
     for path, name in ((folder / "killed.warm.json", warm), (folder / "killed.json", saved)):
         spoil(name, path, dice)
     return warm, saved
+
+
+def _why_cold(daemon: ToldDaemon, elsewhere: bool) -> str:
+    """Why a start went on from no state; figures and paths are left out, to be counted."""
+    if elsewhere:
+        return "its folders cannot be read"
+    told = [e for e in daemon.events if e.code in ("warm_state_refused", "warm_state_damaged")]
+    if not told:
+        return "nothing was kept"
+    if told[0].code == "warm_state_damaged":
+        return "damaged"
+    return re.sub(r"^[\d.]+ s", "too many s", told[0].text)
 
 
 async def _loaded(daemon: ToldDaemon) -> tuple[float, float]:

@@ -215,6 +215,19 @@ async def test_a_state_that_cannot_be_read_is_put_aside_and_told(
     assert Kept(kept.path).keeper.load() is not None
 
 
+async def test_a_folder_in_its_place_gives_way_though_a_file_was_put_aside_before(
+    kept: Kept,
+) -> None:
+    kept.path.write_text("{")
+    assert kept.keeper.load() is None
+    kept.path.mkdir()
+    again = Kept(kept.path)
+    assert again.keeper.load() is None
+    assert [code for code, _ in again.events] == ["saved_state_damaged"]
+    await again.tick(0.0, 0.0)
+    assert Kept(kept.path).keeper.load() is not None
+
+
 def test_what_cannot_be_put_aside_stays_and_is_told(kept: Kept) -> None:
     kept.path.write_text("{")
     Path(f"{kept.path}.bad").mkdir()
