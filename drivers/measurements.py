@@ -185,6 +185,18 @@ class Heading:
 
 
 @dataclass(frozen=True, slots=True)
+class MagneticHeading:
+    """What a compass says: heading of the body's forward axis from magnetic north (rad, clockwise),
+    with whatever deviation the vehicle's own iron and currents make."""
+
+    source: str
+    t_seen_ns: int
+    stamp: Stamp
+    yaw_rad: float
+    rounding_sd_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Height:
     """Ellipsoidal height of the body origin (m), one sigma if given.
 
@@ -240,6 +252,7 @@ Measurement = (
     | Attitude
     | Bearing
     | Heading
+    | MagneticHeading
     | Height
     | WheelSpeed
     | TimeReport

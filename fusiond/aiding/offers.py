@@ -7,6 +7,7 @@ of errors that all measurements of the device share, as of its aids.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 Vector3 = tuple[float, float, float]
@@ -49,11 +50,17 @@ class SpeedOffer(NamedTuple):
 
 
 class HeadingOffer(NamedTuple):
-    """True heading (rad) of the body's forward axis."""
+    """True heading (rad) of the body's forward axis, as `how` measured it.
+
+    `own_sd_rad` is the part of sigma that is of this measurement alone, `shared` the rest: blocks
+    of the model, with what each of their states turns the heading by."""
 
     t_ns: int
     yaw_rad: float
     sd_rad: float
+    how: str = "dual antenna"
+    own_sd_rad: float = math.nan
+    shared: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
 
 class HeightOffer(NamedTuple):

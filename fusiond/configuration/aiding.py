@@ -174,6 +174,24 @@ class HeadingAiding(Aiding):
     sd_deg: PositiveFloat = 1.0
 
 
+class CompassAiding(Aiding):
+    """Heading of a compass, with its deviation as states; see `docs/compass.md`."""
+
+    kind: Literal["compass"] = "compass"
+    sd_deg: PositiveFloat = 1.0
+    """Noise of a single reading."""
+    declination_deg: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
+    """Magnetic north from true north, east positive; without it the World Magnetic Model says it,
+    where and when the fixes are."""
+    deviation_sd_deg: PositiveFloat = 5.0
+    """One sigma of the deviation at any heading: what a compass that was compensated once in a
+    steel vehicle is left with. The filter estimates it."""
+    disturbance_sd_deg: PositiveFloat = 3.0
+    """One sigma of what lasts for some seconds: bridges, vehicles beside, currents of the own."""
+    disturbance_s: PositiveFloat = 20.0
+    """Correlation time of that."""
+
+
 class HeightAiding(Aiding):
     kind: Literal["height"] = "height"
     sd_m: PositiveFloat = 5.0
@@ -226,6 +244,7 @@ AnyAiding = Annotated[
     | StarTrackerAiding
     | SarAiding
     | HeadingAiding
+    | CompassAiding
     | HeightAiding
     | BarometerAiding
     | WheelAiding,

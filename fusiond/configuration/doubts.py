@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from importlib.util import find_spec
 from itertools import combinations
 from math import hypot
 from pathlib import Path
 
+from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
 
@@ -31,6 +33,7 @@ GIVES: dict[str, tuple[str, ...]] = {
     "can_gnss": ("gnss",),
     "can_height": ("height", "barometer"),
     "can_wheel": ("wheel",),
+    "compass": ("compass", "heading"),
     "gnss": ("raw", "gnss", "heading"),
     "nmea": ("gnss", "heading"),
     "obd_speed": ("wheel",),
@@ -45,6 +48,7 @@ def doubts(config: Config) -> list[str]:
         *_imu(config),
         *_ports(config),
         *_aiding(config),
+        *_compass(config),
         *_lever_arms(config),
         *_files(config),
         *_start(config),
@@ -103,6 +107,17 @@ def _aiding(config: Config) -> Iterator[str]:
             f"aiding.{name}.kind = {section.kind!r}: driver {source.driver} gives "
             f"{' or '.join(kinds)}: nothing of it will be used as {section.kind}"
         )
+
+
+def _compass(config: Config) -> Iterator[str]:
+    if find_spec("pygeomag") is not None:
+        return
+    for name, section in config.aiding.items():
+        if isinstance(section, CompassAiding) and section.declination_deg is None:
+            yield (
+                f"aiding.{name}: no magnetic model is installed: pip install fusiond[compass], or "
+                "give declination_deg"
+            )
 
 
 def _lever_arms(config: Config) -> Iterator[str]:

@@ -18,6 +18,7 @@ from drivers.base import PermanentDriverError, monotonic_ns
 from fusiond.configuration.aiding import (
     AnyAiding,
     BarometerAiding,
+    CompassAiding,
     GnssAiding,
     HeightAiding,
     RawAiding,
@@ -43,6 +44,7 @@ _DEFAULT_AIDING: dict[str, type[AnyAiding]] = {
     "can_bearing": SarAiding,
     "can_gnss": GnssAiding,
     "can_height": HeightAiding,
+    "compass": CompassAiding,
     "can_wheel": WheelAiding,
     "obd_speed": WheelAiding,
 }

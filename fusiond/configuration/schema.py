@@ -166,7 +166,11 @@ class Alignment(Section):
     """
 
     heading: tuple[
-        Literal["saved", "config", "dual_antenna", "gyrocompass", "gnss_course", "positions"], ...
+        Literal[
+            *("saved", "config", "dual_antenna", "compass"),
+            *("gyrocompass", "gnss_course", "positions"),
+        ],
+        ...,
     ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course", "positions")
     """Allowed sources of the first heading, in order of preference."""
     heading_deg: float | None = None

@@ -21,6 +21,7 @@ from drivers.measurements import (
     Heading,
     Height,
     ImuSample,
+    MagneticHeading,
     PositionFix,
     WheelSpeed,
 )
@@ -85,6 +86,9 @@ QUANTITIES: Mapping[type, tuple[Quantity, ...]] = {
         ),
     ),
     Heading: (Quantity("heading", ("",), "deg", 2, lambda m: (degrees(m.yaw_rad),)),),
+    MagneticHeading: (
+        Quantity("magnetic heading", ("",), "deg", 2, lambda m: (degrees(m.yaw_rad),)),
+    ),
     Height: (_HEIGHT,),
     WheelSpeed: (Quantity("speed", ("",), "m/s", 2, lambda m: (m.speed_m_s,)),),
     RawGnssEpoch: (Quantity("signals", ("",), "an epoch", 1, lambda m: (float(len(m.signals)),)),),

@@ -23,6 +23,7 @@ from drivers.measurements import (
     Heading,
     Height,
     ImuSample,
+    MagneticHeading,
     PositionFix,
     TimeReport,
     WheelSpeed,
@@ -158,7 +159,7 @@ class Fault:
                 return replace(item, height_m=item.height_m + self._error(item.t_seen_ns))
             case WheelSpeed():
                 return replace(item, speed_m_s=item.speed_m_s + self._error(item.t_seen_ns))
-            case Heading():
+            case Heading() | MagneticHeading():
                 error = math.radians(self._error(item.t_seen_ns))
                 return replace(item, yaw_rad=item.yaw_rad + error)
             case Attitude():

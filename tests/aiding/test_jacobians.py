@@ -12,6 +12,7 @@ import pytest
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.aiding.base import Linearised, NotApplicable
 from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
+from fusiond.aiding.compass import CompassAid, deviation, disturbance
 from fusiond.aiding.height import BarometerAid, HeightAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.velocity import VelocityAid
@@ -191,3 +192,15 @@ def test_scale_factors_are_left_out_of_lever_arms() -> None:
     base = innovation_of(aid, state_of(model, nav, xi)).z
     xi[model.parameters(17)] = 2e-3
     assert np.abs(innovation_of(aid, state_of(model, nav, xi)).z - base).max() < 2e-3
+
+
+def test_compass() -> None:
+    """With a deviation that is known in part; what turns the compass turns the iron with it."""
+    names = "deviation", "disturbance"
+    blocks = deviation(names[0], 0.1), disturbance(names[1], 0.05, 20.0)
+    _check_jacobian(
+        lambda nav: CompassAid(*SOURCE, 0.66, 0.01, *names, 0.1),
+        "ins15",
+        model=make_model("ins15", imu_noise(Imu()), *blocks),
+        estimated=(0.05, -0.04, 0.03, 0.02),
+    )

@@ -23,6 +23,7 @@ SECTIONS = {
     "[aiding.star_tracker]": config_aiding.StarTrackerAiding,
     "[aiding.sar]": config_aiding.SarAiding,
     "[aiding.heading]": config_aiding.HeadingAiding,
+    "[aiding.compass]": config_aiding.CompassAiding,
     "[aiding.height]": config_aiding.HeightAiding,
     "[aiding.barometer]": config_aiding.BarometerAiding,
     "[aiding.wheel]": config_aiding.WheelAiding,

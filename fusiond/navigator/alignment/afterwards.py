@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.witnesses import Witnesses
 from fusiond.navigation.rotation import dcm_from_quaternion, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
-from fusiond.navigator.alignment.headings import CLAIMS, CONFIGURED
+from fusiond.navigator.alignment.headings import CLAIMS, COMPASS, CONFIGURED
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
 
@@ -35,7 +35,7 @@ class Afterwards:
         self._sd_yaw = math.sqrt(start.covariance[2, 2])
         on_wheels = options.no_slip_m is not None and math.isfinite(options.max_reverse_m_s)
         self._backward = start.backward and on_wheels
-        self._configured = start.how == CONFIGURED
+        self._unproven = start.how in (CONFIGURED, COMPASS)
         self._since_ns: int | None = None
 
     @property
@@ -46,7 +46,7 @@ class Afterwards:
         forward with an IMU that is mounted the other way, until it goes forward as well."""
         if self._backward:
             return "the vehicle drives backward, or the IMU is mounted backwards"
-        return "no motion has confirmed it yet" if self._configured else ""
+        return "no motion has confirmed it yet" if self._unproven else ""
 
     def refuted(
         self, t_ns: int, nav: Array, covariance: Array, measured: Witnesses, doubted: bool
@@ -68,7 +68,7 @@ class Afterwards:
         if not self._claim:
             return None
         if math.sqrt(covariance[2, 2]) < DETERMINED * self._sd_yaw and not doubted:
-            self._configured = False
+            self._unproven = False
         velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
         return velocity and self._heading(
             t_ns, velocity, axes, math.sqrt(covariance[2, 2]), doubted
@@ -99,7 +99,7 @@ class Afterwards:
                 f"the first motion did not fit the {self._claim}: aligning anew by the course"
             )
         if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
-            self._claim, self._configured = "", False
+            self._claim, self._unproven = "", False
             return None
         if self._since_ns is None:
             self._since_ns = t_ns

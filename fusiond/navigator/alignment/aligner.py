@@ -19,6 +19,7 @@ from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.collected import Collected
 from fusiond.navigator.alignment.course import from_course
 from fusiond.navigator.alignment.headings import (
+    from_compass,
     from_config,
     from_dual_antenna,
     from_gyrocompass,
@@ -35,6 +36,7 @@ HEADING_SOURCES: dict[str, HeadingSource] = {
     "saved": from_saved,
     "config": from_config,
     "dual_antenna": from_dual_antenna,
+    "compass": from_compass,
     "gyrocompass": from_gyrocompass,
     "gnss_course": from_course,
     "positions": from_positions,

@@ -103,6 +103,7 @@ class Collected:
         """The largest rates (3,) of quiet windows that no bias of the data sheet explains: a turn,
         or a gyro that is not what its sheet says."""
         self.heading: HeadingOffer | None = None
+        self.compass: HeadingOffer | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
         self.contradicted = False
@@ -165,6 +166,8 @@ class Collected:
                     position = offer
                 case VelocityOffer():
                     velocity = offer
+                case HeadingOffer(how="compass"):
+                    self.compass = offer
                 case HeadingOffer():
                     self.heading = offer
         if position is not None:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from fusiond.aiding.offers import HeadingOffer
 from fusiond.navigation.alignment import gyrocompass, gyrocompass_sd, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -23,9 +24,9 @@ from fusiond.navigator.alignment.start import (
 
 # A heading that came this long ago no longer describes a body at rest that may have been moved.
 HEADING_AGE_NS = 2_000_000_000
-SAVED, CONFIGURED = "saved state", "configured heading"
-CLAIMS = (SAVED, CONFIGURED)
-"""Headings that nothing measured at the start."""
+SAVED, CONFIGURED, COMPASS = "saved state", "configured heading", "compass"
+CLAIMS = (SAVED, CONFIGURED, COMPASS)
+"""Headings that nothing measured at the start, or a magnet may have bent."""
 # A claim that is poorer than this is no start where driving tells the heading: the filter would
 # find it as well, but what it says until then helps nobody.
 POOR_SD_RAD = math.radians(15.0)
@@ -38,7 +39,9 @@ ON_THE_WAY = frozenset({"gnss_course", "positions"})
 REST_VELOCITY_SD = np.full(3, 0.1)
 
 
-def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> Start | None:
+def _at_standstill(
+    by: Basis, place: Place, yaw: float, sd: float, how: str, offer: HeadingOffer | None = None
+) -> Start | None:
     standing = by.known.levelled()
     if standing is None:
         return None
@@ -61,6 +64,7 @@ def _at_standstill(by: Basis, place: Place, yaw: float, sd: float, how: str) -> 
         how,
         bias=rest_bias(by.noise, standing, dcm, place[1][0], sd if wide else 0.0),
         levelled=Levelled(dcm),
+        heading=offer,
     )
     return turned_at_rest(by.model, start, place, dcm) if wide else start
 
@@ -101,6 +105,14 @@ def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     return _at_standstill(
         by, place, by.known.heading.yaw_rad, by.known.heading.sd_rad, "dual antenna"
     )
+
+
+def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
+    """What a compass said last, while it is fresh, until the vehicle has shown it to be wrong."""
+    offer = by.known.compass
+    if offer is None or imu.latest_ns - offer.t_ns > HEADING_AGE_NS:
+        return None
+    return _at_standstill(by, place, offer.yaw_rad, offer.sd_rad, COMPASS, offer)
 
 
 def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.offers import HeadingOffer, PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import (
@@ -122,6 +122,7 @@ def build_start(
     compassed: bool = False,
     unexplained: Array | None = None,
     moves: Moves | None = None,
+    heading: HeadingOffer | None = None,
 ) -> Start:
     """A start at `place` with attitude `dcm` (C_nb) and `velocity` (3,) NED, one sigma (3,).
 
@@ -131,7 +132,7 @@ def build_start(
     of before, and its sensors on others. `fitted`: attitude and biases were found from motion;
     `sd_yaw` is then the least.
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
-    `moves`: what the velocity was measured of.
+    `moves`: what the velocity was measured of, `heading`: the yaw.
     """
     fix, where, sd_position = place
     lat, height = float(where[0]), float(where[2])
@@ -159,12 +160,28 @@ def build_start(
         _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2])
     if levelled is not None:
         _correlate(model, p, levelled.dcm, lat, height, compassed)
+    if heading is not None and heading.shared:
+        _by_heading(model, p, heading)
     by = np.eye(model.size)
     if fix is not None:
         _by_fix(model, by, fix, dcm, velocity)
     if moves is not None:
         _by_velocity(model, by, moves, dcm)
     return Start(t_ns, nav, xi, by @ p @ by.T, how)
+
+
+def _by_heading(model: Model, p: Array, heading: HeadingOffer) -> None:
+    """Heading error and what it shares with the device's: an innovation of 0
+    (fusiond.aiding.compass) says phi_D = e - d dev; else the next readings would prove dev = 0."""
+    shared = [
+        (slot, rate)
+        for block, rates in heading.shared
+        for slot, rate in zip(model.slots_of(block), rates, strict=False)
+    ]
+    common = sum(p[slot, slot] * rate**2 for slot, rate in shared)
+    p[PHI + 2, PHI + 2] += heading.own_sd_rad**2 + common - heading.sd_rad**2
+    for slot, rate in shared:
+        p[PHI + 2, slot] = p[slot, PHI + 2] = -rate * p[slot, slot]
 
 
 def _by_fix(model: Model, by: Array, fix: PositionOffer, dcm: Array, velocity: Array) -> None:

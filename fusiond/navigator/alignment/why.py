@@ -115,6 +115,8 @@ def _of_source(source: str, by: Basis, imu: ImuBuffer, latitude: float) -> list[
                 return [f"the last heading of two antennas is {age_ns * 1e-9:.0f} s old"]
         case "dual_antenna" if not ON_THE_WAY.intersection(o.heading):
             return ["no heading of two antennas has come"]
+        case "compass" if known.compass is None:
+            return ["no heading of a compass has come"]
         case "gyrocompass":
             return _gyrocompass(by, latitude)
         case "gnss_course" if not known.fixes:

@@ -17,7 +17,17 @@ from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import AnyAiding
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility
 from fusiond.models.blocks import Block
-from fusiond.navigator.intake import attitude, bearing, gnss, heading, height, raw, rdss, wheel
+from fusiond.navigator.intake import (
+    attitude,
+    bearing,
+    compass,
+    gnss,
+    heading,
+    height,
+    raw,
+    rdss,
+    wheel,
+)
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
 from fusiond.navigator.intake.pace import Pace
 from fusiond.navigator.intake.plausible import refusal
@@ -28,6 +38,7 @@ KINDS: tuple[Kind, ...] = (
     rdss.KIND,
     wheel.KIND,
     heading.KIND,
+    compass.KIND,
     attitude.KIND,
     height.KIND,
     bearing.KIND,
@@ -66,6 +77,7 @@ class Intake:
                 refused = refusal(m, self._limits) or self._pace.refusal(m, t_ns)
                 if refused is not None:
                     return refused
+                self._sections.met(m)
                 found = kind.aids(m, self._sections, when)
                 if isinstance(found, str) or not self._sections.robust(m.source):
                     return found

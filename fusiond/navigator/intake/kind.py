@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
+from drivers.measurements import DelayedFix, PositionFix, UtcStamp
 from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
@@ -33,6 +34,10 @@ class Sections:
             for name, section in aiding.items()
             if isinstance(section, RawAiding)
         }
+        self.place: tuple[float, float] | None = None
+        """Latitude and longitude (rad) of the last fix."""
+        self.utc_ns: int | None = None
+        """The last instant that a fix's stamp said with its date (POSIX)."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
 
@@ -46,6 +51,13 @@ class Sections:
         self._found.clear()
         for name in self.receivers.keys() & gates:
             self.receivers[name].gate = gates[name]
+
+    def met(self, m: object) -> None:
+        """A measurement has passed the door."""
+        if isinstance(m, PositionFix | DelayedFix):
+            self.place = m.lat_rad, m.lon_rad
+            if isinstance(m.stamp, UtcStamp):
+                self.utc_ns = m.stamp.utc_ns
 
     def of(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""

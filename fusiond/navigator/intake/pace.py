@@ -22,6 +22,7 @@ from drivers.measurements import (
     DelayedFix,
     Heading,
     Height,
+    MagneticHeading,
     Measurement,
     PositionFix,
     WheelSpeed,
@@ -34,6 +35,7 @@ RATES: Mapping[type, tuple[float, str]] = {
     PositionFix: (50.0, "fixes"),
     RawGnssEpoch: (50.0, "epochs"),
     Heading: (50.0, "headings"),
+    MagneticHeading: (50.0, "headings"),
     # The fastest cards may be asked once a second (docs/rdss-terminal.md).
     DelayedFix: (2.0, "fixes"),
     # CAN carries wheel speeds every 10 or 20 ms; attitude units and altimeters reach 200 Hz.

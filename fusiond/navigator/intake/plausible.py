@@ -21,6 +21,7 @@ from drivers.measurements import (
     DelayedFix,
     Heading,
     Height,
+    MagneticHeading,
     Measurement,
     PositionFix,
     WheelSpeed,
@@ -70,6 +71,8 @@ def refusal(m: Measurement | RawGnssEpoch, limits: Plausibility) -> str | None:
             )
         case Heading():
             return _finite((m.yaw_rad,)) or _sigma((m.sd_rad,), SIGMA_RAD)
+        case MagneticHeading():
+            return _finite((m.yaw_rad,))
         case Height():
             return _height(m.height_m, limits) or _sigma((m.sd_m,), SIGMA_M)
         case WheelSpeed():

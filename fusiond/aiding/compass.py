@@ -1,0 +1,80 @@
+r"""Heading of a compass: magnetic, and bent by the vehicle it is in.
+
+    psi_m = psi - D + a + b sin psi + c cos psi + d + v
+
+D is the declination where the vehicle is. a (mounting, and what the field's model is wrong by) and
+b, c (the vehicle's permanent magnetism, the semicircular deviation) are constants, or nearly; d is
+what lasts for some seconds (bridges, vehicles beside, currents of the own), a first-order
+Gauss-Markov process; v is white. The measurement is psi_m + D:
+
+    z = psi^ + dev(psi^) - (psi_m + D),   d z = d psi (1 + b cos psi - c sin psi) - d dev
+
+with d dev what the states of the deviation are short of. Soft iron (sin 2 psi) is mostly a tenth of
+it and goes into d. Source: Groves, 2nd ed., section 6.1.1; Bowditch, The American Practical
+Navigator (2019), chapter 8 (coefficients A to E).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusiond.aiding.attitude import HeadingAid
+from fusiond.aiding.base import Innovation, NotApplicable, State
+from fusiond.aiding.offers import HeadingOffer
+from fusiond.models.blocks import Block
+from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle
+
+DEVIATION, DISTURBANCE = "compass_deviation", "compass_disturbance"
+
+
+def deviation(name: str, sd_rad: float) -> Block:
+    """a, b and c, each with the same sigma, so that at any heading their sum has `sd_rad`, and at
+    opposite ones nothing in common: var(a + b sin psi + c cos psi) = 2 s^2."""
+    each = sd_rad / math.sqrt(2.0)
+    return Block(name, "rad", ("a", "b", "c"), (-1, -1, -1), initial=each)
+
+
+def disturbance(name: str, sd_rad: float, lasts_s: float) -> Block:
+    """d."""
+    return Block(name, "rad", ("d",), (-1,), initial=sd_rad, steady=sd_rad, tau_s=lasts_s)
+
+
+@dataclass(frozen=True, slots=True)
+class CompassAid(HeadingAid):
+    """A compass's heading with the declination added (rad), `sd_rad` of its white noise;
+    `deviation` and `disturbance` name the model's blocks of the rest, of which one sigma in all is
+    `lasting_sd_rad`."""
+
+    deviation: str
+    disturbance: str
+    lasting_sd_rad: float
+
+    def innovation(self, state: State) -> Innovation | NotApplicable:
+        # super() needs its arguments in a dataclass with slots.
+        found = super(CompassAid, self).innovation(state)
+        if isinstance(found, NotApplicable):
+            return found
+        yaw = rpy_from_dcm(state.dcm)[2]
+        slots = [*state.model.slots_of(self.deviation), *state.model.slots_of(self.disturbance)]
+        by = np.array(lasting(yaw))
+        of = state.xi[slots]
+        # What turns the compass turns the iron with it.
+        turned = 1.0 + of[1] * math.cos(yaw) - of[2] * math.sin(yaw)
+        h = found.h * turned
+        h[0, slots] = -by
+        return Innovation(np.array([wrap_angle(found.z[0] + float(by @ of))]), h, found.r)
+
+    def offers(self) -> tuple[HeadingOffer, ...]:
+        """A claim: how wrong it is, the deviation shares."""
+        by = lasting(self.yaw_rad)
+        shared = ((self.deviation, by[:3]), (self.disturbance, by[3:]))
+        sd = math.hypot(self.sd_rad, self.lasting_sd_rad)
+        return (HeadingOffer(self.t_ns, self.yaw_rad, sd, "compass", self.sd_rad, shared),)
+
+
+def lasting(yaw: float) -> tuple[float, float, float, float]:
+    """By how much a, b, c and d turn the compass of a vehicle that heads `yaw`."""
+    return 1.0, math.sin(yaw), math.cos(yaw), 1.0

@@ -1,0 +1,92 @@
+"""Heading of a compass: the declination is added here, where the world's magnetic model is asked.
+
+Where and when the vehicle is, the last fix said that had passed the door. The model is asked for a
+cell of `CELL_DEG` and for a month, so that which of two fixes came first does not show: over a cell
+the declination changes by some 0.05 deg where compasses work, in a month by 0.02 deg, and the model
+itself is off by 0.3 deg and more (WMM2025, technical report, section 3), which is part of the
+deviation: a constant, as long as the vehicle stays in the country.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from functools import lru_cache
+
+from drivers.measurements import MagneticHeading
+from fusiond.aiding.base import Aid
+from fusiond.aiding.compass import DEVIATION, DISTURBANCE, CompassAid, deviation, disturbance
+from fusiond.configuration.aiding import CompassAiding
+from fusiond.configuration.settings import DEG
+from fusiond.models.blocks import Block
+from fusiond.navigator.intake.kind import Instants, Kind, Sections
+
+CELL_DEG = 0.1
+LEAST_FIELD_NT = 6000.0
+"""Horizontal: below it lies the caution zone of the World Magnetic Model around its poles, where it
+warns of compasses."""
+_MODEL = "wmm/WMM_2025.COF"
+
+
+def aids(m: MagneticHeading, sections: Sections, when: Instants) -> list[Aid] | str:
+    """The heading with the declination. Refused are `place_unknown` and `date_unknown` before a
+    fix has said them, `near_magnetic_pole`, `beyond_magnetic_model` (its five years), and
+    `no_magnetic_model` without the package; with a declination of the configuration none is."""
+    o = sections.of(m.source, CompassAiding)
+    found = _declination(o, sections)
+    if isinstance(found, str):
+        return found
+    sd_rad = math.hypot(o.sd_deg * DEG * o.sigma_scale, m.rounding_sd_rad)
+    names = _names(m.source, o, sections)
+    lasting = math.hypot(o.deviation_sd_deg, o.disturbance_sd_deg) * DEG
+    yaw = math.remainder(m.yaw_rad + found, math.tau)
+    return [CompassAid(m.source, when.t_ns, o.gate_probability, yaw, sd_rad, *names, lasting)]
+
+
+def _declination(o: CompassAiding, sections: Sections) -> float | str:
+    if o.declination_deg is not None:
+        return o.declination_deg * DEG
+    if sections.place is None:
+        return "place_unknown"
+    if sections.utc_ns is None:
+        return "date_unknown"
+    lat, lon = (round(math.degrees(angle) / CELL_DEG) for angle in sections.place)
+    day = datetime.fromtimestamp(sections.utc_ns * 1e-9, UTC)
+    return declination(lat, lon, day.year, day.month)
+
+
+@lru_cache(maxsize=64)
+def declination(lat: int, lon: int, year: int, month: int) -> float | str:
+    """East of true north (rad), in the middle of a month, at a cell: so many `CELL_DEG` north of
+    the equator and east of Greenwich."""
+    try:
+        from pygeomag import GeoMag  # noqa: PLC0415  (extra `[compass]`)
+    except ImportError:
+        return "no_magnetic_model"
+    model = GeoMag(coefficients_file=_MODEL)
+    time = year + (month - 0.5) / 12.0
+    try:
+        field = model.calculate(glat=lat * CELL_DEG, glon=lon * CELL_DEG, alt=0.0, time=time)
+    except ValueError:
+        return "beyond_magnetic_model"
+    if field.h < LEAST_FIELD_NT:
+        return "near_magnetic_pole"
+    return math.radians(field.d)
+
+
+def blocks(source: str, section: CompassAiding, sections: Sections) -> list[Block]:
+    """Deviation, and what disturbs for some seconds."""
+    of_vehicle, passing = _names(source, section, sections)
+    sd_rad = section.disturbance_sd_deg * DEG
+    return [
+        deviation(of_vehicle, section.deviation_sd_deg * DEG),
+        disturbance(passing, sd_rad, section.disturbance_s),
+    ]
+
+
+def _names(source: str, section: CompassAiding, sections: Sections) -> tuple[str, str]:
+    own = sections.own
+    return own(DEVIATION, source, section), own(DISTURBANCE, source, section)
+
+
+KIND = Kind(MagneticHeading, aids, {CompassAiding: blocks})
