@@ -100,8 +100,8 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             "[aiding.roof]",
             "aiding.roof: lacks the key kind; "
-            "allowed: gnss, raw, rdss, attitude, star_tracker, sar, heading, compass, height, barometer, "
-            "wheel",
+            "allowed: gnss, raw, rdss, attitude, star_tracker, sar, heading, compass, height, "
+            "barometer, wheel",
         ),
         ("[sources.rx]", "sources.rx.driver: missing; expected text in quotes"),
         (
