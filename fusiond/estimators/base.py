@@ -107,6 +107,9 @@ class Estimator(Protocol):
     nav: Array
     xi: Array
     step: Array
+    time_slot: int
+    """Of the offset in time that solutions are published with (fusiond.estimators.reading): the
+    model's, or -1 where the receiver has shown to be no clock."""
 
     @property
     def covariance(self) -> Array:
@@ -174,6 +177,7 @@ class ErrorStateFilter:
 
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         self.model = model
+        self.time_slot = model.time_slot
         self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
@@ -240,7 +244,7 @@ class ErrorStateFilter:
             self._phi,
             model.packed,
             imu.packed,
-            model.time_slot,
+            self.time_slot,
             self.sample - start,
             imu.end,
             self.t_ns,
@@ -266,7 +270,7 @@ class ErrorStateFilter:
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self._covs[0], self.nav, self.step, self.model.time_slot, out)
+        sigmas(self._covs[0], self.nav, self.step, self.time_slot, out)
         return out
 
     def _feed_back(self, dx: Array) -> None:

@@ -123,7 +123,7 @@ class UnscentedEstimator(KalmanEstimator):
             model.sensor_terms,
             model.rate_terms,
             model.noise,
-            model.time_slot,
+            self.time_slot,
             imu.times,
             imu.samples,
             imu.densities,
