@@ -27,6 +27,7 @@ from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigation.vibration import Vibration
 from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
+from fusiond.navigator.alignment.lateness import Lateness
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.calibration import CalibrationWatch
@@ -113,6 +114,7 @@ class Navigator:
         self.calibration: SavedCalibration | None = None
         """What an earlier drive has shown, taken up by each alignment until it is refuted."""
         self.calibrating = CalibrationWatch(self.model, self._event, askew)
+        self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -187,6 +189,7 @@ class Navigator:
             return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
+        aids = self._lateness.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
         if isinstance(m, PositionFix):
@@ -221,7 +224,7 @@ class Navigator:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
-            if start is None:
+            if start is None or self._late() or self._aligner.waits(self._lateness.suspects):
                 return
             if self.calibration is not None and not self.on_trial:
                 start = take_up(start, self.model, self.calibration)
@@ -251,6 +254,9 @@ class Navigator:
             self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
+            return
+        look = self._lateness.due(e.t_ns)
+        if look and self._standing.doubtful(e, self.timeline.isolation) and self._late():
             return
         self._left_out.tell()
         if self.warm is not None and self.warm.refused_by is not None:
@@ -286,6 +292,17 @@ class Navigator:
         self._event(*wrong)
         self.reset(wrong[1])
         self._aligner.known.told.add(wrong[0])
+        return True
+
+    def _late(self) -> bool:
+        """Whether a receiver is found to be late; alignment then begins anew, by its last fixes at
+        the instants at which they were true."""
+        why = self._lateness.look(self.imu)
+        if why is None:
+            return False
+        self.estimator.time_slot = -1  # by the IMU's clock: it has said when the fixes were
+        self.reset(why)
+        self._aligner.aids(self._lateness.kept())
         return True
 
     def _warm_start(self) -> Start | None:

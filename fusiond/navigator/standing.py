@@ -139,6 +139,11 @@ class Standing:
             return None
         return f"on trial for {left_ns * 1e-9:.0f} s more after a failure"
 
+    def doubtful(self, estimator: Estimator, isolation: Isolation) -> bool:
+        """Whether it is not known that filter and aids fit each other."""
+        unproven = self.unproven(estimator.t_ns) is not None
+        return unproven or self.shaken(estimator, isolation) is not None
+
     def shaken(self, estimator: Estimator, isolation: Isolation) -> str | None:
         """Why a solution is coasting though aids come; None where it is not."""
         t_ns = estimator.t_ns

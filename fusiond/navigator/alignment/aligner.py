@@ -71,6 +71,12 @@ class Aligner:
             self.known.window(window)
         self._track.hear(aids)
 
+    def waits(self, why: str) -> bool:
+        """Whether a start that was found must wait: there is a reason `why`."""
+        if why:
+            self.reason = why
+        return bool(why)
+
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""
         if not imu.end:

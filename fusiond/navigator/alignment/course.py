@@ -17,12 +17,14 @@ velocity tell forward from backward (fusiond.navigator.alignment.motion).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import VelocityOffer
+from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.alignment import integrate_from_rest, level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -36,6 +38,7 @@ from fusiond.navigation.rotation import (
 from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import Fix, Standing, place_of
+from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
     BACKWARD,
     BIAS_SETTLING_S,
@@ -139,7 +142,7 @@ def _moved_off(
         return None
     felt = wrap_angle(math.atan2(antenna[1], antenna[0]) - turned)
     backward = abs(felt) > math.pi / 2.0
-    by_course = _along(by, velocity, rate, backward)
+    by_course = _along(by.options, velocity, rate, backward)
     apart = wrap_angle(felt - by_course.angle)
     if abs(apart) > COURSE_AGREEMENT_RAD:
         return by.known.doubted("the vehicle was felt to move off sideways: check [imu] axes")
@@ -195,16 +198,18 @@ def _felt_sd(by: Basis, g: float, seconds: float, turned: float, speed: float) -
     )
 
 
-def _along(by: Basis, velocity: VelocityOffer, rate: Array, backward: bool) -> Along:
+def _along(
+    options: AlignmentOptions, velocity: VelocityOffer, rate: Array, backward: bool
+) -> Along:
     """Where the antenna moves in a body that turns and does not slide."""
-    no_slip = by.options.no_slip_m
+    no_slip = options.no_slip_m
     known = no_slip is not None
     arm = np.array(velocity.lever) - np.array(no_slip if no_slip is not None else (0.0, 0.0, 0.0))
     speed = math.hypot(*velocity.v_ned[:2])
     across = float(np.cross(rate, arm)[1])
     forward = math.sqrt(max(speed**2 - across**2, 0.0))
     bend = abs(float(rate[2])) * (MEASURED_LEVER_SD_M if known else UNKNOWN_LEVER_SD_M)
-    sd = math.hypot(by.options.course_sd_rad, math.hypot(max(velocity.sd[:2]), bend) / speed)
+    sd = math.hypot(options.course_sd_rad, math.hypot(max(velocity.sd[:2]), bend) / speed)
     return Along(math.atan2(across, -forward if backward else forward), sd)
 
 
@@ -231,6 +236,36 @@ def _reversing(by: Basis, velocity: VelocityOffer) -> str:
     return ""
 
 
+class BothWays(NamedTuple):
+    """What was felt, and the best fit of a vehicle that drives forward, and backward."""
+
+    felt: motion.Felt
+    fits: tuple[motion.Fit, motion.Fit]
+
+
+def both_ways(
+    imu: ImuBuffer,
+    usable: Sequence[VelocityOffer],
+    options: AlignmentOptions,
+    noise: ImuNoise,
+    g: float,
+    most: int = motion.MOST_FIXES,
+) -> BothWays:
+    """Measured velocities in order of time against what the IMU felt; `most` of them, evenly, where
+    they are more."""
+    every = math.ceil(len(usable) / most)
+    fixes = usable[::-1][::every][::-1]
+    velocity = fixes[-1]
+    f = motion.felt(imu, [x.t_ns for x in fixes], np.zeros(3))
+    course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
+
+    def fitted(backward: bool) -> motion.Fit:
+        along = _along(options, velocity, f.rates[-1], backward)
+        return motion.fit(imu, f, fixes, noise, g, course - along.angle, along.sd)
+
+    return BothWays(f, (fitted(backward=False), fitted(backward=True)))
+
+
 def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start | None:
     velocity = latest.velocity
     shortest, longest = MOTION_NS
@@ -239,16 +274,8 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
     if not usable or velocity.t_ns - usable[0].t_ns < shortest:
         by.known.doubted("moving: collecting fixes")
         return None
-    every = math.ceil(len(usable) / motion.MOST_FIXES)
-    fixes = usable[::-1][::every][::-1]
-    f = motion.felt(imu, [x.t_ns for x in fixes], np.zeros(3))
     lat, _, height = (float(v) for v in place[1])
-    g = gravity(lat, height)
-    course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
-    fits = []
-    for backward in (False, True):
-        along = _along(by, velocity, f.rates[-1], backward)
-        fits.append(motion.fit(imu, f, fixes, by.noise, g, course - along.angle, along.sd))
+    f, fits = both_ways(imu, usable, by.options, by.noise, gravity(lat, height))
     forward_fit, backward_fit = fits
     best = min(fits, key=lambda x: x.cost)
     # Where even the better fit is poor, the sigmas are too small by as much.

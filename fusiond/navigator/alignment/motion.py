@@ -210,7 +210,7 @@ def _since_first(f: Felt, fixes: Sequence[VelocityOffer], here: Guess) -> tuple[
     antenna's about the IMU."""
     more = here.biases[3:] - f.bias
     dcm = here.last @ (_turn(f.turns @ more) @ f.turned[-1]).T
-    levers = np.array([np.cross(w, x.lever) for w, x in zip(f.rates, fixes, strict=True)])
+    levers = np.cross(f.rates, np.array([x.lever for x in fixes]))
     arms = (f.turned @ levers[:, :, None])[:, :, 0]
     return dcm, (f.gained + f.slopes @ np.concatenate([here.biases[:3], more]) + arms) @ dcm.T
 

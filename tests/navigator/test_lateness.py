@@ -1,0 +1,83 @@
+"""A receiver that is later than its stamps: found by the IMU, by how much, and not where it is
+not."""
+
+import math
+
+import numpy as np
+import pytest
+
+from fusiond.navigator.alignment.lateness import SETTLED_SD_S, Lateness
+from fusiond.navigator.alignment.options import alignment_options
+from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults import aid_faults, imu_faults
+from fusiond.studies.faults.judge import longest_lie_s
+from fusiond.studies.faults.recording import Drive, Recording
+from fusiond.studies.faults.runs import VEHICLE, navigate
+
+LATE_S = aid_faults.LATE_S
+TRUTH, ON_TIME = Drive(duration_s=60.0).recorded(VEHICLE, seed=5)
+ALWAYS_LATE = aid_faults.late(ON_TIME, 0.0, math.inf)
+
+
+def looked(
+    recording: Recording, until_s: tuple[float, ...]
+) -> tuple[list[str], Lateness, Navigator]:
+    """What looks at some instants have told."""
+    told: list[str] = []
+    navigator = Navigator(VEHICLE)
+    late = Lateness(
+        alignment_options(VEHICLE),
+        navigator._noise,
+        navigator.model,
+        lambda code, text: told.append(code),
+    )
+    given = taken = 0
+    for now_ns in (round(s * 1e9) for s in until_s):
+        end = int(np.searchsorted(recording.imu_seen, now_ns, side="right"))
+        navigator.imu.append(recording.stamps[given:end], recording.samples[given:end])
+        given = end
+        while recording.received[taken].seen_ns <= now_ns:
+            item = recording.received[taken]
+            taken += 1
+            aids = navigator._intake.aids(item.measurement, item.t_ns, 0.0, item.seen_ns)
+            assert not isinstance(aids, str)
+            late.hear(item.measurement.source, aids)
+        late.look(navigator.imu)
+    return told, late, navigator
+
+
+def test_lateness_is_found_when_the_vehicle_drives_off() -> None:
+    told, late, navigator = looked(ALWAYS_LATE, (19.0, 20.5, 22.0, 23.5, 25.0))
+    assert told == ["fixes_late"]
+    item = ALWAYS_LATE.received[0]
+    source = item.measurement.source
+    aids = navigator._intake.aids(item.measurement, item.t_ns, 0.0, item.seen_ns)
+    assert not isinstance(aids, str)
+    shifted_s = (aids[0].t_ns - late.hear(source, aids)[0].t_ns) * 1e-9
+    assert shifted_s == pytest.approx(LATE_S, abs=4.0 * SETTLED_SD_S)
+
+
+@pytest.mark.parametrize(
+    "recording",
+    [
+        ON_TIME,
+        imu_faults.mount_turned(ON_TIME, 22.0, 40.0),
+        imu_faults.bias_step(ON_TIME, 30.0, 30.0),
+    ],
+    ids=["nothing wrong", "IMU turned", "gyro off"],
+)
+def test_nothing_else_is_taken_for_lateness(recording: Recording) -> None:
+    told, late, _ = looked(recording, (20.0, 30.0, 42.0, 43.5, 45.0))
+    assert not told
+    assert not late.suspects
+
+
+def test_late_from_the_first_fix_on() -> None:
+    course = navigate(VEHICLE, ALWAYS_LATE, TRUTH)
+    assert [e.code for e in course.events if e.code in ("fixes_late", "aligned")] == [
+        "fixes_late",
+        "aligned",
+    ]
+    assert longest_lie_s(course.samples) == 0.0
+    assert course.samples[-1].mode == "navigating"
+    assert course.samples[-1].horizontal_m < 1.0
