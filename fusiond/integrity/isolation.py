@@ -142,6 +142,10 @@ class Isolation:
         """Why nobody can tell whether filter or sources are right; None where that is known."""
         return support.contested(self._records, t_ns)
 
+    def supported_by_another(self, device: str) -> bool:
+        """Whether a position of another device has been fused since the start."""
+        return support.from_another(self._records, device)
+
     def velocity_left_out(self, t_ns: int) -> bool:
         """Whether a velocity that comes is not believed."""
         return support.velocity_left_out(self._records, t_ns)

@@ -21,6 +21,9 @@ FINE_M = 3.0
 COARSER = 3.0
 # While the velocity of the same device was fused this lately, the filter's motion is supported.
 SUPPORT_NS = 2_000_000_000
+# Two velocities in a row that the gate of 0.9999 refuses are no chance: an IMU that has turned is
+# wrong by the full acceleration from the first on, and of a receiver of 1 Hz the third comes late.
+REFUSED_TWICE = 2
 # A coarse position contradicts one that is so many of its sigmas away; it is asked for seldom, and
 # an IMU keeps within the same for a minute.
 DISPUTE_SIGMAS, DISPUTE_NS = 6.0, 60_000_000_000
@@ -75,8 +78,9 @@ def contested(records: Records, t_ns: int) -> str | None:
         if r.locates and r.excluded and not fine_enough(records, r, t_ns):
             return f"{name} is left out ({r.excluded}) and no other is as fine"
         # A velocity that jumped away is wrong by itself; one that left slowly may be right.
-        if r.moves and r.excluded and not r.jumped and not _moving(records, r, t_ns):
-            return f"{name} is left out ({r.excluded}), or the IMU is wrong"
+        wrong = r.excluded or (r.refused >= REFUSED_TWICE and "refused")
+        if r.moves and wrong and not r.jumped and not _moving(records, r, t_ns):
+            return f"{name} is left out ({wrong}), or the IMU is wrong"
         if (
             r.proof
             and not r.proof.goes_along
@@ -116,6 +120,14 @@ def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:
         and (r.proof is None or r.proof.goes_along)
         and r.sd_m <= sd_m
         and t_ns - r.fused_ns <= OTHERS_NS
+        for r in records.values()
+    )
+
+
+def from_another(records: Records, device: str) -> bool:
+    """Whether another device's position is believed and was fused, be it a coarse one."""
+    return any(
+        r.locates and r.device != device and r.believed and r.fused_ns > NEVER_NS
         for r in records.values()
     )
 

@@ -8,6 +8,8 @@ what follows for the operator:
     turned     the gyros felt a turn of a vehicle that stood: they are wrong, or what it stands on
                has turned, and until it has moved nobody can tell
     contested  what was left out may be right: nobody can tell
+    left       what the solution started from had left the one before it by a jump, and no other
+               device has said since which of the two was right
     askew      the IMU does not sit on the vehicle as it was configured: whose attitude is it?
     given up   the filter is wrong, or cannot be told from wrong any more: alignment begins anew
 
@@ -77,6 +79,7 @@ class Standing:
         self._since_ns = 0
         self._from = self._fastest = 0.0
         self._changed = 0.0
+        self._left = ""
 
     def started(self, t_ns: int) -> None:
         """A navigation has begun."""
@@ -111,6 +114,7 @@ class Standing:
         waited_ns = t_ns - lost.since_ns
         if waited_ns <= patience_ns:
             return None
+        self._left = lost.device if lost.cause == "source" else ""
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
     def _watch(self, t_ns: int, isolation: Isolation, nav: Array) -> None:
@@ -155,6 +159,10 @@ class Standing:
             return f"IMU and aids did not fit: sigma widened, {left_ns * 1e-9:.0f} s to prove it"
         if self._trial_ns and not self._proven:
             return "after a failure, and no change of speed has proven it since"
+        if self._left and isolation.supported_by_another(self._left):
+            self._left = ""
+        if self._left:
+            return f"{self._left} left the solution of before the start: nothing else can check it"
         if self._turned:
             return "a turn was felt at rest: a gyro is wrong, or the ground has turned"
         return isolation.contested(t_ns) or _askew(estimator)

@@ -10,6 +10,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.isolation import Isolation
+from fusiond.integrity.support import Lost
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import MOUNTING, mounting
 from fusiond.navigation.strapdown import VE, VN
@@ -167,3 +168,37 @@ def test_what_never_drives_fast_proves_itself_by_most_of_its_speed() -> None:
     nav[VN] = 0.3
     assert standing.failure(31 * S, isolation, nav) is None
     assert standing.shaken(at(31.0), isolation) is None
+
+
+class Left(Isolation):
+    """An isolation of a receiver that has left the filter by a jump, until another device is
+    fused."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.since_ns: int | None = 0
+        self.supported = False
+
+    def lost(self, t_ns: int) -> Lost | None:
+        if self.since_ns is None:
+            return None
+        return Lost(self.since_ns, "source", "gnss", "jumped", disputed=False)
+
+    def supported_by_another(self, device: str) -> bool:
+        assert device == "gnss"
+        return self.supported
+
+
+def test_a_start_from_a_receiver_that_had_jumped_away_coasts_until_another_device_agrees() -> None:
+    isolation, standing = Left(), Standing(150.0)
+    still = np.zeros(10)
+    assert standing.failure(59 * S, isolation, still) is None
+    assert standing.failure(61 * S, isolation, still) is not None
+    isolation.since_ns = None
+    standing.started(62 * S)
+    for t_s in (63, 1000, 100_000):
+        assert "nothing else can check it" in (standing.shaken(at(t_s), isolation) or "")
+    isolation.supported = True
+    assert standing.shaken(at(100_001), isolation) is None
+    isolation.supported = False
+    assert standing.shaken(at(100_002), isolation) is None
