@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import os
 import pickle
 import secrets
@@ -83,7 +82,13 @@ class KernelCache(NullCache):
         rtsys.initialize(target)  # what kernels allocate arrays with
         path = self._path(signature, target.codegen())
         try:
-            data = path.read_bytes()
+            with path.open("rb") as file:
+                data = memoryview(file.read())
+                if hashlib.sha256(data[_DIGEST_SIZE:]).digest() != data[:_DIGEST_SIZE]:
+                    _discard(path, "its checksum is wrong")
+                    return None
+                file.seek(_DIGEST_SIZE)  # nobody writes into a file that is there
+                made = _Unpickler(file).load()
         except FileNotFoundError:
             return None
         except IsADirectoryError:
@@ -92,11 +97,7 @@ class KernelCache(NullCache):
         except OSError as error:
             _tell(f"{path} cannot be read ({error})")
             return None
-        payload = memoryview(data)[_DIGEST_SIZE:]
-        if hashlib.sha256(payload).digest() != data[:_DIGEST_SIZE]:
-            _discard(path, "its checksum is wrong")
-            return None
-        return _linked(target, *_Unpickler(io.BytesIO(payload)).load())
+        return _linked(target, *made)
 
     def save_overload(self, signature: object, data: Any) -> None:
         """Write what was compiled; where that fails it is compiled again at the next start."""
