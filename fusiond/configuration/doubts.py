@@ -64,11 +64,19 @@ def _imu(config: Config) -> Iterator[str]:
     foreign = [s.driver for s in config.sources.values() if s.driver not in GIVES]
     if not imus and not foreign:
         yield "sources: none is an IMU, and nothing is navigated without: add one (can_imu)"
-    if len(imus) > 1:
+    spare = config.imu.spare
+    if spare is not None and (spare.source not in imus or len(imus) < 2) and not foreign:
+        yield (
+            f"imu.spare.source = {spare.source!r}: two IMUs are needed in sources, one of them "
+            f"with this name; there {'is' if len(imus) == 1 else 'are'} "
+            f"{' and '.join(imus) or 'none'}"
+        )
+    if len(imus) > (1 if spare is None else 2):
         first, *others = imus
         yield (
             f"sources: {' and '.join(imus)} are IMUs: the one whose samples come first is used, "
-            f"the others are counted and ignored; keep {first} or {' or '.join(others)}"
+            f"the others are counted and ignored; keep {first} or {' or '.join(others)}, or make "
+            f'one the spare: [imu.spare] source = "{others[-1]}"'
         )
     imu = config.imu
     if imu.rate_hz * imu.gap_s < 1.0:

@@ -53,6 +53,24 @@ Axis = Annotated[str, Field(pattern=r"^[+-]?[xyz]$")]
 Axes = Annotated[tuple[Axis, Axis, Axis], AfterValidator(_right_handed)]
 
 
+class SpareImu(Section):
+    """A second inertial unit of the same kind, which takes over when the first one fails."""
+
+    source: str
+    """The source, of those in `[sources]`, that is the spare."""
+    axes: Axes = ("+x", "+y", "+z")
+    """Its sensor axes along body forward, right and down."""
+    mounting_deg: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of its nominal sensor frame against the body."""
+    mounting_sd_deg: PositiveFloat = 1.0
+    """One sigma of what each of those angles is wrong by against the first unit's."""
+
+    @property
+    def mounted(self) -> dict[str, Any]:
+        """How it sits, by the keys of `[imu]`."""
+        return {"axes": self.axes, "mounting_deg": self.mounting_deg}
+
+
 class Imu(Section):
     """Inertial sensor: mounting and error model.
 
@@ -98,6 +116,8 @@ class Imu(Section):
     gap_s: PositiveFloat = 0.5
     """A pause longer than this is a gap: the solution says so. The covariance grows for any that is
     longer than 3.5 samples."""
+    spare: SpareImu | None = None
+    """`[imu.spare]`: a second unit; see `docs/can-imu.md`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -167,8 +187,13 @@ class Alignment(Section):
 
     heading: tuple[
         Literal[
-            *("saved", "config", "dual_antenna", "compass"),
-            *("gyrocompass", "gnss_course", "positions"),
+            "saved",
+            "config",
+            "dual_antenna",
+            "compass",
+            "gyrocompass",
+            "gnss_course",
+            "positions",
         ],
         ...,
     ] = ("saved", "dual_antenna", "gyrocompass", "gnss_course", "positions")

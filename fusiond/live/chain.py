@@ -60,7 +60,7 @@ class Chain:
     def tick(self, t_ns: int) -> Solution:
         """Run the filter on all that has come, and read the solution at `t_ns`."""
         self.sources.release(t_ns)
-        arrived = self.sources.take_imu()
+        arrived = self.sources.take_imu(t_ns)
         if arrived is not None:
             self.navigator.add_imu(*arrived)
         self.navigator.advance()

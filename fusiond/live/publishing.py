@@ -127,6 +127,7 @@ class Publishing:
                 scheduler=self._scheduler(),
                 fused=fused,
                 rejected=rejected,
+                imu=self._sources.imu.used,
                 calibrated=self._navigator.calibrating.settled,
                 recording=self._recording(),
                 injected=self._injection.active,

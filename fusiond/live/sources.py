@@ -7,7 +7,7 @@ stamp becomes an instant, an IMU sample waits for the next tick, a time report g
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from math import degrees
@@ -24,6 +24,7 @@ from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
+from fusiond.live.imu_choice import ImuChoice
 from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
 from fusiond.navigator.navigator import Navigator
@@ -32,10 +33,6 @@ from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth, SourceHe
 
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]
-
-# Samples that may wait for a tick: 2 s at 1 kHz. A tick comes every 10 ms; a full queue means that
-# the loop stood still, and the newest samples are the ones worth keeping.
-IMU_QUEUE = 2000
 
 
 class Source:
@@ -67,9 +64,7 @@ class Sources:
         self._navigator = navigator
         self._on_event = on_event
         clock.on_event = lambda code, text: on_event("clock", code, text)
-        self._imu: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=IMU_QUEUE)
-        self._imu_source: str | None = None
-        self.counters: Counter[str] = Counter()
+        self.imu = ImuChoice(config.imu, on_event)
         self.on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None] | None = None
         """Hears every measurement with its instant."""
         self.all: dict[str, Source] = {}
@@ -124,22 +119,17 @@ class Sources:
         if self.on_arrival is not None:
             self.on_arrival(item, instant)
         if isinstance(item, ImuSample):
-            self._imu_source = self._imu_source or item.source
-            if item.source != self._imu_source:
-                self.counters["second_imu"] += 1
-                return
-            self.counters["imu_queue_overflow"] += len(self._imu) == IMU_QUEUE
-            self._imu.append((instant.t_valid_ns, (*item.gyro_rad_s, *item.accel_m_s2)))
+            self.imu.take(item, instant.t_valid_ns)
             return
         self._navigator.add(item, instant.t_valid_ns, instant.sd_s, item.t_seen_ns)
 
-    def take_imu(self) -> tuple[NDArray[np.int64], Array] | None:
-        """The samples since the last call, (m,) ns and (m, 6); None if there are none."""
-        if not self._imu:
-            return None
-        times, samples = zip(*self._imu, strict=True)
-        self._imu.clear()
-        return np.array(times, dtype=np.int64), np.array(samples, dtype=np.float64)
+    def take_imu(self, t_ns: int) -> tuple[NDArray[np.int64], Array] | None:
+        """The samples since the last call, (m,) ns and (m, 6); None if there are none. Where the
+        spare takes over, the navigator has been told before."""
+        navigator = self._navigator
+        if self.imu.changes(t_ns, navigator.imu.latest_ns if navigator.imu.end else None):
+            navigator.change_imu()
+        return self.imu.samples()
 
     # ------------------------------------------------------------------ state
 
@@ -201,8 +191,8 @@ class Sources:
             if name in navigator.raw:
                 counters |= dict(navigator.raw[name].refused)
             fused = ended["fused"]
-            if name == self._imu_source:
-                counters |= {k: int(v) for k, v in self.counters.items() if v}
+            if name == self.imu.used:
+                counters |= {k: int(v) for k, v in self.imu.counters.items() if v}
                 rejected |= {k: int(v) for k, v in navigator.imu.counters.items() if v}
                 gaps = rejected.pop("gap", 0)
                 counters["gap"] = gaps

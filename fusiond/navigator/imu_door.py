@@ -96,6 +96,11 @@ class ImuDoor:
         self._latest_ns = None
         return True
 
+    def change(self) -> None:
+        """What comes is of another unit: what was seen of the first says nothing of it."""
+        self._check.restart()
+        self._troubles.clear()
+
     def admit(
         self, times: Stamps, samples: Array, imu: ImuBuffer, navigating: bool
     ) -> Iterator[Run]:

@@ -34,6 +34,7 @@ from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, model_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
+from fusiond.navigator.imu_change import hand_over
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
@@ -152,6 +153,14 @@ class Navigator:
         if self._door.restarts(self.imu):
             self._begin_anew("IMU stamps went back")
         return taken
+
+    def change_imu(self) -> None:
+        """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
+        self._door.change()
+        if self.started is None:
+            return self._begin_anew("the spare IMU is used")
+        hand_over(self.estimator, self.config.imu)
+        return self.timeline.start()
 
     def _begin_anew(self, why: str) -> None:
         """Nothing that the samples so far have told counts any more."""

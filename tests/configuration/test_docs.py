@@ -16,6 +16,7 @@ from tests.places import REPOSITORY
 PAGE = (REPOSITORY / "docs" / "configuration.md").read_text(encoding="utf-8")
 SECTIONS = {
     "[imu]": config.Imu,
+    "[imu.spare]": config.SpareImu,
     "[aiding.gnss]": config_aiding.GnssAiding,
     "[aiding.raw]": config_aiding.RawAiding,
     "[aiding.rdss]": config_aiding.RdssAiding,

@@ -94,8 +94,8 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             '[aiding.roof]\nkind = "gns"',
             "aiding.roof.kind = \"gns\": did you mean 'gnss'? "
-            "allowed: attitude, barometer, gnss, heading, height, raw, rdss, sar, star_tracker, "
-            "wheel",
+            "allowed: attitude, barometer, compass, gnss, heading, height, raw, rdss, sar, "
+            "star_tracker, wheel",
         ),
         (
             "[aiding.roof]",

@@ -87,6 +87,7 @@ EXAMPLES: dict[str, Any] = {
         fused=35_610,
         rejected=14,
         calibrated=False,
+        imu="imu",
         recording=RecordingStatus(
             "recording",
             "/var/lib/fusiond/logs/truck_20261120T223307Z_5e0c1f9a_0001.mcap",

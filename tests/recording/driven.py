@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from fusiond.configuration.schema import Config
 from fusiond.demo.demo import demo_config, demo_scenario
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.clock.host_time import MS, Host
@@ -18,8 +19,10 @@ class Drive(Rig):
     `unplugged` devices send nothing.
     """
 
-    def __init__(self, folder: Path, duration_s: float, **options: Any) -> None:
-        config = demo_config(1, folder / "gnss", folder / "rdss")
+    def __init__(
+        self, folder: Path, duration_s: float, config: Config | None = None, **options: Any
+    ) -> None:
+        config = config or demo_config(1, folder / "gnss", folder / "rdss")
         self.vehicle = SimulatedVehicle(demo_scenario(config), seed=3, duration_s=duration_s)
         host = Host()
         self._start_ns = self.vehicle.start_ns = host.mono + 500 * MS

@@ -31,6 +31,7 @@ class StatusMessage(Message):
     mode: Mode
     why: str
     protection: BoundState
+    imu: str | None = Field(description="the source whose samples are used")
     calibrated: bool = Field(description="all of `calibration` has settled")
     since_utc: str | None
     since_ms: int | None
@@ -65,6 +66,7 @@ def status_message(
     fused: int,
     rejected: int,
     calibrated: bool,
+    imu: str | None,
     recording: RecordingStatus,
     injected: tuple[str, ...],
     mqtt: Mapping[str, int],
@@ -78,6 +80,7 @@ def status_message(
         mode=solution.mode,
         why=solution.reason,
         protection=solution.bound.state,
+        imu=imu,
         calibrated=calibrated,
         since_utc=since_utc,
         since_ms=since_ms,

@@ -1,0 +1,102 @@
+"""Which inertial unit is used: the first, or the spare that takes over.
+
+The rule is that of gaps: once `gap_s` long no sample of the unit in use has been taken, whether it
+is silent, or says what cannot be true (stuck, saturated, dead: fusiond.navigator.imu_door), and the
+spare sends, the spare is used. Its samples of that time have been kept, so that it goes on where
+the other ended. It stays until the daemon starts again: a unit that has failed once is not trusted
+until somebody has looked at it, and two that fail in turn must not take turns.
+
+All of it happens in ticks and depends on arrivals alone: a replay chooses alike.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.measurements import ImuSample
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import sensor_to_body
+
+Array = NDArray[np.float64]
+Row = tuple[int, tuple[float, ...]]
+
+# Samples that may wait for a tick: 2 s at 1 kHz. A tick comes every 10 ms; a full queue means that
+# the loop stood still, and the newest samples are the ones worth keeping.
+IMU_QUEUE = 2000
+
+
+class ImuChoice:
+    """Keeps the samples of all units until a tick. `on_event(source, code, text)` hears of a
+    change."""
+
+    def __init__(self, imu: Imu, on_event: Callable[[str, str, str], None]) -> None:
+        self._spare, self._gap_ns = imu.spare, round(imu.gap_s * 1e9)
+        self._event = on_event
+        self.used: str | None = None
+        """The source whose samples count; None before the first."""
+        self.counters: Counter[str] = Counter()
+        self._waiting: deque[Row] = deque(maxlen=IMU_QUEUE)
+        self._standby: deque[Row] = deque(maxlen=IMU_QUEUE)
+        self._standby_since_ns: int | None = None
+        self._taken_ns = 0
+        self._turn = np.eye(3)
+        if imu.spare is not None:
+            own = imu.model_copy(update=imu.spare.mounted)
+            self._turn = sensor_to_body(imu).T @ sensor_to_body(own)
+
+    def take(self, item: ImuSample, t_valid_ns: int) -> None:
+        """A sample has come."""
+        row: Row = t_valid_ns, (*item.gyro_rad_s, *item.accel_m_s2)
+        if self._spare is not None and item.source == self._spare.source:
+            row = t_valid_ns, self._turned(row[1])
+            if self.used != item.source:
+                self._standby.append(row)
+                if self._standby_since_ns is None:
+                    self._standby_since_ns = item.t_seen_ns
+                return
+        self.used = self.used or item.source
+        if item.source != self.used:
+            self.counters["second_imu"] += 1
+            return
+        self.counters["imu_queue_overflow"] += len(self._waiting) == IMU_QUEUE
+        self._waiting.append(row)
+
+    def _turned(self, sample: tuple[float, ...]) -> tuple[float, ...]:
+        """From the spare's axes to those of the first unit."""
+        both = np.reshape(sample, (2, 3)) @ self._turn.T
+        return tuple(both.ravel().tolist())
+
+    def changes(self, t_ns: int, taken_ns: int | None) -> bool:
+        """Whether the spare takes over in the tick at `t_ns`; `taken_ns` is the instant of the
+        newest sample that the navigator has taken, None while it has none."""
+        if taken_ns is not None:
+            self._taken_ns = max(self._taken_ns, taken_ns)
+        if self._spare is None or self.used == self._spare.source or not self._standby:
+            return False
+        since_ns = max(self._taken_ns, self._standby_since_ns or 0)
+        silent_ns = t_ns - since_ns
+        if silent_ns <= self._gap_ns or t_ns - self._standby[-1][0] > self._gap_ns:
+            return False
+        before, self.used = self.used or "the first IMU", self._spare.source
+        self._waiting = deque((r for r in self._standby if r[0] > self._taken_ns), IMU_QUEUE)
+        self._standby.clear()
+        self.counters["took_over"] += 1
+        self._event(
+            self.used,
+            "imu_spare",
+            f"{before} has given nothing that counts for {silent_ns * 1e-9:.1f} s: {self.used} is "
+            "used, with biases unknown, until the daemon starts again",
+        )
+        return True
+
+    def samples(self) -> tuple[NDArray[np.int64], Array] | None:
+        """Those since the last call, (m,) ns and (m, 6); None if there are none."""
+        if not self._waiting:
+            return None
+        times, samples = zip(*self._waiting, strict=True)
+        self._waiting.clear()
+        return np.array(times, dtype=np.int64), np.array(samples, dtype=np.float64)

@@ -1,0 +1,36 @@
+"""The filter's state when another inertial unit goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import DEG
+from fusiond.estimators.base import Estimator
+from fusiond.models.vehicle import MOUNTING
+from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR
+
+Array = NDArray[np.float64]
+
+
+def hand_over(estimator: Estimator, imu: Imu) -> None:
+    """Go on with the spare of `imu` where the filter is.
+
+    Biases, scale factors and the mounting against the vehicle were the first unit's: they are as at
+    a start, 0 with their priors and without any correlation. The body is now what the new unit says
+    it is: the attitude's variance grows by that of its mounting. The timeline begins here: the two
+    units are no one course of samples, and what a fix says of an instant before comes too late.
+    """
+    assert imu.spare is not None
+    model, p = estimator.model, estimator.covariance.copy()
+    slots = [s for column in range(RATE_ERROR, COLUMN_END) for s in model.parameters(column)]
+    slots += model.slots_of(MOUNTING)
+    xi = estimator.xi.copy()
+    xi[slots] = 0.0
+    p[slots, :] = 0.0
+    p[:, slots] = 0.0
+    p[slots, slots] = np.square(model.initial[slots])
+    attitude = np.arange(PHI, PHI + 3)
+    p[attitude, attitude] += (imu.spare.mounting_sd_deg * DEG) ** 2
+    estimator.initialise(estimator.t_ns, estimator.sample, estimator.nav.copy(), xi, p)
