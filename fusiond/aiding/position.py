@@ -159,11 +159,12 @@ class PositionAid(Aid):
         rows = 2 if self.height_m is None or model.hold_height else 3
         height = 0.0 if self.height_m is None else self.height_m
         z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
-        slots = model.slots_of_each(self.bias, (self.time,), (self.rest,))
+        bias, time, rest = model.slots_of_each(self.bias, (self.time,), (self.rest,))
+        slots = model.column_of, bias, time, rest
         fix = self.lat_rad, self.lon_rad, height
         where = *self.lever, *self.sd, self.sd_time_s
         of_time = _UNKNOWN if p is None else p
-        _position(nav, xi, step, model.column_of, *slots, *fix, *where, of_time, z, h, r)
+        _position(nav, xi, step, *slots, *fix, *where, of_time, z, h, r)
         return Innovation(z, h, r)
 
     def coarser(self, factor: float) -> PositionAid:

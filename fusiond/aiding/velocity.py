@@ -118,10 +118,13 @@ class VelocityAid(Aid):
         nav, xi, step, model, _ = state
         rows = 2 if model.hold_height else len(self.v_ned)
         z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
-        slots = model.slots_of_each((self.time,), (self.rest,))
-        v, sd = (*self.v_ned, 0.0)[:3], (*self.sd, 0.0)[:3]
+        time, rest = model.slots_of_each((self.time,), (self.rest,))
+        slots = model.column_of, time, rest
+        north, east, down = (*self.v_ned, 0.0)[:3]
+        sd_n, sd_e, sd_d = (*self.sd, 0.0)[:3]
+        measured = north, east, down, sd_n, sd_e, sd_d
         where = *self.lever, self.sd_time_s
-        _velocity(nav, xi, step, model.column_of, *slots, *v, *sd, *where, z, h, r)
+        _velocity(nav, xi, step, *slots, *measured, *where, z, h, r)
         return Innovation(z, h, r)
 
     def offers(self) -> tuple[VelocityOffer, ...]:

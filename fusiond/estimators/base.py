@@ -166,7 +166,7 @@ def _jumped(codes: Codes, of_clock: Array) -> bool:
     # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
     ranges = (np.abs(of_clock) > 0.5).any(axis=1)
     lost = np.count_nonzero(codes[ranges] != KEPT)
-    return lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges)
+    return bool(lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges))
 
 
 class ErrorStateFilter:

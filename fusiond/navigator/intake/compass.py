@@ -60,7 +60,7 @@ def declination(lat: int, lon: int, year: int, month: int) -> float | str:
     """East of true north (rad), in the middle of a month, at a cell: so many `CELL_DEG` north of
     the equator and east of Greenwich."""
     try:
-        from pygeomag import GeoMag  # noqa: PLC0415  (extra `[compass]`)
+        from pygeomag.geomag import GeoMag  # noqa: PLC0415  (extra `[compass]`)
     except ImportError:
         return "no_magnetic_model"
     model = GeoMag(coefficients_file=_MODEL)

@@ -30,6 +30,7 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
     """The speed, with the section's sigma where the device states none, and what rounding adds."""
     o = sections.of(m.source, WheelAiding)
     sd_m_s = math.hypot((m.sd_m_s or o.sd_m_s) * o.sigma_scale, m.rounding_sd_m_s)
+    drift, scale, latency, rounding = sections.each_own(_ERRORS, m.source, o)
     return [
         WheelSpeedAid(
             m.source,
@@ -40,7 +41,10 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
             o.lever_arm_m,
             m.signed,
             m.rounding_sd_m_s,
-            *sections.each_own(_ERRORS, m.source, o),
+            drift,
+            scale,
+            latency,
+            rounding,
             m.shared_step_m_s,
         )
     ]
