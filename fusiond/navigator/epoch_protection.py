@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -91,11 +92,16 @@ class EpochProtection:
     """Levels from raw epochs, at a `risk` and a rate of `false_alarm`s, each an hour."""
 
     def __init__(self, risk: float, false_alarm: float) -> None:
+        self._requirement = requirement(risk, false_alarm)
+        self._risk = risk
+        self._heard: dict[str, _Heard] = {}
+
+    @cached_property
+    def _quantile(self) -> float:
+        """Of the Gaussian law: what one position exceeds with half the risk."""
         from scipy.special import ndtri  # noqa: PLC0415 - slow to load
 
-        self._requirement = requirement(risk, false_alarm)
-        self._quantile = -float(ndtri(0.5 * risk / INDEPENDENT_PER_HOUR))
-        self._heard: dict[str, _Heard] = {}
+        return -float(ndtri(0.5 * self._risk / INDEPENDENT_PER_HOUR))
 
     def clear(self) -> None:
         """The solution has begun anew."""
