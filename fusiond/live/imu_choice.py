@@ -42,7 +42,8 @@ class ImuChoice:
         self._waiting: deque[Row] = deque(maxlen=IMU_QUEUE)
         self._standby: deque[Row] = deque(maxlen=IMU_QUEUE)
         self._standby_since_ns: int | None = None
-        self._taken_ns = 0
+        self._taken_ns = self._offered_ns = 0
+        self._failed_before = False
         self._turn = np.eye(3)
         if imu.spare is not None:
             own = imu.model_copy(update=imu.spare.mounted)
@@ -72,15 +73,23 @@ class ImuChoice:
 
     def changes(self, t_ns: int, taken_ns: int | None) -> bool:
         """Whether the spare takes over in the tick at `t_ns`; `taken_ns` is the instant of the
-        newest sample that the navigator has taken, None while it has none."""
+        newest sample that the navigator has taken, None while it has none.
+
+        Two ticks in a row must say so: after a stall of the host the first may come before the
+        frames that have gathered.
+        """
         if taken_ns is not None:
             self._taken_ns = max(self._taken_ns, taken_ns)
         if self._spare is None or self.used == self._spare.source or not self._standby:
             return False
         since_ns = max(self._taken_ns, self._standby_since_ns or 0)
-        silent_ns = t_ns - since_ns
-        if silent_ns <= self._gap_ns or t_ns - self._standby[-1][0] > self._gap_ns:
+        refused = self._offered_ns - since_ns > self._gap_ns
+        silent = not self._waiting and t_ns - since_ns > self._gap_ns
+        failed = (refused or silent) and t_ns - self._standby[-1][0] <= self._gap_ns
+        if not (failed and self._failed_before):
+            self._failed_before = failed
             return False
+        silent_ns = t_ns - since_ns
         before, self.used = self.used or "the first IMU", self._spare.source
         self._waiting = deque((r for r in self._standby if r[0] > self._taken_ns), IMU_QUEUE)
         self._standby.clear()
@@ -99,4 +108,5 @@ class ImuChoice:
             return None
         times, samples = zip(*self._waiting, strict=True)
         self._waiting.clear()
+        self._offered_ns = max(self._offered_ns, times[-1])
         return np.array(times, dtype=np.int64), np.array(samples, dtype=np.float64)

@@ -10,11 +10,12 @@ from fusiond.configuration.settings import DEG
 from fusiond.estimators.base import Estimator
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR
+from fusiond.navigator.timeline import Timeline
 
 Array = NDArray[np.float64]
 
 
-def hand_over(estimator: Estimator, imu: Imu) -> None:
+def hand_over(estimator: Estimator, timeline: Timeline, imu: Imu) -> None:
     """Go on with the spare of `imu` where the filter is.
 
     Biases, scale factors and the mounting against the vehicle were the first unit's: they are as at
@@ -34,3 +35,4 @@ def hand_over(estimator: Estimator, imu: Imu) -> None:
     attitude = np.arange(PHI, PHI + 3)
     p[attitude, attitude] += (imu.spare.mounting_sd_deg * DEG) ** 2
     estimator.initialise(estimator.t_ns, estimator.sample, estimator.nav.copy(), xi, p)
+    timeline.start()

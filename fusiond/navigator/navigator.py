@@ -119,9 +119,8 @@ class Navigator:
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
-        return Aligner(
-            alignment_options(self.config), self._noise, self.model, self._saved, self._event
-        )
+        options = alignment_options(self.config)
+        return Aligner(options, self._noise, self.model, self._saved, self._event)
 
     # ------------------------------------------------------------------ arrivals
 
@@ -158,9 +157,9 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
         if self.started is None:
-            return self._begin_anew("the spare IMU is used")
-        hand_over(self.estimator, self.config.imu)
-        return self.timeline.start()
+            self._begin_anew("the spare IMU is used")
+        else:
+            hand_over(self.estimator, self.timeline, self.config.imu)
 
     def _begin_anew(self, why: str) -> None:
         """Nothing that the samples so far have told counts any more."""

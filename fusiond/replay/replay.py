@@ -182,7 +182,7 @@ class Replay:
             if self._navigate:
                 tick = self._tick(record)
             else:
-                self.chain.sources.take_imu(record.t_ns)
+                self.chain.sources.imu.samples()
         elif kind is Kind.COMMAND:
             self._command(record)
         elif kind is Kind.SENT:

@@ -132,15 +132,21 @@ def test_two_that_are_silent_do_not_take_turns_and_no_spare_comes_alone() -> Non
     found = choice.samples()
     assert found is not None
     assert len(found[0]) == 1
-    assert not choice.changes(3 * second, second)  # the spare is silent as well
+    for t_ns in (3 * second, 3 * second + 1):
+        assert not choice.changes(t_ns, second)  # the spare is silent as well
     give("imu2", 3 * second)
-    assert choice.changes(3 * second + 1, second)
+    give("imu", 3 * second)  # the host stood still, not the unit
+    assert not any(choice.changes(3 * second + k, second) for k in range(3))
+    assert choice.samples() is not None
+    give("imu2", 4 * second)
+    assert not choice.changes(4 * second, 3 * second)
+    assert choice.changes(4 * second + 1, 3 * second)
     found = choice.samples()
     assert found is not None
-    assert found[0].tolist() == [3 * second]  # not those that the first has covered
+    assert found[0].tolist() == [4 * second]  # not those that the first has covered
     assert found[1][0, 3:].tolist() == pytest.approx([2.0, 1.0, -3.0])  # in the first one's axes
-    give("imu", 4 * second)  # the first is back: it is not used
-    assert not choice.changes(9 * second, 3 * second)
+    give("imu", 5 * second)  # the first is back: it is not used
+    assert not any(choice.changes(9 * second + k, 4 * second) for k in range(3))
     assert +choice.counters == {"took_over": 1, "second_imu": 1}
     assert told == ["imu_spare"]
 
