@@ -18,7 +18,10 @@ from fusiond.live.imu_choice import ImuChoice
 from fusiond.navigation.solution import Mode
 from fusiond.replay.run import Wish, replay
 from fusiond.simulation.can.imu import CanImu
+from fusiond.simulation.vehicle import SimulatedVehicle
 from fusiond.studies.faults.runs import compared
+from tests.live.daemon_bench import NO_MQTT, PARKED, REST, Bench, imu_section, running
+from tests.patience import until
 from tests.recording.driven import Drive
 
 Array = NDArray[np.float64]
@@ -79,21 +82,14 @@ class Failing(Drive):
         super().serve(until_ns)
 
 
-def stuck() -> Callable[[Array], Array]:
-    """The first sample again and again."""
+def test_the_spare_goes_on_where_the_first_got_stuck(tmp_path: Path) -> None:
     kept: list[Array] = []
-    return lambda sample: kept[0] if kept else (kept.append(sample), sample)[1]
 
+    def stuck(sample: Array) -> Array:
+        kept.append(sample)
+        return kept[0]
 
-FAULTS: dict[str, Callable[[Array], Array | None]] = {
-    "silent": lambda sample: None,
-    "stuck": stuck(),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_the_spare_goes_on_where_the_first_ended(tmp_path: Path, fault: str) -> None:
-    drive = Failing(tmp_path, FAULTS[fault])
+    drive = Failing(tmp_path, stuck)
     drive.run(FAILS_S)
     before = drive.solutions[-1]
     assert before.mode is Mode.NAVIGATING
@@ -116,6 +112,30 @@ def test_the_spare_goes_on_where_the_first_ended(tmp_path: Path, fault: str) -> 
     assert summary["identical"], summary
     health = drive.chain.sources.health(drive.host.mono)
     assert health["imu2"].counters["took_over"] == 1
+
+
+async def test_the_daemon_on_two_buses_loses_one_of_them(bench: Bench) -> None:
+    """At rest, with the real drivers: the first unit is unplugged, and comes back."""
+    other = bench.imu.model_copy(update={"channel": f"{bench.imu.channel}-2"})
+    second = imu_section(other).replace("[sources.imu]", "[sources.imu2]")
+    spare = '[imu.spare]\nsource = "imu2"\naxes = ["+x", "-y", "-z"]\n'
+    daemon = bench.daemon(spare, second, NO_MQTT)
+    vehicle = bench.vehicle(gnss_link=bench.folder / "gnss")
+    spare_unit = SimulatedVehicle(REST, seed=5, duration_s=60.0, can_imu=other)
+    async with running(daemon, vehicle, spare_unit):
+        await bench.mode(PARKED)
+        assert bench.made.sources.imu.used == "imu"
+        vehicle.unplug("imu")
+        await until(lambda: bool(bench.events("imu_spare")))
+        vehicle.plug("imu")
+        seen = len(bench.seen)
+        received = bench.health["imu"].received
+        await until(lambda: bench.health["imu"].received > received)
+        await until(lambda: len(bench.seen) > seen + 50)
+        assert {s.mode for s in bench.seen[seen:]} == {PARKED}
+        assert bench.health["imu2"].counters["took_over"] == 1
+        assert bench.health["imu2"].fused > 0
+    assert len(bench.events("imu_spare")) == 1
 
 
 def test_two_that_are_silent_do_not_take_turns_and_no_spare_comes_alone() -> None:
