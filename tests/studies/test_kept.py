@@ -45,10 +45,12 @@ class Here:
             yield Outcome(index, "done", result=work(item))
 
 
-def kept_runs(path: Path, work: Callable[[int], Any], runs: int) -> tuple[list[Any], int]:
+def kept_runs(
+    path: Path, work: Callable[[int], Any], runs: int, study: str = "s"
+) -> tuple[list[Any], int]:
     """Results, and how many were made for them."""
     here = Here()
-    with RowFile(path) as file, runs_on(here, KeptRuns(file, "s", 0)):
+    with RowFile(path) as file, runs_on(here, KeptRuns(file, study, 0)):
         return on_processes(work, runs), here.made
 
 
@@ -113,12 +115,13 @@ def test_runs_are_children_of_the_seeds_sequence() -> None:
     assert len(states) == 400
 
 
-def test_rows_of_the_command(tmp_path: Path) -> None:
+def test_the_command_goes_on_where_its_rows_end(tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
-    call = ["study", "rdss-static", "--runs", "2", "--workers", "1", "--out", str(path)]
-    said = [CliRunner().invoke(app, call).stderr for _ in range(2)]
-    assert "2 done" in said[0]
-    assert "2 there" in said[1]
-    refused = CliRunner().invoke(app, ["study", "rdss-map", "--out", str(path)])
-    assert refused.exit_code == 2
-    assert "none is a row" in refused.stderr
+    kept_runs(path, partial(drives.drive_run, drives.DURATION_S, 0), 2, "drives")
+    call = ["study", "drives", "--workers", "1", "--out", str(path), "--runs"]
+    done = CliRunner().invoke(app, [*call, "2"])
+    assert "2 there" in done.stderr
+    assert "2 of 2 drives navigated" in done.stdout
+    other = CliRunner().invoke(app, ["study", "rdss-map", "--out", str(path)])
+    assert other.exit_code == 2
+    assert "none is a row" in other.stderr
