@@ -35,6 +35,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
@@ -223,7 +224,7 @@ class Lateness:
             costs = [(cost(s, MOST_FIXES)[0], s) for s in SEARCHED_S]
             about_s = min(costs)[1]
         late = _bottom(lambda s: cost(s)[0], about_s)
-        if late is None:
+        if late is None or late.seconds > MOST_LATE_S:
             return
         least = cost(late.seconds)[0]
         time = self._model.slots_of(fixes[-1].time)
@@ -241,7 +242,8 @@ class Lateness:
 def _fixes(
     heard: Iterable[Sequence[Aid]], first_ns: int, last_ns: int
 ) -> tuple[list[VelocityOffer], PositionOffer | None]:
-    """Velocities of a span in their order, and a position."""
+    """Velocities of a span in their order, and a position. What repeats the one before to the bit
+    is no measurement, but of a vehicle that stands."""
     found, place = [], None
     for aids in heard:
         for aid in aids:
@@ -250,7 +252,9 @@ def _fixes(
                     place = offer
                 elif isinstance(offer, VelocityOffer) and first_ns <= offer.t_ns <= last_ns:
                     found.append(offer)
-    return sorted(found, key=lambda o: o.t_ns), place
+    found.sort(key=lambda o: o.t_ns)
+    new = (not k or o.v_ned != found[k - 1].v_ned or not any(o.v_ned) for k, o in enumerate(found))
+    return list(compress(found, new)), place
 
 
 def _bottom(cost: Callable[[float], float], about_s: float) -> Late | None:
