@@ -1,4 +1,4 @@
-"""From a vehicle's configuration to its error-state model and its estimator.
+"""From a vehicle's configuration to what its navigator is made of: model, estimator, IMU buffer.
 
 A new estimator is one module in `fusiond.estimators` and one case here; nothing else knows which
 one runs. Each is imported where it is asked for: loading its kernels takes a start's time.
@@ -6,18 +6,23 @@ one runs. Each is imported where it is asked for: loading its kernels takes a st
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import imu_noise
+from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.separation import SeparatedEstimator
+from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
+from fusiond.navigation.crosstalk import Crosstalk
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.vibration import Vibration
 
 if TYPE_CHECKING:
     from fusiond.estimators.federated.filter import FederatedFilter
@@ -57,6 +62,29 @@ def estimator_of(config: Config, model: Model) -> Estimator:
             return UnscentedEstimator(model, config.imu.gap_s, u.spread, u.propagation)
         case "federated":
             return _federated(config, model)
+
+
+def imu_buffer_of(config: Config) -> ImuBuffer:
+    """The buffer of IMU samples, with what they say of vibration and of axes out of square."""
+    imu, noise = config.imu, imu_noise(config.imu)
+    period_s, askew = 1.0 / imu.rate_hz, imu.misalignment_deg * DEG
+    return ImuBuffer(
+        imu.rate_hz,
+        config.estimator.buffer_s,
+        sensor_to_body(imu),
+        imu.time_offset_s,
+        imu.gap_s,
+        Vibration(period_s, noise.rate_noise, noise.force_noise),
+        Crosstalk(period_s, askew) if askew else None,
+    )
+
+
+def verdicts_of(config: Config, on_event: Callable[[str, str], None]) -> Verdicts:
+    """The verdicts on each source's sigma, told as they change."""
+    test = config.consistency
+    return Verdicts(
+        test.window, test.alpha, lambda s, v: on_event(f"verdict_{v}", f"innovations of {s}")
+    )
 
 
 def federated(

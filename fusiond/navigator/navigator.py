@@ -16,15 +16,11 @@ from drivers.measurements import Measurement, PositionFix
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.standstill import TURNS_AT_REST
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
+from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
-from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.model import Model
-from fusiond.navigation.crosstalk import Crosstalk
-from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigation.vibration import Vibration
 from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
 from fusiond.navigator.alignment.lateness import Lateness
@@ -32,7 +28,7 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
-from fusiond.navigator.filters import estimator_of, model_of
+from fusiond.navigator.filters import estimator_of, imu_buffer_of, model_of, verdicts_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_change import hand_over
 from fusiond.navigator.imu_door import ImuDoor
@@ -79,21 +75,11 @@ class Navigator:
         self.raw = self._intake.receivers
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
         self.model = model_of(config, *of_vehicle, *self._intake.extra_blocks())
-        vibration = Vibration(1.0 / imu.rate_hz, self._noise.rate_noise, self._noise.force_noise)
-        askew = imu.misalignment_deg * DEG
-        self.imu = ImuBuffer(
-            imu.rate_hz,
-            e.buffer_s,
-            sensor_to_body(imu),
-            imu.time_offset_s,
-            imu.gap_s,
-            vibration,
-            Crosstalk(1.0 / imu.rate_hz, askew) if askew else None,
-        )
+        self.imu = imu_buffer_of(config)
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._event)
         self.estimator = estimator(config, self.model)
-        self.verdicts = self._verdicts()
+        self.verdicts = verdicts_of(config, self._event)
         self.timeline = Timeline(
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
@@ -114,7 +100,7 @@ class Navigator:
         """A start to be tried before any alignment, and its trial."""
         self.calibration: SavedCalibration | None = None
         """What an earlier drive has shown, taken up by each alignment until it is refuted."""
-        self.calibrating = CalibrationWatch(self.model, self._event, askew)
+        self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
         self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
         self._aligner = self._new_aligner()
 
@@ -124,16 +110,10 @@ class Navigator:
 
     # ------------------------------------------------------------------ arrivals
 
-    def _verdicts(self) -> Verdicts:
-        test = self.config.consistency
-        return Verdicts(
-            test.window, test.alpha, lambda s, v: self._event(f"verdict_{v}", f"innovations of {s}")
-        )
-
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""
         self._intake.set_gates(gates)
-        self.verdicts = self._verdicts()
+        self.verdicts = verdicts_of(self.config, self._event)
 
     def add_imu(self, times: NDArray[np.int64], samples: Array) -> int:
         """IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; how many count.
