@@ -2,7 +2,8 @@
 
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
-of errors that all measurements of the device share, as of its aids.
+of errors that all measurements of the device share, as of its aids; `bias_share` is what part of a
+state of `bias` there is in each axis.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ class PositionOffer(NamedTuple):
     bias: tuple[str, ...] = ()
     time: str = ""
     rest: str = ""
+    bias_share: Vector3 = (1.0, 1.0, 1.0)
 
 
 class VelocityOffer(NamedTuple):

@@ -1,15 +1,16 @@
 r"""Position of an antenna: a GNSS fix, with or without height.
 
-    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + b^
+    z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + s b^
         + v_a^ tau^ + a^ tau^2 / 2
-      = dr + (C l) x phi + tau^ dv_a - C dl - db - (v_a + a tau^) dtau + tau^2 / 2 [f x] phi + noise
+      = dr + (C l) x phi + tau^ dv_a - C dl - s db - (v_a + a tau^) dtau + tau^2 / 2 [f x] phi
+        + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
-ionosphere), tau how much later than its stamp the fix is valid, v_a the antenna's velocity
-(fusiond.aiding.antenna), a the acceleration, smoothed, f the specific force that it is felt by;
-where the model has states for them they are estimated, true minus estimated in dl, db, dtau. A
-timing error of sigma s_t that is not shared moves the antenna by v s_t, which adds (v_i s_t)^2 to
-the variance of each axis.
+ionosphere), s what part of it there is in this one, tau how much later than its stamp the fix is
+valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed, f the
+specific force that it is felt by; where the model has states for them they are estimated, true
+minus estimated in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by
+v s_t, which adds (v_i s_t)^2 to the variance of each axis.
 
 An offset in time multiplies v_a. What a linear filter leaves out of the product of the two errors,
 and of dtau's square, is noise to it, where P is the filter's own:
@@ -50,7 +51,7 @@ _UNKNOWN = np.zeros((0, 0))
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8, f8,"
-    "f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])"
+    "f8, f8, f8, f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])"
 )
 def _position(
     nav: Array,
@@ -70,6 +71,9 @@ def _position(
     sd1: float,
     sd2: float,
     sd_time: float,
+    s0: float,
+    s1: float,
+    s2: float,
     p: Array,
     z: Array,
     h: Array,
@@ -79,6 +83,7 @@ def _position(
     what the offset in time leaves out by P (n, n), or (0, 0) where none is known. `bias` (up to
     3,), `time` (0 or 1,), `rest` (0 or 3,): slots in `xi`."""
     m, n = h.shape
+    share = (s0, s1, s2)
     r[0], r[1] = sd0 * sd0, sd1 * sd1
     if m > 2:
         r[2] = sd2 * sd2
@@ -103,8 +108,8 @@ def _position(
         for k in range(rest.size):
             h[i, rest[k]] = -c[3 * i + k]
         if i < bias.size:
-            z[i] += xi[bias[i]]
-            h[i, bias[i]] = -1.0
+            z[i] += share[i] * xi[bias[i]]
+            h[i, bias[i]] = -share[i]
     for slot in time:
         late_s = xi[slot]
         v, of_v = np.empty(m), np.zeros((m, n))
@@ -138,8 +143,9 @@ def _position(
 class PositionAid(Aid):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 
-    `bias`: the blocks whose states north, east, down are the error that the fixes share; `time`
-    that of their offset in time; `rest` that of what is left of the lever arm.
+    `bias`: the blocks whose states north, east, down are the error that the fixes share, and
+    `bias_share` what part of it there is in each axis; `time` that of their offset in time; `rest`
+    that of what is left of the lever arm.
     """
 
     locates: ClassVar[bool] = True
@@ -153,6 +159,7 @@ class PositionAid(Aid):
     bias: tuple[str, ...] = ()
     time: str = ""
     rest: str = ""
+    bias_share: Vector3 = (1.0, 1.0, 1.0)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p = state
@@ -162,7 +169,7 @@ class PositionAid(Aid):
         bias, time, rest = model.slots_of_each(self.bias, (self.time,), (self.rest,))
         slots = model.column_of, bias, time, rest
         fix = self.lat_rad, self.lon_rad, height
-        where = *self.lever, *self.sd, self.sd_time_s
+        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share
         of_time = _UNKNOWN if p is None else p
         _position(nav, xi, step, *slots, *fix, *where, of_time, z, h, r)
         return Innovation(z, h, r)
@@ -174,4 +181,4 @@ class PositionAid(Aid):
     def offers(self) -> tuple[PositionOffer, ...]:
         place = self.lat_rad, self.lon_rad, self.height_m
         shared = self.bias, self.time, self.rest
-        return (PositionOffer(self.t_ns, *place, self.sd, self.lever, *shared),)
+        return (PositionOffer(self.t_ns, *place, self.sd, self.lever, *shared, self.bias_share),)

@@ -102,7 +102,7 @@ def test_blocks_of_the_model() -> None:
     assert one(aiding, bearing("radar", point=(0.5, 1.9, 1.0))).block == SAR_BLOCK
 
 
-def test_fixes_share_an_error_unless_they_are_rtk() -> None:
+def test_fixes_share_an_error_of_which_those_by_phase_have_a_part() -> None:
     aiding: dict[str, AnyAiding] = {
         "gnss": GnssAiding(bias_sd_m=1.5, bias_down_sd_m=4.0, bias_correlation_s=900.0),
         "front": GnssAiding(bias_sd_m=0.5),
@@ -119,15 +119,20 @@ def test_fixes_share_an_error_unless_they_are_rtk() -> None:
     for source, quality, names in (
         ("gnss", 1, ("gnss_bias", "gnss_bias_down")),
         ("gnss", 2, ("gnss_bias", "gnss_bias_down")),
-        ("gnss", 4, ()),
-        ("gnss", 5, ()),
+        ("gnss", 4, ("gnss_bias", "gnss_bias_down")),
+        ("gnss", 5, ("gnss_bias", "gnss_bias_down")),
         ("front", 1, ("gnss_bias_front", "gnss_bias_front_down")),
         ("other", 1, ("gnss_bias", "gnss_bias_down")),  # the section named after its kind
         ("white", 1, ()),
+        ("white", 4, ()),
     ):
         (aid,) = intake.aids(replace(fix, source=source, quality=quality), 7, 0.0)
         assert isinstance(aid, PositionAid)
         assert aid.bias == names, (source, quality)
+        by_phase = math.sqrt(0.5)
+        part = (by_phase / 1.5, by_phase / 1.5, by_phase * 2.0 / 4.0)
+        shares = part if names and quality >= 4 else (1.0, 1.0, 1.0)
+        assert aid.bias_share == pytest.approx(shares)
 
 
 def test_the_navigators_model_has_the_states() -> None:

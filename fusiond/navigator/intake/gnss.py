@@ -39,6 +39,11 @@ RTK = (4, 5)
 PHASE_SD_M = 0.1
 """Nor has code, whatever its corrections, a sigma this small: a tenth of the best chip's noise."""
 FIX_BIAS = "gnss_bias"
+PHASE_SHARE = 0.5
+"""What part of the stated variance of a fix by carrier phase the next ones share, beside what each
+has of its own: multipath and what is left of the atmosphere last for minutes (115 s over baselines
+up to 10 km: Miller, O'Keefe, Gao, Time correlation in GNSS positioning over short baselines,
+J. Surv. Eng. 138, 2012). Receivers do not say how their sigma is divided."""
 # Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
 # An operator who errs by six sigma is wrong.
@@ -77,9 +82,10 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         sd,
         o.lever_arm_m,
         sd_time_s,
-        () if by_phase(m) else _fix_bias(m.source, o, sections),
+        _fix_bias(m.source, o, sections),
         time,
         rest,
+        _phase_share(sd, o) if by_phase(m) else (1.0, 1.0, 1.0),
     )
     if m.v_ned_m_s is None or not o.use_velocity:
         return [position]
@@ -135,6 +141,14 @@ def _speed_sd(stated: float | None, default: float, o: GnssAiding) -> float:
     """One axis: what the receiver states, or `default` where it states nothing credible."""
     sd = default if stated is None or stated < LEAST_SPEED_SD_M_S else stated
     return max(sd * o.sigma_scale, o.min_velocity_sd_m_s)
+
+
+def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:
+    """How much of the error that fixes by code share there is in one by carrier phase."""
+    if o.bias_sd_m == 0.0:
+        return (1.0, 1.0, 1.0)
+    north, east, down = (math.sqrt(PHASE_SHARE) * each for each in sd)
+    return north / o.bias_sd_m, east / o.bias_sd_m, down / o.bias_down_sd_m
 
 
 def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:
