@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from drivers.measurements import ArrivalStamp, Heading, MagneticHeading
+from drivers.nmea import compass
 from drivers.nmea.compass import CompassDecoder, CompassDecoding, CompassDriver, CompassOptions
 from drivers.rounding import NEAREST_SD
 from tests.drivers.at_work import at_work
@@ -98,3 +100,11 @@ async def test_from_a_line_to_headings(tmp_path: Path) -> None:
         await until(lambda: headings() == 2)
         device.unplug()
         await until(lambda: driver.status.state == "absent")
+
+
+def test_what_the_decoder_refuses_is_on_its_page() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "compass.md").read_text()
+    code = Path(compass.__file__).read_text()
+    refused = set(re.findall(r'counters\["(\w+)"\]', code)) - {"headings"}
+    assert len(refused) == 4
+    assert all(f"`{name}`" in page for name in refused)

@@ -17,7 +17,7 @@ _DRIVERS = REPOSITORY / "drivers"
 CODE = "".join(
     path.read_text()
     for path in (
-        *sorted((_DRIVERS / "nmea").glob("*.py")),
+        *sorted(set((_DRIVERS / "nmea").glob("*.py")) - {_DRIVERS / "nmea" / "compass.py"}),
         _DRIVERS / "receiver.py",
         _DRIVERS / "serial_line.py",
     )
