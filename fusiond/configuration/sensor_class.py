@@ -27,9 +27,9 @@ CLASSES: dict[SensorClass, dict[str, float]] = {
         "accel_bias_initial_mg": 50.0,
         "gyro_scale_ppm": 10000.0,
         "accel_scale_ppm": 10000.0,
-        # Data sheets say 1 % (0.57 deg), but no drive has shown it: with 0.2 to 0.5 css_164 went
-        # from 5.8 to 5.6 m, comma2k19_40 from 8.0 to 8.7 and 9.2 m.
-        "misalignment_deg": 0.0,
+        # Data sheets say 1 % (0.57 deg) at most. No better than the class above is what can be
+        # said: docs/vehicle.md has what other values give.
+        "misalignment_deg": 0.2,
     },
     "mems": {
         "gyro_noise_deg_sqrt_h": 0.3,
