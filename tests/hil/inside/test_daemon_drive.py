@@ -125,6 +125,10 @@ def _config(path: Path, line: PtyLine, port: int) -> Path:
     mqtt = f'[mqtt]\nhost = "127.0.0.1"\nport = {port}\nnav_rate_hz = 20.0\n'
     text = text.replace("[mqtt]\nenabled = false\n", mqtt)
     assert mqtt in text
+    # What two starts make of the error that fixes share parts them by centimetres for minutes.
+    lever = "lever_arm_m = [0.0, -0.05, 0.0]\n"
+    assert lever in text
+    text = text.replace(lever, lever + "bias_sd_m = 0.0\n")
     text += imu_section()
     # The recording is older than the program, which refuses such dates unless told otherwise.
     text += f'[sources.gnss]\ndriver = "nmea"\nport = "{line.link}"\nearliest_date = 2025-01-01\n'
