@@ -121,7 +121,7 @@ async def test_a_close_and_a_reset_end_the_line_and_say_so() -> None:
         task = asyncio.create_task(line.run(lambda data, t_ns: None, None, reasons.append))
         await until(lambda: len(server.clients) == 1)
         server.clients[0].close()
-        await until(lambda: len(server.clients) == 2)
+        await until(lambda: len(server.clients) == 2 and line.counters["opened"] == 2)
         server.clients[1].transport.get_extra_info("socket").setsockopt(
             socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\0\0\0\0\0\0\0"
         )

@@ -92,7 +92,9 @@ async def test_outputs_gates_and_log_level_change_while_it_navigates(
         assert "aiding.gnss.gate_probability, log_level, outputs.nmea.port" in taken
         assert "aiding.gnss.lever_arm_m, imu.rate_hz:" in needed
         assert daemon.config.imu.rate_hz == 100.0
-        assert not daemon.navigator.verdicts.reports()
+        # They have begun anew; a fix may have come since.
+        begun = daemon.navigator.verdicts.reports().values()
+        assert all(report.verdict == "too_few" for report in begun)
         await until(lambda: bench.health["gnss"].rejected.get("gated", 0) > 0)
 
         # What is as it runs already needs nothing.
