@@ -104,6 +104,9 @@ AIDS: dict[str, Callable[[Array], Linearised]] = {
     "horizontal position": lambda nav: position_aid(nav, False),
     "position with a shared error": lambda nav: replace(position_aid(nav), bias=FIX_BIAS),
     "horizontal, shared error": lambda nav: replace(position_aid(nav, False), bias=FIX_BIAS),
+    "position with a part of it": lambda nav: replace(
+        position_aid(nav), bias=FIX_BIAS, bias_share=(0.3, 0.7, 0.2)
+    ),
     "rdss": rdss_aid,
     "rdss, moved by the delay": lambda nav: rdss_aid(nav, 1.5),
     "velocity": lambda nav: VelocityAid(*SOURCE, (12.3, -7.2, 0.7), (0.1, 0.1, 0.2), LEVER),

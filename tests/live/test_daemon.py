@@ -62,8 +62,10 @@ async def test_it_aligns_navigates_and_says_how_each_device_is(bench: Bench) -> 
         await until(lambda: {h.state for h in bench.health.values()} == {"running"})
         health, solution = bench.health, bench.seen[-1]
     modes = list(dict.fromkeys(s.mode for s in bench.seen))
-    # The first frames may come before the first tick; a host that is starved has gaps.
-    assert [m for m in modes if m not in (Mode.WAITING, Mode.INVALID)] == [Mode.ALIGNING, PARKED]
+    if bench.events("imu_gap"):  # the host was starved
+        modes = [mode for mode in modes if mode not in (Mode.WAITING, Mode.INVALID)]
+    assert modes[-2:] == [Mode.ALIGNING, PARKED]
+    assert modes[:-2] in ([], [Mode.WAITING])  # the first frames may come before the first tick
     why = "heading from configured heading; no motion has confirmed it yet"
     assert solution.reason == why
     true = vehicle.truth_at(solution.t_ns)

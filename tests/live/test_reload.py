@@ -82,6 +82,7 @@ async def test_outputs_gates_and_log_level_change_while_it_navigates(
             (f"port = {before}", f"port = {after}"),
             ('vehicle = "test"', 'vehicle = "test"\nlog_level = "debug"'),
         )
+        verdicts = daemon.navigator.verdicts
         await daemon.reload(lambda: load_config(path))
         assert (await _sentence(after)).startswith(b"$")
         with pytest.raises(ConnectionRefusedError):
@@ -93,8 +94,9 @@ async def test_outputs_gates_and_log_level_change_while_it_navigates(
         assert "aiding.gnss.lever_arm_m, imu.rate_hz:" in needed
         assert daemon.config.imu.rate_hz == 100.0
         # They have begun anew; a fix may have come since.
-        begun = daemon.navigator.verdicts.reports().values()
-        assert all(report.verdict == "too_few" for report in begun)
+        begun = daemon.navigator.verdicts
+        assert begun is not verdicts
+        assert all(report.verdict == "too_few" for report in begun.reports().values())
         await until(lambda: bench.health["gnss"].rejected.get("gated", 0) > 0)
 
         # What is as it runs already needs nothing.

@@ -43,7 +43,8 @@ PHASE_SHARE = 0.5
 """What part of the stated variance of a fix by carrier phase the next ones share, beside what each
 has of its own: multipath and what is left of the atmosphere last for minutes (115 s over baselines
 up to 10 km: Miller, O'Keefe, Gao, Time correlation in GNSS positioning over short baselines,
-J. Surv. Eng. 138, 2012). Receivers do not say how their sigma is divided."""
+J. Surv. Eng. 138, 2012). Receivers do not say how their sigma is divided. It is a part of the state
+that fixes by code share, and so has that one's correlation time, `bias_correlation_s`: longer."""
 # Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
 # An operator who errs by six sigma is wrong.
