@@ -70,26 +70,54 @@ def level_in_motion(
     return roll, (-pitch + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@compiled("void(i8[::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1])")
-def integrate_from_rest(
-    times: NDArray[np.int64], samples: Array, bias: Array, q: Array, g: float, velocity: Array
+@compiled("void(i8[::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
+def integrate_felt(
+    times: NDArray[np.int64],
+    samples: Array,
+    bias: Array,
+    at: NDArray[np.int64],
+    gained: Array,
+    turned: Array,
+    slopes: Array,
 ) -> None:
-    """Turn `q` (4,) in place through samples (m, 6) and add the velocity gained to `velocity` (3,).
+    """Integrate samples (m, 6) less a rate bias (3,) in the axes of their begin; write what they
+    come to after `at` (k,) of them, in order of size: the velocity gained (k, 3), the attitude
+    (k, 3, 3), the slopes of that velocity by force bias and rate bias (k, 3, 6).
 
-    Over tens of seconds from rest: Earth rate, transport and Coriolis are left out. `times` (m +
-    1,) in
-    ns holds the start before the first sample. Velocity in the axes that `q` refers to.
+    `times` (m + 1,) ns holds the begin before the first sample. Over tens of seconds: Earth rate,
+    transport and Coriolis are left out, and so is gravity. With C' = C [w - b_w]x the attitude's
+    error, a rotation vector in the axes of the begin, is D db_w with D' = -C, and the velocity's is
+    -int C dt db_f + int [D db_w]x C f dt: so D is the velocity's slope by force, too, and that by
+    rate is V with V' = -[C f]x D.
     """
-    dcm = np.empty((3, 3))
-    for i in range(samples.shape[0]):
-        h = (times[i + 1] - times[i]) * 1e-9
-        x = 0.5 * h * (samples[i, 0] - bias[0])
-        y = 0.5 * h * (samples[i, 1] - bias[1])
-        z = 0.5 * h * (samples[i, 2] - bias[2])
-        rotate_quaternion(q, x, y, z, False)
-        quaternion_to_dcm(q, dcm)
-        for r in range(3):
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    dcm = np.eye(3)
+    v, d, s = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    f, mid = np.empty(3), np.empty((3, 3))
+    done = 0
+    for k in range(at.shape[0]):
+        for i in range(done, at[k]):
+            h = (times[i + 1] - times[i]) * 1e-9
+            x = 0.5 * h * (samples[i, 0] - bias[0])
+            y = 0.5 * h * (samples[i, 1] - bias[1])
+            z = 0.5 * h * (samples[i, 2] - bias[2])
+            rotate_quaternion(q, x, y, z, False)
+            quaternion_to_dcm(q, dcm)
+            for r in range(3):
+                f[r] = 0.0
+                for j in range(3):
+                    f[r] += dcm[r, j] * samples[i, 3 + j]
+                    mid[r, j] = d[r, j] - 0.5 * h * dcm[r, j]
+                    d[r, j] -= h * dcm[r, j]
+                v[r] += h * f[r]
             for j in range(3):
-                velocity[r] += h * dcm[r, j] * samples[i, 3 + j]
-        velocity[2] += g * h
-        rotate_quaternion(q, x, y, z, False)
+                s[0, j] -= h * (f[1] * mid[2, j] - f[2] * mid[1, j])
+                s[1, j] -= h * (f[2] * mid[0, j] - f[0] * mid[2, j])
+                s[2, j] -= h * (f[0] * mid[1, j] - f[1] * mid[0, j])
+            rotate_quaternion(q, x, y, z, False)
+        done = max(done, at[k])
+        quaternion_to_dcm(q, dcm)
+        gained[k] = v
+        turned[k] = dcm
+        slopes[k, :, :3] = d
+        slopes[k, :, 3:] = s

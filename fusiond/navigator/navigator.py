@@ -190,6 +190,7 @@ class Navigator:
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
         self.started = None
+        self._lateness.stop()
         self.timeline.clear()
         self._protection.restart()
         self._saved, self.warm = saved, None
@@ -212,7 +213,7 @@ class Navigator:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
-            if start is None or self._late() or self._aligner.waits(self._lateness.suspects):
+            if start is None or self._late() or self._aligner.waits(start, self._lateness):
                 return
             if self.calibration is not None and not self.on_trial:
                 start = take_up(start, self.model, self.calibration)
@@ -229,8 +230,7 @@ class Navigator:
             self._standing.started(start.t_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
-        what = broken(self.estimator)
-        if what is not None:
+        if (what := broken(self.estimator)) is not None:
             self._event("filter_not_finite", f"{what}: aligning anew")
             self.reset(what)
             return
@@ -243,8 +243,9 @@ class Navigator:
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
-        look = self._lateness.due(e.t_ns)
-        if look and self._standing.doubtful(e, self.timeline.isolation) and self._late():
+        due = self._lateness.due(e.t_ns)
+        doubtful = due and self._standing.doubtful(e, self.timeline.isolation)
+        if (doubtful or self._lateness.looking) and self._late():
             return
         self._left_out.tell()
         if self.warm is not None and self.warm.refused_by is not None:
@@ -360,9 +361,8 @@ class Navigator:
             return Mode.COASTING, f"heading from {self.started.how}; {hangs}"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
-        shaken = self._standing.shaken(self.estimator, self.timeline.isolation)
-        if shaken is not None:
-            return Mode.COASTING, shaken
+        if (why := self._standing.shaken(self.estimator, self.timeline.isolation)) is not None:
+            return Mode.COASTING, why
         unaided = (t_ns - self._last_position_ns) * 1e-9
         if unaided > e.coast_after_s:
             return Mode.COASTING, f"no position fused for {unaided:.0f} s"

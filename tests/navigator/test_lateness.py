@@ -2,10 +2,12 @@
 not."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
+from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.lateness import SETTLED_SD_S, Lateness
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.navigator import Navigator
@@ -14,6 +16,7 @@ from fusiond.studies.faults.judge import longest_lie_s
 from fusiond.studies.faults.recording import Drive, Recording
 from fusiond.studies.faults.runs import VEHICLE, navigate
 
+TICKS_HZ = 100.0
 LATE_S = aid_faults.LATE_S
 TRUTH, ON_TIME = Drive(duration_s=60.0).recorded(VEHICLE, seed=5)
 ALWAYS_LATE = aid_faults.late(ON_TIME, 0.0, math.inf)
@@ -43,6 +46,8 @@ def looked(
             assert not isinstance(aids, str)
             late.hear(item.measurement.source, aids)
         late.look(navigator.imu)
+        while late.looking:
+            late.look(navigator.imu)
     return told, late, navigator
 
 
@@ -81,3 +86,32 @@ def test_late_from_the_first_fix_on() -> None:
     assert longest_lie_s(course.samples) == 0.0
     assert course.samples[-1].mode == "navigating"
     assert course.samples[-1].horizontal_m < 1.0
+
+
+def test_no_tick_waits_for_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    fits, fit = [0], motion.fit
+
+    def counted(*args: Any) -> motion.Fit:
+        fits[-1] += 1
+        return fit(*args)
+
+    monkeypatch.setattr(motion, "fit", counted)
+    told: list[str] = []
+    navigator = Navigator(VEHICLE, on_event=lambda code, text: told.append(code))
+    given = taken = 0
+    for tick in range(round(25.0 * TICKS_HZ)):
+        now_ns = round(tick / TICKS_HZ * 1e9)
+        end = int(np.searchsorted(ALWAYS_LATE.imu_seen, now_ns, side="right"))
+        if end > given:
+            navigator.add_imu(ALWAYS_LATE.stamps[given:end], ALWAYS_LATE.samples[given:end])
+        given = end
+        while ALWAYS_LATE.received[taken].seen_ns <= now_ns:
+            item = ALWAYS_LATE.received[taken]
+            taken += 1
+            navigator.add(item.measurement, item.t_ns, 0.0, item.seen_ns)
+        fits.append(0)
+        navigator.advance()
+    assert told.count("fixes_late") == 1
+    # The search of 25 costs by two fits; a tick in which a start is tried has two of its own.
+    assert sum(fits) >= 50
+    assert max(fits) <= 4

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,13 +26,11 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.models.blocks import ImuNoise
-from fusiond.navigation.alignment import integrate_from_rest, level
+from fusiond.navigation.alignment import level
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import (
-    dcm_from_quaternion,
     dcm_from_rpy,
-    quaternion_from_rpy,
     rpy_from_dcm,
     wrap_angle,
 )
@@ -120,20 +119,12 @@ def _moved_off(
     velocity: it was no rest."""
     lat, _, height = (float(v) for v in place[1])
     g = gravity(lat, height)
-    q = quaternion_from_rpy(*level(standing.mean_force), 0.0)
-    first, end = imu.index_after(standing.end_ns), imu.index_after(velocity.t_ns)
-    gained = np.zeros(3)
-    integrate_from_rest(
-        np.concatenate(([standing.end_ns], imu.times[first:end])),
-        np.ascontiguousarray(imu.samples[first:end]),
-        standing.mean_rate,
-        q,
-        g,
-        gained,
-    )
-    dcm = dcm_from_quaternion(q)
+    f = motion.felt(imu, np.array([standing.end_ns, velocity.t_ns]), standing.mean_rate)
+    rested = dcm_from_rpy(*level(standing.mean_force), 0.0)
+    gained = rested @ f.gained[1] + [0.0, 0.0, g * f.t_s[1]]
+    dcm = rested @ f.turned[1]
     roll, pitch, turned = rpy_from_dcm(dcm)
-    rate = motion.rate_at(imu, velocity.t_ns) - standing.mean_rate
+    rate = f.rates[1]
     antenna = gained + dcm @ np.cross(rate, velocity.lever)
     felt_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
     sd_felt = _felt_sd(by, g, (velocity.t_ns - standing.end_ns) * 1e-9, turned, speed)
@@ -236,34 +227,43 @@ def _reversing(by: Basis, velocity: VelocityOffer) -> str:
     return ""
 
 
-class BothWays(NamedTuple):
-    """What was felt, and the best fit of a vehicle that drives forward, and backward."""
+@dataclass(frozen=True, slots=True)
+class Ways:
+    """Measured velocities against what the IMU felt; what fits best is asked for each way."""
 
     felt: motion.Felt
-    fits: tuple[motion.Fit, motion.Fit]
+    _past: motion.Past
+    _measured: motion.Measured
+    _latest: VelocityOffer
+    _options: AlignmentOptions
+    _noise: ImuNoise
+    _g: float
+
+    def fit(self, backward: bool) -> motion.Fit:
+        """The best fit of a vehicle that drives forward, or backward."""
+        velocity = self._latest
+        course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
+        along = _along(self._options, velocity, self.felt.rates[-1], backward)
+        yaw = course - along.angle
+        return motion.fit(
+            self._past, self.felt, self._measured, self._noise, self._g, yaw, along.sd
+        )
 
 
-def both_ways(
-    imu: ImuBuffer,
+def ways(
+    past: motion.Past,
     usable: Sequence[VelocityOffer],
     options: AlignmentOptions,
     noise: ImuNoise,
     g: float,
     most: int = motion.MOST_FIXES,
-) -> BothWays:
-    """Measured velocities in order of time against what the IMU felt; `most` of them, evenly, where
-    they are more."""
+) -> Ways:
+    """Of velocities in order of time; of `most` of them, evenly, where they are more."""
     every = math.ceil(len(usable) / most)
     fixes = usable[::-1][::every][::-1]
-    velocity = fixes[-1]
-    f = motion.felt(imu, [x.t_ns for x in fixes], np.zeros(3))
-    course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
-
-    def fitted(backward: bool) -> motion.Fit:
-        along = _along(options, velocity, f.rates[-1], backward)
-        return motion.fit(imu, f, fixes, noise, g, course - along.angle, along.sd)
-
-    return BothWays(f, (fitted(backward=False), fitted(backward=True)))
+    m = motion.measured(fixes)
+    f = motion.felt(past, m.instants, np.zeros(3))
+    return Ways(f, past, m, fixes[-1], options, noise, g)
 
 
 def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start | None:
@@ -275,9 +275,10 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         by.known.doubted("moving: collecting fixes")
         return None
     lat, _, height = (float(v) for v in place[1])
-    f, fits = both_ways(imu, usable, by.options, by.noise, gravity(lat, height))
-    forward_fit, backward_fit = fits
-    best = min(fits, key=lambda x: x.cost)
+    either = ways(imu, usable, by.options, by.noise, gravity(lat, height))
+    rate = either.felt.rates[-1]
+    forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
+    best = min(forward_fit, backward_fit, key=lambda x: x.cost)
     # Where even the better fit is poor, the sigmas are too small by as much.
     doubt = max(1.0, best.cost / best.degrees)
     ratio = 0.5 * (backward_fit.cost - forward_fit.cost) / doubt
@@ -292,7 +293,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
             place,
             backward_fit.dcm,
             LEAST_YAW_SD_RAD,
-            f.rates[-1],
+            rate,
             "GNSS course, on the move" + BACKWARD,
             fitted=Fitted(backward_fit.biases, doubt * backward_fit.covariance),
         )
@@ -314,7 +315,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         place,
         forward_fit.dcm,
         LEAST_YAW_SD_RAD,
-        f.rates[-1],
+        rate,
         "GNSS course, on the move",
         fitted=Fitted(forward_fit.biases, doubt * forward_fit.covariance),
     )

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import NamedTuple
@@ -45,7 +45,8 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.alignment.course import both_ways
+from fusiond.navigator.alignment import motion
+from fusiond.navigator.alignment.course import ways
 from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.options import AlignmentOptions
 
@@ -71,9 +72,15 @@ ALL_FIXES = 75
 SETTLED_SD_S, PATIENCE_NS = 0.05, 10_000_000_000
 # So many looks must have seen it, within so many sigmas of each other.
 SEEN, AGREED = 3, 4.0
-# A look costs 30 ms of a fast computer, a search 0.4 s: as often is looked, and so long nothing is
-# searched for again where nothing was found.
+# A look is 6 fits of 1 ms of a fast computer each, one that searches 50: as often is looked, and so
+# long nothing is searched for again where nothing was found.
 EVERY_NS, SEARCHED_NS = 1_000_000_000, 10_000_000_000
+# One fit at a time: no tick waits for many. A tenth of a processor, whatever the rate of ticks.
+FIT_EVERY_NS = 10_000_000
+
+
+# Twice the negative log likelihood of a lateness and its degrees of freedom, a fit at a time.
+Fitting = Generator[None, None, tuple[float, int]]
 
 
 class Late(NamedTuple):
@@ -136,7 +143,8 @@ class Lateness:
         self._options, self._noise, self._model = options, noise, model
         self._event = on_event
         self._receivers: dict[str, _Receiver] = {}
-        self._due_ns = 0
+        self._due_ns = self._fitted_ns = 0
+        self._looking: Generator[None, None, str | None] | None = None
 
     def hear(self, source: str, aids: Sequence[Aid]) -> Sequence[Aid]:
         """A measurement has come, as the aids it stands for; the same at the instants at which it
@@ -160,8 +168,17 @@ class Lateness:
         ]
 
     def due(self, t_ns: int) -> bool:
-        """Whether it is time to look again."""
-        return t_ns >= self._due_ns
+        """Whether it is time to look again, or to go on with it."""
+        return self._looking is not None or not 0 < self._due_ns - t_ns <= SEARCHED_NS
+
+    @property
+    def looking(self) -> bool:
+        """Whether a look has begun and not ended."""
+        return self._looking is not None
+
+    def stop(self) -> None:
+        """A look that has not ended is given up: what was made of the fixes is."""
+        self._looking, self._due_ns = None, 0
 
     @property
     def suspects(self) -> str:
@@ -176,14 +193,34 @@ class Lateness:
         return ""
 
     def look(self, imu: ImuBuffer) -> str | None:
-        """Why all that was made of a receiver's fixes must be made anew: it is found to be late, by
-        the samples and fixes of the last seconds; None where none is, or it is not `due`."""
-        if not self.due(imu.latest_ns):
+        """Begin or go on to look; why all that was made of a receiver's fixes must be made anew: it
+        is found to be late, by the samples and fixes of the last seconds before the look began."""
+        t_ns = imu.latest_ns
+        if not self.due(t_ns):
             return None
-        self._due_ns = imu.latest_ns + EVERY_NS
-        for source, receiver in self._receivers.items():
-            self._weigh(receiver, imu)
-            late = receiver.settled(imu.latest_ns)
+        if self._looking is None:
+            self._looking, self._fitted_ns = self._look(imu), t_ns
+        due = (t_ns - self._fitted_ns) // FIT_EVERY_NS
+        self._fitted_ns = t_ns
+        for _ in range(max(1, due)):
+            try:
+                next(self._looking)
+            except StopIteration as end:
+                self._looking = None
+                found: str | None = end.value
+                return found
+        return None
+
+    def _look(self, imu: ImuBuffer) -> Generator[None, None, str | None]:
+        """`look` at all that there is now, a fit at a time."""
+        t_ns = imu.latest_ns
+        self._due_ns = t_ns + EVERY_NS
+        earliest_ns = round((MOST_LATE_S + NEAR_S[0]) * 1e9)
+        first_ns = max(imu.oldest_ns + earliest_ns, t_ns - KEPT_NS)
+        past = motion.span_since(imu, first_ns - earliest_ns)
+        for source, receiver in tuple(self._receivers.items()):
+            yield from self._weigh(receiver, past, first_ns, t_ns)
+            late = receiver.settled(t_ns)
             if late is None:
                 continue
             text = (
@@ -194,11 +231,12 @@ class Lateness:
             return text
         return None
 
-    def _weigh(self, receiver: _Receiver, imu: ImuBuffer) -> None:
-        """What the last fixes say of a receiver's lateness; the best that they have said counts."""
-        first_ns = imu.oldest_ns + round((MOST_LATE_S + NEAR_S[0]) * 1e9)
-        first_ns = max(first_ns, imu.latest_ns - KEPT_NS)
-        fixes, place = _fixes(receiver.heard, first_ns, imu.latest_ns)
+    def _weigh(
+        self, receiver: _Receiver, past: motion.Past, first_ns: int, t_ns: int
+    ) -> Generator[None, None, None]:
+        """What the fixes of a span say of a receiver's lateness; the best that they have said
+        counts."""
+        fixes, place = _fixes(receiver.heard, first_ns, t_ns)
         # The last must have a course.
         while fixes and math.hypot(*fixes[-1].v_ned[:2]) < self._options.course_speed_m_s:
             fixes.pop()
@@ -206,27 +244,34 @@ class Lateness:
             return
         g = gravity(place.lat_rad, place.height_m or 0.0)
 
-        def cost(late_s: float, most: int = ALL_FIXES) -> tuple[float, int]:
+        def cost(late_s: float, most: int = ALL_FIXES) -> Fitting:
             ns = round(late_s * 1e9)
             shifted = [o._replace(t_ns=o.t_ns - ns) for o in fixes]
-            ways = both_ways(imu, shifted, self._options, self._noise, g, most)
-            return min((way.cost, way.degrees) for way in ways.fits)
+            either = ways(past, shifted, self._options, self._noise, g, most)
+            forward = either.fit(backward=False)
+            yield
+            backward = either.fit(backward=True)
+            yield
+            return min((fit.cost, fit.degrees) for fit in (forward, backward))
 
         now_s, suspected = receiver.late_ns * 1e-9, receiver.suspected
-        now, degrees = cost(now_s)
-        slope = cost(now_s, MOST_FIXES)[0] - cost(now_s + GLANCE_S, MOST_FIXES)[0]
-        if now <= gate_threshold(FITS, degrees) and slope <= 0.5 * EVIDENCE:
+        now, degrees = yield from cost(now_s)
+        some = yield from cost(now_s, MOST_FIXES)
+        later = yield from cost(now_s + GLANCE_S, MOST_FIXES)
+        if now <= gate_threshold(FITS, degrees) and some[0] - later[0] <= 0.5 * EVIDENCE:
             return
         if suspected is not None:
             about_s = suspected.seconds
         else:
-            self._due_ns = imu.latest_ns + SEARCHED_NS
-            costs = [(cost(s, MOST_FIXES)[0], s) for s in SEARCHED_S]
+            self._due_ns = t_ns + SEARCHED_NS
+            costs = []
+            for s in SEARCHED_S:
+                costs.append(((yield from cost(s, MOST_FIXES))[0], s))
             about_s = min(costs)[1]
-        late = _bottom(lambda s: cost(s)[0], about_s)
+        late = yield from _bottom(cost, about_s)
         if late is None or late.seconds > MOST_LATE_S:
             return
-        least = cost(late.seconds)[0]
+        least, _ = yield from cost(late.seconds)
         time = self._model.slots_of(fixes[-1].time)
         prior = max([LEAST_PRIOR_S, *(float(self._model.initial[slot]) for slot in time)])
         if (
@@ -235,8 +280,8 @@ class Lateness:
             or abs(late.seconds - now_s) <= PRIOR_SIGMAS * prior
         ):
             return
-        self._due_ns = imu.latest_ns + EVERY_NS
-        receiver.suspect(Late(max(0.0, late.seconds), late.sd), imu.latest_ns)
+        self._due_ns = t_ns + EVERY_NS
+        receiver.suspect(Late(max(0.0, late.seconds), late.sd), t_ns)
 
 
 def _fixes(
@@ -257,12 +302,14 @@ def _fixes(
     return list(compress(found, new)), place
 
 
-def _bottom(cost: Callable[[float], float], about_s: float) -> Late | None:
+def _bottom(cost: Callable[[float], Fitting], about_s: float) -> Generator[None, None, Late | None]:
     """The bottom of a valley of costs by parabolas, and the sigma that its bend means; None where
     it is none."""
     sd = math.inf
     for h in NEAR_S:
-        before, here, after = (cost(about_s + k * h) for k in (-1, 0, 1))
+        before, _ = yield from cost(about_s - h)
+        here, _ = yield from cost(about_s)
+        after, _ = yield from cost(about_s + h)
         bent = before - 2.0 * here + after
         if bent <= 0.0:
             return None

@@ -29,14 +29,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.models.blocks import ImuNoise
-from fusiond.navigation.alignment import integrate_from_rest
+from fusiond.navigation.alignment import integrate_felt
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import (
@@ -52,30 +53,73 @@ Array = NDArray[np.float64]
 # One sigma (rad) of how a road and a vehicle's body on it slope: 10 %, beyond which streets are
 # signposted.
 TILT_SD_RAD = 0.1
-# Steps for the slopes by the biases: m/s^2 and rad/s.
-FORCE_STEP, RATE_STEP = 0.1, 1e-3
 # Steps of Gauss-Newton at most, and the one, in sigmas, that ends them.
 ITERATIONS, CONVERGED = 16, 0.1
 # The integrals are made anew where the rate bias found would turn the axes by more (rad) than those
 # that they were made with: what is left out is half its square, 0.3 %.
 BENT_RAD = 0.08
+# (a x b)_i = CROSS_ijk a_j b_k.
+CROSS = np.zeros((3, 3, 3))
+CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
+# A rate or a force at an instant is the mean of so much (ns) to each side.
+AROUND_NS = 100_000_000
 MOST_FIXES = 20
 """Of the fixes, evenly: more add little, for their changes are alike."""
+
+
+class Past(Protocol):
+    """IMU samples of some seconds: times (m,) ns, rate and force (m, 6), the row of the first
+    later than an instant."""
+
+    @property
+    def times(self) -> NDArray[np.int64]: ...
+
+    @property
+    def samples(self) -> Array: ...
+
+    def index_after(self, t_ns: int) -> int: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A `Past` that stays as it is."""
+
+    times: NDArray[np.int64]
+    samples: Array
+
+    def index_after(self, t_ns: int) -> int:
+        """Row of the first sample later than `t_ns`."""
+        return int(np.searchsorted(self.times, t_ns, side="right"))
+
+
+class Measured(NamedTuple):
+    """Velocities of k fixes: instants (k,) ns, NED (k, 3), one sigma (k, 3), levers (k, 3)."""
+
+    instants: NDArray[np.int64]
+    velocity: Array
+    sd: Array
+    levers: Array
 
 
 class Felt(NamedTuple):
     """Integrals from the first fix to each of k, with a rate bias (3,) taken off: times (k,) s,
     gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of the velocity
-    by force and rate bias (k, 3, 6), of the last attitude (a rotation vector in the axes of the
-    first) by rate bias (3, 3), rates at the fixes (k, 3)."""
+    by force and rate bias (k, 3, 6), rates at the fixes (k, 3)."""
 
     t_s: Array
     gained: Array
     turned: Array
     slopes: Array
-    turns: Array
     rates: Array
     bias: Array
+
+    @property
+    def turns(self) -> Array:
+        """Slopes (3, 3) of the last attitude, a rotation vector in the axes of the first, by rate
+        bias: those of the velocity by force bias."""
+        turns: Array = self.slopes[-1][:, :3]
+        return turns
 
 
 class Fit(NamedTuple):
@@ -89,85 +133,85 @@ class Fit(NamedTuple):
     covariance: Array
 
 
-def rate_at(imu: ImuBuffer, t_ns: int) -> Array:
+def span_since(imu: ImuBuffer, t_ns: int) -> Span:
+    """A copy of the samples from an instant on, and of what `rate_at` it looks at."""
+    first = max(0, imu.index_after(t_ns - AROUND_NS) - 1)
+    return Span(imu.times[first : imu.end].copy(), imu.samples[first : imu.end].copy())
+
+
+def measured(fixes: Sequence[VelocityOffer]) -> Measured:
+    """What some fixes say."""
+    found = [velocity_of(x) for x in fixes]
+    return Measured(
+        np.array([x.t_ns for x in fixes]),
+        np.array([v for v, _ in found]),
+        np.array([sd for _, sd in found]),
+        np.array([x.lever for x in fixes]),
+    )
+
+
+def rate_at(past: Past, t_ns: int) -> Array:
     """Mean rate (3,) around an instant."""
-    return samples_at(imu, t_ns)[:3]
+    return samples_at(past, t_ns)[:3]
 
 
-def samples_at(imu: ImuBuffer, t_ns: int) -> Array:
-    """Mean (6,) of the samples around an instant: 0.1 s to each side, as many as there are."""
-    first = max(0, imu.index_after(t_ns - 100_000_000) - 1)
-    end = max(first + 1, imu.index_after(t_ns + 100_000_000))
-    mean: Array = imu.samples[first:end].mean(axis=0)
+def samples_at(past: Past, t_ns: int) -> Array:
+    """Mean (6,) of the samples around an instant, as many as there are."""
+    first = max(0, past.index_after(t_ns - AROUND_NS) - 1)
+    end = max(first + 1, past.index_after(t_ns + AROUND_NS))
+    mean: Array = past.samples[first:end].mean(axis=0)
     return mean
 
 
-def felt(imu: ImuBuffer, instants: Sequence[int], bias: Array) -> Felt:
-    """What the IMU felt from the first instant to each, less a rate bias (3,)."""
-    first, end = imu.index_after(instants[0]), imu.index_after(instants[-1])
-    times = np.concatenate(([instants[0]], imu.times[first:end]))
-    samples = imu.samples[first:end]
-    at = [imu.index_after(t) - first for t in instants]
-    gained, turned = _integrate(times, samples, at, bias)
-    slopes, turns = np.empty((len(at), 3, 6)), np.empty((3, 3))
-    for axis in range(3):
-        shifted = samples.copy()
-        shifted[:, 3 + axis] -= FORCE_STEP
-        slopes[:, :, axis] = (_integrate(times, shifted, at, bias)[0] - gained) / FORCE_STEP
-        more = bias.copy()
-        more[axis] += RATE_STEP
-        faster, aside = _integrate(times, samples, at, more)
-        slopes[:, :, 3 + axis] = (faster - gained) / RATE_STEP
-        turn = (aside[-1] @ turned[-1].T - turned[-1] @ aside[-1].T) / (2.0 * RATE_STEP)
-        turns[:, axis] = turn[2, 1], turn[0, 2], turn[1, 0]
-    t_s = (np.array(instants) - instants[0]) * 1e-9
-    rates = np.array([rate_at(imu, t) for t in instants]) - bias
-    return Felt(t_s, gained, turned, slopes, turns, rates, bias)
-
-
-def _integrate(
-    times: NDArray[np.int64], samples: Array, at: Sequence[int], bias: Array
-) -> tuple[Array, Array]:
-    q, velocity = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+def felt(past: Past, instants: NDArray[np.int64], bias: Array) -> Felt:
+    """What the IMU felt from the first of instants (k,) to each, less a rate bias (3,)."""
+    first, end = past.index_after(int(instants[0])), past.index_after(int(instants[-1]))
+    times = np.concatenate((instants[:1], past.times[first:end]))
+    at = np.searchsorted(times[1:], instants, side="right")
     gained, turned = np.empty((len(at), 3)), np.empty((len(at), 3, 3))
-    before = 0
-    for k, row in enumerate(at):
-        if row > before:
-            part = np.ascontiguousarray(samples[before:row])
-            integrate_from_rest(times[before : row + 1], part, bias, q, 0.0, velocity)
-        before = max(before, row)
-        gained[k], turned[k] = velocity, dcm_from_quaternion(q)
-    return gained, turned
+    slopes = np.empty((len(at), 3, 6))
+    integrate_felt(times, past.samples[first:end], bias, at, gained, turned, slopes)
+    t_s = (instants - instants[0]) * 1e-9
+    return Felt(t_s, gained, turned, slopes, _rates_at(past, instants) - bias, bias)
+
+
+def _rates_at(past: Past, instants: NDArray[np.int64]) -> Array:
+    """`rate_at` (k, 3) of instants (k,) in their order."""
+    low = max(0, past.index_after(int(instants[0]) - AROUND_NS) - 1)
+    end = past.index_after(int(instants[-1]) + AROUND_NS)
+    times = past.times[low:end]
+    before = np.maximum(0, np.searchsorted(times, instants - AROUND_NS, side="right") - 1)
+    after = np.maximum(before + 1, np.searchsorted(times, instants + AROUND_NS, side="right"))
+    sums = np.zeros((end - low + 1, 3))
+    np.cumsum(past.samples[low:end, :3], axis=0, out=sums[1:])
+    rates: Array = (sums[after] - sums[before]) / (after - before)[:, None]
+    return rates
 
 
 def fit(
-    imu: ImuBuffer,
+    past: Past,
     f: Felt,
-    fixes: Sequence[VelocityOffer],
+    m: Measured,
     noise: ImuNoise,
     g: float,
     yaw: float,
     sd_yaw: float,
 ) -> Fit:
     """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, begun at `f`."""
-    measured = np.array([velocity_of(x)[0] for x in fixes])
-    sd = np.array([velocity_of(x)[1] for x in fixes])
     white = noise.force_noise**2 * f.t_s
     white += (STANDARD_GRAVITY_M_S2 * noise.rate_noise) ** 2 * f.t_s**3 / 3.0
-    weight = 1.0 / np.sqrt(sd**2 + white[:, None])
+    weight = 1.0 / np.sqrt(m.sd**2 + white[:, None])
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     rate = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
     prior = np.array([TILT_SD_RAD] * 2 + [sd_yaw] + [force] * 3 + [rate] * 3)
-    gained = measured - np.outer(f.t_s, [0.0, 0.0, g])
-    instants = [x.t_ns for x in fixes]
-    here = Guess(dcm_from_rpy(0.0, 0.0, yaw), np.zeros(6), measured[0])
+    gained = m.velocity - np.outer(f.t_s, [0.0, 0.0, g])
+    here = Guess(dcm_from_rpy(0.0, 0.0, yaw), np.zeros(6), m.velocity[0])
     for _ in range(ITERATIONS):
         if np.abs(here.biases[3:] - f.bias).max() * f.t_s[-1] > BENT_RAD:
-            f = felt(imu, instants, here.biases[3:])
-        dcm, there = _since_first(f, fixes, here)
-        h = np.zeros((len(fixes), 3, 12))
-        for axis in range(3):  # d(exp(phi) u) = dphi x u
-            h[:, :, axis] = np.cross(np.eye(3)[axis], there)
+            f = felt(past, m.instants, here.biases[3:])
+        dcm, there = _since_first(f, m, here)
+        h = np.zeros((len(there), 3, 12))
+        h[:, :, :3] = np.einsum("ijk,mk->mij", CROSS, there)  # d(exp(phi) u) = dphi x u
         h[:, :, 3:9] = dcm @ f.slopes
         h[:, :, 6:9] -= h[:, :, :3] @ (dcm @ f.turns)
         h[:, :, 9:] = np.eye(3)
@@ -179,7 +223,7 @@ def fit(
         here = here.moved(step)
         if np.linalg.norm(rows @ step) < CONVERGED:
             break
-    z = (gained - here.first - _since_first(f, fixes, here)[1]) * weight
+    z = (gained - here.first - _since_first(f, m, here)[1]) * weight
     cost = float((z**2).sum() + ((here.apart(yaw) / prior) ** 2).sum())
     covariance = np.linalg.inv(rows.T @ rows)[:9, :9]
     return Fit(cost, max(1, z.size - 3), here.last, here.biases, covariance)
@@ -205,12 +249,12 @@ class Guess(NamedTuple):
         return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases])
 
 
-def _since_first(f: Felt, fixes: Sequence[VelocityOffer], here: Guess) -> tuple[Array, Array]:
+def _since_first(f: Felt, m: Measured, here: Guess) -> tuple[Array, Array]:
     """C_0 (3, 3), and the velocity (k, 3) gained since the first fix but for gravity's, with the
     antenna's about the IMU."""
     more = here.biases[3:] - f.bias
     dcm = here.last @ (_turn(f.turns @ more) @ f.turned[-1]).T
-    levers = np.cross(f.rates, np.array([x.lever for x in fixes]))
+    levers = np.einsum("ijk,mj,mk->mi", CROSS, f.rates, m.levers)
     arms = (f.turned @ levers[:, :, None])[:, :, 0]
     return dcm, (f.gained + f.slopes @ np.concatenate([here.biases[:3], more]) + arms) @ dcm.T
 
