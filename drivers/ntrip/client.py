@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import ssl
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Literal
+from socket import socket
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from drivers.aside import aside
 from drivers.base import Backoff, DriverOptions
@@ -45,6 +47,8 @@ class NtripOptions(DriverOptions):
     mountpoint: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.+-]{1,100}$")]
     user: str = ""
     """Its password is in the environment, FUSIOND_NTRIP_PASSWORD."""
+    tls: bool = False
+    """The certificate must be the caster's and of an authority that the system trusts."""
     send_gga: bool = False
     """Send the receiver's own position up: for mountpoints that make corrections for a place."""
 
@@ -54,6 +58,12 @@ class NtripOptions(DriverOptions):
         if ":" in user or not user.isprintable():
             raise ValueError("a user has no colon and no line end (RFC 7617)")
         return user
+
+    @model_validator(mode="after")
+    def _port_of_tls(self) -> Self:
+        if self.tls and ":" not in self.caster:
+            raise ValueError("with tls the caster needs its port, HOST:PORT: no common one exists")
+        return self
 
     @property
     def address(self) -> tuple[str, int]:
@@ -78,6 +88,24 @@ class _Frames:
         self._counters["ntrip_damaged"] += self._of_stream.pop("rtcm_damaged", 0)
         self._counters["ntrip_garbage_bytes"] += self._of_stream.pop("garbage_bytes", 0)
         return frames
+
+
+def _reach(host: str, port: int, tls: bool) -> tuple[socket, ssl.SSLContext | None]:
+    """Connected, and what to verify the caster with; the authorities are read from files here."""
+    connected = connect(host, port)
+    return connected, ssl.create_default_context() if tls else None
+
+
+def _without_tls(error: ssl.SSLError) -> str:
+    """Why no connection with TLS came about, and what would do."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return (
+            f"its certificate is not accepted: {error.verify_message} (an authority of your own: "
+            "SSL_CERT_FILE in the environment)"
+        )
+    if error.reason == "WRONG_VERSION_NUMBER":
+        return "there is no TLS at that port"
+    return error.reason or str(error)
 
 
 class NtripClient:
@@ -121,6 +149,8 @@ class NtripClient:
                 asked = self._options.user and PASSWORD_VARIABLE not in os.environ
                 hint = f"; {PASSWORD_VARIABLE} is not set" if asked else ""
                 self._set_state("refused", f"{error}{hint}")
+            except ssl.SSLError as error:
+                self._set_state("refused", _without_tls(error))
             except OSError as error:
                 self._set_state("lost", error.strerror or str(error))
             except EOFError:
@@ -137,8 +167,12 @@ class NtripClient:
     async def _fetch(self) -> None:
         """One connection, to its end, which is an exception."""
         host, port = self._options.address
-        connected = await aside(partial(connect, host, port), lambda late: late.close())
-        reader, writer = await asyncio.open_connection(sock=connected)
+        reach = partial(_reach, host, port, self._options.tls)
+        connected, context = await aside(reach, lambda late: late[0].close())
+        name = host if context is not None else None
+        reader, writer = await asyncio.open_connection(
+            sock=connected, ssl=context, server_hostname=name
+        )
         upward: asyncio.Task[None] | None = None
         try:
             password = os.environ.get(PASSWORD_VARIABLE, "")

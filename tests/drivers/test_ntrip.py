@@ -6,6 +6,8 @@ import asyncio
 import base64
 import os
 import re
+import ssl
+import subprocess
 import tomllib
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
@@ -103,9 +105,11 @@ def test_the_last_chunk_is_the_end_and_takes_nothing_with_it() -> None:
 class Caster:
     """Answers every connection with `answer`, and keeps what came up."""
 
-    def __init__(self, answer: bytes) -> None:
-        self.answer = answer
+    def __init__(self, answer: bytes, tls: ssl.SSLContext | None = None) -> None:
+        self.answer, self._tls = answer, tls
         self.port = free_port()
+        self.peers: list[asyncio.StreamWriter] = []
+        """Who has connected; `clients` have asked for something, too."""
         self.clients: list[asyncio.StreamWriter] = []
         self.requests: list[str] = []
         self.heard = bytearray()
@@ -114,6 +118,7 @@ class Caster:
         return NtripOptions(caster=f"localhost:{self.port}", mountpoint="VRS3", **more)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.peers.append(writer)
         with suppress(ConnectionError, asyncio.IncompleteReadError):
             self.requests.append((await reader.readuntil(b"\r\n\r\n")).decode())
             writer.write(self.answer)
@@ -123,13 +128,14 @@ class Caster:
 
     @asynccontextmanager
     async def up(self) -> AsyncIterator[Caster]:
-        server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
+        server = await asyncio.start_server(self._serve, "127.0.0.1", self.port, ssl=self._tls)
         try:
             yield self
         finally:
             server.close()
-            while self.clients:
-                self.clients.pop().transport.abort()
+            self.clients.clear()
+            while self.peers:
+                self.peers.pop().transport.abort()
             await server.wait_closed()
 
 
@@ -233,11 +239,11 @@ async def test_the_position_goes_up_once_the_receiver_has_one(device: Device) ->
 class Attempts:
     """A client alone, whose receiver takes nothing, with waits that a test can bear."""
 
-    def __init__(self, caster: Caster) -> None:
+    def __init__(self, caster: Caster, *, tls: bool = False) -> None:
         self.states: list[tuple[str, str]] = []
         self.counters: Counter[str] = Counter()
         self.client = NtripClient(
-            caster.options(),
+            caster.options(tls=tls),
             self.counters,
             lambda frame: False,
             lambda: b"",
@@ -273,6 +279,59 @@ async def test_a_caster_that_goes_silent_is_left(monkeypatch: pytest.MonkeyPatch
     assert ("lost", "nothing for 0.2 s") in [(s, t.partition(": ")[2]) for s, t in attempts.states]
 
 
+# ------------------------------------------------------------------ TLS
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of `localhost`, signed by itself, with its key behind it in one file."""
+    pem = tmp_path_factory.mktemp("caster") / "caster.pem"
+    command = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2"
+    names = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"]
+    key = pem.with_suffix(".key")
+    files = ["-keyout", str(key), "-out", str(pem)]
+    subprocess.run([*command.split(), *names, *files], check=True, capture_output=True)
+    pem.write_text(pem.read_text() + key.read_text())
+    return pem
+
+
+def secured(certificate: Path) -> Caster:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate)
+    return Caster(ICY + FRAMES[0], context)
+
+
+async def test_a_caster_with_tls_is_verified_and_heard(
+    certificate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    caster = secured(certificate)
+    attempts = Attempts(caster, tls=True)
+    async with caster.up(), at_work(attempts.client.run()):
+        await until(lambda: attempts.client.state == "running")
+    assert attempts.counters["ntrip_frames"] >= 1
+
+
+async def test_a_caster_whose_authority_is_unknown_gets_no_password(certificate: Path) -> None:
+    caster = secured(certificate)
+    attempts = Attempts(caster, tls=True)
+    async with caster.up(), at_work(attempts.client.run()):
+        await until(lambda: attempts.client.state == "refused")
+    assert "certificate is not accepted: self-signed certificate" in attempts.client.detail
+    assert "SSL_CERT_FILE" in attempts.client.detail
+    assert caster.requests == []
+
+
+async def test_a_port_without_tls_is_named() -> None:
+    caster = Caster(ICY)
+    attempts = Attempts(caster, tls=True)
+    async with caster.up(), at_work(attempts.client.run()):
+        await until(lambda: bool(caster.peers))
+        caster.peers[0].write(b"ICY 400 what is that\r\n\r\n")
+        await until(lambda: attempts.client.state == "refused")
+    assert attempts.client.detail.endswith("there is no TLS at that port")
+
+
 # ------------------------------------------------------------------ configuration
 
 
@@ -282,6 +341,7 @@ async def test_a_caster_that_goes_silent_is_left(monkeypatch: pytest.MonkeyPatch
         {"caster": "http://caster"},
         {"mountpoint": "A B"},
         {"mountpoint": "A\r\nHost: x"},
+        {"tls": True},
         {"user": "a:b"},
         {"user": "a\r\nX: y"},
         {"password": "secret"},
