@@ -16,7 +16,14 @@ if TYPE_CHECKING:
     from fusiond.doctor.finding import Device
 
 config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
-_NAMES = {"can_imu": "imu", "can_gnss": "gnss", "nmea": "gnss", "gnss": "gnss", "rdss": "rdss"}
+_NAMES = {
+    "can_imu": "imu",
+    "can_gnss": "gnss",
+    "nmea": "gnss",
+    "gnss": "gnss",
+    "compass": "compass",
+    "rdss": "rdss",
+}
 ARM = typer.Option(metavar="F,R,D", help="m forward, right, down of the IMU.")
 
 
@@ -158,7 +165,7 @@ def _sources(devices: list[Device]) -> list[DraftSource]:
         if driver == "gnss" and raw:
             driver = "nmea"  # one receiver's raw data at most
         raw |= driver == "gnss"
-        sources[name] = DraftSource(name, driver, options, device.text)
+        sources[name] = DraftSource(name, driver, options, device.text, device.aiding)
     return list(sources.values())
 
 

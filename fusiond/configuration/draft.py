@@ -22,6 +22,8 @@ class DraftSource:
     driver: str
     options: Mapping[str, Any]
     found: str = ""
+    aiding: str | None = None
+    """The kind of its `[aiding]`, where the driver alone does not say it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +105,17 @@ def _source(d: Draft, source: DraftSource) -> Iterator[str]:
     yield f"driver = {_value(source.driver)}"
     for key, value in source.options.items():
         yield f"{key} = {_value(value)}"
-    kind = _AIDING_KIND.get(source.driver)
+    kind = source.aiding or _AIDING_KIND.get(source.driver)
     if kind is None:
         return
     yield ""
     yield f"[aiding.{source.name}]"
     if kind != source.name:
         yield f"kind = {_value(kind)}"
+    if source.driver == "compass":
+        yield "# Noise of one reading; what the vehicle's iron makes of it: docs/compass.md."
+        yield "sd_deg = 1.0"
+        return
     arm = d.lever_arms_m.get(kind if kind == "rdss" else "gnss")
     yield "# From the IMU to the antenna: forward, right, down. Measure it to a few centimetres."
     yield f"lever_arm_m = {_value(arm or (0.0, 0.0, 0.0))}"

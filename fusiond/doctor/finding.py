@@ -19,6 +19,7 @@ from drivers.can.bus import CanBus, CanFrame, Interface
 from drivers.can.decoder import CanDecoder
 from drivers.can.gnss import CanGnssDriver
 from drivers.can.imu import CanImuDriver
+from drivers.nmea.compass import FORMATTERS
 from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.serial_line import SerialLine
@@ -41,6 +42,10 @@ _DRIVERS: dict[str, Any] = {"can_imu": CanImuDriver, "can_gnss": CanGnssDriver}
 # RTCM 10403.3, table 3.5-78: MSM1 to MSM7 of GPS to BeiDou are 1071 to 1127.
 _MSM = range(1071, 1128)
 _RXM_RAWX = b"\x02\x15"
+# NMEA 0183 4.11: sentences that hold a position.
+_POSITIONS = ("GGA", "GNS", "RMC", "GLL")
+_HEADINGS = Counter(FORMATTERS)
+_BINARY = {"raw": "raw observations", "ubx": "UBX frames", "rtcm": "RTCM frames"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,8 @@ class Device:
     options: dict[str, Any]
     text: str
     rate_hz: float | None = None
+    aiding: str | None = None
+    """The kind of `[aiding]`, of a driver that may give several."""
 
 
 @dataclass(slots=True)
@@ -68,10 +75,19 @@ class _Line:
     def sound(self) -> bool:
         return self.kinds.total() >= SOUND_ITEMS
 
+    @property
+    def known(self) -> bool:
+        """Whether more would not change what it is: a receiver of two antennas tells its heading
+        and its position in one epoch, a compass never any position."""
+        return self.sound and ("position" in self.kinds or not self.kinds & _HEADINGS)
+
 
 def _kind(item: Sentence | Frame) -> str:
     if isinstance(item, Sentence):
-        return "rdss" if is_rdss_sentence(item) else "nmea"
+        if is_rdss_sentence(item):
+            return "rdss"
+        name = item.formatter
+        return name if name in FORMATTERS else "position" if name in _POSITIONS else "nmea"
     if item.kind == "ubx":
         return "raw" if item.raw[2:4] == _RXM_RAWX else "ubx"
     number = int.from_bytes(item.raw[3:5], "big") >> 4
@@ -87,7 +103,7 @@ async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) 
         heard = _Line()
         line = SerialLine(port, baud)
         async with _running(line.run(heard.take)):
-            await _until(lambda heard=heard: heard.sound, listen_s)
+            await _until(lambda heard=heard: heard.known, listen_s)
         if heard.sound:
             return _receiver(port, baud, heard.kinds)
         if not line.counters["opened"]:
@@ -98,18 +114,25 @@ async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) 
 
 
 def _receiver(port: str, baud: int, kinds: Counter[str]) -> Device:
-    what = {
-        "nmea": "NMEA sentences",
-        "raw": "raw observations",
-        "ubx": "UBX frames",
-        "rtcm": "RTCM frames",
-        "rdss": "sentences of an RDSS terminal",
-    }
-    text = f"{port}: {', '.join(what[kind] for kind in what if kinds[kind])} at {baud} baud"
-    if kinds["rdss"] > kinds["nmea"]:
-        return Device("rdss", {"port": port}, text)
-    driver = "gnss" if kinds["raw"] else "nmea"
-    return Device(driver, {"port": port, "baud": baud}, text)
+    nmea = {*FORMATTERS, "position", "nmea"}
+    if kinds["rdss"] > sum(kinds[kind] for kind in nmea):
+        return Device("rdss", {"port": port}, _told(port, baud, ["sentences of an RDSS terminal"]))
+    said = [_BINARY[kind] for kind in _BINARY if kinds[kind]]
+    if nmea & set(kinds):
+        said.insert(0, "NMEA sentences")
+    options = {"port": port, "baud": baud}
+    if kinds["raw"]:
+        return Device("gnss", options, _told(port, baud, said))
+    headings = [name for name in FORMATTERS if kinds[name]]
+    if headings and not kinds["position"]:
+        text = _told(port, baud, [f"a compass ({', '.join(headings)})"])
+        kind = "heading" if headings == ["HDT"] else "compass"
+        return Device("compass", options, text, aiding=kind)
+    return Device("nmea", options, _told(port, baud, said))
+
+
+def _told(port: str, baud: int, heard: list[str]) -> str:
+    return f"{port}: {', '.join(heard)} at {baud} baud"
 
 
 async def _terminal(port: str) -> Device | None:

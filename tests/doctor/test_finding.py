@@ -22,12 +22,14 @@ from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
+from tests.drivers.nmea.sentences import gga, made
 from tests.drivers.raw.frames import measurement, rawx
 from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 from tests.pty_device import Device
 
 RAWX = rawx(measurement())
+HDM, HDT = (f"{made(text)}\r\n".encode() for text in ("HCHDM,101.5,M", "HEHDT,97.2,T"))
 
 
 async def test_what_is_plugged_in_becomes_a_file_that_check_passes(tmp_path: Path) -> None:
@@ -87,6 +89,7 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
     [
         (RAWX * 3, "gnss", "raw observations"),
         (b"$GNVTG,,T,,M,0.0,N,0.0,K,A*3D\r\n" * 4 + RAWX, "gnss", "NMEA sentences, raw"),
+        (HDT * 3 + gga(1), "nmea", "NMEA sentences"),  # a receiver of two antennas
         (b"$BDICI,0242286,,,,,,60*00\r\n", None, ""),
         (bytes(range(256)) * 4, None, ""),
     ],
@@ -110,6 +113,37 @@ async def test_what_speaks_on_a_port(
     device.unplug()
     assert (found.driver if found else None) == driver
     assert found is None or said in found.text
+
+
+async def test_compasses_become_sections_that_check_passes(tmp_path: Path) -> None:
+    devices = {Device(tmp_path / "magnetic"): HDM + HDT, Device(tmp_path / "gyro"): HDT}
+    for device in devices:
+        device.plug()
+
+    async def send() -> None:
+        while True:
+            for device, data in devices.items():
+                with contextlib.suppress(BlockingIOError):
+                    device.send(data)
+            await asyncio.sleep(0.02)
+
+    sending = asyncio.create_task(send())
+    out = tmp_path / "boat.toml"
+    arguments = ["config", "init", str(out), "--yes", "--class", "marine"]
+    arguments += ["--can", f"virtual:{tmp_path}"]
+    arguments += [text for device in devices for text in ("--port", str(device.link))]
+    done = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+    sending.cancel()
+    for device in devices:
+        device.unplug()
+    assert done.exit_code == 0, done.output
+    config = load_config(out)
+    kinds = {source.options["port"]: name for name, source in config.sources.items()}
+    told = {str(tmp_path / "magnetic"): "HDM, HDT", str(tmp_path / "gyro"): "HDT"}
+    for (port, said), kind in zip(told.items(), ("compass", "heading"), strict=True):
+        assert f"{port}: a compass ({said}) at 115200 baud" in done.stdout
+        assert config.sources[kinds[port]].driver == "compass"
+        assert config.aiding[kinds[port]].kind == kind
 
 
 @pytest.mark.parametrize("page", ["can-imu.md", "can-gnss.md"])
