@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurements import Measurement, PositionFix
+from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.standstill import TURNS_AT_REST
 from fusiond.configuration.schema import Config
@@ -136,6 +136,7 @@ class Navigator:
     def change_imu(self) -> None:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
+        self._units.change()
         if self.started is None:
             self._begin_anew("the spare IMU is used")
         else:
@@ -180,8 +181,7 @@ class Navigator:
         aids = self._lateness.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
-        if isinstance(m, PositionFix):
-            self._units.fix(m, t_ns, self.imu)
+        self._units.fix(m, t_ns, self.imu)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
             self.timeline.insert(aid)
@@ -340,7 +340,6 @@ class Navigator:
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """What the solution is worth at `t_ns`, and why."""
-        e = self.config.estimator
         if not self.imu.end:
             return Mode.WAITING, self._door.silence(None)
         if self._units.wrong is not None:
@@ -353,7 +352,7 @@ class Navigator:
         if silent > self.config.imu.gap_s:
             return Mode.INVALID, self._door.silence(silent)
         p = self.estimator.covariance
-        if not 0.0 <= (variance := p[6, 6] + p[7, 7]) <= e.invalid_sd_m**2:
+        if not 0.0 <= (variance := p[6, 6] + p[7, 7]) <= self.config.estimator.invalid_sd_m**2:
             return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
         if self.on_trial:
             return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"
@@ -361,10 +360,11 @@ class Navigator:
             return Mode.COASTING, f"heading from {self.started.how}; {hangs}"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
-        if (why := self._standing.shaken(self.estimator, self.timeline.isolation)) is not None:
+        shaken = self._standing.shaken(self.estimator, self.timeline.isolation)
+        if (why := shaken or self._units.unproven(self.estimator)) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - self._last_position_ns) * 1e-9
-        if unaided > e.coast_after_s:
+        if unaided > self.config.estimator.coast_after_s:
             return Mode.COASTING, f"no position fused for {unaided:.0f} s"
         return Mode.NAVIGATING, f"heading from {self.started.how}"
 

@@ -8,11 +8,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from drivers.measurements import PositionFix
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode
-from fusiond.navigator.imu_units import CourseTurns, force_unit, other_unit, rms_unit
+from fusiond.navigator.imu_units import (
+    CourseTurns,
+    RateUnits,
+    force_unit,
+    other_unit,
+    rms_unit,
+)
 from fusiond.navigator.navigator import Navigator
-from tests.navigator.vehicle import CONFIG, RATE_HZ, Array, drive, started
+from tests.navigator.vehicle import CONFIG, RATE_HZ, START_NS, Array, drive, started
 
 GRAVITY_M_S2 = 9.80665
 
@@ -46,6 +53,32 @@ def test_rates_in_deg_s_are_told_in_the_first_bend_and_nothing_is_vouched_for() 
     mode, why = navigator.mode(navigator.imu.latest_ns)
     assert mode is Mode.INVALID
     assert "they look like deg/s" in why
+
+
+@pytest.mark.parametrize(
+    ("block", "axis", "bias", "said"),
+    [
+        ("gyro_bias", 2, math.radians(-0.6), "the gyro's bias of 0.6 deg/s is 6 sigma of [imu]"),
+        ("accel_bias", 0, 0.49, "the accelerometer's bias of 0.49 m/s^2 is 5 sigma of [imu]"),
+    ],
+)
+def test_a_bias_of_no_data_sheet_is_not_vouched_for_until_a_bend_shows_the_unit(
+    block: str, axis: int, bias: float, said: str
+) -> None:
+    """Rates in deg/s have such a bias; so has a gyro that is worse than its sheet."""
+    d, navigator = drive(), started()[0]
+    estimator, units = navigator.estimator, RateUnits(lambda code, text: None)
+    assert units.unproven(estimator) is None
+    estimator.xi[navigator.model.slots_of(block)[axis]] = bias
+    assert str(units.unproven(estimator)).startswith(said)
+    navigator.imu.append(d.times[navigator.imu.end :], d.samples[navigator.imu.end :])
+    fixes = [m for m in d.measurements if isinstance(m, PositionFix)]
+    for m in fixes:
+        units.fix(m, m.t_seen_ns, navigator.imu)
+        turning = m.t_seen_ns > START_NS + 19_000_000_000  # 30 deg of the first bend
+        assert (units.unproven(estimator) is None) == turning
+    units.change()  # of the spare's unit nothing is known
+    assert str(units.unproven(estimator)).startswith(said)
 
 
 def test_good_rates_are_not_spoken_of() -> None:
