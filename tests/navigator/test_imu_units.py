@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,10 +25,12 @@ from tests.navigator.vehicle import CONFIG, RATE_HZ, START_NS, Array, drive, sta
 GRAVITY_M_S2 = 9.80665
 
 
-def _driven(change: Callable[[Array], Array]) -> tuple[Navigator, list[tuple[str, str]]]:
+def _driven(
+    change: Callable[[Array], Array], settings: dict[str, Any] = CONFIG
+) -> tuple[Navigator, list[tuple[str, str]]]:
     """The drive, its samples (n, 6) changed once the filter runs, and what was told."""
     told: list[tuple[str, str]] = []
-    navigator, row = started(on_event=lambda code, text: told.append((code, text)))
+    navigator, row = started(settings, on_event=lambda code, text: told.append((code, text)))
     d = drive()
     samples = change(d.samples.copy())
     waiting = list(d.measurements)
@@ -85,6 +88,20 @@ def test_good_rates_are_not_spoken_of() -> None:
     navigator, told = _driven(lambda samples: samples)
     assert [code for code, _ in told if code.startswith("imu")] == []
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
+
+
+def test_a_spare_with_such_a_bias_is_not_vouched_for_before_a_bend() -> None:
+    """The unit of the first IMU has been shown, and says nothing of the spare's."""
+    imu = {**CONFIG["imu"], "spare": {"source": "second"}}
+    navigator, _ = _driven(lambda samples: samples, {**CONFIG, "imu": imu})
+    gyro_z = navigator.model.slots_of("gyro_bias")[2]
+    navigator.estimator.xi[gyro_z] = math.radians(0.6)
+    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
+    navigator.change_imu()
+    navigator.estimator.xi[gyro_z] = math.radians(0.6)
+    mode, why = navigator.mode(navigator.imu.latest_ns)
+    assert mode is Mode.COASTING
+    assert "the gyro's bias of 0.6 deg/s is 6 sigma of [imu]" in why
 
 
 def test_a_unit_that_is_corrected_is_believed_after_the_next_bend() -> None:
