@@ -92,8 +92,8 @@ class _Frames:
 
 def _reach(host: str, port: int, tls: bool) -> tuple[socket, ssl.SSLContext | None]:
     """Connected, and what to verify the caster with; the authorities are read from files here."""
-    connected = connect(host, port)
-    return connected, ssl.create_default_context() if tls else None
+    context = ssl.create_default_context() if tls else None
+    return connect(host, port), context
 
 
 def _without_tls(error: ssl.SSLError) -> str:
@@ -149,6 +149,8 @@ class NtripClient:
                 asked = self._options.user and PASSWORD_VARIABLE not in os.environ
                 hint = f"; {PASSWORD_VARIABLE} is not set" if asked else ""
                 self._set_state("refused", f"{error}{hint}")
+            except ssl.SSLEOFError:
+                self._set_state("lost", "the caster closed the connection")
             except ssl.SSLError as error:
                 self._set_state("refused", _without_tls(error))
             except OSError as error:
