@@ -15,7 +15,7 @@ Source: Groves, 2nd ed., eq. 14.109.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -130,6 +130,9 @@ class VelocityAid(Aid):
         where = *self.lever, self.sd_time_s
         _velocity(nav, xi, step, *slots, *measured, *where, z, h, r)
         return Innovation(z, h, r)
+
+    def coarser(self, factor: float) -> VelocityAid:
+        return replace(self, sd=tuple(factor * each for each in self.sd))
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

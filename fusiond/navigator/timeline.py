@@ -230,13 +230,14 @@ class Timeline:
         return outcome
 
     def _update(self, aid: Aid) -> Outcome:
-        """Fold one aid in; as coarser than it says where its motion is yet to be seen. Its
-        innovation then says nothing of the sigma that it states."""
-        unproven = aid.locates and self.isolation.unproven(aid.source, aid.t_ns)
-        if not unproven or self.estimator.isolates:
+        """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its
+        errors last. In the first case its innovation says nothing of the sigma that it states."""
+        if self.estimator.isolates:
             return self.estimator.update(aid)
-        outcome = self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))
-        return outcome._replace(whitened=())
+        if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
+            return self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
+        lasting = self.isolation.coarseness(aid)
+        return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         counts = self.counters.outcomes[entry.aid.source]
