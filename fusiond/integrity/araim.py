@@ -55,6 +55,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.chi_square import quantile
+from fusiond.navigation.distributions import gaussian_quantile
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -210,10 +211,8 @@ def _risk_of(terms: list[tuple[float, float, float]], level: float) -> float:
 
 def _level_of(term: tuple[float, float, float], risk: float) -> float:
     """Where one term alone has `risk`; minus infinity where it never has as much."""
-    from scipy.special import ndtri  # noqa: PLC0415 - slow to load
-
     weight, offset, sigma = term
-    return offset - float(ndtri(min(1.0, risk / weight))) * sigma
+    return offset - gaussian_quantile(min(1.0, risk / weight)) * sigma
 
 
 def fault_modes(epoch: Epoch, unmonitored_risk: float) -> tuple[tuple[FaultMode, ...], float]:
@@ -248,8 +247,6 @@ def _most_events(priors: Sequence[float], risk: float) -> int:
 
 def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
     """Protection levels of the epoch, before any measurement; None without a solution."""
-    from scipy.special import ndtri  # noqa: PLC0415 - slow to load
-
     design, everything = epoch.design, np.zeros(len(epoch.constellation), dtype=bool)
     variance = epoch.integrity_sigma_m**2
     first = _solve(design, variance, everything)
@@ -269,8 +266,8 @@ def protect(epoch: Epoch, requirement: Requirement) -> Protection | None:
     separation_sigma = np.sqrt(((gain - gain[0]) ** 2) @ accuracy)
     number = max(1, len(kept))
     tests = number * requirement.samples
-    k_horizontal = -ndtri(requirement.horizontal_false_alarm / (4.0 * tests))
-    k_vertical = -ndtri(requirement.vertical_false_alarm / (2.0 * tests))
+    k_horizontal = -gaussian_quantile(requirement.horizontal_false_alarm / (4.0 * tests))
+    k_vertical = -gaussian_quantile(requirement.vertical_false_alarm / (2.0 * tests))
     threshold = separation_sigma * np.array([k_horizontal, k_horizontal, k_vertical])
     separation = Separation(
         gain,

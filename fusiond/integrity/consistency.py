@@ -42,6 +42,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.navigation.distributions import (
+    f_quantile,
+    f_tail,
+    gamma_quantile,
+    gamma_tails,
+    gaussian_quantile,
+    noncentrality,
+)
+
 Array = NDArray[np.float64]
 Verdict = Literal["consistent", "optimistic", "pessimistic", "coloured", "too_few"]
 Interval = tuple[float, float]
@@ -167,18 +176,16 @@ NO_LIMITS = Limits(
 
 @lru_cache(maxsize=2048)
 def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Limits:
-    from scipy.special import fdtri, gammainccinv, gammaincinv, ndtri  # noqa: PLC0415
-
     shape, scale = _average_law(k, dof, gate)
     level = 1.0 - math.sqrt(1.0 - alpha)
     n = dof if whitened else k
     d, nu = 8.0 + 207.0 / n - 1670.0 / n**2, 13.6 + 0.277 * n
-    r = -float(ndtri((1.0 - INTERVAL_LEVEL) / 2.0)) / math.sqrt(n)
+    r = -gaussian_quantile((1.0 - INTERVAL_LEVEL) / 2.0) / math.sqrt(n)
 
     def between(outside: float) -> Interval:
         return (
-            scale * float(gammaincinv(shape, outside / 2.0)),
-            scale * float(gammainccinv(shape, outside / 2.0)),
+            scale * gamma_quantile(shape, outside / 2.0),
+            scale * gamma_quantile(shape, outside / 2.0, upper=True),
         )
 
     return Limits(
@@ -189,7 +196,7 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
         n + 2.0 * (1.0 - _LAG / k),
         (d, nu),
         (-r, r),
-        float(fdtri(d, nu, 1.0 - level)) * LAGS * (nu - 2.0) / nu,
+        f_quantile(d, nu, level) * LAGS * (nu - 2.0) / nu,
     )
 
 
@@ -198,12 +205,10 @@ def _average_law(k: int, dof: int, gate: float) -> tuple[float, float]:
 
     E[x^j; x < g] of a chi-square with m degrees: m (m + 2) .. (m + 2j - 2) F_{m+2j}(g).
     """
-    from scipy.special import gammainc, gammaincinv  # noqa: PLC0415
-
     m = dof / k
-    g = 2.0 * float(gammaincinv(m / 2.0, gate))
-    mean = m * float(gammainc(m / 2.0 + 1.0, g / 2.0)) / gate
-    variance = m * (m + 2.0) * float(gammainc(m / 2.0 + 2.0, g / 2.0)) / gate - mean * mean
+    g = 2.0 * gamma_quantile(m / 2.0, gate)
+    mean = m * gamma_tails(m / 2.0 + 1.0, g / 2.0)[0] / gate
+    variance = m * (m + 2.0) * gamma_tails(m / 2.0 + 2.0, g / 2.0)[0] / gate - mean * mean
     return k * mean * mean / variance, variance / (mean * dof)
 
 
@@ -212,15 +217,13 @@ def _detectable(
     k: int, dof: int, alpha: float, gate: float, whitened: bool
 ) -> tuple[Interval, float]:
     """NIS ratios and a single lag's rho that are noticed with POWER."""
-    from scipy.special import chndtrinc, gammainccinv, gammaincinv  # noqa: PLC0415
-
     limits = limits_of(k, dof, alpha, gate, whitened)
     low, high = limits.nis_limits
     ratio = (
-        low / (limits.scale * float(gammaincinv(limits.shape, POWER))),
-        high / (limits.scale * float(gammainccinv(limits.shape, POWER))),
+        low / (limits.scale * gamma_quantile(limits.shape, POWER)),
+        high / (limits.scale * gamma_quantile(limits.shape, POWER, upper=True)),
     )
-    shift = float(chndtrinc(limits.portmanteau, LAGS, 1.0 - POWER))
+    shift = noncentrality(limits.portmanteau, LAGS, 1.0 - POWER)
     return ratio, min(1.0, math.sqrt(shift / (dof if whitened else k)))
 
 
@@ -239,8 +242,6 @@ def judge(
     Raises ValueError when they cannot be figures of a window: not 8 lags, K below 1 or above K m.
     With fewer than FEWEST epochs the verdict is `too_few` and no figure is given.
     """
-    from scipy.special import fdtrc, gammainc, gammaincc  # noqa: PLC0415
-
     if len(rho) != LAGS or not 1 <= k <= dof:
         raise ValueError(f"K = {k}, {dof} degrees of freedom, {len(rho)} lags; needs {LAGS} lags")
     if k < FEWEST:
@@ -249,10 +250,7 @@ def judge(
     ratio, single = _detectable(k, dof, alpha, gate, whitened)
     values = np.asarray(rho, dtype=float)
     q = float(limits.weights @ (values * values))
-    tails = (
-        float(gammainc(limits.shape, average / limits.scale)),
-        float(gammaincc(limits.shape, average / limits.scale)),
-    )
+    tails = gamma_tails(limits.shape, average / limits.scale)
     d, nu = limits.freedom
     verdict = verdict_of(average, q, limits)
     return Consistency(
@@ -268,7 +266,7 @@ def judge(
         rho_interval=limits.rho_interval,
         portmanteau=q,
         portmanteau_limit=limits.portmanteau,
-        portmanteau_p=float(fdtrc(d, nu, q * nu / (LAGS * (nu - 2.0)))),
+        portmanteau_p=f_tail(d, nu, q * nu / (LAGS * (nu - 2.0))),
         alpha=alpha,
         detectable_ratio=ratio,
         detectable_rho=single,

@@ -40,6 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.integrity.araim import protection_level
+from fusiond.navigation.distributions import gaussian_quantile
 
 Array = NDArray[np.float64]
 
@@ -75,14 +76,10 @@ class Level(NamedTuple):
 def axis_level(variance: Array, separation: Array, share: float, limits: IntegrityRisk) -> Level:
     """The level of an axis: `variance` (1 + k,) m^2 of all aids and of the subsets, `separation`
     (k,) m of the subsets, `share` of the risk. Infinite where there is no bound."""
-    from scipy.special import ndtri  # noqa: PLC0415 - slow to load
-
     sigma = np.sqrt(variance)
-    k_fa = -float(
-        ndtri(
-            limits.false_alarm
-            / (2.0 * len(AXIS_SHARE) * max(1, len(separation)) * INDEPENDENT_PER_HOUR)
-        )
+    k_fa = -gaussian_quantile(
+        limits.false_alarm
+        / (2.0 * len(AXIS_SHARE) * max(1, len(separation)) * INDEPENDENT_PER_HOUR)
     )
     # Gates differ: a subset may have taken more than the whole.
     threshold = k_fa * np.sqrt(np.maximum(0.0, variance[1:] - variance[0]))

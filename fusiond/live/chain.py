@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-import scipy.special  # noqa: F401 - a verdict would load it inside a tick
-
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events

@@ -8,9 +8,8 @@ For n degrees of freedom and h = x / 2 the tail has a closed form,
 and its slope is -h^{n/2-1} e^-h / (2 Gamma(n/2)). Newton's steps on ln Q, which is concave from
 n = 2 on and nearly a line far out, begin at the approximation of Wilson and Hilferty.
 
-scipy.special has it too, and takes an eighth of the processor time of a start to load. It is asked
-where gates seldom are: beyond `_MOST_DEGREES` and below `_LEAST_TAIL` the sums above lose their
-digits or their range.
+Where gates seldom are, beyond `_MOST_DEGREES` and below `_LEAST_TAIL`, the sums above lose their
+digits or their range: there it is twice the quantile of a gamma law of shape n / 2.
 
 Source: Abramowitz and Stegun, 26.4.4, 26.4.5 (tail) and 26.4.17 (beginning).
 """
@@ -20,6 +19,8 @@ from __future__ import annotations
 import math
 import sys
 from functools import lru_cache
+
+from fusiond.navigation.distributions import gamma_quantile
 
 # Newton's step is quadratic: one below this leaves an error below the rounding of x.
 _STEP = 1e-9
@@ -43,9 +44,7 @@ def quantile(degrees: int, tail: float) -> float:
     if tail == 0.0:
         return math.inf
     if degrees > _MOST_DEGREES or tail < _LEAST_TAIL:
-        from scipy.special import chdtri  # noqa: PLC0415 - slow to load
-
-        return float(chdtri(degrees, tail))
+        return 2.0 * gamma_quantile(0.5 * degrees, tail, upper=True)
     x = _near(degrees, tail)
     for _ in range(_STEPS):
         q, slope = _tail(degrees, x)

@@ -31,6 +31,7 @@ from fusiond.estimators.base import Estimator
 from fusiond.gnss.ecef import ned_axes
 from fusiond.integrity.araim import LPV_200, Epoch, Requirement, exclude
 from fusiond.integrity.protection import INDEPENDENT_PER_HOUR
+from fusiond.navigation.distributions import gaussian_quantile
 from fusiond.navigation.strapdown import LAT, LON
 from fusiond.navigator.raw_gnss import RawEpochAid
 
@@ -99,9 +100,7 @@ class EpochProtection:
     @cached_property
     def _quantile(self) -> float:
         """Of the Gaussian law: what one position exceeds with half the risk."""
-        from scipy.special import ndtri  # noqa: PLC0415 - slow to load
-
-        return -float(ndtri(0.5 * self._risk / INDEPENDENT_PER_HOUR))
+        return -gaussian_quantile(0.5 * self._risk / INDEPENDENT_PER_HOUR)
 
     def clear(self) -> None:
         """The solution has begun anew."""
