@@ -28,6 +28,8 @@ LEAST_SD_M_S = 0.02
 CONTRADICTION = (10.83, 13.82)
 # Kept longer than any history: a rewind asks again.
 KEEP_NS = 700_000_000_000
+# Spans of which sums are kept: that of the standstill so far, and those of windows in it.
+MOST_SUMS = 8
 # A ride is smooth if this many windows of this time were quiet at a speed that is no rest: chance
 # makes one or two where driving shakes the vehicle.
 SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
@@ -50,6 +52,26 @@ class _Speed(NamedTuple):
     rounding: float
 
 
+class _Sum(NamedTuple):
+    """Of the first `number` speeds of a span: of their variances and of each axis; the largest part
+    that no mean takes away."""
+
+    number: int
+    variance: float
+    v: tuple[float, ...]
+    rounding: float
+
+    def of(self, rows: Sequence[_Speed]) -> _Sum:
+        """With more of them, in order: the same bits as of all at once."""
+        variance, total, rounding = self.variance, list(self.v), self.rounding
+        for row in rows:
+            variance += row.sd * row.sd
+            rounding = max(rounding, row.rounding)
+            for axis in range(len(total)):
+                total[axis] += row.v[axis]
+        return _Sum(self.number + len(rows), variance, tuple(total), rounding)
+
+
 class Witnesses:
     """Speeds that were measured, and the quiet windows that were none of rest."""
 
@@ -58,6 +80,8 @@ class Witnesses:
         self._at_speed: list[int] = []
         self._told: dict[tuple[int, int], Measured] = {}
         """What `measured` has said of spans since the last speed: it is asked at every tick."""
+        self._sums: dict[tuple[str, int], _Sum] = {}
+        """By source and begin of a span: a standstill is asked about at each speed of minutes."""
 
     def hear(self, aids: Sequence[Aid]) -> None:
         """A measurement has come. Epochs of raw ranges are left to the filter: their velocity
@@ -80,10 +104,12 @@ class Witnesses:
         speeds = self._speeds[source]
         speed = _Speed(t_ns, v, sd, rounding)
         if speeds and speed < speeds[-1]:
+            self._sums.clear()
             insort(speeds, speed)
         else:
             speeds.append(speed)
         if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
+            self._sums.clear()
             del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
@@ -95,19 +121,29 @@ class Witnesses:
 
     def _measured(self, begin_ns: int, end_ns: int) -> Measured:
         contradicts, best = False, math.inf
-        for speeds in self._speeds.values():
-            first = bisect_left(speeds, (begin_ns,))
-            found = speeds[first : bisect_left(speeds, (end_ns + 1,))]
-            if not found:
+        for source, speeds in self._speeds.items():
+            found = self._sum(source, speeds, begin_ns, end_ns)
+            if found is None:
                 continue
-            count = len(found)
-            sd = math.sqrt(sum(row.sd * row.sd for row in found)) / count
-            sd = max(sd, LEAST_SD_M_S, *(row.rounding for row in found))
-            size = len(found[0].v)
-            square = sum((sum(row.v[axis] for row in found) / count) ** 2 for axis in range(size))
-            contradicts |= square > CONTRADICTION[size - 1] * sd * sd
+            sd = max(math.sqrt(found.variance) / found.number, found.rounding)
+            square = sum((total / found.number) ** 2 for total in found.v)
+            contradicts |= square > CONTRADICTION[len(found.v) - 1] * sd * sd
             best = min(best, sd)
         return Measured(contradicts, best)
+
+    def _sum(self, source: str, speeds: list[_Speed], begin_ns: int, end_ns: int) -> _Sum | None:
+        """Of a source's speeds in a span, begun where that of a shorter span ended."""
+        first, last = bisect_left(speeds, (begin_ns,)), bisect_left(speeds, (end_ns + 1,))
+        if first >= last:
+            return None
+        known = self._sums.get((source, begin_ns))
+        if known is None or known.number > last - first:
+            known = _Sum(0, 0.0, (0.0,) * len(speeds[first].v), LEAST_SD_M_S)
+        found = known.of(speeds[first + known.number : last])
+        if len(self._sums) >= MOST_SUMS:
+            self._sums.clear()
+        self._sums[source, begin_ns] = found
+        return found
 
     def velocity(self, begin_ns: int, end_ns: int) -> tuple[float, float, float] | None:
         """Mean velocity north, east (m/s) of the source that had most to say from `begin_ns` to

@@ -1,0 +1,44 @@
+"""Speeds of a span say the same, however often and in whatever order they were asked for."""
+
+from __future__ import annotations
+
+import random
+from types import SimpleNamespace
+from typing import Any
+
+from fusiond.aiding.offers import VelocityOffer
+from fusiond.aiding.witnesses import KEEP_NS, Measured, Witnesses
+
+SECOND_NS = 1_000_000_000
+
+
+def _aid(source: str, t_ns: int, v: float, sd: float) -> Any:
+    offer = VelocityOffer(t_ns, (v, -v, 0.0), (sd, sd, sd))
+    return SimpleNamespace(source=source, screened=False, locates=False, offers=lambda: (offer,))
+
+
+def _at_once(heard: list[Any], begin_ns: int, end_ns: int) -> Measured:
+    witnesses = Witnesses()
+    witnesses.hear(sorted(heard, key=lambda aid: aid.offers()[0].t_ns))
+    return witnesses.measured(begin_ns, end_ns)
+
+
+def test_sums_that_grow_have_the_bits_of_those_made_at_once() -> None:
+    """Some speeds come late, and some after so long that the oldest are forgotten."""
+    rng = random.Random(1)
+    witnesses, heard, contradicted = Witnesses(), [], 0
+    t_ns = 0
+    for _ in range(120):
+        t_ns += rng.choice((1, 1, 1, 2)) * SECOND_NS
+        late_ns = rng.choice((0,) * 9 + (5,)) * SECOND_NS
+        aid = _aid(rng.choice("ab"), t_ns - late_ns, rng.gauss(0.1, 0.1), rng.uniform(0.05, 0.2))
+        heard.append(aid)
+        witnesses.hear([aid])
+        for begin_ns in (0, 20 * SECOND_NS, t_ns - 3 * SECOND_NS):
+            for end_ns in (t_ns, t_ns + SECOND_NS, t_ns - SECOND_NS):
+                found = witnesses.measured(begin_ns, end_ns)
+                assert found == _at_once(heard, begin_ns, end_ns)
+                contradicted += found.contradicts
+    assert contradicted  # and not for nothing
+    witnesses.hear([_aid("a", t_ns + 3 * KEEP_NS, 0.0, 0.1)])
+    assert witnesses.measured(0, t_ns + 4 * KEEP_NS).sd < 0.1
