@@ -49,29 +49,31 @@ $(STAMP): requirements-dev.lock $(RUNTIME)
 demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 60 --headless"
 	$(BIN)/fusiond demo --dashboard $(ARGS)
 
-# One core compiles while the other installs the tools and lints. Hardware in the loop waits for real
-# time more than it computes: the unit tests take what it leaves, and are the first to yield.
+# One core compiles while the other installs the tools and lints; then two at a time, in this order.
+# Hardware in the loop waits for real time more than it computes: the others take what it leaves, and
+# are the first to yield.
 test: $(RUNTIME) ## everything that CI checks
-	$(MAKE) --jobs=2 --output-sync lint kernels
-	$(MAKE) --jobs=2 --output-sync=line hil unit YIELDING="nice -n 19"
+	$(MAKE) --jobs=2 --output-sync=line lint hil unit YIELDING="nice -n 19"
 
 lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/mypy
-	$(BIN)/lint-imports --no-cache --no-logo
+	$(YIELDING) $(BIN)/mypy
+	$(YIELDING) $(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python tools/house.py --check
 
+# The collector would look through what the compiler keeps again and again, a tenth of its time.
 kernels: $(RUNTIME)
 	@echo "compiling the kernels once, before the tests share them"
-	$(BIN)/python -c 'import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle, \
+	$(BIN)/python -c 'import gc; gc.set_threshold(50000); \
+	import fusiond.live.daemon, fusiond.offline.process, fusiond.simulation.vehicle, \
 	fusiond.estimators.federated.standing, fusiond.estimators.multiscale.filter, \
 	fusiond.estimators.unscented.filter'
 
 # A file's tests stay on one core: they share what the first of them computed. Each core has its
 # process, so that threads of the linear algebra would only fight for it; one process more works
 # while others wait for brokers and devices, an eighth of the time.
-unit: kernels test-packages ## unit and property tests, on every core
+unit: $(STAMP) kernels test-packages ## unit and property tests, on every core
 	OPENBLAS_NUM_THREADS=1 $(YIELDING) $(BIN)/pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder \
 		--ignore tests/hil/test_hil.py $(ARGS)
 
@@ -79,7 +81,7 @@ fuzz: $(STAMP) ## every parser with atheris; RUNS=1000000 ARGS=nmea for one of t
 	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install --quiet 'atheris>=3'
 	$(BIN)/python -m tests.fuzz.run --runs $(RUNS) $(ARGS)
 
-hil: $(STAMP) test-packages ## hardware in the loop; alone, since the daemon keeps real time
+hil: $(STAMP) kernels test-packages ## hardware in the loop; alone, since the daemon keeps real time
 	$(BIN)/pytest tests/hil/test_hil.py
 
 systemd: $(STAMP) test-packages ## the unit as its README installs it, systemd as process 1 of a guest
