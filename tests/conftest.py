@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+import drivers.can.python_can  # noqa: F401 - a test's `import can` would bring asammdf
+
 # A busy host is no counterexample: properties judge what comes out, not how long it took.
 
 settings.register_profile("fusiond", deadline=None, suppress_health_check=[HealthCheck.too_slow])
