@@ -37,9 +37,10 @@ app = typer.Typer(
 )
 
 
-# Imports make a million objects that live for ever. At CPython's own threshold of 700 the collector
-# looks through them again and again: 0.2 s of the processor's time until a command begins its work.
-COLLECT_AFTER = 50_000
+# Imports make half a million objects that live for ever. At CPython's own threshold of 700 the
+# collector looks through them again and again: 0.2 s of the processor's time until a command begins
+# its work, which sets a lower one (`fusiond.commands.shared.loaded`).
+COLLECT_AFTER = 1_000_000
 
 
 def main() -> None:

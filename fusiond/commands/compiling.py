@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from fusiond.commands.shared import draws
+from fusiond.commands.shared import draws, loaded
 
 # A line of a log every so often, where a terminal's is written anew at each kernel.
 LINE_EVERY_S = 5.0
@@ -20,11 +20,13 @@ LINE_EVERY_S = 5.0
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """Say how far it is while what is imported inside compiles; nothing where nothing does."""
+    """Say how far it is while what is imported inside compiles; nothing where nothing does. The
+    collector of garbage leaves alone what has been loaded by its end."""
     from fusiond.navigation.compiled import gathered  # noqa: PLC0415 - numba
 
     with gathered(Progress(sys.stderr)):
         yield
+        loaded()  # and then compile what is missing
 
 
 class Progress:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, load
+from fusiond.commands.shared import EXIT_UNAVAILABLE, config_errors, load, loaded
 
 if TYPE_CHECKING:
     from fusiond.dashboard.broker import Access
@@ -49,6 +49,7 @@ def dashboard(
         serve_log,
     )
 
+    loaded()
     token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
     serving = Serving(host, port, token if commands and not logs else None, base_map)
     if not serving.loopback:

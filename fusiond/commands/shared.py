@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -16,6 +17,8 @@ import typer
 if TYPE_CHECKING:
     from fusiond.configuration.schema import Config
 
+# Objects made since the last collection: a filter at work makes so many in minutes.
+COLLECT_AFTER = 50_000
 EXIT_DATA = 65
 EXIT_UNAVAILABLE = 69
 EXIT_IO = 74
@@ -74,6 +77,13 @@ def data_errors() -> Iterator[None]:
     except OSError as error:
         typer.echo(f"fusiond: {error.filename or 'output'}: {error.strerror or error}", err=True)
         raise typer.Exit(EXIT_IO) from error
+
+
+def loaded() -> None:
+    """The code of a command is there, and lives as long as the process: no collection looks through
+    it any more, and from now on there are some."""
+    gc.freeze()
+    gc.set_threshold(COLLECT_AFTER)
 
 
 def draws(stream: TextIO) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import re
@@ -12,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from fusiond.commands.compiling import Progress
+from fusiond.commands.compiling import Progress, compiling
+from fusiond.commands.shared import COLLECT_AFTER
 from tests.patience import PATIENCE_S
 
 KERNELS = """
@@ -96,3 +98,16 @@ def test_a_terminal_has_one_line_and_a_dumb_one_lines(
     for done in range(3):
         told(done, 2)
     assert out.getvalue() == written
+
+
+def test_what_has_been_loaded_is_left_alone_by_the_collector() -> None:
+    before = gc.get_threshold()
+    gc.unfreeze()
+    try:
+        with compiling():
+            gc.set_threshold(1_000_000)  # as while a command loads its code
+        assert gc.get_threshold()[0] == COLLECT_AFTER
+        assert gc.get_freeze_count() > COLLECT_AFTER
+    finally:
+        gc.unfreeze()
+        gc.set_threshold(*before)
