@@ -109,7 +109,9 @@ class Estimator(Protocol):
     step: Array
     time_slot: int
     """Of the offset in time that solutions are published with (fusiond.estimators.reading): the
-    model's, or -1 where the receiver has shown to be no clock."""
+    model's, or -1 where they are published by the filter's own clock."""
+    clock_sd_s: float
+    """One sigma of the filter's own clock, where solutions are published by it."""
 
     @property
     def covariance(self) -> Array:
@@ -126,6 +128,10 @@ class Estimator(Protocol):
     @property
     def isolated(self) -> dict[str, str]:
         """Sources that a fault detection keeps out of the solution, and why."""
+
+    def publish_by_own_clock(self, sd_s: float) -> None:
+        """From the next start on a receiver's clock is none to publish by; its own is. Where the
+        model has no offset in time, one sigma of that clock is `sd_s`."""
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -177,7 +183,7 @@ class ErrorStateFilter:
 
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         self.model = model
-        self.time_slot = model.time_slot
+        self.time_slot, self.clock_sd_s = model.time_slot, 0.0
         self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
@@ -215,6 +221,17 @@ class ErrorStateFilter:
         """Sources that a fault detection keeps out of the solution, and why."""
         return {}
 
+    def publish_by_own_clock(self, sd_s: float) -> None:
+        """From the next start on a receiver's clock is none to publish by; its own is.
+
+        It is known as well as what lies between it and the clock of a receiver that is on time:
+        what the model takes for granted of that before anything shows it, or `sd_s` where it has
+        no offset in time.
+        """
+        slot = self.model.time_slot
+        self.clock_sd_s = float(self.model.initial[slot]) if slot >= 0 else sd_s
+        self.time_slot = -1
+
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
         self.t_ns, self.sample = t_ns, sample
@@ -245,6 +262,7 @@ class ErrorStateFilter:
             model.packed,
             imu.packed,
             self.time_slot,
+            self.clock_sd_s,
             self.sample - start,
             imu.end,
             self.t_ns,
@@ -270,7 +288,7 @@ class ErrorStateFilter:
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self._covs[0], self.nav, self.step, self.time_slot, out)
+        sigmas(self._covs[0], self.nav, self.step, self.time_slot, self.clock_sd_s, out)
         return out
 
     def _feed_back(self, dx: Array) -> None:

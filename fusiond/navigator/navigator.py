@@ -286,11 +286,11 @@ class Navigator:
     def _late(self) -> bool:
         """Whether a receiver is found to be late; alignment then begins anew, by its last fixes at
         the instants at which they were true."""
-        why = self._lateness.look(self.imu)
-        if why is None:
+        found = self._lateness.look(self.imu)
+        if found is None:
             return False
-        self.estimator.time_slot = -1  # by the IMU's clock: it has said when the fixes were
-        self.reset(why)
+        self.estimator.publish_by_own_clock(found.sd_s)  # it has said when the fixes were
+        self.reset(found.why)
         self._aligner.aids(self._lateness.kept())
         return True
 

@@ -7,14 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import State
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import compensate
 from fusiond.estimators.reading import in_fix_time
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.solution import Bound, Mode, Solution
-from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, VN, strapdown_step
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, strapdown_step
 
 Array = NDArray[np.float64]
 
@@ -38,8 +37,6 @@ def solution_of(
     in_fix_time(nav, estimator.xi, estimator.step, estimator.time_slot, published)
     nav = published
     sigmas = estimator.sigmas()
-    if estimator.time_slot != estimator.model.time_slot:
-        sigmas = np.hypot(sigmas, _by_imu_clock(estimator))
     sigmas[~estimator.model.stated] = math.nan
     sd = sigmas.tolist()
     values = nav.tolist()
@@ -60,17 +57,6 @@ def solution_of(
         (bias[3], bias[4], bias[5]),
         bound,
     )
-
-
-def _by_imu_clock(estimator: Estimator) -> Array:
-    """What a solution by the IMU's clock is off by, one sigma (9,) of position, velocity, roll,
-    pitch, yaw: that clock is known as well as what lies between it and a receiver's that is on
-    time, which is what the model takes for granted of its offset before anything shows it."""
-    model = estimator.model
-    sd_s = float(model.initial[model.time_slot])
-    state = State(estimator.nav, estimator.xi, estimator.step, model)
-    change = state.nav[VN : VN + 3], state.acceleration, state.rate_b
-    return sd_s * np.abs(np.concatenate(change))
 
 
 def _carried(estimator: Estimator, imu: ImuBuffer, ahead_s: float) -> Array:

@@ -130,7 +130,7 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
     assert estimator.newest is not None
     nodes, _ = nodes_of(estimator.newest, None, NEVER)
     estimator.end()
-    smoothed = Smoother(model).back(nodes)
+    smoothed = Smoother(model, model.time_slot, 0.0).back(nodes)
     count = len(nodes.t_ns)
     n = model.size
     fed_back, row = np.zeros((count, n)), 0

@@ -120,7 +120,7 @@ def _published(d: Array, nav: Array, tau: float, step: Array, out: Array) -> Non
 
 
 @compiled(
-    "void(f8[:, ::1], f8[:, ::1], i8[::1], i8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1],"
+    "void(f8[:, ::1], f8[:, ::1], i8[::1], i8[:, ::1], i8, f8, f8[::1], f8[:, ::1], f8[:, ::1],"
     "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])"
 )
 def _back(
@@ -129,6 +129,7 @@ def _back(
     counts: Indices,
     rate_terms: Indices,
     time_slot: int,
+    clock_sd_s: float,
     lam: Array,
     big: Array,
     error: Array,
@@ -177,7 +178,7 @@ def _back(
                 covariance[m, j, i] = total
             covariance[m, i, i] = max(0.0, covariance[m, i, i])
         _published(d, nav, tau, step, after[m])
-        sigmas(covariance[m], nav, step, CORE_SIZE if time_slot >= 0 else -1, sd)
+        sigmas(covariance[m], nav, step, CORE_SIZE if time_slot >= 0 else -1, clock_sd_s, sd)
         for i in range(9):
             variance[m, i] = sd[i] * sd[i]
         # As it was before the feedback f: nav + f, tau - f, dx_s + f.
@@ -251,10 +252,14 @@ def _back(
 
 
 class Smoother:
-    """Goes back over the nodes of one start, block by block from the last."""
+    """Goes back over the nodes of one start, block by block from the last.
 
-    def __init__(self, model: Model) -> None:
-        self._model = model
+    What is smoothed is by the clock that the start was published by: `time_slot` and `clock_sd_s`
+    of its estimator (fusiond.estimators.reading).
+    """
+
+    def __init__(self, model: Model, time_slot: int, clock_sd_s: float) -> None:
+        self._model, self._clock = model, (time_slot, clock_sd_s)
         self._lambda, self._capital = np.zeros(model.size), np.zeros((model.size, model.size))
 
     def back(self, nodes: Nodes) -> Smoothed:
@@ -270,7 +275,7 @@ class Smoother:
         )
         model = self._model
         _back(
-            *(nodes.bodies, nodes.ops, nodes.counts, model.rate_terms, model.time_slot),
+            *(nodes.bodies, nodes.ops, nodes.counts, model.rate_terms, *self._clock),
             *(self._lambda, self._capital),
             *smoothed[1:],
         )

@@ -85,6 +85,11 @@ class TapedKalman(KalmanEstimator):
         self._ops, self.rewound = [], NEVER
         self._close()
 
+    def publish_by_own_clock(self, sd_s: float) -> None:
+        """From the next start on: a tape is of one clock."""
+        self.end()
+        super().publish_by_own_clock(sd_s)
+
     def end(self) -> None:
         """The tape is complete: no more of this start will come."""
         if self.newest is None:
@@ -100,7 +105,7 @@ class TapedKalman(KalmanEstimator):
         model, dx = self.model, self._dxs[0]
         write_body(
             *(self._covs[0], self._phi, dx, self._fed_back, self.nav, self.xi, self.step),
-            *(model.rate_terms, model.time_slot, body),
+            *(model.rate_terms, self.time_slot, body),
         )
         ops = self._ops[0] if len(self._ops) == 1 else np.concatenate([self._none, *self._ops])
         self.newest = Node(self.newest, self.t_ns, body, ops)

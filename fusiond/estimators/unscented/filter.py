@@ -124,6 +124,7 @@ class UnscentedEstimator(KalmanEstimator):
             model.rate_terms,
             model.noise,
             self.time_slot,
+            self.clock_sd_s,
             imu.times,
             imu.samples,
             imu.densities,
