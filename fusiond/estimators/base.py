@@ -28,7 +28,7 @@ from fusiond.estimators.propagation import (
     scratch_size,
     sensor_estimates,
 )
-from fusiond.estimators.reading import sigmas
+from fusiond.estimators.reading import Published, sigmas
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
@@ -107,11 +107,8 @@ class Estimator(Protocol):
     nav: Array
     xi: Array
     step: Array
-    time_slot: int
-    """Of the offset in time that solutions are published with (fusiond.estimators.reading): the
-    model's, or -1 where they are published by the filter's own clock."""
-    clock_sd_s: float
-    """One sigma of the filter's own clock, where solutions are published by it."""
+    published: Published
+    """What solutions are published by: at first the clock of the model's receiver."""
 
     @property
     def covariance(self) -> Array:
@@ -129,9 +126,8 @@ class Estimator(Protocol):
     def isolated(self) -> dict[str, str]:
         """Sources that a fault detection keeps out of the solution, and why."""
 
-    def publish_by_own_clock(self, sd_s: float) -> None:
-        """From the next start on a receiver's clock is none to publish by; its own is. Where the
-        model has no offset in time, one sigma of that clock is `sd_s`."""
+    def publish_by(self, published: Published) -> None:
+        """From the next start on."""
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -183,7 +179,7 @@ class ErrorStateFilter:
 
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         self.model = model
-        self.time_slot, self.clock_sd_s = model.time_slot, 0.0
+        self.published = Published(model.time_slot)
         self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
@@ -221,16 +217,9 @@ class ErrorStateFilter:
         """Sources that a fault detection keeps out of the solution, and why."""
         return {}
 
-    def publish_by_own_clock(self, sd_s: float) -> None:
-        """From the next start on a receiver's clock is none to publish by; its own is.
-
-        It is known as well as what lies between it and the clock of a receiver that is on time:
-        what the model takes for granted of that before anything shows it, or `sd_s` where it has
-        no offset in time.
-        """
-        slot = self.model.time_slot
-        self.clock_sd_s = float(self.model.initial[slot]) if slot >= 0 else sd_s
-        self.time_slot = -1
+    def publish_by(self, published: Published) -> None:
+        """From the next start on."""
+        self.published = published
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -261,8 +250,7 @@ class ErrorStateFilter:
             self._phi,
             model.packed,
             imu.packed,
-            self.time_slot,
-            self.clock_sd_s,
+            *self.published,
             self.sample - start,
             imu.end,
             self.t_ns,
@@ -288,7 +276,7 @@ class ErrorStateFilter:
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self._covs[0], self.nav, self.step, self.time_slot, self.clock_sd_s, out)
+        sigmas(self._covs[0], self.nav, self.step, *self.published, out)
         return out
 
     def _feed_back(self, dx: Array) -> None:

@@ -17,11 +17,16 @@ By a receiver whose fixes have shown to be late nobody sets a clock. What is pub
 the filter's own t, and tau is by how much that clock, the IMU's, is off: nothing estimates it, so
 it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
 clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
+
+Attitude is that of the axes of the inertial unit that was configured. Once a spare has taken over,
+C_nb is of the spare's, and nothing says how the two sit against each other beyond `axes_sd_rad`,
+about each axis: cov(phi) grows by its square.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +47,16 @@ from fusiond.navigation.strapdown import (
 )
 
 Array = NDArray[np.float64]
+
+
+class Published(NamedTuple):
+    """What a filter's state is published by: the parameter that is the offset of the receiver's
+    clock, or -1 and one sigma (s) of the filter's own; and one sigma (rad) about each axis of what
+    the unit in use is turned by against that of which the attitude is published."""
+
+    time_slot: int
+    clock_sd_s: float = 0.0
+    axes_sd_rad: float = 0.0
 
 
 @compiled("f8(f8[::1], f8[::1], i8)", forceinline=True)
@@ -84,15 +99,20 @@ def in_fix_time(nav: Array, xi: Array, step: Array, time_slot: int, out: Array) 
     )
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8[::1])")
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])")
 def sigmas(
-    cov: Array, nav: Array, step: Array, time_slot: int, clock_sd_s: float, out: Array
+    cov: Array,
+    nav: Array,
+    step: Array,
+    time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
+    out: Array,
 ) -> None:
     """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
 
-    By the clock whose offset is parameter `time_slot`, or (-1) by the filter's own, one sigma of
-    which is `clock_sd_s`. Roll, pitch and yaw follow from phi by Euler kinematics, with C_nb as
-    `step` (21,) holds it.
+    By the clock and the axes of `Published`. Roll, pitch and yaw follow from phi by Euler
+    kinematics, with C_nb as `step` (21,) holds it.
     """
     t = time_slot
     tt = cov[t, t] if t >= 0 else clock_sd_s * clock_sd_s
@@ -106,7 +126,8 @@ def sigmas(
             velocity = max(0.0, velocity + a * (a * tt - 2.0 * vt))
         out[i] = math.sqrt(position)
         out[3 + i] = math.sqrt(velocity)
-    a, b, c = cov[0, 0], cov[1, 1], cov[2, 2]
+    askew = axes_sd_rad * axes_sd_rad
+    a, b, c = cov[0, 0] + askew, cov[1, 1] + askew, cov[2, 2] + askew
     d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
     if tt > 0.0:
         u0, u1, u2 = _turning(step, 0), _turning(step, 1), _turning(step, 2)

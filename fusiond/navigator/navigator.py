@@ -30,14 +30,14 @@ from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, imu_buffer_of, model_of, verdicts_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
-from fusiond.navigator.imu_change import hand_over
+from fusiond.navigator.imu_change import hand_over, publish_first_axes
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
-from fusiond.navigator.readout import solution_of
+from fusiond.navigator.readout import publish_by_own_clock, solution_of
 from fusiond.navigator.saved_calibration import SavedCalibration, refuted, take_up
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
@@ -137,10 +137,10 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
         self._units.change()
-        if self.started is None:
-            self._begin_anew("the spare IMU is used")
-        else:
-            hand_over(self.estimator, self.timeline, self.config.imu)
+        publish_first_axes(self.estimator, self.config.imu)
+        if self.started is not None:
+            return hand_over(self.estimator, self.timeline, self.config.imu)
+        return self._begin_anew("the spare IMU is used")
 
     def _begin_anew(self, why: str) -> None:
         """Nothing that the samples so far have told counts any more."""
@@ -289,7 +289,7 @@ class Navigator:
         found = self._lateness.look(self.imu)
         if found is None:
             return False
-        self.estimator.publish_by_own_clock(found.sd_s)  # it has said when the fixes were
+        publish_by_own_clock(self.estimator, found.sd_s)  # it has said when the fixes were
         self.reset(found.why)
         self._aligner.aids(self._lateness.kept())
         return True

@@ -130,8 +130,7 @@ class SmoothedRows:
             nodes = nodes.first(int(unsound[0]))
         self.nodes += len(nodes.t_ns)
         self.starts += 1
-        e = self._estimator
-        smoother = Smoother(e.model, e.time_slot, e.clock_sd_s)
+        smoother = Smoother(self._estimator.model, self._estimator.published)
         back = [smoother.back(nodes).corrections]
         for held in reversed(self._nodes):
             back.append(smoother.back(Nodes(*self._spool.get(held))).corrections)

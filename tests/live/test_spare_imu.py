@@ -14,8 +14,8 @@ from fusiond.configuration.doubts import doubts
 from fusiond.configuration.schema import Config, Imu, SpareImu
 from fusiond.configuration.settings import DEG, sensor_to_body
 from fusiond.demo.demo import demo_config
-from fusiond.live.imu_choice import ImuChoice
 from fusiond.navigation.solution import Mode
+from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.replay.run import Wish, replay
 from fusiond.simulation.can.imu import CanImu
 from fusiond.simulation.vehicle import SimulatedVehicle

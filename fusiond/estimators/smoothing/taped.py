@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import Outcome, Screened, Snapshot
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.reading import Published
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.smoothing.node import Nodes, body_size, write_body, write_rows
 from fusiond.models.blocks import CLOCK_OFFSET
@@ -85,10 +86,10 @@ class TapedKalman(KalmanEstimator):
         self._ops, self.rewound = [], NEVER
         self._close()
 
-    def publish_by_own_clock(self, sd_s: float) -> None:
-        """From the next start on: a tape is of one clock."""
+    def publish_by(self, published: Published) -> None:
+        """From the next start on: a tape is of one clock and one unit."""
         self.end()
-        super().publish_by_own_clock(sd_s)
+        super().publish_by(published)
 
     def end(self) -> None:
         """The tape is complete: no more of this start will come."""
@@ -105,7 +106,7 @@ class TapedKalman(KalmanEstimator):
         model, dx = self.model, self._dxs[0]
         write_body(
             *(self._covs[0], self._phi, dx, self._fed_back, self.nav, self.xi, self.step),
-            *(model.rate_terms, self.time_slot, body),
+            *(model.rate_terms, self.published.time_slot, body),
         )
         ops = self._ops[0] if len(self._ops) == 1 else np.concatenate([self._none, *self._ops])
         self.newest = Node(self.newest, self.t_ns, body, ops)
