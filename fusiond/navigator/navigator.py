@@ -77,7 +77,7 @@ class Navigator:
         self.model = model_of(config, *of_vehicle, *self._intake.extra_blocks())
         self.imu = imu_buffer_of(config)
         self._door = ImuDoor(imu, e.buffer_s, self._event)
-        self._units = RateUnits(self._event)
+        self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         self.estimator = estimator(config, self.model)
         self.verdicts = verdicts_of(config, self._event)
         self.timeline = Timeline(
@@ -181,7 +181,7 @@ class Navigator:
         aids = self._lateness.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
-        self._units.fix(m, t_ns, self.imu)
+        self._units.fix(m, t_ns, self.imu, aids)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
             self.timeline.insert(aid)
