@@ -123,7 +123,7 @@ class Aid:
         return self
 
     def coarser(self, factor: float) -> Aid:
-        """The same with so many times its sigma; itself where it is no position."""
+        """The same with so many times its sigma; itself where it is no position or velocity."""
         return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:

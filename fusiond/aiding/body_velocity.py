@@ -16,10 +16,10 @@ minus estimated, and e_i the axis's unit vector:
 
     z = e_i exp[m x] (C^T dv - C^T [v x] phi - [l x] e - [w x] dl) + e_i [u x] dm + ds + v
     z = the same (1 + k) - (u_forward - a_forward tau) dk + (1 + k) (a_forward dtau
-        + tau e_i exp[m x] C^T [g x] phi) - ds_w + q sign(y) dp + v                       (wheel)
+        - tau e_i exp[m x] (e - C^T [g x] phi)) - ds_w + q sign(y) dp + v                 (wheel)
 
-a_forward = f + C^T g is smoothed: one sample of a shaken sensor would make the latency look smaller
-than it is.
+a_forward = f + C^T g is smoothed, e what its force is wrong by (fusiond.aiding.felt): one sample of
+a shaken sensor would make the latency look smaller than it is.
 
 Source: Dissanayake et al., The aiding of a low-cost strapdown IMU using vehicle constraints, IEEE
 T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and mounting of odometers).
@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import SpeedOffer
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
@@ -148,6 +149,7 @@ def _rows(
             z[i] -= late * a0
             h[i, 0] += late * b * g
             h[i, 1] -= late * a * g
+            add_of_force(step, column_of, c, -late * t0, -late * t1, -late * t2, h[i])
             if slot[LATENCY] >= 0:
                 h[i, slot[LATENCY]] = a0
             gain = 1.0 + _estimate(xi, slot[SCALE])

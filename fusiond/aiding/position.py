@@ -2,15 +2,14 @@ r"""Position of an antenna: a GNSS fix, with or without height.
 
     z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + s b^
         + v_a^ tau^ + a^ tau^2 / 2
-      = dr + (C l) x phi + tau^ dv_a - C dl - s db - (v_a + a tau^) dtau + tau^2 / 2 [f x] phi
-        + noise
+      = dr + (C l) x phi + tau^ dv_a - C dl - s db - (v_a + a tau^) dtau + tau^2 / 2 da + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
 ionosphere), s what part of it there is in this one, tau how much later than its stamp the fix is
-valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed, f the
-specific force that it is felt by; where the model has states for them they are estimated, true
-minus estimated in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by
-v s_t, which adds (v_i s_t)^2 to the variance of each axis.
+valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
+(fusiond.aiding.felt); where the model has states for them they are estimated, true minus estimated
+in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by v s_t, which
+adds (v_i s_t)^2 to the variance of each axis.
 
 An offset in time multiplies v_a. What a linear filter leaves out of the product of the two errors,
 and of dtau's square, is noise to it, where P is the filter's own:
@@ -36,6 +35,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
@@ -123,6 +123,9 @@ def _position(
                 h[i, j] += late_s * of_v[i, j]
             for j in range(3):
                 h[i, j] += 0.5 * late_s * late_s * turned[i][j]
+            half = 0.5 * late_s * late_s
+            x0, x1, x2 = half * c[3 * i], half * c[3 * i + 1], half * c[3 * i + 2]
+            add_of_force(step, column_of, c, x0, x1, x2, h[i])
             h[i, slot] = -(v[i] + a[i] * late_s)
             if p.size:
                 variance, across = 0.0, 0.0

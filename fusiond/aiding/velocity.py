@@ -1,21 +1,21 @@
 r"""Velocity of an antenna over ground, north-east-down, horizontal or full.
 
     z = v^ + C^ (w x l^) + a^ tau^ - v_fix
-      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ f x phi + noise
+      = dv + (C (w x l)) x phi - C [l x] e - C [w x] dl - a dtau + tau^ da + noise
 
 w is the rate of the body against the Earth (fusiond.aiding.antenna). tau is how much later than its
-stamp the velocity is valid, a the acceleration, smoothed: with the noise of single samples in its
-Jacobian an offset would come out too small, and too sure. What is left of the product of the two
-errors is not taken for noise: on drive_0708 that cost a tenth of the accuracy in outages, and gave
-no more honest a sigma. A timing error of sigma s_t that is not shared changes the velocity by
-a s_t, which adds (a_i s_t)^2 to the variance of each axis.
+stamp the velocity is valid, a the acceleration (its error da: fusiond.aiding.felt), smoothed: with
+the noise of single samples in its Jacobian an offset would come out too small, and too sure. What
+is left of the product of the two errors is not taken for noise: on drive_0708 that cost a tenth of
+the accuracy in outages, and gave no more honest a sigma. A timing error of sigma s_t that is not
+shared changes the velocity by a s_t, which adds (a_i s_t)^2 to the variance of each axis.
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -83,6 +84,9 @@ def _velocity(
             h[2, slot] = -down
             h[2, 0] -= late_s * f1
             h[2, 1] += late_s * f0
+        for i in range(z.shape[0]):
+            x, y, d = late_s * c[3 * i], late_s * c[3 * i + 1], late_s * c[3 * i + 2]
+            add_of_force(step, column_of, c, x, y, d, h[i])
     z[0] -= v0
     z[1] -= v1
     r[0], r[1] = sd0 * sd0, sd1 * sd1
@@ -126,6 +130,9 @@ class VelocityAid(Aid):
         where = *self.lever, self.sd_time_s
         _velocity(nav, xi, step, *slots, *measured, *where, z, h, r)
         return Innovation(z, h, r)
+
+    def coarser(self, factor: float) -> VelocityAid:
+        return replace(self, sd=tuple(factor * each for each in self.sd))
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

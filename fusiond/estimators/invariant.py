@@ -62,9 +62,9 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
+from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.estimators.update import feed_back
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
@@ -139,7 +139,7 @@ class Sought(NamedTuple):
         return (-self.degrees, self.nis) < (-other.degrees, other.nis)
 
 
-class InvariantFilter(KalmanEstimator):
+class InvariantFilter(TiltAxesFilter):
     """The centralised filter, whose updates run in xi while it `turns`.
 
     One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again

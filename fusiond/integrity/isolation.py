@@ -134,6 +134,10 @@ class Isolation:
             return False
         return record.proof is not None or support.outage(self._records, t_ns)
 
+    def coarseness(self, aid: Aid) -> float:
+        """With how many times its stated sigma an aid counts, by how long its errors last."""
+        return support.coarseness(self._records, aid)
+
     def lost(self, t_ns: int) -> Lost | None:
         """Set while positions come and none is believed: since when, and who is to blame."""
         return support.lost(self._records, t_ns)

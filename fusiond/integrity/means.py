@@ -7,8 +7,20 @@ s of a mean is a / (2 - a) for white ones; errors that last (orbits, slip of a t
 it is learned from what the means show themselves, `LEARN_NS` after they have shown it: lately it
 may be the beginning of a fault.
 
+What the slow mean shows says by how much the series' sigma is too small for a filter that takes its
+errors for white. Errors e of variance r whose correlation at a lag of k measurements is rho_k have
+
+    var(sum of n) -> n r (1 + 2 sum rho_k) = n r c^2
+
+with c^2 = (1 + rho) / (1 - rho) where they are of first order. White ones of variance c^2 r have
+the same sums, which is what a filter that looks back further than they last makes of them.
+s / (a / (2 - a)) of the slow mean is c^2 where they last for less than its 59 innovations, and 1
+where they are white and the sigma honest. Once measurements count with c, s shows what is left of
+it: c^2 s is averaged. Where r is little beside H P H^T that leaves c as it is.
+
 Source: Lowry, Woodall, Champ, Rigdon, A multivariate exponentially weighted moving average control
-chart, Technometrics 34 (1992), eq. 2.2.
+chart, Technometrics 34 (1992), eq. 2.2; Bar-Shalom, Li, Kirubarajan (2001), section 8.2 (errors
+that are not white).
 """
 
 from __future__ import annotations
@@ -32,6 +44,19 @@ ASSUMED = 0.2
 # that last (orbits, slip of a tyre) are ordinary, and a fault is what stands out of them. What is
 # assumed at first weighs as much as half the time that the slow mean looks back.
 LEARN_COUNT, ASSUMED_COUNT = 300.0, 15.0
+# Before a series has shown it: half of its variance lasts, for two seconds. A choice, for receivers
+# say nothing of it: cars drawn with errors of that kind were looked at for it.
+LASTING_SHARE, LASTS_S, LIKELY_COUNT = 0.5, 2.0, 8.0
+# Nobody sends more often than 50 times a second.
+LEAST_S = 0.02
+# How long errors last is a receiver's nature, which does not change while it drives: it is averaged
+# over forty minutes of 5 Hz. A fault of some seconds then excuses itself by a percent.
+LASTING_COUNT = 12_000.0
+# The slow mean looks back at 59 innovations, and squares of so few means scatter as much as they
+# are large: as many innovations as make twenty new means are needed before half of what they show
+# is believed. With an eighth of it, receivers whose errors are white hid a drift of 0.1 m/s and a
+# mount that turns for some seconds more than they do.
+DOUBTED_COUNT = 40.0 / SLOW
 # What the means show lately may be the beginning of a fault: it counts once a period as long as it
 # has gone by without one. A drift of 0.1 m/s is found within twice this; longer ones hide nothing.
 LEARN_NS = 15_000_000_000
@@ -39,10 +64,14 @@ LEARN_NS = 15_000_000_000
 FEWEST = 4
 
 # Rows of the array that the kernels read; after `_HEAD` of them the d means of each pace. `_SHOWN`
-# begins the sums of both means' squares, by degree of freedom, and their number, since the instant
-# `_SINCE` (ns, an integer), `_WAITING` the same of the period before. `_LEARNED` counts what the
-# variances have been learned from.
-_SINCE, _COUNT, _SPREAD, _LEARNED, _SHOWN, _WAITING, _HEAD = 0, 1, 2, 4, 5, 8, 11
+# begins the sums of both means' squares, by degree of freedom and no less than of white ones, of
+# the slow mean's as they are, and their number, since the instant `_SINCE` (ns, an integer),
+# `_WAITING` the same of the period before. `_LEARNED` counts what the variances have been learned
+# from; `_SLOWLY` is the slow mean's by that alone and in terms of the sigma that was stated,
+# `_TOLD` what it counts, `_COARSE` the square of c with which the last measurement counted.
+_SINCE, _COUNT, _SPREAD, _LEARNED, _SLOWLY, _TOLD, _COARSE = 0, 1, 2, 4, 5, 6, 7
+_SHOWN, _WAITING, _HEAD = 8, 12, 16
+_SUMS = _WAITING - _SHOWN
 _LONG_AGO_NS = -(2**62)
 
 
@@ -60,9 +89,12 @@ def _add(packed: Array, y: Array) -> None:
 @compiled("void(f8[::1])")
 def _believe(packed: Array) -> None:
     """No fault has followed what waits."""
-    n = packed[_WAITING + 2]
+    n = packed[_WAITING + 3]
     if n == 0.0:
         return
+    packed[_TOLD] = min(packed[_TOLD] + n, LASTING_COUNT)
+    alone = n / packed[_TOLD]
+    packed[_SLOWLY] += alone * (packed[_WAITING + 2] / n - packed[_SLOWLY])
     share = min(1.0, n / min(ASSUMED_COUNT + packed[_LEARNED] + n, LEARN_COUNT))
     for k in range(2):
         packed[_SPREAD + k] += share * (packed[_WAITING + k] / n - packed[_SPREAD + k])
@@ -84,13 +116,14 @@ def _biased(packed: Array, t_ns: int, limit: float) -> bool:
         return True
     if t_ns - packed[:1].view(np.int64)[0] >= LEARN_NS:
         _believe(packed)
-        for k in range(3):
+        for k in range(_SUMS):
             packed[_WAITING + k] = packed[_SHOWN + k]
             packed[_SHOWN + k] = 0.0
         packed[:1].view(np.int64)[0] = t_ns
     packed[_SHOWN] += max(fast / d, WHITE_FAST)
     packed[_SHOWN + 1] += max(slow / d, WHITE_SLOW)
-    packed[_SHOWN + 2] += 1.0
+    packed[_SHOWN + 2] += packed[_COARSE] * slow / d
+    packed[_SHOWN + 3] += 1.0
     return False
 
 
@@ -98,6 +131,7 @@ def _begun(degrees: int) -> Array:
     packed = np.zeros(_HEAD + 2 * degrees)
     packed[:1].view(np.int64)[0] = _LONG_AGO_NS
     packed[_SPREAD : _SPREAD + 2] = WHITE_FAST + ASSUMED, WHITE_SLOW + ASSUMED
+    packed[_SLOWLY], packed[_COARSE] = WHITE_SLOW, 1.0
     return packed
 
 
@@ -148,3 +182,25 @@ class Means:
         """By how much (1) the sigma of a mean over many errors is more than if they were white, as
         the series has shown."""
         return math.sqrt(max(1.0, float(self._packed[_SPREAD + 1]) / WHITE_SLOW))
+
+    def lasting(self, every_s: float) -> float:
+        """c: by how much (1, at least) a sigma is too small for errors that last, as the series has
+        shown; the measurement that comes next counts with it. What is assumed of measurements
+        `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
+        heard = float(self._packed[_COUNT])
+        shown = 1.0 + (float(self._packed[_SLOWLY]) / WHITE_SLOW - 1.0) * self._sureness
+        square = (LIKELY_COUNT * assumed(every_s) + heard * shown) / (LIKELY_COUNT + heard)
+        self._packed[_COARSE] = square = max(1.0, square)
+        return math.sqrt(square)
+
+    @property
+    def _sureness(self) -> float:
+        """How much (1) of what the slow mean has shown is taken for the series' nature."""
+        told = float(self._packed[_TOLD])
+        return told / (DOUBTED_COUNT + told)
+
+
+def assumed(every_s: float) -> float:
+    """c^2 of a receiver's velocities that nothing is known of: half of their variance white."""
+    rho = math.exp(-max(every_s, LEAST_S) / LASTS_S)
+    return 1.0 + LASTING_SHARE * 2.0 * rho / (1.0 - rho)

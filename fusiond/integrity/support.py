@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from fusiond.aiding.base import Aid
 from fusiond.integrity.series import NEVER_NS, Series
 
 # What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
@@ -108,6 +109,18 @@ def velocity_sd(records: Records, device: str) -> float:
     """Sigma (m/s) of the device's velocities as a mean of many shows it; 0 without any."""
     found = (r.sd_m_s * r.means.colour for r in records.values() if r.moves and r.device == device)
     return max(found, default=0.0)
+
+
+def coarseness(records: Records, aid: Aid) -> float:
+    """With how many times its stated sigma a velocity counts: receivers filter theirs, so that its
+    errors last for seconds (fusiond.integrity.means). A position has a state for what its fixes
+    share."""
+    if not aid.moves:
+        return 1.0
+    record = records.get(aid.source)
+    if record is None:
+        return 1.0
+    return record.means.lasting((aid.t_ns - record.heard_ns) * 1e-9)
 
 
 def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:

@@ -136,7 +136,9 @@ def strapdown_step(
     inverse = 1.0 / h
     step[0], step[1], step[2] = d0 * inverse, d1 * inverse, d2 * inverse
     # Nothing before: what is smoothed begins with this interval.
-    gain = h / (h + SMOOTH_S) if step[STEP_SMOOTH_N + 2] != 0.0 else 1.0
+    b = STEP_FORCE_B
+    begun = step[b] != 0.0 or step[b + 1] != 0.0 or step[b + 2] != 0.0
+    gain = h / (h + SMOOTH_S) if begun else 1.0
     for j in range(3):
         step[STEP_SMOOTH_N + j] += gain * (step[j] - step[STEP_SMOOTH_N + j])
     for j in range(3):

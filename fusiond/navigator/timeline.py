@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import Offer
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
@@ -90,15 +91,21 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.isolation = Isolation()
 
-    def start(self, contradicted: bool = False) -> None:
-        """Begin at the estimator's state: nothing earlier can be applied any more. `contradicted`:
-        positions have moved otherwise than their velocities."""
+    def start(self, contradicted: bool = False, used: Collection[Offer] = ()) -> None:
+        """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
+        it was made of, `used`, once more. `contradicted`: positions have moved otherwise than their
+        velocities."""
         self._next = 0
         self.isolation.reset(contradicted)
         self._checkpoints = [
             _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())
         ]
-        self._give_up(bisect_left(self._keys, (self.estimator.t_ns, "", 0)), "no_alignment")
+        t_ns = self.estimator.t_ns
+        self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
+        for row in range(bisect_left(self._keys, (t_ns + 1, "", 0)) - 1, -1, -1):
+            if any(offer in used for offer in self._entries[row].aid.offers()):
+                self._count(self._entries[row], Outcome("start"))
+                del self._entries[row], self._keys[row]
         self.imu.needed = self.estimator.sample
 
     def clear(self) -> None:
@@ -223,13 +230,14 @@ class Timeline:
         return outcome
 
     def _update(self, aid: Aid) -> Outcome:
-        """Fold one aid in; as coarser than it says where its motion is yet to be seen. Its
-        innovation then says nothing of the sigma that it states."""
-        unproven = aid.locates and self.isolation.unproven(aid.source, aid.t_ns)
-        if not unproven or self.estimator.isolates:
+        """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its
+        errors last. In the first case its innovation says nothing of the sigma that it states."""
+        if self.estimator.isolates:
             return self.estimator.update(aid)
-        outcome = self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))
-        return outcome._replace(whitened=())
+        if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
+            return self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
+        lasting = self.isolation.coarseness(aid)
+        return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         counts = self.counters.outcomes[entry.aid.source]

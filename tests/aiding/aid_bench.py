@@ -81,7 +81,7 @@ def vehicle_model() -> Model:
 
 
 def state_of(model: Model, nav: Array, xi: Array) -> State:
-    """As the filter leaves it: `step` holds the rate with the estimates taken out."""
+    """As the filter leaves it: `step` holds rate and force with the estimates taken out."""
     step = np.zeros(STEP_SIZE)
     for axis in range(3):
         bias = sum(xi[s] for s in model.parameters(9 + axis))
@@ -89,7 +89,11 @@ def state_of(model: Model, nav: Array, xi: Array) -> State:
         step[3 + axis] = (RATE_SENSED[axis] - bias) / (1.0 + scale)
     step[9:18] = dcm_from_quaternion(nav[6:]).ravel()
     felt = np.array(ACCELERATION) - [0.0, 0.0, gravity(float(nav[0]), float(nav[2]))]
-    step[18:] = dcm_from_quaternion(nav[6:]) @ (dcm_from_rpy(*RPY).T @ felt)
+    force = dcm_from_rpy(*RPY).T @ felt
+    for axis in range(3):
+        force[axis] -= sum(xi[s] for s in model.parameters(12 + axis))
+        force[axis] /= 1.0 + sum(xi[s] for s in model.parameters(18 + axis))
+    step[18:] = dcm_from_quaternion(nav[6:]) @ force
     return State(nav, xi, step, model)
 
 

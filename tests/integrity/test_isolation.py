@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.base import Outcome
-from fusiond.integrity.isolation import MOTION, Action
+from fusiond.integrity.isolation import MOTION, Action, Isolation
 from fusiond.integrity.means import ASSUMED, WHITE_SLOW, Means
 from tests.integrity.series_bench import GATE, LEVER, NAV, SD_M, Bench, S
 
@@ -90,6 +93,36 @@ def test_what_a_series_shows_lately_does_not_excuse_it() -> None:
     assert means.colour == pytest.approx(assumed)
     show(means, 4.0, range(90, 95))
     assert means.colour > math.sqrt(1.0 / WHITE_SLOW)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_a_velocity_counts_as_coarse_as_its_errors_last(rho: float) -> None:
+    """Five a second, whose errors are of first order: c^2 = (1 + rho) / (1 - rho), or one where
+    they are white; one before any was heard, and at first by half of the variance for 2 s."""
+    isolation, rng = Isolation(), np.random.default_rng(5)
+    aid = VelocityAid("gnss_velocity", 0, GATE, (8.0, 3.0, 0.0), (0.05,) * 3, LEVER)
+    assert isolation.coarseness(aid) == 1.0
+    y = rng.standard_normal(3)
+    seldom, often = 0.0, 0.0
+    for k in range(6000):
+        y = rho * y + math.sqrt(1.0 - rho**2) * rng.standard_normal(3)
+        said = replace(aid, t_ns=k * S // 5, v_ned=(8.0, 3.0 + 0.01 * (k % 7), 0.0))
+        seen = y / isolation.coarseness(said)
+        isolation.judge(said, Outcome("fused", float(seen @ seen), 3, tuple(seen.tolist())), NAV)
+        if k == 14:
+            seldom, often = (
+                isolation.coarseness(replace(said, t_ns=said.t_ns + gap))
+                for gap in (2 * S, S // 10)
+            )
+    last = math.exp(-1.0), math.exp(-0.05)
+    assert [seldom, often] == [
+        pytest.approx(math.sqrt(1.0 + 8.0 / 23.0 * r / (1.0 - r))) for r in last
+    ]
+    shown = math.sqrt((1.0 + rho) / (1.0 - rho))
+    now = replace(aid, t_ns=6000 * S // 5)
+    assert isolation.coarseness(now) == pytest.approx(shown, rel=0.25)
+    fix = PositionAid("gnss", 0, GATE, 0.53, 1.99, 40.0, (SD_M,) * 3, LEVER)
+    assert isolation.coarseness(fix) == 1.0
 
 
 def test_a_frozen_fix_while_moving_is_told_by_its_bits() -> None:

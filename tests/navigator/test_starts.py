@@ -46,6 +46,8 @@ class Case(NamedTuple):
     from_s: float = 0.0
     fixes_from_s: float = 0.0
     lever: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    late_s: float = 0.0
+    """How much later than its stamp a velocity is valid."""
 
 
 TURN_OFF = Leg(8, speed_m_s=9.0, turn_deg=90.0)
@@ -57,6 +59,9 @@ CASES = {
         (Leg(1, climb_deg=6.0), Leg(8), Leg(8, speed_m_s=10.0), Leg(30)), FORWARD, from_s=2.0
     ),
     "on the move": Case((Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER),
+    "on the move, velocities late": Case(
+        (Leg(1), Leg(6, speed_m_s=14.0), *BRAKE), MOVING, 9.0, lever=LEVER, late_s=0.12
+    ),
     "on the move, backward": Case(
         (Leg(1), Leg(6, speed_m_s=-6.0), Leg(4), Leg(4, speed_m_s=-4.0), Leg(6, turn_deg=-60.0),
          Leg(6, turn_deg=40.0), Leg(40)), MOVING_BACKWARD, 8.0,
@@ -82,10 +87,12 @@ def _antenna(case: Case) -> States:
 def _fix(case: Case, row: int, rng: np.random.Generator) -> PositionFix:
     """What the receiver says at the end of the samples `row` to `row` + `EVERY`."""
     antenna, k = _antenna(case), row // EVERY
-    p = antenna.position[k]
+    p, v = antenna.position[k], antenna.v_ned[k]
+    if case.late_s:
+        v = _truth(case).at(antenna.t_s[k : k + 1] + case.late_s, case.lever).v_ned[0]
     away = SD_M * rng.standard_normal(3) / np.abs(runs.metres(float(p[0]), float(p[2])))
     lat, lon, height = (p + away).tolist()
-    north, east, down = (antenna.v_ned[k] + SD_M_S * rng.standard_normal(3)).tolist()
+    north, east, down = (v + SD_M_S * rng.standard_normal(3)).tolist()
     t_ns = round(float(antenna.t_s[k]) * 1e9)
     fix = PositionFix("gnss", t_ns, MonotonicStamp(t_ns), lat, lon, height)
     sd: Any = {"sd_ned_m": (SD_M,) * 3, "sd_v_ned_m_s": (SD_M_S,) * 3}
@@ -164,6 +171,22 @@ def test_sigma_of_a_start_is_honest(name: str) -> None:
     assert np.mean(velocity) < HIGH
     assert np.mean(tilt_and_force) < HIGH_5
     assert np.mean(yaw_sd) < 10.0
+
+
+def test_what_a_start_was_made_of_is_not_told_once_more() -> None:
+    """It has an outcome of its own. A filter that was told it again, having felt nothing, took the
+    vehicle to fall, and its velocities' offset in time to be known to 0.05 m/s by 9.8 m/s^2."""
+    case = CASES["straight"]
+    navigator = _started(case, 3)
+    start = navigator.started
+    assert start is not None
+    counts = navigator.timeline.counters.outcomes
+    for source in ("gnss", "gnss_velocity"):
+        assert counts[source]["start"] == 1
+        assert set(counts[source]) <= {"no_alignment", "start", "fused"}
+    (slot,) = navigator.model.slots_of("gnss_velocity_time")
+    found = navigator.estimator.covariance[slot, slot]
+    assert 0.8 * start.covariance[slot, slot] < found <= 1.001 * start.covariance[slot, slot]
 
 
 def test_an_uncalibrated_sensor_is_met_on_the_move() -> None:

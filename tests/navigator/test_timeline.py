@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.integrity.isolation import Isolation
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
-from fusiond.navigator.timeline import Entry, Timeline
+from fusiond.navigator.timeline import JUDGED, Entry, Timeline
 from tests import runs
 
 Array = NDArray[np.float64]
@@ -45,7 +46,7 @@ class Drive:
         self.nav = runs.true_nav(truth, np.zeros(1))[0]
         self.sd = np.radians([0.3, 0.3, 2.0])
         rng = np.random.default_rng(8)
-        self.aids: list[Linearised] = []
+        self.aids: list[Aid] = []
         for t in np.arange(0.507, SECONDS - 1.0, 0.9):
             nav = runs.true_nav(truth, np.array([t]))[0]
             nav = runs.with_error(
@@ -94,9 +95,10 @@ def drive() -> Drive:
 
 @lru_cache(maxsize=1)
 def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
-    """The reference knows no timeline: propagate to each aid in turn, apply it, go on."""
+    """The reference knows no timeline: propagate to each aid in turn, apply it, a velocity with the
+    sigma that its series deserves, go on."""
     d = drive()
-    estimator = d.estimator()
+    estimator, isolation = d.estimator(), Isolation()
     buffer = runs.filled_buffer(IMU, d.times, d.samples)
     outcomes = []
     for aid in d.aids:
@@ -105,7 +107,11 @@ def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
             estimator.release()
         elif isinstance(aid, RdssPositionAid):
             estimator.hold()
-        outcomes.append(estimator.update(aid))
+        lasting = isolation.coarseness(aid)
+        outcome = estimator.update(aid.coarser(lasting))
+        outcomes.append(outcome)
+        if outcome.name in JUDGED:
+            isolation.judge(aid, outcome, estimator.nav)
     estimator.propagate(buffer, buffer.latest_ns)
     return estimator, outcomes
 

@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.reading import Published, sigmas
-from fusiond.estimators.smoothing.node import PUBLISHED, Nodes
+from fusiond.estimators.smoothing.node import PUBLISHED, Nodes, links
 from fusiond.estimators.update import feed_back
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
@@ -127,7 +127,7 @@ def _back(
     bodies: Array,
     ops: Array,
     counts: Indices,
-    rate_terms: Indices,
+    pairs: Indices,
     time_slot: int,
     clock_sd_s: float,
     axes_sd_rad: float,
@@ -141,7 +141,7 @@ def _back(
 ) -> None:
     """Go back over nodes with `lam` (n,) and `big` (n, n), lambda and Lambda, in place; the arrays
     of `Smoothed` are written. A body is laid out as fusiond.estimators.smoothing.node says."""
-    n, rates = lam.shape[0], rate_terms.shape[1]
+    n, count = lam.shape[0], pairs.shape[1]
     g, turned = np.empty(n), np.empty((n, n))
     half = np.empty((PUBLISHED, n))
     nav, sd, d = np.empty(NAV_SIZE), np.empty(9), np.empty(PUBLISHED)
@@ -152,7 +152,7 @@ def _back(
         rest = body[PUBLISHED * n :]
         phi = rest[: CORE_SIZE * n].reshape(CORE_SIZE, n)
         rest = rest[CORE_SIZE * n :]
-        diagonal, of_rates, rest = rest[:n], rest[n : n + rates], rest[n + rates :]
+        diagonal, linked, rest = rest[:n], rest[n : n + count], rest[n + count :]
         kept, fed_back = rest[:PUBLISHED], rest[PUBLISHED : 2 * PUBLISHED]
         rest = rest[2 * PUBLISHED :]
         nav[:] = rest[:NAV_SIZE]
@@ -226,8 +226,8 @@ def _back(
                 c = big[i, k]
                 for j in range(n):
                     turned[i, j] += c * phi[k, j]
-            for k in range(rates):
-                turned[i, rate_terms[1, k]] += big[i, rate_terms[0, k]] * of_rates[k]
+            for k in range(count):
+                turned[i, pairs[1, k]] += big[i, pairs[0, k]] * linked[k]
         for i in range(n):
             c = diagonal[i] if i >= CORE_SIZE else 0.0
             g[i] = c * lam[i]
@@ -240,11 +240,11 @@ def _back(
                     g[i] += c * lam[k]
                     for j in range(n):
                         big[i, j] += c * turned[k, j]
-        for k in range(rates):
-            offset, rate, c = rate_terms[0, k], rate_terms[1, k], of_rates[k]
-            g[rate] += c * lam[offset]
+        for k in range(count):
+            to, of, c = pairs[0, k], pairs[1, k], linked[k]
+            g[of] += c * lam[to]
             for j in range(n):
-                big[rate, j] += c * turned[offset, j]
+                big[of, j] += c * turned[to, j]
         for i in range(n):
             lam[i] = g[i]
             for j in range(i):
@@ -260,7 +260,7 @@ class Smoother:
     """
 
     def __init__(self, model: Model, published: Published) -> None:
-        self._model, self._published = model, published
+        self._links, self._published = links(model), published
         self._lambda, self._capital = np.zeros(model.size), np.zeros((model.size, model.size))
 
     def back(self, nodes: Nodes) -> Smoothed:
@@ -274,9 +274,8 @@ class Smoother:
             np.empty((count, CORE_SIZE)),
             np.empty((count, 9)),
         )
-        model = self._model
         _back(
-            *(nodes.bodies, nodes.ops, nodes.counts, model.rate_terms, *self._published),
+            *(nodes.bodies, nodes.ops, nodes.counts, self._links, *self._published),
             *(self._lambda, self._capital),
             *smoothed[1:],
         )

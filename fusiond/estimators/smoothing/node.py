@@ -12,21 +12,22 @@ A node is an instant t_j at which aids were fused, or one between them where the
 
 and the navigation state, offset and last step, by which it is published. Process noise, and what
 widens P for whatever other reason, are in P alone. Of Phi the nine rows of the navigation errors
-are kept, the diagonal of the parameters' rows, and what an offset takes from its rate; the rest is
-zero, exactly.
+are kept, the diagonal of the parameters' rows, and `links`; the rest is zero, exactly.
 
 All lies in one row of doubles, `body`; the measurements in rows of 2 n + 2, `ops`.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.error_model import CORE_SIZE
+from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
 
 Array = NDArray[np.float64]
@@ -51,9 +52,19 @@ class Nodes(NamedTuple):
         return Nodes(self.t_ns[:count], self.bodies[:count], self.counts[:count], self.ops[:rows])
 
 
-def body_size(size: int, rates: int) -> int:
-    """Doubles of a body, for `size` states of which `rates` are rates of others."""
-    of_covariance, of_transition = PUBLISHED * size, CORE_SIZE * size + size + rates
+def links(model: Model) -> Indices:
+    """(2, k): rows and columns of what Phi has beside the navigation errors' rows and its diagonal:
+    offsets by their rates, and a vertical accelerometer's bias by those of the others, where the
+    axes of a tilt were turned (fusiond.estimators.tilt_axes)."""
+    down, *others = [model.parameters(FORCE_ERROR + axis) for axis in (2, 0, 1)]
+    slots = [*down[1:], *itertools.chain(*others)] if down else []
+    pairs = np.array([[down[0]] * len(slots), slots] if down else [[], []], dtype=np.int64)
+    return np.ascontiguousarray(np.hstack([model.rate_terms, pairs]))
+
+
+def body_size(size: int, linked: int) -> int:
+    """Doubles of a body, for `size` states and so many `links`."""
+    of_covariance, of_transition = PUBLISHED * size, CORE_SIZE * size + size + linked
     return of_covariance + of_transition + 2 * PUBLISHED + NAV_SIZE + 1 + STEP_SIZE
 
 
@@ -69,7 +80,7 @@ def write_body(
     nav: Array,
     xi: Array,
     step: Array,
-    rate_terms: Indices,
+    pairs: Indices,
     time_slot: int,
     body: Array,
 ) -> None:
@@ -89,9 +100,9 @@ def write_body(
     for i in range(n):
         body[at + i] = phi[i, i]
     at += n
-    for k in range(rate_terms.shape[1]):
-        body[at + k] = phi[rate_terms[0, k], rate_terms[1, k]]
-    at += rate_terms.shape[1]
+    for k in range(pairs.shape[1]):
+        body[at + k] = phi[pairs[0, k], pairs[1, k]]
+    at += pairs.shape[1]
     for i in range(PUBLISHED):
         slot = i if i < CORE_SIZE else time_slot
         body[at + i] = dx[slot] if slot >= 0 else 0.0

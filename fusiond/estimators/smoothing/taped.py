@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import Outcome, Screened, Snapshot
-from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.reading import Published
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.smoothing.node import Nodes, body_size, write_body, write_rows
+from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
+from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -52,7 +52,7 @@ class _Kept(NamedTuple):
     closed_ns: int
 
 
-class TapedKalman(KalmanEstimator):
+class TapedKalman(TiltAxesFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`), with a tape.
 
     `newest` is the newest node of the present start; `on_ended` is given the last one of a start
@@ -74,7 +74,8 @@ class TapedKalman(KalmanEstimator):
         self._none: Array = np.empty((0, 2 * model.size + 2))
         self._fed_back: Array = np.zeros(model.size)
         self._closed_ns = 0
-        self._body_size = body_size(model.size, model.rate_terms.shape[1])
+        self._links = links(model)
+        self._body_size = body_size(model.size, self._links.shape[1])
 
     # ------------------------------------------------------------------ the tape
 
@@ -103,10 +104,10 @@ class TapedKalman(KalmanEstimator):
     def _close(self) -> None:
         """A node of what has happened since the last."""
         body = np.empty(self._body_size)
-        model, dx = self.model, self._dxs[0]
+        dx = self._dxs[0]
         write_body(
             *(self._covs[0], self._phi, dx, self._fed_back, self.nav, self.xi, self.step),
-            *(model.rate_terms, self.published.time_slot, body),
+            *(self._links, self.published.time_slot, body),
         )
         ops = self._ops[0] if len(self._ops) == 1 else np.concatenate([self._none, *self._ops])
         self.newest = Node(self.newest, self.t_ns, body, ops)
@@ -135,11 +136,10 @@ class TapedKalman(KalmanEstimator):
             self._close()
         super().propagate(imu, target_ns, record)
 
-    def update(self, aid: Linearised) -> Outcome:
-        """Fold one aid in, or name why not."""
+    def _fold_in(self, aid: Linearised) -> Outcome:
         np.copyto(self._before, self._covs[0])
         held = self._dxs[0].copy()
-        outcome = super().update(aid)
+        outcome = super()._fold_in(aid)
         rows = self._rows
         if outcome.name == "fused" and not isinstance(rows, NotApplicable):
             z, h, r = rows
@@ -148,6 +148,12 @@ class TapedKalman(KalmanEstimator):
                 z, h, r = z[kept], h[kept], r[kept]
             self._fold(held, z, h, r)
         return outcome
+
+    def _carry_over(self, t: Array) -> None:
+        """An error e (n,) is T e from now on, T (n, n)."""
+        self._close()  # with P as it was: T begins the transition to the next node
+        super()._carry_over(t)
+        self._phi[: len(t), : len(t)] = t
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -128,7 +128,9 @@ def _moved_off(
     antenna = gained + dcm @ np.cross(rate, velocity.lever)
     felt_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
     sd_felt = _felt_sd(by, g, (velocity.t_ns - standing.end_ns) * 1e-9, turned, speed)
-    sd_speed = max(velocity.sd[:2])
+    acceleration = dcm @ f.forces[1] + [0.0, 0.0, g]
+    late = math.hypot(*acceleration[:2]) * _sd_late_s(by, velocity)
+    sd_speed = math.hypot(max(velocity.sd[:2]), late)
     if abs(felt_m_s - speed) > AGREEMENT_SIGMAS * math.hypot(sd_felt, sd_speed):
         return None
     felt = wrap_angle(math.atan2(antenna[1], antenna[0]) - turned)
@@ -238,6 +240,7 @@ class Ways:
     _options: AlignmentOptions
     _noise: ImuNoise
     _g: float
+    _sd_late_s: float
 
     def fit(self, backward: bool) -> motion.Fit:
         """The best fit of a vehicle that drives forward, or backward."""
@@ -245,9 +248,8 @@ class Ways:
         course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
         along = _along(self._options, velocity, self.felt.rates[-1], backward)
         yaw = course - along.angle
-        return motion.fit(
-            self._past, self.felt, self._measured, self._noise, self._g, yaw, along.sd
-        )
+        given = self._past, self.felt, self._measured, self._noise, self._g
+        return motion.fit(*given, yaw, along.sd, self._sd_late_s)
 
 
 def ways(
@@ -257,13 +259,15 @@ def ways(
     noise: ImuNoise,
     g: float,
     most: int = motion.MOST_FIXES,
+    sd_late_s: float = 0.0,
 ) -> Ways:
-    """Of velocities in order of time; of `most` of them, evenly, where they are more."""
+    """Of velocities in order of time, of `most` of them, evenly, where they are more; they are
+    late by 0 to within `sd_late_s`."""
     every = math.ceil(len(usable) / most)
     fixes = usable[::-1][::every][::-1]
     m = motion.measured(fixes)
-    f = motion.felt(past, m.instants, np.zeros(3))
-    return Ways(f, past, m, fixes[-1], options, noise, g)
+    f = motion.felt(past, m.instants, motion.rate_before_motion(past, m))
+    return Ways(f, past, m, fixes[-1], options, noise, g, sd_late_s)
 
 
 def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start | None:
@@ -275,7 +279,8 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         by.known.doubted("moving: collecting fixes")
         return None
     lat, _, height = (float(v) for v in place[1])
-    either = ways(imu, usable, by.options, by.noise, gravity(lat, height))
+    late = _sd_late_s(by, velocity)
+    either = ways(imu, usable, by.options, by.noise, gravity(lat, height), sd_late_s=late)
     rate = either.felt.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)
@@ -295,7 +300,7 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
             LEAST_YAW_SD_RAD,
             rate,
             "GNSS course, on the move" + BACKWARD,
-            fitted=Fitted(backward_fit.biases, doubt * backward_fit.covariance),
+            fitted=_fitted(backward_fit, doubt),
         )
     fast = speed > by.options.max_reverse_m_s
     moving_s = (velocity.t_ns - by.known.moving_since_ns) * 1e-9
@@ -317,8 +322,17 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
         LEAST_YAW_SD_RAD,
         rate,
         "GNSS course, on the move",
-        fitted=Fitted(forward_fit.biases, doubt * forward_fit.covariance),
+        fitted=_fitted(forward_fit, doubt),
     )
+
+
+def _sd_late_s(by: Basis, velocity: VelocityOffer) -> float:
+    """One sigma of how late a receiver's velocities are; 0 where that is not estimated."""
+    return float(sum(by.model.initial[slot] for slot in by.model.slots_of(velocity.time)))
+
+
+def _fitted(fit: motion.Fit, doubt: float) -> Fitted:
+    return Fitted(fit.biases, fit.late_s, doubt * fit.covariance)
 
 
 def _build(
@@ -341,6 +355,8 @@ def _build(
     if fitted is not None:
         force = force - fitted.biases[:3]
     acceleration = dcm @ force + [0.0, 0.0, gravity(float(place[1][0]), float(place[1][2]))]
+    if fitted is not None:
+        velocity = velocity - acceleration * fitted.late_s
     return build_start(
         by.model,
         offer.t_ns,

@@ -1,12 +1,15 @@
 r"""Which way a moving vehicle faces: felt against measured changes of velocity, by least squares.
 
-    v(t_k) = v_0 + C_0 a_k + g t_k + C_k (w_k x l),   a_k = int C(0, t) (f - b_f) dt
+    v(t_k) = v_0 + C_0 a_k + g t_k + C_k (w_k x l) + (C_k (f_k - b_f) + g) tau
+    a_k = int C(0, t) (f - b_f) dt
 
-C_0 attitude at the first fix, C(0, t) its change by the gyros (less b_w), l the antenna's lever.
-v_0, the rotation vector phi of C_0 = exp(phi) R_z(yaw_0), b_f and b_w are sought, with the data
-sheet's biases, a road's slope and the course's sigma as priors; C(0, t) is integrated anew with the
-rate bias found, for 3 deg/s turn the axes by a radian in 20 s. At the last fix the attitude is
-C_T = C_0 C(0, T), and its error follows from those of C_0 and b_w,
+C_0 attitude at the first fix, C(0, t) its change by the gyros (less b_w), l the antenna's lever,
+tau how much later than their stamps the velocities are valid. v_0, the rotation vector phi of
+C_0 = exp(phi) R_z(yaw_0), b_f, b_w and tau are sought, with the data sheet's biases, a road's
+slope, the course's sigma and that of the receiver's offset as priors (pulling away by 3 m/s^2 with
+velocities that are 0.1 s late gains 0.3 m/s too much, in 5 s a third of a degree of tilt); C(0, t)
+is integrated anew with the rate bias found, for 3 deg/s turn the axes by a radian in 20 s. At the
+last fix the attitude is C_T = C_0 C(0, T), and its error follows from those of C_0 and b_w,
 
     phi_T = phi + C_0 D db_w,   D = d C(0, T) / d b_w as a rotation vector (3, 3)
 
@@ -64,6 +67,8 @@ CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
 CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 # A rate or a force at an instant is the mean of so much (ns) to each side.
 AROUND_NS = 100_000_000
+# A velocity below so many of its sigmas is none.
+STILL_SIGMAS = 3.0
 MOST_FIXES = 20
 """Of the fixes, evenly: more add little, for their changes are alike."""
 
@@ -105,13 +110,14 @@ class Measured(NamedTuple):
 class Felt(NamedTuple):
     """Integrals from the first fix to each of k, with a rate bias (3,) taken off: times (k,) s,
     gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of the velocity
-    by force and rate bias (k, 3, 6), rates at the fixes (k, 3)."""
+    by force and rate bias (k, 3, 6), rates and forces at the fixes (k, 3)."""
 
     t_s: Array
     gained: Array
     turned: Array
     slopes: Array
     rates: Array
+    forces: Array
     bias: Array
 
     @property
@@ -124,12 +130,14 @@ class Felt(NamedTuple):
 
 class Fit(NamedTuple):
     """The best fit under one hypothesis: cost, degrees of freedom, attitude C_nb (3, 3) at the last
-    fix, biases (6,) of force and rate, covariance (9, 9) of attitude and biases."""
+    fix, biases (6,) of force and rate, the velocities' offset in time (s), covariance (10, 10) of
+    them all."""
 
     cost: float
     degrees: int
     dcm: Array
     biases: Array
+    late_s: float
     covariance: Array
 
 
@@ -148,6 +156,19 @@ def measured(fixes: Sequence[VelocityOffer]) -> Measured:
         np.array([sd for _, sd in found]),
         np.array([x.lever for x in fixes]),
     )
+
+
+def rate_before_motion(past: Past, m: Measured) -> Array:
+    """Mean rate (3,) over the first of the fixes, as long as they say that it stands: what a
+    linearisation about no bias would have to find in the dark, 60 deg of turning for 3 deg/s in
+    20 s. Nothing if it never stood."""
+    moves = (np.abs(m.velocity[:, :2]) > STILL_SIGMAS * m.sd[:, :2]).any(axis=1)
+    stood = int(np.argmax(moves)) if moves.any() else len(moves)
+    first, end = past.index_after(int(m.instants[0])), past.index_after(int(m.instants[stood - 1]))
+    if stood < 2 or end <= first:
+        return np.zeros(3)
+    mean: Array = past.samples[first:end, :3].mean(axis=0)
+    return mean
 
 
 def rate_at(past: Past, t_ns: int) -> Array:
@@ -172,20 +193,21 @@ def felt(past: Past, instants: NDArray[np.int64], bias: Array) -> Felt:
     slopes = np.empty((len(at), 3, 6))
     integrate_felt(times, past.samples[first:end], bias, at, gained, turned, slopes)
     t_s = (instants - instants[0]) * 1e-9
-    return Felt(t_s, gained, turned, slopes, _rates_at(past, instants) - bias, bias)
+    means = _samples_at(past, instants)
+    return Felt(t_s, gained, turned, slopes, means[:, :3] - bias, means[:, 3:], bias)
 
 
-def _rates_at(past: Past, instants: NDArray[np.int64]) -> Array:
-    """`rate_at` (k, 3) of instants (k,) in their order."""
+def _samples_at(past: Past, instants: NDArray[np.int64]) -> Array:
+    """`samples_at` (k, 6) of instants (k,) in their order."""
     low = max(0, past.index_after(int(instants[0]) - AROUND_NS) - 1)
     end = past.index_after(int(instants[-1]) + AROUND_NS)
     times = past.times[low:end]
     before = np.maximum(0, np.searchsorted(times, instants - AROUND_NS, side="right") - 1)
     after = np.maximum(before + 1, np.searchsorted(times, instants + AROUND_NS, side="right"))
-    sums = np.zeros((end - low + 1, 3))
-    np.cumsum(past.samples[low:end, :3], axis=0, out=sums[1:])
-    rates: Array = (sums[after] - sums[before]) / (after - before)[:, None]
-    return rates
+    sums = np.zeros((end - low + 1, 6))
+    np.cumsum(past.samples[low:end], axis=0, out=sums[1:])
+    means: Array = (sums[after] - sums[before]) / (after - before)[:, None]
+    return means
 
 
 def fit(
@@ -196,57 +218,69 @@ def fit(
     g: float,
     yaw: float,
     sd_yaw: float,
+    sd_late_s: float = 0.0,
 ) -> Fit:
-    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, begun at `f`."""
+    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, and velocities that are
+    late by 0, to within `sd_late_s`, begun at `f`."""
     white = noise.force_noise**2 * f.t_s
     white += (STANDARD_GRAVITY_M_S2 * noise.rate_noise) ** 2 * f.t_s**3 / 3.0
     weight = 1.0 / np.sqrt(m.sd**2 + white[:, None])
     force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
     rate = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
-    prior = np.array([TILT_SD_RAD] * 2 + [sd_yaw] + [force] * 3 + [rate] * 3)
+    # The offset in its sigmas: one that is known has a column of zeros.
+    prior = np.array([TILT_SD_RAD] * 2 + [sd_yaw] + [force] * 3 + [rate] * 3 + [1.0])
     gained = m.velocity - np.outer(f.t_s, [0.0, 0.0, g])
-    here = Guess(dcm_from_rpy(0.0, 0.0, yaw), np.zeros(6), m.velocity[0])
+    biases = np.concatenate([np.zeros(3), f.bias])
+    here = Guess(dcm_from_rpy(0.0, 0.0, yaw), biases, 0.0, m.velocity[0])
     for _ in range(ITERATIONS):
         if np.abs(here.biases[3:] - f.bias).max() * f.t_s[-1] > BENT_RAD:
             f = felt(past, m.instants, here.biases[3:])
         dcm, there = _since_first(f, m, here)
-        h = np.zeros((len(there), 3, 12))
+        while_late = sd_late_s * _accelerations(f, dcm, here, g)
+        h = np.zeros((len(there), 3, 13))
         h[:, :, :3] = np.einsum("ijk,mk->mij", CROSS, there)  # d(exp(phi) u) = dphi x u
         h[:, :, 3:9] = dcm @ f.slopes
         h[:, :, 6:9] -= h[:, :, :3] @ (dcm @ f.turns)
-        h[:, :, 9:] = np.eye(3)
+        h[:, :, 9] = while_late
+        h[:, :, 10:] = np.eye(3)
         h *= weight[:, :, None]
-        rows = np.vstack([h.reshape(-1, 12), np.hstack([np.diag(1.0 / prior), np.zeros((9, 3))])])
-        z = (gained - here.first - there) * weight
+        rows = np.vstack([h.reshape(-1, 13), np.hstack([np.diag(1.0 / prior), np.zeros((10, 3))])])
+        z = (gained - here.first - there - here.late * while_late) * weight
         z = np.concatenate([z.ravel(), here.apart(yaw) / prior])
         step = np.linalg.lstsq(rows, z, rcond=None)[0]
         here = here.moved(step)
         if np.linalg.norm(rows @ step) < CONVERGED:
             break
-    z = (gained - here.first - _since_first(f, m, here)[1]) * weight
+    dcm, there = _since_first(f, m, here)
+    while_late = sd_late_s * _accelerations(f, dcm, here, g)
+    z = (gained - here.first - there - here.late * while_late) * weight
     cost = float((z**2).sum() + ((here.apart(yaw) / prior) ** 2).sum())
-    covariance = np.linalg.inv(rows.T @ rows)[:9, :9]
-    return Fit(cost, max(1, z.size - 3), here.last, here.biases, covariance)
+    scale = np.array([1.0] * 9 + [sd_late_s])
+    covariance = np.linalg.inv(rows.T @ rows)[:10, :10] * np.outer(scale, scale)
+    late_s = sd_late_s * here.late
+    return Fit(cost, max(1, z.size - 3), here.last, here.biases, late_s, covariance)
 
 
 class Guess(NamedTuple):
-    """Attitude C_nb (3, 3) at the last fix, biases (6,) of force and rate, velocity (3,) at the
-    first fix."""
+    """Attitude C_nb (3, 3) at the last fix, biases (6,) of force and rate, offset in time in
+    sigmas, velocity (3,) at the first fix."""
 
     last: Array
     biases: Array
+    late: float
     first: Array
 
     def moved(self, step: Array) -> Guess:
-        """By a step (12,)."""
+        """By a step (13,)."""
         last = _turn(step[:3]) @ self.last
-        return Guess(last, self.biases + step[3:9], self.first + step[9:])
+        late = self.late + float(step[9])
+        return Guess(last, self.biases + step[3:9], late, self.first + step[10:])
 
     def apart(self, yaw: float) -> Array:
-        """How far the priors (9,) are: level, `yaw` (rad), no biases."""
+        """How far the priors (10,) are: level, `yaw` (rad), no biases, no offset."""
         c = self.last
         apart = wrap_angle(yaw - math.atan2(c[1, 0], c[0, 0]))
-        return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases])
+        return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases, [-self.late]])
 
 
 def _since_first(f: Felt, m: Measured, here: Guess) -> tuple[Array, Array]:
@@ -257,6 +291,13 @@ def _since_first(f: Felt, m: Measured, here: Guess) -> tuple[Array, Array]:
     levers = np.einsum("ijk,mj,mk->mi", CROSS, f.rates, m.levers)
     arms = (f.turned @ levers[:, :, None])[:, :, 0]
     return dcm, (f.gained + f.slopes @ np.concatenate([here.biases[:3], more]) + arms) @ dcm.T
+
+
+def _accelerations(f: Felt, dcm: Array, here: Guess, g: float) -> Array:
+    """Of the body, NED (k, 3) at the fixes, with C_0 (3, 3)."""
+    forces = (dcm @ f.turned) @ (f.forces - here.biases[:3])[:, :, None]
+    accelerations: Array = forces[:, :, 0] + [0.0, 0.0, g]
+    return accelerations
 
 
 def _turn(phi: Array) -> Array:

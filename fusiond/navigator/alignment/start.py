@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.offers import HeadingOffer, PositionOffer, VelocityOffer
+from fusiond.aiding.offers import HeadingOffer, Offer, PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import (
@@ -68,10 +68,12 @@ class Levelled(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """Force and rate biases (6,) of a level found in motion, and the covariance (9, 9) that they
-    share with the attitude, which comes first."""
+    """Force and rate biases (6,) of a level found in motion, offset in time (s) of the velocities
+    that it was found from, and the covariance (10, 10) that they share with the attitude, which
+    comes first."""
 
     biases: Array
+    late_s: float
     covariance: Array
 
 
@@ -89,7 +91,8 @@ class Start:
 
     `turns`: the heading is known so poorly that the filter should update in the coordinates of
     `fusiond.estimators.invariant`. `contradicted`: before it, positions have moved otherwise than
-    the velocities of the same receiver.
+    the velocities of the same receiver. `used`: what of its own instant it was made of, which no
+    filter may be told once more.
     """
 
     t_ns: int
@@ -99,6 +102,7 @@ class Start:
     how: str
     turns: bool = False
     contradicted: bool = False
+    used: tuple[Offer, ...] = ()
 
     @property
     def backward(self) -> bool:
@@ -157,7 +161,8 @@ def build_start(
             slot = model.parameters(9 + axis)[0]
             p[slot, slot] += float(unexplained[axis]) ** 2
     if fitted is not None:
-        _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2])
+        time = model.slots_of(moves.offer.time) if moves is not None else []
+        _take_fitted(model, p, xi, fitted, -gravity(lat, height) * dcm[2], time)
     if levelled is not None:
         _correlate(model, p, levelled.dcm, lat, height, compassed)
     if heading is not None and heading.shared:
@@ -167,7 +172,9 @@ def build_start(
         _by_fix(model, by, fix, dcm, velocity)
     if moves is not None:
         _by_velocity(model, by, moves, dcm)
-    return Start(t_ns, nav, xi, by @ p @ by.T, how)
+    made_of = fix, moves.offer if moves is not None else None, heading
+    used = tuple(offer for offer in made_of if offer is not None)
+    return Start(t_ns, nav, xi, by @ p @ by.T, how, used=used)
 
 
 def _by_heading(model: Model, p: Array, heading: HeadingOffer) -> None:
@@ -215,9 +222,11 @@ def _by_velocity(model: Model, by: Array, moves: Moves, dcm: Array) -> None:
     by[~model.active] = 0.0
 
 
-def _take_fitted(model: Model, p: Array, xi: Array, fitted: Fitted, force: Array) -> None:
-    """Take biases as fitted, with the covariance that they share with the attitude; what P has of
-    attitude already is added to it.
+def _take_fitted(
+    model: Model, p: Array, xi: Array, fitted: Fitted, force: Array, time: list[int]
+) -> None:
+    """Take biases, and the offset of slots `time` (0 or 1), as fitted, with the covariance that
+    they share with the attitude; what P has of attitude already is added to it.
 
     What was felt as a force bias is b + s f, of which f (3,) is all but gravity: where the model
     has the scale factor s, b is known no better than s f, and cov(b, s) = -f var(s).
@@ -230,6 +239,10 @@ def _take_fitted(model: Model, p: Array, xi: Array, fitted: Fitted, force: Array
             rows.append(3 + row)
             xi[slot] = fitted.biases[row]
             p[slot, slot] = 0.0
+    for slot in time:
+        slots.append(slot)
+        rows.append(9)
+        xi[slot], p[slot, slot] = fitted.late_s, 0.0
     p[np.ix_(slots, slots)] += fitted.covariance[np.ix_(rows, rows)]
     for axis in range(3):
         for slot in model.parameters(FORCE_ERROR + axis)[:1]:

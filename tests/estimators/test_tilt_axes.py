@@ -1,0 +1,90 @@
+"""The axes in which a tilt is known, when an update turns the heading."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusiond.aiding.attitude import AttitudeAid, HeadingAid
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.invariant import InvariantFilter
+from fusiond.estimators.tilt_axes import heading_turn
+from fusiond.models.catalogue import make_model
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.error_model import DV, PHI
+from fusiond.navigation.rotation import (
+    dcm_from_quaternion,
+    dcm_from_rpy,
+    quaternion_from_rpy,
+    rpy_from_dcm,
+)
+from tests import runs
+
+Array = NDArray[np.float64]
+
+FORCE_SD, KNOWN_SD = 0.1, 1e-3
+HEADING_SD_RAD = math.radians(3.0)
+
+
+def _felt(f: InvariantFilter) -> Array:
+    """What tilt and force biases make of the acceleration, north, east, down: rows (3, n)."""
+    rows = np.zeros((3, f.model.size))
+    rows[:2, PHI : PHI + 2] = STANDARD_GRAVITY_M_S2 * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    rows[:, 12:15] = dcm_from_quaternion(f.nav[6:])
+    return rows
+
+
+def _straight_on(yaw_rad: float) -> InvariantFilter:
+    """At 20 m/s: heading to `HEADING_SD_RAD`, force biases to `FORCE_SD`, and what they and the
+    tilt make together to `KNOWN_SD`."""
+    f = InvariantFilter(make_model("ins15", imu_noise(Imu())), 1.0)
+    n = f.model.size
+    nav = runs.level_nav(
+        (0.0, 0.0, yaw_rad), (20.0 * math.cos(yaw_rad), 20.0 * math.sin(yaw_rad), 0.0)
+    )
+    p = np.diag(f.model.initial**2)
+    p[PHI : PHI + 2, PHI : PHI + 2] = KNOWN_SD**2 * np.eye(2)
+    p[PHI + 2, PHI + 2] = HEADING_SD_RAD**2
+    p[DV : DV + 6, DV : DV + 6] = 0.01 * np.eye(6)
+    p[12:15, 12:15] = np.diag([FORCE_SD**2, FORCE_SD**2, KNOWN_SD**2])
+    f.initialise(0, 0, nav, np.zeros(n), np.eye(n))
+    felt = np.eye(n)
+    felt[[PHI, PHI + 1, 14]] = _felt(f)
+    from_felt = np.linalg.inv(felt)
+    f.covariance[:] = from_felt @ p @ from_felt.T
+    return f
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 75.0, -160.0])
+def test_a_turned_heading_leaves_what_tilt_and_bias_make_together(yaw_deg: float) -> None:
+    f = _straight_on(math.radians(yaw_deg))
+    for off_deg in (3.0, -4.0, 5.0):
+        f.covariance[2, 2] = HEADING_SD_RAD**2
+        yaw = math.radians(yaw_deg + off_deg)
+        assert f.update(HeadingAid("compass", 0, 0.9999, yaw, HEADING_SD_RAD)).name == "fused"
+        known = _felt(f) @ f.covariance @ _felt(f).T
+        assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
+        assert np.sqrt(np.diag(f.covariance)[12:14]) == pytest.approx(FORCE_SD, rel=0.01)
+        assert f.covariance == pytest.approx(f.covariance.T, abs=1e-15)
+
+
+def test_a_corrected_tilt_leaves_what_the_biases_make_downward() -> None:
+    f = _straight_on(0.3)
+    level = math.radians(2.0)
+    aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
+    assert f.update(aid).name == "fused"
+    known = _felt(f) @ f.covariance @ _felt(f).T
+    assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
+
+
+def test_how_far_a_heading_was_turned() -> None:
+    before = np.array(quaternion_from_rpy(0.1, -0.2, 3.0))
+    for psi in (0.0, 1e-3, -0.4, 2.5):
+        turned = dcm_from_rpy(0.0, 0.0, psi) @ dcm_from_quaternion(before)
+        after = np.array(quaternion_from_rpy(*rpy_from_dcm(turned)))
+        assert heading_turn(before, after) == pytest.approx(psi, abs=1e-12)
+        assert heading_turn(before, -after) == pytest.approx(psi, abs=1e-12)
