@@ -28,7 +28,7 @@ from fusiond.estimators.propagation import (
     scratch_size,
     sensor_estimates,
 )
-from fusiond.estimators.reading import sigmas
+from fusiond.estimators.reading import Published, sigmas
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
@@ -117,9 +117,8 @@ class Estimator(Protocol):
     nav: Array
     xi: Array
     step: Array
-    time_slot: int
-    """Of the offset in time that solutions are published with (fusiond.estimators.reading): the
-    model's, or -1 where the receiver has shown to be no clock."""
+    published: Published
+    """What solutions are published by: at first the clock of the model's receiver."""
 
     @property
     def covariance(self) -> Array:
@@ -136,6 +135,9 @@ class Estimator(Protocol):
     @property
     def isolated(self) -> dict[str, str]:
         """Sources that a fault detection keeps out of the solution, and why."""
+
+    def publish_by(self, published: Published) -> None:
+        """From the next start on."""
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -187,7 +189,7 @@ class ErrorStateFilter:
 
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         self.model = model
-        self.time_slot = model.time_slot
+        self.published = Published(model.time_slot)
         self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
@@ -225,6 +227,10 @@ class ErrorStateFilter:
         """Sources that a fault detection keeps out of the solution, and why."""
         return {}
 
+    def publish_by(self, published: Published) -> None:
+        """From the next start on."""
+        self.published = published
+
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
         self.t_ns, self.sample = t_ns, sample
@@ -256,7 +262,7 @@ class ErrorStateFilter:
             self._phi,
             model.packed,
             imu.packed,
-            self.time_slot,
+            *self.published,
             self.sample - start,
             imu.end,
             self.t_ns,
@@ -282,7 +288,7 @@ class ErrorStateFilter:
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self._covs[0], self.nav, self.step, self.time_slot, out)
+        sigmas(self._covs[0], self.nav, self.step, *self.published, out)
         return out
 
     def _feed_back(self, dx: Array) -> None:

@@ -127,7 +127,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
 
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], u1[::1], f8[::1],"
-        "i8, i8, i8, i8, i8, i8, i8)",
+        "i8, f8, f8, i8, i8, i8, i8, i8, i8)",
         variant=width,
     )
     def propagate(
@@ -139,6 +139,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         model: NDArray[np.uint8],
         imu: Array,
         time_slot: int,
+        clock_sd_s: float,
+        axes_sd_rad: float,
         first: int,
         end: int,
         now: int,
@@ -225,7 +227,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             if now == times[i]:
                 if record:
                     in_fix_time(nav, xi, step, time_slot, nav_out[i])
-                    sigmas(covs[0], nav, step, time_slot, sigma_out[i])
+                    sigmas(covs[0], nav, step, time_slot, clock_sd_s, axes_sd_rad, sigma_out[i])
                 i += 1
         return i, now
 

@@ -1,4 +1,4 @@
-r"""Compiled kernels: what a filter publishes of its state, by the receiver's clock.
+r"""Compiled kernels: what a filter publishes of its state, by the receiver's clock or by its own.
 
 A receiver defines the time that others label a solution with. Where a filter estimates by how much
 tau its fixes are later valid than their stamps say, its own instant t is t - tau there, and what it
@@ -12,11 +12,21 @@ P_tt is of tau's error, true minus estimate as of all parameters; that of p, v a
 fusiond.navigation.error_model has it. Fixes measure p and v: there the offset's own sigma cancels.
 Nothing measures the attitude by the receiver's clock, and in a bend w times the sigma of tau can be
 the most of what is unknown of the heading. a is smoothed.
+
+By a receiver whose fixes have shown to be late nobody sets a clock. What is published is then for
+the filter's own t, and tau is by how much that clock, the IMU's, is off: nothing estimates it, so
+it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
+clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
+
+Attitude is that of the axes of the inertial unit that was configured. Once a spare has taken over,
+C_nb is of the spare's, and nothing says how the two sit against each other beyond `axes_sd_rad`,
+about each axis: cov(phi) grows by its square.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +47,16 @@ from fusiond.navigation.strapdown import (
 )
 
 Array = NDArray[np.float64]
+
+
+class Published(NamedTuple):
+    """What a filter's state is published by: the parameter that is the offset of the receiver's
+    clock, or -1 and one sigma (s) of the filter's own; and one sigma (rad) about each axis of what
+    the unit in use is turned by against that of which the attitude is published."""
+
+    time_slot: int
+    clock_sd_s: float = 0.0
+    axes_sd_rad: float = 0.0
 
 
 @compiled("f8(f8[::1], f8[::1], i8)", forceinline=True)
@@ -79,31 +99,47 @@ def in_fix_time(nav: Array, xi: Array, step: Array, time_slot: int, out: Array) 
     )
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8[::1])")
-def sigmas(cov: Array, nav: Array, step: Array, time_slot: int, out: Array) -> None:
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])")
+def sigmas(
+    cov: Array,
+    nav: Array,
+    step: Array,
+    time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
+    out: Array,
+) -> None:
     """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
 
-    Roll, pitch and yaw follow from phi by Euler kinematics, with C_nb as `step` (21,) holds it.
+    By the clock and the axes of `Published`. Roll, pitch and yaw follow from phi by Euler
+    kinematics, with C_nb as `step` (21,) holds it.
     """
     t = time_slot
+    tt = cov[t, t] if t >= 0 else clock_sd_s * clock_sd_s
     for i in range(3):
         position, velocity = cov[6 + i, 6 + i], cov[3 + i, 3 + i]
-        if t >= 0:
+        if tt > 0.0:
             v, a = nav[VN + i], _acceleration(nav, step, i)
-            position = max(0.0, position + v * (v * cov[t, t] - 2.0 * cov[6 + i, t]))
-            velocity = max(0.0, velocity + a * (a * cov[t, t] - 2.0 * cov[3 + i, t]))
+            rt = cov[6 + i, t] if t >= 0 else 0.0
+            vt = cov[3 + i, t] if t >= 0 else 0.0
+            position = max(0.0, position + v * (v * tt - 2.0 * rt))
+            velocity = max(0.0, velocity + a * (a * tt - 2.0 * vt))
         out[i] = math.sqrt(position)
         out[3 + i] = math.sqrt(velocity)
-    a, b, c = cov[0, 0], cov[1, 1], cov[2, 2]
+    askew = axes_sd_rad * axes_sd_rad
+    a, b, c = cov[0, 0] + askew, cov[1, 1] + askew, cov[2, 2] + askew
     d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
-    if t >= 0:
+    if tt > 0.0:
         u0, u1, u2 = _turning(step, 0), _turning(step, 1), _turning(step, 2)
-        a += u0 * (u0 * cov[t, t] + 2.0 * cov[0, t])
-        b += u1 * (u1 * cov[t, t] + 2.0 * cov[1, t])
-        c += u2 * (u2 * cov[t, t] + 2.0 * cov[2, t])
-        d += u0 * (u1 * cov[t, t] + cov[1, t]) + u1 * cov[0, t]
-        e += u0 * (u2 * cov[t, t] + cov[2, t]) + u2 * cov[0, t]
-        f += u1 * (u2 * cov[t, t] + cov[2, t]) + u2 * cov[1, t]
+        t0 = cov[0, t] if t >= 0 else 0.0
+        t1 = cov[1, t] if t >= 0 else 0.0
+        t2 = cov[2, t] if t >= 0 else 0.0
+        a += u0 * (u0 * tt + 2.0 * t0)
+        b += u1 * (u1 * tt + 2.0 * t1)
+        c += u2 * (u2 * tt + 2.0 * t2)
+        d += u0 * (u1 * tt + t1) + u1 * t0
+        e += u0 * (u2 * tt + t2) + u2 * t0
+        f += u1 * (u2 * tt + t2) + u2 * t1
     # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
     # 0], and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
     sp = -step[STEP_DCM + 6]

@@ -76,7 +76,9 @@ class CalibrationKeeper:
             await asyncio.to_thread(_write, self._path, saved)
 
     def _of(self, navigator: Navigator) -> SavedCalibration | None:
-        if navigator.started is None or navigator.on_trial:
+        # How a spare sits on the vehicle says nothing of the unit that the next run begins with.
+        spare = navigator.estimator.published.axes_sd_rad > 0.0
+        if navigator.started is None or navigator.on_trial or spare:
             return None
         return saved_calibration(navigator.calibrating.parameters, self._digest)
 

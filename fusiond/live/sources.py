@@ -24,9 +24,9 @@ from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.live.imu_choice import ImuChoice
 from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
+from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.raw_gnss import Seen
 from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth, SourceHealth

@@ -121,9 +121,12 @@ class WarmKeeper:
             await asyncio.to_thread(self._write, self._path, state)
 
     def state(self, solution: Solution, navigator: Navigator) -> KeptState | None:
-        """The state as it is, None where it is not worth keeping."""
+        """The state as it is, None where it is not worth keeping: axes and biases of a spare are
+        none of the unit that the next run begins with."""
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.on_trial or not usable:
+            return None
+        if navigator.estimator.published.axes_sd_rad:
             return None
         try:
             state = warm_state(

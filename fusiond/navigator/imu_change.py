@@ -1,4 +1,4 @@
-"""The filter's state when another inertial unit goes on."""
+"""The filter's state, and what is published of it, when another inertial unit goes on."""
 
 from __future__ import annotations
 
@@ -13,6 +13,14 @@ from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR
 from fusiond.navigator.timeline import Timeline
 
 Array = NDArray[np.float64]
+
+
+def publish_first_axes(estimator: Estimator, imu: Imu) -> None:
+    """What is published is the attitude of the first unit's axes still: whoever has mounted
+    something by them has not moved it. The spare tells its own."""
+    assert imu.spare is not None
+    sd_rad = imu.spare.mounting_sd_deg * DEG
+    estimator.publish_by(estimator.published._replace(axes_sd_rad=sd_rad))
 
 
 def hand_over(estimator: Estimator, timeline: Timeline, imu: Imu) -> None:

@@ -8,23 +8,28 @@ vehicle that moves, the yaw rate's integral is the change of course,
 
 1 for rad/s and 180 / pi for deg/s.
 
-Until a course has turned nobody can tell. What can be seen of rates in deg/s is their bias, which
-is 57 times what it is, too: while it is none that the data sheet allows, nothing is vouched for.
+Where there are positions alone, the way between them is asked (fusiond.navigator.imu_way).
+
+Until the way has turned nobody can tell. What can be seen of rates in deg/s is their bias, which is
+57 times what it is, too: while it is none that the data sheet allows, nothing is vouched for.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import PositionFix
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Estimator
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.imu_way import PROOF, WayTurns
 
 Array = NDArray[np.float64]
 
@@ -132,13 +137,14 @@ class CourseTurns:
 
 class RateUnits:
     """Watches the rates of a running vehicle. `wrong` is the sentence while they are in another
-    unit, by the last turns of 30 deg or the last ten seconds that could tell.
+    unit, by the last turns of 30 deg, the last way or the last ten seconds that could tell.
 
-    `on_event(code, text)` hears of `imu_units` and `imu_units_well`.
+    `bias_sd` (rad/s) is one sigma of the data sheet's. `on_event(code, text)` hears of `imu_units`
+    and `imu_units_well`.
     """
 
-    def __init__(self, on_event: Callable[[str, str], None]) -> None:
-        self._event = on_event
+    def __init__(self, bias_sd: float, on_event: Callable[[str, str], None]) -> None:
+        self._bias_sd, self._event = bias_sd, on_event
         self.change()
 
     def change(self) -> None:
@@ -146,6 +152,7 @@ class RateUnits:
         self.wrong: str | None = None
         self._fit = False
         self._turns: dict[str, CourseTurns] = {}
+        self._ways: dict[str, WayTurns] = {}
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
     def unproven(self, estimator: Estimator) -> str | None:
@@ -160,15 +167,24 @@ class RateUnits:
         newest_ns = imu.latest_ns
         if not self._count:
             self._since_ns = int(imu.times[new])
+        for way in () if self._fit else self._ways.values():
+            if way.samples(imu.times[new : imu.end], rates[:, 2]):
+                self._weigh(way)
         self._squares += float(np.vdot(rates, rates))
         self._count += len(rates)
         if newest_ns - self._since_ns >= RMS_S * 1e9:
             self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
             self._squares, self._count = 0.0, 0
 
-    def fix(self, m: object, t_ns: int, imu: ImuBuffer) -> None:
-        """A measurement, valid at `t_ns`; a receiver's fix counts."""
+    def fix(self, m: object, t_ns: int, imu: ImuBuffer, aids: Sequence[Aid]) -> None:
+        """A measurement, valid at `t_ns`, as the aids it stands for: velocities count, and
+        positions of a source that gives none."""
         if not isinstance(m, PositionFix) or m.v_ned_m_s is None:
+            for aid in () if self._fit else aids:
+                for offer in aid.offers():
+                    if isinstance(offer, PositionOffer):
+                        way = self._ways.setdefault(aid.source, WayTurns(self._bias_sd))
+                        way.fix(offer._replace(t_ns=t_ns))
             return
         if not all(math.isfinite(v) for v in m.v_ned_m_s if v is not None):
             return
@@ -180,6 +196,16 @@ class RateUnits:
             self._tell(turns.said())
             self._fit = self.wrong is None and (self._fit or turns.fits)
             turns.begin_anew()
+
+    def _weigh(self, way: WayTurns) -> None:
+        """A way has gone on: what it tells of the unit."""
+        evidence = way.told()
+        if abs(evidence) <= PROOF:
+            return
+        well = evidence > 0.0
+        self._tell(None if well else f"the rates are not those of the way between fixes: {ADVICE}")
+        self._fit = well
+        way.begin_anew()
 
     def _tell(self, wrong: str | None) -> None:
         if wrong is not None and self.wrong is None:

@@ -30,14 +30,14 @@ from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, imu_buffer_of, model_of, verdicts_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
-from fusiond.navigator.imu_change import hand_over
+from fusiond.navigator.imu_change import hand_over, publish_first_axes
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
-from fusiond.navigator.readout import solution_of
+from fusiond.navigator.readout import publish_by_own_clock, solution_of
 from fusiond.navigator.saved_calibration import SavedCalibration, refuted, take_up
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
@@ -77,7 +77,7 @@ class Navigator:
         self.model = model_of(config, *of_vehicle, *self._intake.extra_blocks())
         self.imu = imu_buffer_of(config)
         self._door = ImuDoor(imu, e.buffer_s, self._event)
-        self._units = RateUnits(self._event)
+        self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         self.estimator = estimator(config, self.model)
         self.verdicts = verdicts_of(config, self._event)
         self.timeline = Timeline(
@@ -137,10 +137,10 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
         self._units.change()
-        if self.started is None:
-            self._begin_anew("the spare IMU is used")
-        else:
-            hand_over(self.estimator, self.timeline, self.config.imu)
+        publish_first_axes(self.estimator, self.config.imu)
+        if self.started is not None:
+            return hand_over(self.estimator, self.timeline, self.config.imu)
+        return self._begin_anew("the spare IMU is used")
 
     def _begin_anew(self, why: str) -> None:
         """Nothing that the samples so far have told counts any more."""
@@ -181,7 +181,7 @@ class Navigator:
         aids = self._lateness.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
-        self._units.fix(m, t_ns, self.imu)
+        self._units.fix(m, t_ns, self.imu, aids)
         self._constraints.witnesses.hear(aids)
         for aid in aids:
             self.timeline.insert(aid)
@@ -286,11 +286,11 @@ class Navigator:
     def _late(self) -> bool:
         """Whether a receiver is found to be late; alignment then begins anew, by its last fixes at
         the instants at which they were true."""
-        why = self._lateness.look(self.imu)
-        if why is None:
+        found = self._lateness.look(self.imu)
+        if found is None:
             return False
-        self.estimator.time_slot = -1  # by the IMU's clock: it has said when the fixes were
-        self.reset(why)
+        publish_by_own_clock(self.estimator, found.sd_s)  # it has said when the fixes were
+        self.reset(found.why)
         self._aligner.aids(self._lateness.kept())
         return True
 

@@ -7,14 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import State
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import compensate
 from fusiond.estimators.reading import in_fix_time
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigation.solution import Bound, Mode, Solution
-from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, VN, strapdown_step
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, strapdown_step
 
 Array = NDArray[np.float64]
 
@@ -35,11 +34,9 @@ def solution_of(
     if ahead_ns > 0 and imu.end:
         nav = _carried(estimator, imu, ahead_ns * 1e-9)
     published = np.empty(NAV_SIZE)
-    in_fix_time(nav, estimator.xi, estimator.step, estimator.time_slot, published)
+    in_fix_time(nav, estimator.xi, estimator.step, estimator.published.time_slot, published)
     nav = published
     sigmas = estimator.sigmas()
-    if estimator.time_slot != estimator.model.time_slot:
-        sigmas = np.hypot(sigmas, _by_imu_clock(estimator))
     sigmas[~estimator.model.stated] = math.nan
     sd = sigmas.tolist()
     values = nav.tolist()
@@ -62,15 +59,17 @@ def solution_of(
     )
 
 
-def _by_imu_clock(estimator: Estimator) -> Array:
-    """What a solution by the IMU's clock is off by, one sigma (9,) of position, velocity, roll,
-    pitch, yaw: that clock is known as well as what lies between it and a receiver's that is on
-    time, which is what the model takes for granted of its offset before anything shows it."""
-    model = estimator.model
-    sd_s = float(model.initial[model.time_slot])
-    state = State(estimator.nav, estimator.xi, estimator.step, model)
-    change = state.nav[VN : VN + 3], state.acceleration, state.rate_b
-    return sd_s * np.abs(np.concatenate(change))
+def publish_by_own_clock(estimator: Estimator, sd_s: float) -> None:
+    """A receiver's clock has shown to be none to publish by: from the next start on it is the
+    filter's own, the IMU's.
+
+    That is known as well as what lies between it and the clock of a receiver that is on time: what
+    the model takes for granted of that before anything shows it, or `sd_s`, one sigma of how late
+    the fixes are, where it has no offset in time.
+    """
+    slot = estimator.model.time_slot
+    clock_sd_s = float(estimator.model.initial[slot]) if slot >= 0 else sd_s
+    estimator.publish_by(estimator.published._replace(time_slot=-1, clock_sd_s=clock_sd_s))
 
 
 def _carried(estimator: Estimator, imu: ImuBuffer, ahead_s: float) -> Array:

@@ -130,7 +130,7 @@ class SmoothedRows:
             nodes = nodes.first(int(unsound[0]))
         self.nodes += len(nodes.t_ns)
         self.starts += 1
-        smoother = Smoother(self._estimator.model)
+        smoother = Smoother(self._estimator.model, self._estimator.published)
         back = [smoother.back(nodes).corrections]
         for held in reversed(self._nodes):
             back.append(smoother.back(Nodes(*self._spool.get(held))).corrections)

@@ -233,4 +233,4 @@ def run(
     newest = estimator.newest
     assert newest is not None
     nodes, _ = nodes_of(newest, None, NEVER)
-    return Tape(estimator, nodes, Smoother(m).back(nodes))
+    return Tape(estimator, nodes, Smoother(m, estimator.published).back(nodes))

@@ -73,5 +73,39 @@ def test_sigmas_are_those_of_what_is_published(seed: int) -> None:
     cov = root @ root.T
     j = jacobian(nav, xi, step)
     said = np.empty(9)
-    sigmas(cov, nav, step, TIME_SLOT, said)
+    sigmas(cov, nav, step, TIME_SLOT, 0.0, 0.0, said)
     np.testing.assert_allclose(said, np.sqrt(np.diag(j @ cov @ j.T)), rtol=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sigmas_by_its_own_clock_are_those_of_an_offset_that_nothing_estimates(seed: int) -> None:
+    nav, xi, step = bend()
+    xi[TIME_SLOT] = 0.0
+    rng = np.random.default_rng(seed)
+    scale = np.array([*(2e-3,) * 3, *(0.05,) * 3, *(0.5,) * 3, 1e-3, 0.01, 1e-3])
+    root = scale[:, None] * rng.standard_normal((STATES, STATES))
+    cov = root @ root.T
+    beside = cov.copy()
+    beside[TIME_SLOT], beside[:, TIME_SLOT] = 0.0, 0.0
+    beside[TIME_SLOT, TIME_SLOT] = 0.1**2
+    by_offset, by_clock, without = np.empty(9), np.empty(9), np.empty(9)
+    sigmas(beside, nav, step, TIME_SLOT, 0.0, 0.0, by_offset)
+    sigmas(cov, nav, step, -1, 0.1, 0.0, by_clock)
+    sigmas(cov, nav, step, -1, 0.0, 0.0, without)
+    np.testing.assert_allclose(by_clock, by_offset, rtol=1e-12)
+    np.testing.assert_allclose(np.hypot(without[:2], 0.1 * np.abs(nav[3:5])), by_clock[:2])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_axes_that_are_askew_are_three_more_errors_of_the_attitude(seed: int) -> None:
+    nav, xi, step = bend()
+    rng = np.random.default_rng(seed)
+    scale = np.array([*(2e-3,) * 3, *(0.05,) * 3, *(0.5,) * 3, 1e-3, 0.01, 1e-3])
+    root = scale[:, None] * rng.standard_normal((STATES, STATES))
+    cov = root @ root.T
+    turned = cov.copy()
+    turned[:3, :3] += 0.02**2 * np.eye(3)
+    j = jacobian(nav, xi, step)
+    said = np.empty(9)
+    sigmas(cov, nav, step, TIME_SLOT, 0.0, 0.02, said)
+    np.testing.assert_allclose(said, np.sqrt(np.diag(j @ turned @ j.T)), rtol=1e-2)

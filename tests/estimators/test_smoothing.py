@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, Linearised
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
+from fusiond.estimators.reading import Published
 from fusiond.estimators.smoothing.backward import Smoother
 from fusiond.estimators.smoothing.taped import NEVER, TapedKalman, nodes_of
 from fusiond.estimators.tilt_axes import TiltAxesFilter
@@ -135,7 +136,7 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
     assert estimator.newest is not None
     nodes, _ = nodes_of(estimator.newest, None, NEVER)
     estimator.end()
-    smoothed = Smoother(model).back(nodes)
+    smoothed = Smoother(model, Published(model.time_slot)).back(nodes)
     count = len(nodes.t_ns)
     n = model.size
     fed_back, row = np.zeros((count, n)), 0

@@ -14,8 +14,8 @@ from fusiond.configuration.doubts import doubts
 from fusiond.configuration.schema import Config, Imu, SpareImu
 from fusiond.configuration.settings import DEG, sensor_to_body
 from fusiond.demo.demo import demo_config
-from fusiond.live.imu_choice import ImuChoice
 from fusiond.navigation.solution import Mode
+from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.replay.run import Wish, replay
 from fusiond.simulation.can.imu import CanImu
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -93,6 +93,7 @@ def test_the_spare_goes_on_where_the_first_got_stuck(tmp_path: Path) -> None:
     drive.run(FAILS_S)
     before = drive.solutions[-1]
     assert before.mode is Mode.NAVIGATING
+    assert drive._warm.state(before, drive.chain.navigator) is not None
     drive.run(LENGTH_S)
     choice, navigator = drive.chain.sources.imu, drive.chain.navigator
     assert choice.used == "imu2"
@@ -108,6 +109,8 @@ def test_the_spare_goes_on_where_the_first_got_stuck(tmp_path: Path) -> None:
     sample = compared(after, true)
     assert max(sample.ratios) < 4.0
     assert after.sd_rpy_rad[2] > before.sd_rpy_rad[2]
+    assert min(after.sd_rpy_rad) > SPARE.mounting_sd_deg * DEG
+    assert drive._warm.state(after, navigator) is None  # of a unit that does not come first
     summary = replay(drive.close(), Wish())
     assert summary["identical"], summary
     health = drive.chain.sources.health(drive.host.mono)

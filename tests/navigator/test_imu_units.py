@@ -23,6 +23,8 @@ from fusiond.navigator.navigator import Navigator
 from tests.navigator.vehicle import CONFIG, RATE_HZ, START_NS, Array, drive, started
 
 GRAVITY_M_S2 = 9.80665
+SHEET_RAD_S = math.radians(0.1)
+"""One sigma of the gyro's bias by the default of [imu]."""
 
 
 def _driven(
@@ -70,14 +72,14 @@ def test_a_bias_of_no_data_sheet_is_not_vouched_for_until_a_bend_shows_the_unit(
 ) -> None:
     """Rates in deg/s have such a bias; so has a gyro that is worse than its sheet."""
     d, navigator = drive(), started()[0]
-    estimator, units = navigator.estimator, RateUnits(lambda code, text: None)
+    estimator, units = navigator.estimator, RateUnits(SHEET_RAD_S, lambda code, text: None)
     assert units.unproven(estimator) is None
     estimator.xi[navigator.model.slots_of(block)[axis]] = bias
     assert str(units.unproven(estimator)).startswith(said)
     navigator.imu.append(d.times[navigator.imu.end :], d.samples[navigator.imu.end :])
     fixes = [m for m in d.measurements if isinstance(m, PositionFix)]
     for m in fixes:
-        units.fix(m, m.t_seen_ns, navigator.imu)
+        units.fix(m, m.t_seen_ns, navigator.imu, ())
         turning = m.t_seen_ns > START_NS + 19_000_000_000  # 30 deg of the first bend
         assert (units.unproven(estimator) is None) == turning
     units.change()  # of the spare's unit nothing is known

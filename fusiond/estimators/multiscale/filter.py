@@ -109,7 +109,7 @@ class MultiscaleEstimator(ErrorStateFilter):
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
-        sigmas(self.covariance, self.nav, self.step, self.time_slot, out)
+        sigmas(self.covariance, self.nav, self.step, *self.published, out)
         return out
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:

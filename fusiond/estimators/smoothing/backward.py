@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.reading import sigmas
+from fusiond.estimators.reading import Published, sigmas
 from fusiond.estimators.smoothing.node import PUBLISHED, Nodes, links
 from fusiond.estimators.update import feed_back
 from fusiond.models.model import Model
@@ -120,7 +120,7 @@ def _published(d: Array, nav: Array, tau: float, step: Array, out: Array) -> Non
 
 
 @compiled(
-    "void(f8[:, ::1], f8[:, ::1], i8[::1], i8[:, ::1], i8, f8[::1], f8[:, ::1], f8[:, ::1],"
+    "void(f8[:, ::1], f8[:, ::1], i8[::1], i8[:, ::1], i8, f8, f8, f8[::1], f8[:, ::1], f8[:, ::1],"
     "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])"
 )
 def _back(
@@ -129,6 +129,8 @@ def _back(
     counts: Indices,
     pairs: Indices,
     time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
     lam: Array,
     big: Array,
     error: Array,
@@ -177,7 +179,8 @@ def _back(
                 covariance[m, j, i] = total
             covariance[m, i, i] = max(0.0, covariance[m, i, i])
         _published(d, nav, tau, step, after[m])
-        sigmas(covariance[m], nav, step, CORE_SIZE if time_slot >= 0 else -1, sd)
+        slot = CORE_SIZE if time_slot >= 0 else -1
+        sigmas(covariance[m], nav, step, slot, clock_sd_s, axes_sd_rad, sd)
         for i in range(9):
             variance[m, i] = sd[i] * sd[i]
         # As it was before the feedback f: nav + f, tau - f, dx_s + f.
@@ -251,10 +254,13 @@ def _back(
 
 
 class Smoother:
-    """Goes back over the nodes of one start, block by block from the last."""
+    """Goes back over the nodes of one start, block by block from the last.
 
-    def __init__(self, model: Model) -> None:
-        self._model, self._links = model, links(model)
+    What is smoothed is by the clock and the axes that the start was `published` by.
+    """
+
+    def __init__(self, model: Model, published: Published) -> None:
+        self._links, self._published = links(model), published
         self._lambda, self._capital = np.zeros(model.size), np.zeros((model.size, model.size))
 
     def back(self, nodes: Nodes) -> Smoothed:
@@ -268,9 +274,8 @@ class Smoother:
             np.empty((count, CORE_SIZE)),
             np.empty((count, 9)),
         )
-        model = self._model
         _back(
-            *(nodes.bodies, nodes.ops, nodes.counts, self._links, model.time_slot),
+            *(nodes.bodies, nodes.ops, nodes.counts, self._links, *self._published),
             *(self._lambda, self._capital),
             *smoothed[1:],
         )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import Outcome, Screened, Snapshot
+from fusiond.estimators.reading import Published
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
 from fusiond.estimators.tilt_axes import TiltAxesFilter
@@ -86,6 +87,11 @@ class TapedKalman(TiltAxesFilter):
         self._ops, self.rewound = [], NEVER
         self._close()
 
+    def publish_by(self, published: Published) -> None:
+        """From the next start on: a tape is of one clock and one unit."""
+        self.end()
+        super().publish_by(published)
+
     def end(self) -> None:
         """The tape is complete: no more of this start will come."""
         if self.newest is None:
@@ -98,10 +104,10 @@ class TapedKalman(TiltAxesFilter):
     def _close(self) -> None:
         """A node of what has happened since the last."""
         body = np.empty(self._body_size)
-        model, dx = self.model, self._dxs[0]
+        dx = self._dxs[0]
         write_body(
             *(self._covs[0], self._phi, dx, self._fed_back, self.nav, self.xi, self.step),
-            *(self._links, model.time_slot, body),
+            *(self._links, self.published.time_slot, body),
         )
         ops = self._ops[0] if len(self._ops) == 1 else np.concatenate([self._none, *self._ops])
         self.newest = Node(self.newest, self.t_ns, body, ops)

@@ -123,7 +123,7 @@ class UnscentedEstimator(KalmanEstimator):
             model.sensor_terms,
             model.rate_terms,
             model.noise,
-            self.time_slot,
+            *self.published,
             imu.times,
             imu.samples,
             imu.densities,

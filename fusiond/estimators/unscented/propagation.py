@@ -153,7 +153,7 @@ def turn_attitude(cov: Array, before: Array, after: Array) -> None:
 
 @compiled(
     "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8, b1, b1[::1], i8[:, ::1],"
-    "i8[:, ::1], f8[:, ::1], i8, i8[::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, b1,"
+    "i8[:, ::1], f8[:, ::1], i8, f8, f8, i8[::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, b1,"
     "f8[:, ::1], f8[:, ::1], b1, f8[::1])"
 )
 def propagate_points(
@@ -169,6 +169,8 @@ def propagate_points(
     rate_terms: Indices,
     noise: Array,
     time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
     times: Indices,
     samples: Array,
     densities: Array,
@@ -290,6 +292,6 @@ def propagate_points(
         if now == times[i]:
             if record:
                 in_fix_time(nav, xi, step, time_slot, nav_out[i])
-                sigmas(cov, nav, step, time_slot, sigma_out[i])
+                sigmas(cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, sigma_out[i])
             i += 1
     return i, now

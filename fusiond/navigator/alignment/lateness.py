@@ -22,7 +22,8 @@ in some looks that agree. On drive_0708 and css_164, which have no late fixes, t
 all but the first; the smoothing of receivers moves tau* by 0.1 s.
 
 What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
-fixes that are late, and not the vehicle that is ahead.
+fixes that are late, and not the vehicle that is ahead. From then on that clock is what solutions
+are published by (fusiond.estimators.reading).
 
 Source: Wu and Pan (as motion); profile likelihood: Venzon, Moolgavkar, Applied Statistics 37
 (1988), 87; the offset in time as a parameter of alignment: Li, Mourikis, Online temporal
@@ -94,6 +95,14 @@ class Late(NamedTuple):
         return abs(self.seconds - other.seconds) <= AGREED * math.hypot(self.sd, other.sd)
 
 
+class Found(NamedTuple):
+    """A receiver is late: why all that was made of its fixes must be made anew, and one sigma (s)
+    of what their instants are known to."""
+
+    why: str
+    sd_s: float
+
+
 @dataclass(slots=True)
 class _Receiver:
     """The last aids of a receiver as they were stamped, how late they are taken to be (ns), and
@@ -144,7 +153,7 @@ class Lateness:
         self._event = on_event
         self._receivers: dict[str, _Receiver] = {}
         self._due_ns = self._fitted_ns = 0
-        self._looking: Generator[None, None, str | None] | None = None
+        self._looking: Generator[None, None, Found | None] | None = None
 
     def hear(self, source: str, aids: Sequence[Aid]) -> Sequence[Aid]:
         """A measurement has come, as the aids it stands for; the same at the instants at which it
@@ -192,9 +201,9 @@ class Lateness:
                 )
         return ""
 
-    def look(self, imu: ImuBuffer) -> str | None:
-        """Begin or go on to look; why all that was made of a receiver's fixes must be made anew: it
-        is found to be late, by the samples and fixes of the last seconds before the look began."""
+    def look(self, imu: ImuBuffer) -> Found | None:
+        """Begin or go on to look; what is found by the samples and fixes of the last seconds before
+        the look began."""
         t_ns = imu.latest_ns
         if not self.due(t_ns):
             return None
@@ -207,11 +216,11 @@ class Lateness:
                 next(self._looking)
             except StopIteration as end:
                 self._looking = None
-                found: str | None = end.value
+                found: Found | None = end.value
                 return found
         return None
 
-    def _look(self, imu: ImuBuffer) -> Generator[None, None, str | None]:
+    def _look(self, imu: ImuBuffer) -> Generator[None, None, Found | None]:
         """`look` at all that there is now, a fit at a time."""
         t_ns = imu.latest_ns
         self._due_ns = t_ns + EVERY_NS
@@ -228,7 +237,7 @@ class Lateness:
                 "its fixes count as of then"
             )
             self._event("fixes_late", text)
-            return text
+            return Found(text, late.sd)
         return None
 
     def _weigh(

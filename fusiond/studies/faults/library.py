@@ -13,7 +13,7 @@ from functools import partial
 from typing import Literal
 
 from fusiond.configuration.aiding import WheelAiding
-from fusiond.configuration.schema import Config
+from fusiond.configuration.schema import Config, SpareImu
 from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
@@ -126,9 +126,16 @@ def with_wheels(config: Config) -> Config:
     return config.model_copy(update={"aiding": {**config.aiding, "wheel": section}})
 
 
+def with_spare(config: Config) -> Config:
+    """With a second inertial unit, turned by a quarter."""
+    spare = SpareImu(source="spare", axes=("+y", "+x", "-z"))
+    return config.model_copy(update={"imu": config.imu.model_copy(update={"spare": spare})})
+
+
 _of_imu = partial(Fault, of_imu=True)
 _in_bend = partial(_of_imu, imu.silent, phases=("navigating",), begin_s=BEND_S)
 _of_wheels = partial(_of_imu, length_s=30.0, phases=UNDER_WAY, drive=Drive(wheels=True))
+_with_spare = partial(_of_imu, drive=Drive(spare=True))
 _from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
 _under_way = partial(Fault, phases=("navigating",))
 
@@ -178,6 +185,11 @@ FAULTS: dict[str, Fault] = {
     "imu_silent_15s_bend": _in_bend(15.0),
     "imu_lost_0.3s_bend": _in_bend(0.3),
     "imu_lost_0.45s_bend": _in_bend(0.45),
+    # of the first of two units
+    "imu_silent_spare": _with_spare(imu.silent),
+    "imu_silent_spare_bend": _with_spare(imu.silent, phases=("navigating",), begin_s=BEND_S),
+    "imu_stuck_spare": _with_spare(imu.stuck),
+    "gyro_axis_dead_spare": _with_spare(imu.dead_axis, phases=UNDER_WAY),
     # stamps of the IMU
     "imu_stamp_0.7s_ahead": _of_imu(imu.stamp_ahead, 0.1),
     "imu_stamps_reversed": _from_start(imu.stamps_reversed),

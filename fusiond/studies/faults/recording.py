@@ -20,7 +20,7 @@ from fusiond.configuration.settings import DEG
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre
-from fusiond.simulation.scenarios import SCENARIOS, random_streams
+from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
 from fusiond.simulation.trajectories import Leg, Path, follow
 
 Array = NDArray[np.float64]
@@ -49,12 +49,14 @@ class Received:
 @dataclass(frozen=True, slots=True)
 class Recording:
     """IMU samples (n, 6) rate and force in sensor axes, their stamps (n,) and arrivals (n,) in ns,
-    and all else in order of arrival."""
+    and all else in order of arrival. `spare` holds the samples of a second unit, in its own axes,
+    and nothing else."""
 
     stamps: Stamps
     imu_seen: Stamps
     samples: Array
     received: tuple[Received, ...]
+    spare: Recording | None = None
 
     def window(self, begin_s: float, length_s: float) -> NDArray[np.bool_]:
         """Which samples (n,) arrive in the window."""
@@ -118,6 +120,8 @@ class Drive:
 
     path: Callable[[float], Path] = town
     wheels: bool = False
+    spare: bool = False
+    """A second inertial unit, `[imu.spare]` of the configuration."""
     gnss_rate_hz: float = 5.0
     duration_s: float = DURATION_S
 
@@ -128,7 +132,8 @@ class Drive:
         the configuration has them; the same seed says the same."""
         car = replace(SCENARIOS["drive"], path=self.path).fitted(config)
         truth = car.truth(self.duration_s)
-        imu_rng, gnss_rng, rdss_rng, wheel_rng = random_streams(seed)
+        sequence = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
+        imu_rng, gnss_rng, rdss_rng, wheel_rng = random_streams(sequence)
         imu = car.imu_output(truth, imu_rng)
         stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
         receiver = replace(car.gnss, rate_hz=self.gnss_rate_hz)
@@ -137,7 +142,24 @@ class Drive:
         if self.wheels:
             received += _wheels(truth, wheel_rng)
         samples = np.hstack((imu.gyro, imu.accel))
-        return truth, Recording(stamps, stamps, samples, ()).with_received(received)
+        recording = Recording(stamps, stamps, samples, ()).with_received(received)
+        if self.spare:
+            [spare_seed] = sequence.spawn(1)
+            second = _spare(car, truth, np.random.default_rng(spare_seed))
+            recording = replace(recording, spare=replace(recording, samples=second, received=()))
+        return truth, recording
+
+
+def _spare(car: Scenario, truth: Truth, rng: np.random.Generator) -> Array:
+    """What the spare of a car says (n, 6): errors of its own, as large, and it sits askew by what
+    the configuration allows."""
+    spare = car.imu.spare
+    assert spare is not None
+    askew = np.add(spare.mounting_deg, rng.normal(0.0, spare.mounting_sd_deg, 3))
+    own = {"axes": spare.axes, "mounting_deg": tuple(askew.tolist())}
+    sits = replace(car, imu=car.imu.model_copy(update=own))
+    said = sits.imu_output(truth, rng)
+    return np.hstack((said.gyro, said.accel))
 
 
 def gnss_fixes(receiver: GnssReceiver) -> list[Received]:

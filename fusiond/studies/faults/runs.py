@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.measurements import ImuSample, MonotonicStamp
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.judge import Course, Event, Sample, axis_ratio, judge
-from fusiond.studies.faults.library import FAULTS, PHASES, Fault, PhaseName, with_wheels
+from fusiond.studies.faults.library import FAULTS, PHASES, Fault, PhaseName, with_spare, with_wheels
 from fusiond.studies.faults.recording import DURATION_S, Drive, Recording, town
 
 Array = NDArray[np.float64]
@@ -77,7 +79,8 @@ def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
     fault = FAULTS[row.fault]
     if drive is not None and fault.drive.path is town:
         found = drawn(drive)
-        fault = replace(fault, drive=replace(found, wheels=fault.drive.wheels))
+        found = replace(found, wheels=fault.drive.wheels, spare=fault.drive.spare)
+        fault = replace(fault, drive=found)
     return {"fault": row.fault, "phase": row.phase, **run(fault, row.phase, seed)}
 
 
@@ -99,6 +102,8 @@ def _unharmed(drive: Drive, phase: PhaseName, seed: int) -> Course:
 
 def _driven(fault: Fault, phase: PhaseName, seed: int) -> Course:
     vehicle = with_wheels(VEHICLE) if fault.drive.wheels else VEHICLE
+    if fault.drive.spare:
+        vehicle = with_spare(vehicle)
     truth, recording = fault.drive.recorded(vehicle, seed)
     outage = PHASES[phase].outage_s
     if outage is not None:
@@ -125,18 +130,16 @@ def navigate(
         events.append(Event(now_s, code, text))
 
     navigator = Navigator(config, on_event=hear)
-    given = taken = 0
+    units = _Units(config, recording, lambda source, code, text: hear(code, text))
+    taken = 0
     received = recording.received
     # Of all seconds at once: one by one it takes as long as the navigation.
     track = truth.at(np.arange(1.0, truth.duration_s + 0.5))
     for tick in range(1, round(truth.duration_s * TICKS_PER_S) + 1):
         now_s = tick / TICKS_PER_S
         now_ns = round(now_s * 1e9)
-        end = int(np.searchsorted(recording.imu_seen, now_ns, side="right"))
         try:
-            if end > given:
-                navigator.add_imu(recording.stamps[given:end], recording.samples[given:end])
-            given = end
+            units.give(navigator, now_ns)
             while taken < len(received) and received[taken].seen_ns <= now_ns:
                 item = received[taken]
                 taken += 1
@@ -149,6 +152,47 @@ def navigate(
         except Exception as error:  # whatever leaves the navigator ends the daemon: a finding
             return Course(samples, events, f"{type(error).__name__} at {now_s:g} s: {error}")
     return Course(samples, events)
+
+
+class _Units:
+    """Hands over the samples of a recording, of the unit that is used."""
+
+    def __init__(
+        self, config: Config, recording: Recording, on_event: Callable[[str, str, str], None]
+    ) -> None:
+        self._recording, self._given = recording, 0
+        self._choice: ImuChoice | None = None
+        spare, self._said = config.imu.spare, list[ImuSample]()
+        if spare is not None and recording.spare is not None:
+            self._choice = ImuChoice(config.imu, on_event)
+            self._said = [*_said("imu", recording), *_said(spare.source, recording.spare)]
+            self._said.sort(key=lambda sample: sample.t_seen_ns)
+
+    def give(self, navigator: Navigator, now_ns: int) -> None:
+        """What has come until now."""
+        if self._choice is None:
+            r, given = self._recording, self._given
+            self._given = end = int(np.searchsorted(r.imu_seen, now_ns, side="right"))
+            if end > given:
+                navigator.add_imu(r.stamps[given:end], r.samples[given:end])
+            return
+        while self._given < len(self._said) and self._said[self._given].t_seen_ns <= now_ns:
+            sample = self._said[self._given]
+            assert isinstance(sample.stamp, MonotonicStamp)
+            self._choice.take(sample, sample.stamp.t_ns)
+            self._given += 1
+        if self._choice.changes(now_ns, navigator.imu.latest_ns if navigator.imu.end else None):
+            navigator.change_imu()
+        if (samples := self._choice.samples()) is not None:
+            navigator.add_imu(*samples)
+
+
+def _said(source: str, r: Recording) -> list[ImuSample]:
+    rows = zip(r.imu_seen.tolist(), r.stamps.tolist(), r.samples.tolist(), strict=True)
+    return [
+        ImuSample(source, seen, MonotonicStamp(t), (x[0], x[1], x[2]), (x[3], x[4], x[5]))
+        for seen, t, x in rows
+    ]
 
 
 def compared(solution: Solution, true: States, row: int = 0) -> Sample:
