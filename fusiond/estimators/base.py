@@ -35,19 +35,8 @@ from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.chi_square import quantile
-from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_quaternion
-from fusiond.navigation.strapdown import (
-    HEIGHT,
-    LAT,
-    NAV_SIZE,
-    Q0,
-    STEP_DCM,
-    STEP_FORCE_N,
-    STEP_SIZE,
-    STEP_SMOOTH_N,
-)
+from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
 
 Array = NDArray[np.float64]
 
@@ -242,10 +231,7 @@ class ErrorStateFilter:
         self._covs[:] = 0.0
         self._covs[:, :n, :n] = p / self._shares[:, None, None]
         self._dxs[:], self._holding = 0.0, False
-        self.step[:] = 0.0  # it moves evenly: by no force it would fall, and tell offsets in time
-        g = gravity(float(nav[LAT]), float(nav[HEIGHT]))
-        self.step[STEP_FORCE_N + 2] = self.step[STEP_SMOOTH_N + 2] = -g
-        self.step[STEP_DCM:STEP_SMOOTH_N] = dcm_from_quaternion(self.nav[Q0:]).ravel()
+        self.step[:] = step_before(nav)
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""

@@ -150,3 +150,13 @@ def strapdown_step(
     step[STEP_DCM + 4], step[STEP_DCM + 5] = 0.5 * (c11 + n11), 0.5 * (c12 + n12)
     step[STEP_DCM + 6], step[STEP_DCM + 7] = 0.5 * (c20 + n20), 0.5 * (c21 + n21)
     step[STEP_DCM + 8] = 0.5 * (c22 + n22)
+
+
+def step_before(nav: Array) -> Array:
+    """What there is (STEP_SIZE,) of a state (10,) before its first interval: it moves evenly. By no
+    force it would fall, and offsets in time would be told by that."""
+    step = np.zeros(STEP_SIZE)
+    g = gravity(float(nav[LAT]), float(nav[HEIGHT]))
+    step[STEP_FORCE_N + 2] = step[STEP_SMOOTH_N + 2] = -g
+    step[STEP_DCM:STEP_SMOOTH_N] = dcm_elements(nav[Q0:])
+    return step

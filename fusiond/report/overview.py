@@ -18,8 +18,8 @@ MARKED_FROM = 0.05
 """Share of refusals that catches the eye: a gate alone refuses 1e-4 by its default."""
 _NO_FAULT = frozenset(
     (
-        *("start", "no_alignment", "no_imu", "moving", "turning", "turns_at_rest", "quiet_at_speed"),
-        *("too_slow", "height_held"),
+        *("start", "no_alignment", "no_imu", "moving", "turning", "turns_at_rest"),
+        *("quiet_at_speed", "too_slow", "height_held"),
     )
 )
 """Outcomes that say nothing against the source: it could not be used just then."""

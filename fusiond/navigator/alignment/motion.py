@@ -162,7 +162,8 @@ def rate_before_motion(past: Past, m: Measured) -> Array:
     """Mean rate (3,) over the first of the fixes, as long as they say that it stands: what a
     linearisation about no bias would have to find in the dark, 60 deg of turning for 3 deg/s in
     20 s. Nothing if it never stood."""
-    moves = (np.abs(m.velocity[:, :2]) > STILL_SIGMAS * m.sd[:, :2]).any(axis=1)
+    beyond = np.abs(m.velocity) > STILL_SIGMAS * m.sd
+    moves = beyond[:, 0] | beyond[:, 1]
     stood = int(np.argmax(moves)) if moves.any() else len(moves)
     first, end = past.index_after(int(m.instants[0])), past.index_after(int(m.instants[stood - 1]))
     if stood < 2 or end <= first:
