@@ -130,7 +130,10 @@ class Timeline:
         """Put an aid in its place; refused at once as `too_old` or `duplicate`."""
         # What is due to be fed back is fed back before anything of the same instant is applied: the
         # next RDSS request may leave at the very instant at which its predecessor's fix arrived.
-        key = (aid.t_ns, "" if aid.feedback == "release" else aid.source, serial)
+        # Of one instant, velocities come first: after an outage a false position passes its gate by
+        # the outage's sigma and takes the velocity along, and then the honest velocity would fail.
+        first = " " if aid.moves and not aid.locates else ""
+        key = (aid.t_ns, "" if aid.feedback == "release" else first + aid.source, serial)
         entry = Entry(key, aid)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
