@@ -15,6 +15,8 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
@@ -103,7 +105,8 @@ class Timeline:
         t_ns = self.estimator.t_ns
         self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
         for row in range(bisect_left(self._keys, (t_ns + 1, "", 0)) - 1, -1, -1):
-            if any(offer in used for offer in self._entries[row].aid.offers()):
+            offers = self._entries[row].aid.offers()
+            if any(_same(one, other) for one in offers for other in used):
                 self._count(self._entries[row], Outcome("start"))
                 del self._entries[row], self._keys[row]
         self.imu.needed = self.estimator.sample
@@ -301,3 +304,11 @@ class Timeline:
             del self._entries[:stale]
             del self._keys[:stale]
             self._next -= stale
+
+
+def _same(one: Offer, other: Offer) -> bool:
+    """Whether two offers are alike; vectors may be arrays, as a caller from Python gives them."""
+    return type(one) is type(other) and all(
+        a is b or np.array_equal(np.asarray(a), np.asarray(b))
+        for a, b in zip(one, other, strict=True)
+    )
