@@ -83,9 +83,11 @@ class TiltAxesFilter(KalmanEstimator):
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
-        before, poor = self.nav[Q0:].copy(), self._poor
+        if self._holding or not self._poor:
+            return self._fold_in(aid)
+        before = self.nav[Q0:].copy()
         outcome = self._fold_in(aid)
-        if poor and outcome.name == "fused" and not self._holding:
+        if outcome.name == "fused":
             self._carry_over(felt_kept(self.model, before, self.nav[Q0:]))
         return outcome
 
