@@ -32,7 +32,7 @@ def _writing(content: bytes) -> Spoil:
 
 def _whole(path: Path) -> bytes:
     """What is there, or a saved state as it may be from before the vehicle drove off."""
-    if not path.is_file():
+    if not path.is_file() or not path.stat().st_size:
         save_state(path, SavedState(time.time() - 60.0, (0.53, 1.99, 38.0), 3.0, 0.7, 0.05))
     return path.read_bytes()
 
@@ -56,7 +56,9 @@ def _random(path: Path, dice: random.Random) -> None:
 def _old(path: Path, dice: random.Random) -> None:
     try:
         state = json.loads(_whole(path))
-    except ValueError:  # nothing to make an old one of
+    except (ValueError, RecursionError):
+        state = None
+    if not isinstance(state, dict):  # spoilt before: nothing to make an old one of
         state = {}
     state.pop("crc32", None)
     path.write_text(json.dumps({**state, "version": 0}))
