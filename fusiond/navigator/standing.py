@@ -80,10 +80,12 @@ class Standing:
         self._from = self._fastest = 0.0
         self._changed = 0.0
         self._left = ""
+        self._shaken: tuple[int, str | None] | None = None
 
     def started(self, t_ns: int) -> None:
         """A navigation has begun."""
         self._started_ns, self._turned_ns, self._turned = t_ns, NEVER_NS, False
+        self._shaken = None
 
     def turned(self, t_ns: int) -> None:
         """The gyros have felt a turn of a vehicle that stands."""
@@ -97,10 +99,12 @@ class Standing:
         self._trial_ns = min(longer_ns, LONGEST_TRIAL_NS)
 
     def failure(self, t_ns: int, isolation: Isolation, nav: Array) -> str | None:
-        """Why navigation must begin anew; None while it need not.
+        """Why navigation must begin anew; None while it need not. To be asked whenever the filter
+        has run.
 
         `nav` (10,) at `t_ns`, the filter's instant.
         """
+        self._shaken = None
         self._watch(t_ns, isolation, nav)
         speed = math.hypot(nav[VN], nav[VE])
         if speed > self._max_speed:
@@ -149,7 +153,13 @@ class Standing:
         return unproven or self.shaken(estimator, isolation) is not None
 
     def shaken(self, estimator: Estimator, isolation: Isolation) -> str | None:
-        """Why a solution is coasting though aids come; None where it is not."""
+        """Why a solution is coasting though aids come; None where it is not. Several ask it of one
+        tick."""
+        if self._shaken is None or self._shaken[0] != estimator.t_ns:
+            self._shaken = estimator.t_ns, self._shakes(estimator, isolation)
+        return self._shaken[1]
+
+    def _shakes(self, estimator: Estimator, isolation: Isolation) -> str | None:
         t_ns = estimator.t_ns
         lost = isolation.lost(t_ns)
         if lost is not None and t_ns - lost.since_ns > UNCHECKED_NS:

@@ -23,20 +23,18 @@ def state_digest(navigator: Navigator, solution: Solution) -> bytes:
     bits. 10 us a tick.
     """
     s = solution
-    found = blake2b(s.mode.encode(), digest_size=DIGEST_BYTES)
-    found.update(
-        _SOLUTION.pack(
-            s.t_ns,
-            *(s.lat_rad, s.lon_rad, s.height_m),
-            *(*s.v_ned_m_s, *s.rpy_rad, *s.sd_ned_m, *s.sd_v_ned_m_s, *s.sd_rpy_rad),
-            *(*s.gyro_bias_rad_s, *s.accel_bias_m_s2),
-            *(s.bound.hpl_m, s.bound.vpl_m),
-        )
+    of = s.mode.encode() + _SOLUTION.pack(
+        s.t_ns,
+        *(s.lat_rad, s.lon_rad, s.height_m),
+        *(*s.v_ned_m_s, *s.rpy_rad, *s.sd_ned_m, *s.sd_v_ned_m_s, *s.sd_rpy_rad),
+        *(*s.gyro_bias_rad_s, *s.accel_bias_m_s2),
+        *(s.bound.hpl_m, s.bound.vpl_m),
     )
     if navigator.started is not None:
         e = navigator.estimator
-        found.update(_T_NS.pack(e.t_ns) + e.nav.tobytes() + e.xi.tobytes())
-        covariance = e.covariance.tobytes()
-        for at in range(0, len(covariance), _SLICE):
-            found.update(covariance[at : at + _SLICE])
+        parts = _T_NS.pack(e.t_ns), e.nav.tobytes(), e.xi.tobytes(), e.covariance.tobytes()
+        of += b"".join(parts)
+    found = blake2b(of[:_SLICE], digest_size=DIGEST_BYTES)
+    for at in range(_SLICE, len(of), _SLICE):
+        found.update(of[at : at + _SLICE])
     return found.digest()
