@@ -39,7 +39,7 @@ GAP_FORCE_M_S2 = 1.0
 
 
 # What a propagation does beside the usual, added up.
-HOLD_HEIGHT, RECORD, CARRY = 1, 2, 4
+HOLD_HEIGHT, RECORD, CARRY, TURN_TILT = 1, 2, 4, 8
 
 
 def scratch_size(width: int) -> int:
@@ -120,6 +120,19 @@ def shake(cov: Array, active: NDArray[np.bool_], step: Array, density: Array, h:
                     cov[first + i, first + j] += h * total
 
 
+@compiled("void(f8[:, ::1], f8)", forceinline=True)
+def turn_tilt(cov: Array, known: float) -> None:
+    """Add to `cov` what a turn does to the axes of a tilt, if nobody knows whether it was one: the
+    heading's variance was `known` (rad^2) before it (fusiond.estimators.tilt_axes)."""
+    grown = cov[2, 2] - known
+    if grown > 0.0:
+        north, east, both = cov[0, 0], cov[1, 1], cov[0, 1]
+        cov[0, 0] += grown * east
+        cov[1, 1] += grown * north
+        cov[0, 1] -= grown * both
+        cov[1, 0] = cov[0, 1]
+
+
 @cache
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
@@ -157,12 +170,14 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         of `densities` beyond `noise`. Samples first ... end-1 may be used; the last one only as far
         as `target`, so a target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD,
         with which the solution and the sigmas of covariance 0 at the end of each whole sample go
-        into the IMU's rows, and CARRY, with which the error estimates `dxs` (k, n) are propagated
-        too. `covs` (k, width, width) are covariances, their noise divided by `shares` (k,). `phi`
+        into the IMU's rows, CARRY, with which the error estimates `dxs` (k, n) are propagated too,
+        and TURN_TILT, with which a turn that is not known turns the axes of a tilt. `covs`
+        (k, width, width) are covariances, their noise divided by `shares` (k,). `phi`
         (width, width) is propagated unless it is (0, 0).
         """
         hold_height = (options & HOLD_HEIGHT) != 0
         record, carry = (options & RECORD) != 0, (options & CARRY) != 0
+        turning = (options & TURN_TILT) != 0
         n, m = dxs.shape[1], imu.shape[0] // ROW_SIZE
         nav, xi = state[:NAV_SIZE], state[NAV_SIZE : NAV_SIZE + n]
         step = state[NAV_SIZE + n : NAV_SIZE + n + STEP_SIZE]
@@ -199,11 +214,19 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 compensate(samples, i, estimate, rate, force)
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
                 coefficients(nav, step, h, c)
+                # The held sample of a gap is a guess: its error acts over the whole of it.
+                whole = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
                 for k in range(covs.shape[0]):
-                    q = 1.0 / shares[k]
+                    cov, q = covs[k], 1.0 / shares[k]
+                    known = cov[2, 2]
                     propagate_covariance(
-                        covs[k], step, c, h, active, sensor_terms, rate_terms, noise, q, work
+                        cov, step, c, h, active, sensor_terms, rate_terms, noise, q, work
                     )
+                    shake(cov, active, step, densities[i], h / shares[k])
+                    if silent:
+                        widen_for_gap(cov, active, whole, h / shares[k])
+                    if turning:
+                        turn_tilt(cov, known)
                 if phi.shape[0]:
                     propagate_transition(
                         phi, step, c, h, active, sensor_terms, rate_terms, noise, work
@@ -216,13 +239,6 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if decaying:
                     propagate_parameters(xi, h, rate_terms, decay_rate)
                     sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
-                for k in range(covs.shape[0]):
-                    shake(covs[k], active, step, densities[i], h / shares[k])
-                if silent:
-                    # The held sample is a guess: its error acts over the whole of the gap.
-                    whole = (times[i] - times[i - 1]) * 1e-9
-                    for k in range(covs.shape[0]):
-                        widen_for_gap(covs[k], active, whole, h / shares[k])
             now = stop
             if now == times[i]:
                 if record:

@@ -84,13 +84,13 @@ class Logging(TapedKalman):
         super().propagate(imu, target_ns, record)
         self.prior = self.covariance.copy()
 
-    def _carry_over(self, t: Array) -> None:
-        super()._carry_over(t)
+    def _carry_over(self, before: Array) -> None:
+        super()._carry_over(before)
         self.prior = self.covariance.copy()
 
-    def update(self, aid: Linearised) -> Outcome:
+    def _fold_in(self, aid: Linearised) -> Outcome:
         offsets = self.model.slots_of("clock_offset")
-        outcome = super().update(aid)
+        outcome = super()._fold_in(aid)
         if offsets and self._phi[offsets[0]].any() == 0:  # the clock started anew
             self.prior = self._before[: self.model.size, : self.model.size].copy()
         return outcome

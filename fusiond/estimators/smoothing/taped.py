@@ -18,10 +18,11 @@ from fusiond.estimators.base import Outcome, Screened, Snapshot
 from fusiond.estimators.reading import Published
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
-from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.strapdown import Q0
 
 Array = NDArray[np.float64]
 
@@ -149,11 +150,11 @@ class TapedKalman(TiltAxesFilter):
             self._fold(held, z, h, r)
         return outcome
 
-    def _carry_over(self, t: Array) -> None:
-        """An error e (n,) is T e from now on, T (n, n)."""
+    def _carry_over(self, before: Array) -> None:
+        """P after an update that has turned the attitude q_nb (4,) `before`."""
         self._close()  # with P as it was: T begins the transition to the next node
-        super()._carry_over(t)
-        self._phi[: len(t), : len(t)] = t
+        super()._carry_over(before)
+        turn_rows(self._phi, before, self.nav[Q0:], *self._biases)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

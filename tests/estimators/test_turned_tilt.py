@@ -1,0 +1,135 @@
+"""Cars whose tilt is known by its sum with the force biases alone: the filter stays honest.
+
+Consumer sensors (50 mg, 3 deg/s), a heading known to 3 deg, ten seconds at rest, half a minute
+straight on and a bend. What a filter makes of headings that it only thinks has turned tilt and
+biases apart (fusiond.estimators.tilt_axes).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
+from fusiond.navigation.error_model import DV, FORCE_ERROR, PHI, RATE_ERROR
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.trajectories import drive
+from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
+from tests import runs
+from tests.estimators.monte_carlo import interval
+
+Array = NDArray[np.float64]
+
+RATE_HZ, SECONDS, CARS = 50.0, 60, 24
+IMU = Imu(sensor_class="consumer", rate_hz=RATE_HZ)
+START_SD = np.array([2e-3, 2e-3, math.radians(3.0), 0.1, 0.1, 0.1, 1.0, 1.0, 1.0])
+FIX_SD_M, VELOCITY_SD_M_S, SLIP_SD_M_S = 1.0, 0.1, 0.05
+REST = (0.0, 0.0, 0.0)
+G = 9.79
+
+
+def _tied(attitude: Array, model: Model) -> Array:
+    """T (n, n): the tilt of an attitude (4,) hides the biases, C b - g z x t = 0, and no more."""
+    c, t = dcm_from_quaternion(attitude), np.eye(model.size)
+    biases = [model.parameters(FORCE_ERROR + axis)[0] for axis in range(3)]
+    t[PHI, biases], t[PHI + 1, biases] = c[1] / G, -c[0] / G
+    return t
+
+
+@cache
+def _nees(kind: type[KalmanEstimator], number: int) -> tuple[float, float]:
+    """NEES (2 degrees each) of tilt and horizontal velocity at the end of one car's drive."""
+    rng = np.random.default_rng([700, number])
+    noise, truth = imu_noise(IMU), Truth(drive(SECONDS + 1.0, 10.0), runs.ORIGIN, RATE_HZ, SECONDS)
+    model = make_model("ins21", noise)
+    sd = model.initial.copy()
+    sd[:9] = START_SD
+    drawn = rng.standard_normal(model.size) * sd
+    begin = true_nav(truth, np.array([0.0]))[0]
+    turned = with_error(begin, np.array([0.0, 0.0, drawn[PHI + 2], *[0.0] * 6]))
+    tied = _tied(turned[6:], model)
+    error = tied @ drawn
+    biases = [error[model.parameters(column)[0]] for column in range(RATE_ERROR, FORCE_ERROR + 3)]
+    white = np.repeat([noise.rate_noise, noise.force_noise], 3) * math.sqrt(RATE_HZ)
+    sensed = np.hstack([truth.gyro, truth.accel]) + biases
+    sensed += rng.standard_normal(sensed.shape) * white
+    imu = ImuBuffer(RATE_HZ, SECONDS + 2.0, np.eye(3), 0.0, 0.5)
+    imu.append(runs.sample_times(truth), sensed)
+    filter_ = kind(model, 0.5)
+    start = with_error(begin, error[:9])
+    filter_.initialise(0, 0, start, np.zeros(model.size), tied @ np.diag(sd**2) @ tied.T)
+    t_s = np.arange(1.003, SECONDS, 1.0)
+    true = truth.at(t_s, REST)
+    for k, t_ns in enumerate(np.rint(t_s * 1e9).astype(np.int64).tolist()):
+        filter_.propagate(imu, t_ns)
+        to_metres = metres(float(true.position[k, 0]), float(true.position[k, 2]))
+        lat, lon, height = true.position[k] + rng.standard_normal(3) * FIX_SD_M / to_metres
+        north, east, down = true.v_ned[k] + rng.standard_normal(3) * VELOCITY_SD_M_S
+        sd_v, sd_p = (VELOCITY_SD_M_S,) * 3, (FIX_SD_M,) * 3
+        filter_.update(NonHolonomicAid("slip", t_ns, 1.0, SLIP_SD_M_S, SLIP_SD_M_S, 1.0, REST))
+        filter_.update(VelocityAid("velocity", t_ns, 1.0, (north, east, down), sd_v, REST))
+        filter_.update(PositionAid("fix", t_ns, 1.0, lat, lon, height, sd_p, REST))
+    end_s = SECONDS - 0.5
+    filter_.propagate(imu, round(end_s * 1e9))
+    left = nav_error(filter_.nav, true_nav(truth, np.array([end_s]))[0])
+    tilt, velocity = (slice(first, first + 2) for first in (PHI, DV))
+    p = filter_.covariance
+    a, b = (float(left[s] @ np.linalg.solve(p[s, s], left[s])) for s in (tilt, velocity))
+    return a, b
+
+
+def test_a_turn_that_was_none_tells_nothing_of_the_biases() -> None:
+    total = np.sum([_nees(TiltAxesFilter, number) for number in range(CARS)], axis=0)
+    low, high = interval(2 * CARS, 0.99)
+    print(
+        f"NEES a degree {total / (2 * CARS)}, 99 %: {low / (2 * CARS):.2f}, {high / (2 * CARS):.2f}"
+    )
+    assert (total >= low).all()
+    assert (total <= high).all()
+
+
+def test_the_plain_filter_takes_it_for_one() -> None:
+    """The cars are such that it matters: sigma is many times too small."""
+    total = np.sum([_nees(KalmanEstimator, number) for number in range(CARS)], axis=0)
+    assert (total > 10.0 * 2 * CARS).all()
+
+
+@pytest.mark.parametrize("turning", [True, False])
+def test_an_unknown_turn_turns_the_axes_of_a_tilt(turning: bool) -> None:
+    model = make_model("ins21", imu_noise(IMU))
+    samples = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -G], (10, 1))
+    covariances = []
+    for kind in (TiltAxesFilter, KalmanEstimator):
+        imu = ImuBuffer(RATE_HZ, 2.0, np.eye(3), 0.0, 0.5)
+        imu.append(np.arange(1, 11) * round(1e9 / RATE_HZ), samples)
+        p = np.diag(model.initial**2)
+        p[:3, :3] = np.diag([0.05, 0.02, 0.1]) ** 2 + 4e-4 * np.outer([1, 1, 0], [1, 1, 0])
+        if not turning:  # a gyro without noise or error about the vertical
+            down = model.parameters(RATE_ERROR + 2)
+            p[down], p[:, down] = 0.0, 0.0
+        f = kind(model, 0.5)
+        nav = runs.level_nav((0.0, 0.0, 0.7), REST)
+        f.initialise(0, 0, nav, np.zeros(model.size), p)
+        f.propagate(imu, imu.latest_ns)
+        covariances.append(f.covariance[:3, :3].copy())
+    grown = covariances[0] - covariances[1]
+    turn = covariances[1][2, 2] - 0.01
+    assert turn > (1e-5 if turning else 0.0)
+    north, east, both = covariances[1][0, 0], covariances[1][1, 1], covariances[1][0, 1]
+    expected = turn * np.array([[east, -both], [-both, north]])
+    assert grown[:2, :2] == pytest.approx(expected, rel=0.2)
+    assert grown[2] == pytest.approx(0.0, abs=1e-9)
