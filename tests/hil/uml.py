@@ -28,7 +28,7 @@ NETWORK = HERE / "network.sh"
 GUEST_MEMORY_MIB = 2048
 # What the guest takes over from the caller's environment; the rest is the host's own affair.
 PASSED_ON = (
-    *("FUSIOND_", "NUMBA_", "PYTEST_", "PYTHONPATH", "XDG_CACHE_HOME"),
+    *("FUSIOND_", "NUMBA_", "OPENBLAS_", "PYTEST_", "PYTHONPATH", "XDG_CACHE_HOME"),
     *("CI", "HOME", "LANG", "TERM", "VIRTUAL_ENV"),
 )
 _turns = itertools.count()
