@@ -4,8 +4,8 @@
 
 Connects `COUNT` of each, says `connected`, and at the end of its input prints as JSON how many
 messages (MQTT), lines (gpsd, NMEA) the slowest and the fastest client of each kind had since then,
-and how much of a core this process took. A client counts what comes and reads no more of it: they run
-on the daemon's computer, and what they take is not there for the daemon.
+and how much of a core this process took. A client counts what comes and reads no more of it: they
+run on the daemon's computer, and what they take is not there for the daemon.
 """
 
 from __future__ import annotations
