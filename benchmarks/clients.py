@@ -3,7 +3,9 @@
     python benchmarks/clients.py COUNT MQTT_PORT GPSD_PORT NMEA_PORT
 
 Connects `COUNT` of each, says `connected`, and at the end of its input prints as JSON how many
-messages (MQTT), lines (gpsd, NMEA) the slowest and the fastest client of each kind had since then.
+messages (MQTT), lines (gpsd, NMEA) the slowest and the fastest client of each kind had since then,
+and how much of a core this process took. A client counts what comes and reads no more of it: they
+run on the daemon's computer, and what they take is not there for the daemon.
 """
 
 from __future__ import annotations
@@ -11,63 +13,103 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
-
-import aiomqtt
+import time
+from functools import partial
 
 WATCH = b'?WATCH={"enable":true,"json":true}\n'
+PUBLISH = 3
+CONNECT_CLEAN = b"\x00\x04MQTT\x04\x02\x00\x00"
+"""MQTT 3.1.1, clean session, no keep-alive (section 3.1 of the standard); the name follows."""
+TOPIC = b"fusiond/#"
 
 
-class Counts:
-    """What each client of a kind has received."""
-
-    def __init__(self, clients: int) -> None:
-        self.received = [0] * clients
-        self.connected = asyncio.Semaphore(0)
-
-    def begin(self) -> None:
-        self.received = [0] * len(self.received)
-
-    def range(self) -> list[int]:
-        return [min(self.received), max(self.received)]
+def _text(data: bytes) -> bytes:
+    return len(data).to_bytes(2) + data
 
 
-async def _mqtt(port: int, counts: Counts, number: int) -> None:
-    async with aiomqtt.Client("127.0.0.1", port) as client:
-        await client.subscribe("fusiond/#")
-        counts.connected.release()
-        async for _ in client.messages:
-            counts.received[number] += 1
+def _packet(kind: int, body: bytes) -> bytes:
+    assert len(body) < 128
+    return bytes([kind, len(body)]) + body
 
 
-async def _lines(port: int, greeting: bytes, counts: Counts, number: int) -> None:
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    writer.write(greeting)
-    counts.connected.release()
-    while await reader.readline():
-        counts.received[number] += 1
+class Lines(asyncio.Protocol):
+    """Says something once it is connected, then counts lines."""
+
+    def __init__(self, greeting: bytes, ready: asyncio.Semaphore) -> None:
+        self._greeting = greeting
+        self._ready = ready
+        self.received = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.WriteTransport)
+        transport.write(self._greeting)
+        self._ready.release()
+
+    def data_received(self, data: bytes) -> None:
+        self.received += data.count(b"\n")
 
 
-async def main(clients: int, mqtt: int, gpsd: int, nmea: int) -> None:
-    counts = {name: Counts(clients) for name in ("mqtt", "gpsd", "nmea")}
-    async with asyncio.TaskGroup() as group:
-        tasks = [
-            group.create_task(work)
-            for k in range(clients)
-            for work in (
-                _mqtt(mqtt, counts["mqtt"], k),
-                _lines(gpsd, WATCH, counts["gpsd"], k),
-                _lines(nmea, b"", counts["nmea"], k),
-            )
-        ]
-        for each in counts.values():
-            for _ in range(clients):
-                await each.connected.acquire()
-            each.begin()
-        print("connected", flush=True)
-        await asyncio.to_thread(sys.stdin.read)
-        print(json.dumps({name: each.range() for name, each in counts.items()}), flush=True)
-        for task in tasks:
-            task.cancel()
+class Messages(asyncio.Protocol):
+    """Subscribes to all of fusiond with quality 0, then counts what is published."""
+
+    def __init__(self, number: int, ready: asyncio.Semaphore) -> None:
+        self._name = f"listener-{number}".encode()
+        self._ready = ready
+        self._rest = b""
+        self.received = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.WriteTransport)
+        transport.write(_packet(0x10, CONNECT_CLEAN + _text(self._name)))
+        transport.write(_packet(0x82, b"\x00\x01" + _text(TOPIC) + b"\x00"))
+        self._ready.release()
+
+    def data_received(self, data: bytes) -> None:
+        data = self._rest + data
+        begin = 0
+        while (after := _end(data, begin)) is not None:
+            self.received += data[begin] >> 4 == PUBLISH
+            begin = after
+        self._rest = data[begin:]
+
+
+def _end(data: bytes, begin: int) -> int | None:
+    """Where the packet at `begin` ends (section 2.2.3); None while it is not all there."""
+    length, shift, at = 0, 0, begin + 1
+    while at < len(data):
+        length |= (data[at] & 0x7F) << shift
+        shift += 7
+        at += 1
+        if not data[at - 1] & 0x80:
+            return at + length if at + length <= len(data) else None
+    return None
+
+
+async def main(count: int, mqtt: int, gpsd: int, nmea: int) -> None:
+    ready = asyncio.Semaphore(0)
+    loop = asyncio.get_running_loop()
+    clients: dict[str, list[Messages | Lines]] = {"mqtt": [], "gpsd": [], "nmea": []}
+    for number in range(count):
+        for name, port, make in (
+            ("mqtt", mqtt, partial(Messages, number, ready)),
+            ("gpsd", gpsd, partial(Lines, WATCH, ready)),
+            ("nmea", nmea, partial(Lines, b"", ready)),
+        ):
+            _, client = await loop.create_connection(make, "127.0.0.1", port)
+            clients[name].append(client)
+    for _ in range(3 * count):
+        await ready.acquire()
+    before = {name: [client.received for client in each] for name, each in clients.items()}
+    began_s, used_s = time.monotonic(), time.process_time()
+    print("connected", flush=True)
+    await asyncio.to_thread(sys.stdin.read)
+    core = (time.process_time() - used_s) / (time.monotonic() - began_s)
+    found = {
+        name: [client.received - n for client, n in zip(each, before[name], strict=True)]
+        for name, each in clients.items()
+    }
+    told = {name: [min(counts), max(counts)] for name, counts in found.items()}
+    print(json.dumps({**told, "cpu_percent": round(100.0 * core, 1)}), flush=True)
 
 
 if __name__ == "__main__":

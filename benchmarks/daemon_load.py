@@ -15,8 +15,8 @@ cost more: UDP, msgpack and a Python object for each.
 `--record` records all of it: what that costs is the difference to a run without. `--clients` has N
 clients of MQTT, gpsd and NMEA each listen, at 10 Hz. `age_ms` is the time from the instant of a
 solution, that of its newest CAN frame, to the arrival of its `nav` at a client of the broker:
-median, 99 % and most. With many clients that is a matter of the machine, of which they and the
-broker take most.
+median, 99 % and most. With many clients that is a matter of the machine as well, of which they
+(`clients_cpu_percent`) and the broker take a part.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import aiomqtt
 import numpy as np
@@ -153,9 +154,9 @@ async def _ages_ms(broker: Broker) -> AsyncIterator[list[float]]:
 
 
 @asynccontextmanager
-async def _clients(count: int, *ports: int) -> AsyncIterator[dict[str, list[int]]]:
+async def _clients(count: int, *ports: int) -> AsyncIterator[dict[str, Any]]:
     """That many of each kind, in a process of their own; what they heard is there afterwards."""
-    heard: dict[str, list[int]] = {}
+    heard: dict[str, Any] = {}
     if not count:
         yield heard
         return
@@ -241,6 +242,7 @@ async def measure(
         "lateness_p99_ms": after["lateness_p99_ms"],
         "age_ms": [round(float(np.percentile(ages_ms, q)), 1) for q in (50, 99, 100)],
         "clients": clients,
+        "clients_cpu_percent": served.pop("cpu_percent", 0.0),
         "received_least_and_most": served,
     }
 

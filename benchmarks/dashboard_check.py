@@ -41,8 +41,9 @@ AIM_MB = 80.0
 SETTLED_S = 60.0
 """After which growth counts: buffers fill for some seconds, history for ten minutes."""
 GROWTH_MB = 8.0
-"""What history holds when it is full, after ten minutes: 6.8 MB of the demo (tracemalloc), most of
-it 12000 innovations. Nothing else may grow, however many minutes there are."""
+"""History, full after ten minutes, takes 3 of them (RSS, at ten times the rate), most of it 12000
+innovations; the rest is for what frames and buffers leave. Nothing else may grow, however many
+minutes there are."""
 BROWSERS = 5
 COMPARED_S = 30.0
 CORE_PERCENT = 10.0

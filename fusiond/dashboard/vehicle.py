@@ -6,14 +6,15 @@ count and asks for what is newer: a slow one gets the newest and never a queue o
 
 from __future__ import annotations
 
+import sys
 from collections import deque
-from collections.abc import Mapping, Reversible
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import takewhile
 from statistics import median
 from typing import Any
 
 from fusiond.dashboard.advice import advice
+from fusiond.dashboard.history import Keyed, Ring
 
 Said = Mapping[str, Any]
 
@@ -29,6 +30,8 @@ ROW_EVERY_S = 0.5
 """Spacing of the rows of a solution: ten minutes are 1200 points, about a plot's pixels."""
 MOST_ROWS = {"nav": 1200, "nis": 4800, "delay": 500, "event": 200}
 """By kind. `nis`: eight sources for ten minutes at 1 Hz."""
+KINDS = {"nav": "ddo" + 10 * "d", "nis": "doddd", "delay": "dod", "event": "do"}
+"""By column, as `history` has them: those of `nav` are `nav_row`'s."""
 MOST_INNOVATIONS = 12000
 """20 a second for ten minutes: position and velocity of a receiver at 10 Hz."""
 CARRIED = ("nav", "status", "health", "consistency", "calibration")
@@ -51,10 +54,8 @@ class Vehicle:
         self.name = name
         self.count = 0
         self._latest: dict[str, Heard] = {}
-        self._rows: dict[str, deque[tuple[int, list[Any]]]] = {
-            kind: deque(maxlen=most) for kind, most in MOST_ROWS.items()
-        }
-        self._innovations: dict[tuple[str, float], tuple[int, list[Any]]] = {}
+        self._rows = {kind: Ring(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
+        self._innovations = Keyed(MOST_INNOVATIONS, "doodd")
         self._next_row_s = float("-inf")
         self._received: dict[str, int] = {}
 
@@ -88,16 +89,9 @@ class Vehicle:
             for topic, heard in self._latest.items()
             if heard.number > count
         }
-        rows: dict[str, list[list[Any]]] = {}
-        kinds: dict[str, Reversible[tuple[int, list[Any]]]] = {
-            **self._rows,
-            "innovation": self._innovations.values(),
-        }
-        for kind, kept in kinds.items():
-            newer = [row for _, row in takewhile(lambda each: each[0] > count, reversed(kept))]
-            if newer:
-                rows[kind] = newer[::-1]
-        return {"messages": messages, "rows": rows}
+        kinds: dict[str, Ring | Keyed] = {**self._rows, "innovation": self._innovations}
+        newer = {kind: kept.newer(count) for kind, kept in kinds.items()}
+        return {"messages": messages, "rows": {kind: rows for kind, rows in newer.items() if rows}}
 
     def limit_s(self, topic: str) -> float | None:
         """Age from which what `topic` said is old, in s; None for what does not age."""
@@ -126,7 +120,7 @@ class Vehicle:
 
     def _row(self, kind: str, row: list[Any]) -> None:
         self.count += 1
-        self._rows[kind].append((self.count, row))
+        self._rows[kind].add(self.count, row)
 
     def _told_before(self, events: object, kept: bool) -> None:
         """The events before anybody listened here, which the broker had kept."""
@@ -182,12 +176,11 @@ class Vehicle:
         source, outcome = said.get("source"), said.get("outcome")
         if not (isinstance(source, str) and isinstance(outcome, str) and key is not None):
             return
-        _, before = self._innovations.pop((source, key), (0, [at_s]))
-        row = [before[0], source, outcome, number(said, "nis"), number(said, "degrees")]
+        place = sys.intern(source), key
+        first_s = (self._innovations.get(place) or [at_s])[0]
         self.count += 1
-        self._innovations[source, key] = self.count, row
-        if len(self._innovations) > MOST_INNOVATIONS:
-            del self._innovations[next(iter(self._innovations))]
+        row = [first_s, source, outcome, number(said, "nis"), number(said, "degrees")]
+        self._innovations.put(place, self.count, row)
 
 
 NAV_COLUMNS = (

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import version
 
 from fusiond.configuration.load import config_digest
@@ -63,6 +64,7 @@ class Publishing:
         self._tracking = Tracking()
         self._status = Every(STATUS_EVERY_S * SECOND_NS)
         self._calibration = Every(CALIBRATION_EVERY_S * SECOND_NS)
+        self._waiting: deque[tuple[Topic, Message]] = deque()
         self.serve(config, outputs)
 
     def serve(self, config: Config, outputs: Mapping[str, Output]) -> None:
@@ -74,16 +76,21 @@ class Publishing:
         self._calibrated: tuple[CalibrationState, ...] = ()
 
     def tick(self, t_ns: int, solution: Solution) -> None:
-        """Publish what is due at the tick of `t_ns`, the status at every change of mode too."""
+        """Publish what is due at the tick of `t_ns`, the status at every change of mode too.
+
+        The large messages of a second are of one instant and go out a tick each: a broker hands one
+        to all its clients before the next, and the next solution would wait for all of them."""
         changed = solution.mode is not self._mode
         if changed:
             self._mode, self._since_ns = solution.mode, t_ns
         utc_ns = self._clock.utc_ns(t_ns)
         self._publish_nav(t_ns, utc_ns, solution)
+        if self._health.due(t_ns):
+            self._publish_waiting(most=len(self._waiting))
+            self._waiting.extend(self._of_health(t_ns, utc_ns))
         if self._status.due(t_ns) or changed:
             self._publish_status(t_ns, utc_ns, solution)
-        if self._health.due(t_ns):
-            self._publish_health(t_ns, utc_ns)
+        self._publish_waiting(most=1)
         self._publish_calibration(t_ns, utc_ns)
 
     def _tell(self, topic: Topic, message: Message) -> None:
@@ -135,9 +142,13 @@ class Publishing:
             ),
         )
 
-    def _publish_health(self, t_ns: int, utc_ns: int | None) -> None:
+    def _publish_waiting(self, most: int) -> None:
+        for _ in range(min(most, len(self._waiting))):
+            self._tell(*self._waiting.popleft())
+
+    def _of_health(self, t_ns: int, utc_ns: int | None) -> Iterator[tuple[Topic, Message]]:
         cpu_percent, memory_mb = self._usage.sample()
-        self._tell(
+        yield (
             HEALTH,
             health_message(
                 utc_ns,
@@ -151,10 +162,10 @@ class Publishing:
         )
         reports = self._navigator.verdicts.reports()
         if reports:
-            self._tell(CONSISTENCY, consistency_message(utc_ns, reports))
+            yield CONSISTENCY, consistency_message(utc_ns, reports)
         innovations = self._innovations.since()
         if innovations:
-            self._tell(INNOVATIONS, innovations_message(utc_ns, innovations))
+            yield INNOVATIONS, innovations_message(utc_ns, innovations)
 
 
 def _health(output: Output) -> OutputHealth:

@@ -26,11 +26,9 @@ HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parents[1]
 NETWORK = HERE / "network.sh"
 GUEST_MEMORY_MIB = 2048
-# What the guest takes over from the caller's environment; the rest is the host's own affair. What
-# chooses between arithmetics that differ in the last bit is taken over: a host replays a guest's log.
+# What the guest takes over from the caller's environment; the rest is the host's own affair.
 PASSED_ON = (
-    *("FUSIOND_", "NUMBA_", "PYTEST_", "PYTHONPATH", "XDG_CACHE_HOME"),
-    *("OPENBLAS_", "NPY_", "GLIBC_TUNABLES"),
+    *("FUSIOND_", "NUMBA_", "OPENBLAS_", "PYTEST_", "PYTHONPATH", "XDG_CACHE_HOME"),
     *("CI", "HOME", "LANG", "TERM", "VIRTUAL_ENV"),
 )
 _turns = itertools.count()
