@@ -12,7 +12,10 @@ An update that turns C by psi about the vertical and leaves P's t in its axes sa
 as well, and both at once are true of b = 0 alone: each of the headings that a vehicle of poorly
 known heading is taken to have tells some more of b, of which nothing was measured. On a straight,
 with the heading known to 3 deg, tilt had shrunk to half its sigma after a minute and was 7.8 sigma
-off. The error is one in the axes that turn with the heading,
+off. What an angle known to s_a makes of a bias known to s_b is another acceleration by s_a s_b, and
+that counts once the sum is known as well: after a doubt of the motion, which leaves 0.5 m/s^2 in
+each bias, a heading known to a degree is as poor as one of 5 deg is at a start. The error is one in
+the axes that turn with the heading,
 
     C = R(psi) exp(t x) C^        (as in fusiond.estimators.invariant)
 
@@ -46,9 +49,9 @@ from fusiond.navigation.strapdown import Q0
 
 Array = NDArray[np.float64]
 
-# Below this sigma of the heading it is left: turns of less than that move what biases of 0.1 m/s^2
-# make by 3 mm/s^2, and no update of a vehicle that knows its heading pays for it.
-POOR_SD_RAD = math.radians(2.0)
+# Below this (m/s^2) of s_a s_b it is left: a receiver's velocities of 5 cm/s, two a second, show no
+# slope of less within half a minute, and no update of a vehicle that knows its heading pays for it.
+SLIGHT_M_S2 = 1e-3
 # Cosine of the tilt beyond which no accelerometer is the vertical one.
 UPRIGHT = 0.5
 
@@ -81,13 +84,21 @@ def felt_kept(model: Model, before: Array, after: Array) -> Array:
 class TiltAxesFilter(KalmanEstimator):
     """The centralised filter, in whose P the axes of a tilt turn with a poorly known heading."""
 
+    def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
+        super().__init__(model, gap_s, shares)
+        self.turned = 0.0
+        """By how much (rad) the last update turned the axes in which P has the tilt."""
+        self._felt_by = [slot for axis in range(3) for slot in model.parameters(FORCE_ERROR + axis)]
+
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
+        self.turned = 0.0
         if self._holding or not self._poor:
             return self._fold_in(aid)
         before = self.nav[Q0:].copy()
         outcome = self._fold_in(aid)
         if outcome.name == "fused":
+            self.turned = heading_turn(before, self.nav[Q0:])
             self._carry_over(felt_kept(self.model, before, self.nav[Q0:]))
         return outcome
 
@@ -100,7 +111,10 @@ class TiltAxesFilter(KalmanEstimator):
 
     @property
     def _poor(self) -> bool:
-        return bool(self._covs[0, PHI + 2, PHI + 2] > POOR_SD_RAD**2)
+        """Whether an angle that is corrected makes much of what the biases may be."""
+        variance = self._covs[0].diagonal().tolist()
+        biases = [variance[slot] for slot in self._felt_by]
+        return bool(biases) and max(variance[PHI : PHI + 3]) * max(biases) > SLIGHT_M_S2**2
 
     def _fold_in(self, aid: Linearised) -> Outcome:
         return super().update(aid)
