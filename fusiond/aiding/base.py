@@ -113,6 +113,11 @@ class Aid:
         return self.source
 
     @property
+    def white(self) -> bool:
+        """Whether its errors are configured to share nothing from one to the next."""
+        return False
+
+    @property
     def feedback(self) -> Feedback:
         """When the estimate that it leads to is fed back."""
         return "at_once"

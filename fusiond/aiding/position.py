@@ -148,7 +148,7 @@ class PositionAid(Aid):
 
     `bias`: the blocks whose states north, east, down are the error that the fixes share, and
     `bias_share` what part of it there is in each axis; `time` that of their offset in time; `rest`
-    that of what is left of the lever arm.
+    that of what is left of the lever arm. `shares_nothing`: there is no such error.
     """
 
     locates: ClassVar[bool] = True
@@ -163,6 +163,11 @@ class PositionAid(Aid):
     time: str = ""
     rest: str = ""
     bias_share: Vector3 = (1.0, 1.0, 1.0)
+    shares_nothing: bool = False
+
+    @property
+    def white(self) -> bool:
+        return self.shares_nothing
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p = state

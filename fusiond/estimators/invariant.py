@@ -247,6 +247,7 @@ class InvariantFilter(TiltAxesFilter):
             self.turns = True
         if not self.turns or self._holding:
             return super().update(aid)
+        self.turned = 0.0
         outcome = self._update(aid)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = self._doubted = False
@@ -278,8 +279,8 @@ class InvariantFilter(TiltAxesFilter):
         after = self.of_vehicle(nav, xi) @ self.jacobian(found.error, turning)
         p = after @ found.covariance @ after.T
         self.covariance[:] = 0.5 * (p + p.T)
-        self.nav[:], self.xi[:] = nav, xi
-        self.step[:] = _turned(self.step, float(found.error[PHI + 2]))
+        self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
+        self.step[:] = _turned(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
     def _unfelt(self, p: Array) -> None:

@@ -10,8 +10,9 @@ An update that turns C by psi about the vertical and leaves P's t in its axes sa
     R(psi) C b - g z x t = 0
 
 as well, and both at once are true of b = 0 alone: each of the headings that a vehicle is taken to
-have tells some more of b, of which nothing was measured. It does with a heading that is known to
-0.3 deg, if b is large. The error is one in the axes that turn with the heading,
+have tells some more of b, of which nothing was measured. What an angle known to s_a makes of a bias
+known to s_b is an acceleration of s_a s_b, and that counts once the sum is known as well: a heading
+known to 0.3 deg does it, if b is large. The error is one in the axes that turn with the heading,
 
     C = R(psi) exp(t x) C^        (as in fusiond.estimators.invariant)
 
@@ -31,8 +32,8 @@ r and t are independent to the first order, and t's covariance grows by var(r) (
 (TURN_TILT of fusiond.estimators.propagation); once an update takes r out of the heading, t is
 turned by as much, though it had not stayed behind: an error of that very variance. All are of the
 second order, psi b, dt b, r b. Twelve cars with accelerometers of 50 mg and gyros of 3 deg/s, each
-tilt known by its sum with a bias, after a minute and its one bend: NEES a degree 169 of the tilt and
-95 of the velocity without any of this, 1.2 and 0.5 with it.
+tilt known by its sum with a bias, after a minute and its one bend: NEES a degree 169 of the tilt
+and 95 of the velocity without any of this, 1.2 and 0.5 with it.
 
 Source: Solà, Quaternion kinematics for the error-state Kalman filter (2017), section 6.3, for the
 transform of a covariance on reset; Huang, Mourikis, Roumeliotis, IJRR 29 (2010), 502, for what a
@@ -53,6 +54,7 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, PHI
 from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import Q0
@@ -60,9 +62,9 @@ from fusiond.navigation.strapdown import Q0
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# g times this, 1e-4 m/s^2, is left (rad^2): one sigma of the heading times one of the tilt. A
-# vehicle whose velocity is measured to 0.1 m/s knows its acceleration to 2e-3 within a minute.
-LEFT_RAD2 = 1e-5
+# Below this (m/s^2) of s_a s_b it is left: velocities good to 0.1 m/s show an acceleration of 2e-3
+# within a minute, and no update of a vehicle that knows its tilt pays for it.
+SLIGHT_M_S2 = 1e-4
 # Cosine of the tilt beyond which no accelerometer is the vertical one.
 UPRIGHT = 0.5
 
@@ -107,21 +109,27 @@ class TiltAxesFilter(KalmanEstimator):
 
     def __init__(self, model: Model, gap_s: float) -> None:
         super().__init__(model, gap_s)
-        self._options |= TURN_TILT
+        self.turned = 0.0
+        """By how much (rad) the last update turned the axes in which P has the tilt."""
         # Slots and axes, the vertical one first: without it there is none to take what is left.
         found = [
             (slot, axis) for axis in (2, 0, 1) for slot in model.parameters(FORCE_ERROR + axis)
         ]
         known = found if found and found[0][1] == 2 else []
         self._biases = np.array(known, dtype=np.int64).reshape(-1, 2).T.copy()
+        self._slots: list[int] = self._biases[0].tolist()
+        if known:
+            self._options |= TURN_TILT
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
+        self.turned = 0.0
         if self._holding or not self._apart:
             return self._fold_in(aid)
         before = self.nav[Q0:].copy()
         outcome = self._fold_in(aid)
         if outcome.name == "fused":
+            self.turned = heading_turn(before, self.nav[Q0:])
             self._carry_over(before)
         return outcome
 
@@ -135,9 +143,13 @@ class TiltAxesFilter(KalmanEstimator):
     @property
     def _apart(self) -> bool:
         """Whether an update may tell tilt and bias apart that nothing has told apart."""
-        p = self._covs[0]
-        tilt = max(p[PHI, PHI], p[PHI + 1, PHI + 1])
-        return bool(p[PHI + 2, PHI + 2] * tilt > LEFT_RAD2**2)
+        if not self._slots:
+            return False
+        p = self._covs[0].item
+        tilt = max(p(PHI, PHI), p(PHI + 1, PHI + 1))
+        of_heading = STANDARD_GRAVITY_M_S2**2 * p(PHI + 2, PHI + 2)
+        force = max(of_heading, *[p(slot, slot) for slot in self._slots])
+        return tilt * force > SLIGHT_M_S2**2
 
     def _fold_in(self, aid: Linearised) -> Outcome:
         return super().update(aid)

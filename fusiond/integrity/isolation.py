@@ -9,8 +9,11 @@ Gate          y^T y against the chi-square of the aid's gate. `REFUSED_IN_A_ROW`
 Mean          m <- (1 - a) m + a y at two paces a. |m|^2 / (a / (2 - a) + c) is chi-square of d for
               innovations that share the part c of their variance, as the errors of a receiver
               without corrections do; beyond the quantile 1 - p the series has a bias that the gate
-              cannot see: a ramp, a step inside the gate, a velocity of another instant.
-Repetition    what is the same to the bit while the filter moves, more often than by chance.
+              cannot see: a ramp, a step inside the gate, a velocity of another instant. Of a series
+              that is configured to share nothing c is 0 until it shows otherwise: sigma shrinks as
+              if that were so, and what is as slow must be told as soon.
+Repetition    what is the same to the bit while the filter moves, more often than by chance; a
+              velocity as soon as the position of the same device is: a receiver that hangs.
 
 A series that fails the mean test is measured against the rest: where another position, or the
 velocity of the same device, is believed, the series is excluded; where nothing is left to compare
@@ -20,8 +23,10 @@ aids that are fused correct its tilt more than its P allows (fusiond.integrity.t
 An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
 over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
 filter's own bound, grown as the IMU's errors let it, or another source then supports it. Patience
-does not. After an outage of all positions the first that comes back is taken at once, but counts
-less until it is seen to go with the motion (fusiond.integrity.proof).
+does not. The filter's error, P / (P + R) of a position's variance, is the same in all of them, and
+c no less: a filter that has gone astray by one of its sigmas could never be corrected else. After
+an outage of all positions the first that comes back is taken at once, but counts less until it is
+seen to go with the motion (fusiond.integrity.proof).
 
 With all series of position refused nobody can say who is wrong from innovations alone; how it began
 can. An IMU's fault reaches the velocity before the position, and moves the position by no more than
@@ -37,7 +42,6 @@ Srinath, IEEE Trans. AC 32 (1987), 1133.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
@@ -45,11 +49,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
+from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
-from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart
-from fusiond.integrity.series import DRIFTS, NEVER_NS, Series
+from fusiond.integrity.means import Means
+from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
+from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting
 
@@ -178,16 +183,18 @@ class Isolation:
 
     # ------------------------------------------------------------------ judgement
 
-    def judge(self, aid: Aid, outcome: Outcome, nav: Array) -> Action:
+    def judge(
+        self, aid: Aid, outcome: Outcome, nav: Array, covariance: Array | None = None
+    ) -> Action:
         """Take in how an aid ended, fused, gated or only looked at; what the filter shall do.
 
-        `nav` (10,): the navigation state that it was compared with.
+        `nav` (10,): the navigation state that it was compared with; P (n, n), where it is known.
         """
         t_ns = aid.t_ns
         record = self._record(aid)
         passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
         lat, lon, _, v_n, v_e, *_ = nav.tolist()
-        offer, velocity, value = _said(aid.offers())
+        offer, velocity, value = said(aid.offers())
         offset = None
         if offer is not None:
             offset = apart(offer, lat, lon, nav)
@@ -195,12 +202,13 @@ class Isolation:
         elif record.moves:
             record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
         moving = math.hypot(v_n, v_e) > MOVING_M_S
-        repeats = value is not None and record.repeats_itself(value, moving)
+        repeats = value is not None and support.repeats(self._records, record, value, moving)
         if record.excluded:
-            self._look(record, t_ns, passed and not repeats, outcome.whitened, offset)
+            own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
+            self._look(record, t_ns, passed and not repeats, outcome.whitened, offset, own)
             return Action.NONE
         if repeats:
-            self._exclude(record, t_ns, "repeats itself", jumped=True)
+            self._exclude(record, t_ns, REPEATS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED if passed else Action.NONE, t_ns)
         if outcome.name != "fused":
             if aid.constraint:
@@ -208,7 +216,7 @@ class Isolation:
                 return Action.NONE
             if passed:
                 return Action.NONE
-            away = record.away_m if aid.locates else _velocity_away(velocity, v_n, v_e)
+            away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
         runs = offer is not None and self._prove(record, offer, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
@@ -226,10 +234,10 @@ class Isolation:
         P (n, n)."""
         self._tilting.before(nav, covariance)
 
-    def corrected(self, t_ns: int, nav: Array, covariance: Array) -> Action:
-        """It was, and these are what came of it; what the filter shall do about the attitude, as
-        fusiond.integrity.tilt has it."""
-        if not self._tilting.after(t_ns, nav, covariance):
+    def corrected(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> Action:
+        """It was, and these are what came of it, P in axes that have `turned` (rad); what the
+        filter shall do about the attitude, as fusiond.integrity.tilt has it."""
+        if not self._tilting.after(t_ns, nav, covariance, turned):
             return Action.NONE
         self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)
@@ -240,6 +248,7 @@ class Isolation:
         record = self._records.get(aid.source)
         if record is None:
             record = Series(aid.device, aid.locates, aid.moves, t_ns, aid.no_slip)
+            record.means = Means.begun(aid.white)
             self._records[aid.source] = record
             return record
         if aid.source in self._shared:
@@ -323,8 +332,10 @@ class Isolation:
         passed: bool,
         whitened: tuple[float, ...],
         offset: Offset | None,
+        own: float,
     ) -> None:
-        """An innovation of a series that is left out: what may bring it back."""
+        """An innovation of a series that is left out: what may bring it back. `own` of its variance
+        is the filter's."""
         if not passed:
             record.passes = 0
             record.means.restart()
@@ -341,7 +352,7 @@ class Isolation:
             record.passes >= READMIT_COUNT
             and t_ns - record.passing_ns >= READMIT_NS
             and (offset is None or record.trend.steady(record.least_trend_sd))
-            and not self._biased(record, t_ns)
+            and not self._biased(record, t_ns, own)
         ):
             record.excluded, record.fused_ns = "", t_ns
             record.refused, record.jumped, record.proof = 0, False, None
@@ -353,10 +364,10 @@ class Isolation:
 
     # ------------------------------------------------------------------ the mean test
 
-    def _biased(self, record: Series, t_ns: int) -> bool:
+    def _biased(self, record: Series, t_ns: int, own: float = 0.0) -> bool:
         means = record.means
         degrees = means.degrees
-        return degrees > 0 and means.biased(t_ns, gate_threshold(self._pass, degrees))
+        return degrees > 0 and means.biased(t_ns, gate_threshold(self._pass, degrees), own)
 
     def _blame(self, record: Series, aid: Aid) -> Action:
         """A bias inside the gate: the series', where something else supports the filter."""
@@ -369,30 +380,3 @@ class Isolation:
             return Action.DOUBT_FILTER
         self._exclude(record, aid.t_ns, DRIFTS, jumped=record.locates)
         return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
-
-
-def _said(
-    offers: Sequence[Offer],
-) -> tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]:
-    """What an aid says of position and velocity, and what a sensor that hangs repeats to the
-    bit."""
-    position = velocity = value = None
-    for offer in offers:
-        said: tuple[float, ...] | None = None
-        if isinstance(offer, PositionOffer):
-            position, said = offer, (offer.lat_rad, offer.lon_rad)
-        elif isinstance(offer, VelocityOffer):
-            velocity, said = offer, offer.v_ned
-        elif isinstance(offer, SpeedOffer):
-            said = (offer.speed_m_s,)
-        if value is None:
-            value = said
-    return position, velocity, value
-
-
-def _velocity_away(velocity: VelocityOffer | None, north: float, east: float) -> float:
-    """How far a measured velocity is from the filter's (m/s); a lever arm that turns is left to the
-    sigma. 0 where none was measured."""
-    if velocity is None:
-        return 0.0
-    return math.hypot(velocity.v_ned[0] - north, velocity.v_ned[1] - east)

@@ -101,19 +101,22 @@ def _believe(packed: Array) -> None:
     packed[_LEARNED] = min(packed[_LEARNED] + n, LEARN_COUNT)
 
 
-@compiled("b1(f8[::1], i8, f8)")
-def _biased(packed: Array, t_ns: int, limit: float) -> bool:
-    """Whether a mean is beyond `limit`, the quantile of chi-square of d; learn from it if not."""
+@compiled("b1(f8[::1], i8, f8, f8)")
+def _biased(packed: Array, t_ns: int, limit: float, own: float) -> bool:
+    """Whether a mean is beyond `limit`, the quantile of chi-square of d, where `own` of each
+    innovation's variance is common to all; learn from it if not, and nothing is."""
     d = (packed.shape[0] - _HEAD) // 2
     fast = slow = 0.0
     for i in range(d):
         fast += packed[_HEAD + i] * packed[_HEAD + i]
         slow += packed[_HEAD + d + i] * packed[_HEAD + d + i]
-    if fast > limit * packed[_SPREAD] or slow > limit * packed[_SPREAD + 1]:
+    if fast > limit * (packed[_SPREAD] + own) or slow > limit * (packed[_SPREAD + 1] + own):
         for k in range(_SHOWN, _HEAD):
             packed[k] = 0.0
         packed[:1].view(np.int64)[0] = _LONG_AGO_NS
         return True
+    if own > 0.0:
+        return False
     if t_ns - packed[:1].view(np.int64)[0] >= LEARN_NS:
         _believe(packed)
         for k in range(_SUMS):
@@ -127,10 +130,10 @@ def _biased(packed: Array, t_ns: int, limit: float) -> bool:
     return False
 
 
-def _begun(degrees: int) -> Array:
-    packed = np.zeros(_HEAD + 2 * degrees)
+def _begun(assumed: float) -> Array:
+    packed = np.zeros(_HEAD)
     packed[:1].view(np.int64)[0] = _LONG_AGO_NS
-    packed[_SPREAD : _SPREAD + 2] = WHITE_FAST + ASSUMED, WHITE_SLOW + ASSUMED
+    packed[_SPREAD : _SPREAD + 2] = WHITE_FAST + assumed, WHITE_SLOW + assumed
     packed[_SLOWLY], packed[_COARSE] = WHITE_SLOW, 1.0
     return packed
 
@@ -141,7 +144,12 @@ class Means:
     __slots__ = ("_packed",)
 
     def __init__(self, packed: Array | None = None) -> None:
-        self._packed = _begun(0) if packed is None else packed
+        self._packed = _begun(ASSUMED) if packed is None else packed
+
+    @staticmethod
+    def begun(white: bool) -> Means:
+        """Of a series that nothing is known of; `white`: its errors are said to share nothing."""
+        return Means(_begun(0.0 if white else ASSUMED))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Means) and self._packed.tobytes() == other._packed.tobytes()
@@ -172,10 +180,11 @@ class Means:
         packed = self._packed
         return (packed.shape[0] - _HEAD) // 2 if packed[_COUNT] >= FEWEST else 0
 
-    def biased(self, t_ns: int, limit: float) -> bool:
+    def biased(self, t_ns: int, limit: float, own: float = 0.0) -> bool:
         """Whether a mean of the innovations until `t_ns` is beyond chance: `limit` is the quantile
-        of chi-square of `degrees`. If not, what it shows is learned from."""
-        return _biased(self._packed, t_ns, limit)
+        of chi-square of `degrees`, `own` the part (1) of each innovation's variance that is the
+        filter's and common to all. If not, what it shows of the series is learned from."""
+        return _biased(self._packed, t_ns, limit, own)
 
     @property
     def colour(self) -> float:

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.error_model import DR
 from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VE, VN
 
@@ -52,9 +53,9 @@ WALKED = math.sqrt(1.2)
 TREND_SD_M_S = 0.07
 # One that was left out because it drifted, by a third and less: 0.1 m/s is what a receiver's honest
 # velocity shows within twenty seconds, and five of this. Not so one that was seen to run away by
-# five times the above: a drift as slow as that is not what has to be over.
-DRIFT_SD_M_S = 0.02
-RUNS_SD_M_S, RUNS_M_S = 0.5 * TREND_SD_M_S, 5.0 * TREND_SD_M_S
+# five times the above, five sigma beyond half of that: a drift as slow is not what has to be over.
+DRIFT_SD_M_S, SLOWEST_M_S = 0.02, 0.1
+RUNS_M_S, RUNS_SIGMAS = 5.0 * TREND_SD_M_S, 5.0
 
 
 class Offset(NamedTuple):
@@ -111,7 +112,7 @@ class Trend(NamedTuple):
     def runs_away(self) -> bool:
         """Whether the slope is known to be that of no slow drift."""
         slope, sd = self.slope
-        return sd <= RUNS_SD_M_S and slope > RUNS_M_S
+        return slope > RUNS_M_S and slope > 0.5 * RUNS_M_S + RUNS_SIGMAS * sd
 
 
 NO_TREND = Trend()
@@ -172,8 +173,11 @@ class Proof(NamedTuple):
 
     @property
     def proven(self) -> bool:
-        """Whether the slowest drift that is told from none would show."""
-        return self.trend.slope[1] * self.colour <= DRIFT_SD_M_S and self._none
+        """Whether it would show if it drifted, and is three sigma from the slowest drift that
+        shows."""
+        slope, sd = self.trend.slope
+        clear = slope + 3.0 * self.sigma < SLOWEST_M_S
+        return sd * self.colour <= DRIFT_SD_M_S and self._none and clear
 
     @property
     def _none(self) -> bool:
@@ -197,6 +201,13 @@ def apart(offer: PositionOffer, lat: float, lon: float, nav: Array) -> Offset:
     """From the body's origin as measured to a place (rad, rad); `nav` (10,) turns the lever arm."""
     north, east = _apart(nav, lat - offer.lat_rad, lon - offer.lon_rad, *offer.lever)
     return Offset(north, east, max(offer.sd[:2]))
+
+
+def filters_own(offer: PositionOffer, covariance: Array) -> float:
+    """The part (1) of the variance of a position's innovation that is the filter's own error, in P
+    (n, n): of the axis where it is most."""
+    own: list[float] = covariance.diagonal()[DR : DR + 3].tolist()
+    return max(p / (p + sd * sd) for p, sd in zip(own, offer.sd, strict=True))
 
 
 @compiled("UniTuple(f8, 2)(f8[::1], f8, f8, f8, f8, f8)")

@@ -6,9 +6,11 @@ A series is what one source says of one thing; fusiond.integrity.isolation judge
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 
+from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.integrity.means import Means
 from fusiond.integrity.proof import (
     DRIFT_SD_M_S,
@@ -18,7 +20,7 @@ from fusiond.integrity.proof import (
     Trend,
 )
 
-DRIFTS = "drifts"
+DRIFTS, REPEATS = "drifts", "repeats itself"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2
@@ -93,9 +95,42 @@ class Series:
         return math.log(CHANCE) / math.log(min(max(self.repeating, 0.01), 1.0 - 1e-12))
 
     @property
+    def returning(self) -> bool:
+        """While excluded: whether it passes, and cannot be known to run away or not as yet."""
+        slope, sd = self.trend.slope
+        return self.passes > 0 and sd > self.least_trend_sd and slope <= 3.0 * sd
+
+    @property
     def believed(self) -> bool:
         """Whether its last innovation was fused."""
         return not (self.refused or self.excluded)
 
 
 _FIELDS = attrgetter(*Series.__slots__)
+
+
+def said(
+    offers: Sequence[Offer],
+) -> tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]:
+    """What an aid says of position and velocity, and what a sensor that hangs repeats to the
+    bit."""
+    position = velocity = value = None
+    for offer in offers:
+        said: tuple[float, ...] | None = None
+        if isinstance(offer, PositionOffer):
+            position, said = offer, (offer.lat_rad, offer.lon_rad)
+        elif isinstance(offer, VelocityOffer):
+            velocity, said = offer, offer.v_ned
+        elif isinstance(offer, SpeedOffer):
+            said = (offer.speed_m_s,)
+        if value is None:
+            value = said
+    return position, velocity, value
+
+
+def velocity_away(velocity: VelocityOffer | None, north: float, east: float) -> float:
+    """How far a measured velocity is from the filter's (m/s); a lever arm that turns is left to the
+    sigma. 0 where none was measured."""
+    if velocity is None:
+        return 0.0
+    return math.hypot(velocity.v_ned[0] - north, velocity.v_ned[1] - east)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
-from fusiond.integrity.series import NEVER_NS, Series
+from fusiond.integrity.series import NEVER_NS, REPEATED, Series
 
 # What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
 FORGET_NS = 5_000_000_000
@@ -35,13 +35,14 @@ Records = Mapping[str, Series]
 class Lost(NamedTuple):
     """No position is believed: since when, whether `source` or `filter` is to blame, and how the
     first of them ended (`jumped`, `drifts`, ...). `disputed`: a coarse position that is believed
-    says that the source is wrong."""
+    says that the source is wrong. `returning`: one is on its way back."""
 
     since_ns: int
     cause: str
     device: str
     reason: str
     disputed: bool
+    returning: bool = False
 
 
 def lost(records: Records, t_ns: int) -> Lost | None:
@@ -66,7 +67,8 @@ def lost(records: Records, t_ns: int) -> Lost | None:
     )
     reason = first.excluded or "refused"
     cause = "source" if source else "filter"
-    return Lost(first.refused_ns, cause, first.device, reason, disputed)
+    returning = any(r.excluded and r.returning for r in heard)
+    return Lost(first.refused_ns, cause, first.device, reason, disputed, returning)
 
 
 def contested(records: Records, t_ns: int) -> str | None:
@@ -90,6 +92,18 @@ def contested(records: Records, t_ns: int) -> str | None:
         ):
             return f"{name} is back and not yet seen to go with the motion"
     return None
+
+
+def repeats(records: Records, record: Series, value: tuple[float, ...], moving: bool) -> bool:
+    """Whether a new value, of a vehicle that may be `moving`, is none: its series repeats itself,
+    or does so no less often than the position of the same device, so that the device hangs."""
+    return record.repeats_itself(value, moving) or (
+        record.repeats >= REPEATED
+        and any(
+            r.locates and r.device == record.device and r.repeats >= REPEATED
+            for r in records.values()
+        )
+    )
 
 
 def supported(records: Records, device: str, t_ns: int) -> bool:

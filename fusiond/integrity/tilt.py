@@ -10,6 +10,9 @@ tilts the navigation axes by more each second; gravity makes a velocity of that,
 velocity takes it back again and again in the same direction. Each single innovation is small, and
 so is their mean, for the filter follows: what it has followed by is what tells.
 
+Where an update turns the heading by psi and P with it (fusiond.estimators.tilt_axes), P+ is taken
+back to the axes of P-, and c and V are in those of P+ from then on.
+
 Source: Mehra, Peschon, An innovations approach to fault detection and diagnosis in dynamic systems,
 Automatica 7 (1971), section 3.
 """
@@ -45,8 +48,22 @@ def _remember(nav: Array, covariance: Array, before: Array) -> None:
     before[4], before[5], before[6] = covariance[0, 0], covariance[0, 1], covariance[1, 1]
 
 
-@compiled("b1(f8[::1], i8, f8[::1], f8[::1], f8[:, :])")
-def _add(sums: Array, t_ns: int, before: Array, nav: Array, covariance: Array) -> bool:
+@compiled("UniTuple(f8, 3)(f8, f8, f8, f8)")
+def _turn(nn: float, ne: float, ee: float, psi: float) -> tuple[float, float, float]:
+    """R V R^T of a V (2, 2) for a turn R by `psi` (rad) about down."""
+    c, s = math.cos(psi), math.sin(psi)
+    across = 2.0 * c * s * ne
+    return (
+        c * c * nn - across + s * s * ee,
+        c * s * (nn - ee) + (c * c - s * s) * ne,
+        s * s * nn + across + c * c * ee,
+    )
+
+
+@compiled("b1(f8[::1], i8, f8[::1], f8[::1], f8[:, :], f8)")
+def _add(
+    sums: Array, t_ns: int, before: Array, nav: Array, covariance: Array, turned: float
+) -> bool:
     """Add an update to `sums`; whether they do not fit the covariance that they were made with."""
     since_ns = sums[:1].view(np.int64)
     f = math.exp(-max(0, t_ns - since_ns[0]) * 1e-9 / LASTS_S)
@@ -58,10 +75,16 @@ def _add(sums: Array, t_ns: int, before: Array, nav: Array, covariance: Array) -
     north = f * sums[_C] + way * (to_x * w - to_w * x - to_y * z + to_z * y)
     east = f * sums[_C + 1] + way * (to_y * w - to_w * y + to_x * z - to_z * x)
     sums[_C], sums[_C + 1] = north, east
-    after = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    after = _turn(covariance[0, 0], covariance[0, 1], covariance[1, 1], -turned)
     for k in range(3):
         sums[_V + k] = f * f * sums[_V + k] + (before[4 + k] - after[k])
     nn, ne, ee = sums[_V], sums[_V + 1], sums[_V + 2]
+    if turned != 0.0:
+        c, s = math.cos(turned), math.sin(turned)
+        north, east = c * north - s * east, s * north + c * east
+        nn, ne, ee = _turn(nn, ne, ee, turned)
+        sums[_C], sums[_C + 1] = north, east
+        sums[_V], sums[_V + 1], sums[_V + 2] = nn, ne, ee
     determinant = nn * ee - ne * ne
     if nn <= 0.0 or determinant <= 1e-9 * nn * ee:
         return False
@@ -92,7 +115,7 @@ class Tilting:
         """What a filter holds before an update: the state `nav` (10,) and P (n, n)."""
         _remember(nav, covariance, self._before)
 
-    def after(self, t_ns: int, nav: Array, covariance: Array) -> bool:
-        """Add that update, after which it holds these; whether the corrections do not fit the
-        covariance that they were made with."""
-        return _add(self._sums, t_ns, self._before, nav, covariance)
+    def after(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> bool:
+        """Add that update, after which it holds these, P in axes that have `turned` (rad); whether
+        the corrections do not fit the covariance that they were made with."""
+        return _add(self._sums, t_ns, self._before, nav, covariance, turned)

@@ -112,7 +112,8 @@ class Standing:
         if sum(t_ns - doubt_ns <= DOUBTS_NS for doubt_ns in isolation.doubts) > MOST_DOUBTS:
             return "IMU and aids do not fit each other"
         lost = isolation.lost(t_ns)
-        if lost is None or lost.disputed:
+        # To begin anew from what is on its way back were to believe it before it has proven itself.
+        if lost is None or lost.disputed or (lost.cause == "source" and lost.returning):
             return None
         patience_ns = FILTER_WRONG_NS if lost.cause == "filter" else SOURCE_WRONG_NS
         waited_ns = t_ns - lost.since_ns

@@ -20,6 +20,7 @@ import numpy as np
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
+from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -228,9 +229,11 @@ class Timeline:
             entry.error = repr(error)
             return Outcome("failed")
         if outcome.name in JUDGED and not estimator.isolates:
-            action = isolation.judge(aid, outcome, estimator.nav)
+            action = isolation.judge(aid, outcome, estimator.nav, estimator.covariance)
             if action is Action.NONE and outcome.name == "fused" and tilts:
-                action = isolation.corrected(aid.t_ns, estimator.nav, estimator.covariance)
+                turned = estimator.turned if isinstance(estimator, TiltAxesFilter) else 0.0
+                after = estimator.nav, estimator.covariance
+                action = isolation.corrected(aid.t_ns, *after, turned)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome

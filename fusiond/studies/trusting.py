@@ -15,10 +15,12 @@ Array = NDArray[np.float64]
 class Trusting(Isolation):
     """Leaves all to the filter: its gate, and what detects faults in a federated one."""
 
-    def judge(self, aid: Aid, outcome: Outcome, nav: Array) -> Action:
+    def judge(
+        self, aid: Aid, outcome: Outcome, nav: Array, covariance: Array | None = None
+    ) -> Action:
         """Nobody is ever suspected."""
         return Action.NONE
 
-    def corrected(self, t_ns: int, before: Array, after: Array) -> Action:
+    def corrected(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> Action:
         """Nor is the IMU."""
         return Action.NONE

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.base import DOUBTED_FORCE_M_S2
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.tilt_axes import heading_turn
 from fusiond.models.catalogue import make_model
@@ -38,9 +39,11 @@ def _felt(f: InvariantFilter) -> Array:
     return rows
 
 
-def _straight_on(yaw_rad: float) -> InvariantFilter:
-    """At 20 m/s: heading to `HEADING_SD_RAD`, force biases to `FORCE_SD`, and what they and the
-    tilt make together to `KNOWN_SD`."""
+def _straight_on(
+    yaw_rad: float, heading_sd: float = HEADING_SD_RAD, force_sd: float = FORCE_SD
+) -> InvariantFilter:
+    """At 20 m/s: heading to `heading_sd`, force biases to `force_sd`, and what they and the tilt
+    make together to `KNOWN_SD`."""
     f = InvariantFilter(make_model("ins15", imu_noise(Imu())), 1.0)
     n = f.model.size
     nav = runs.level_nav(
@@ -48,9 +51,9 @@ def _straight_on(yaw_rad: float) -> InvariantFilter:
     )
     p = np.diag(f.model.initial**2)
     p[PHI : PHI + 2, PHI : PHI + 2] = KNOWN_SD**2 * np.eye(2)
-    p[PHI + 2, PHI + 2] = HEADING_SD_RAD**2
+    p[PHI + 2, PHI + 2] = heading_sd**2
     p[DV : DV + 6, DV : DV + 6] = 0.01 * np.eye(6)
-    p[12:15, 12:15] = np.diag([FORCE_SD**2, FORCE_SD**2, KNOWN_SD**2])
+    p[12:15, 12:15] = np.diag([force_sd**2, force_sd**2, KNOWN_SD**2])
     f.initialise(0, 0, nav, np.zeros(n), np.eye(n))
     felt = np.eye(n)
     felt[[PHI, PHI + 1, 14]] = _felt(f)
@@ -60,15 +63,20 @@ def _straight_on(yaw_rad: float) -> InvariantFilter:
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 75.0, -160.0])
-def test_a_turned_heading_leaves_what_tilt_and_bias_make_together(yaw_deg: float) -> None:
-    f = _straight_on(math.radians(yaw_deg))
-    for off_deg in (3.0, -4.0, 5.0):
-        f.covariance[2, 2] = HEADING_SD_RAD**2
-        yaw = math.radians(yaw_deg + off_deg)
-        assert f.update(HeadingAid("compass", 0, 0.9999, yaw, HEADING_SD_RAD)).name == "fused"
+@pytest.mark.parametrize(("heading_deg", "force_sd"), [(3.0, FORCE_SD), (1.0, DOUBTED_FORCE_M_S2)])
+def test_a_turned_heading_leaves_what_tilt_and_bias_make_together(
+    heading_deg: float, force_sd: float, yaw_deg: float
+) -> None:
+    """Of a start on the move, and of a heading known to a degree after a doubt of the motion."""
+    sd = math.radians(heading_deg)
+    f = _straight_on(math.radians(yaw_deg), sd, force_sd)
+    for off in (1.0, -4.0 / 3.0, 5.0 / 3.0):
+        f.covariance[2, 2] = sd**2
+        yaw = math.radians(yaw_deg) + off * sd
+        assert f.update(HeadingAid("compass", 0, 0.9999, yaw, sd)).name == "fused"
         known = _felt(f) @ f.covariance @ _felt(f).T
         assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
-        assert np.sqrt(np.diag(f.covariance)[12:14]) == pytest.approx(FORCE_SD, rel=0.01)
+        assert np.sqrt(np.diag(f.covariance)[12:14]) == pytest.approx(force_sd, rel=0.01)
         assert f.covariance == pytest.approx(f.covariance.T, abs=1e-15)
 
 

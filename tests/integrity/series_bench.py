@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +24,14 @@ SD_M = 1.0
 
 class Bench:
     """A filter that stands at `NAV` and believes its innovations to be of variance one: what the
-    isolation is told of a receiver's fixes and velocities."""
+    isolation is told of a receiver's fixes and velocities. `white`: its fixes are configured to
+    share no error. `covariance`: P (9, 9), where the isolation is told of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, white: bool = False) -> None:
         self.isolation = Isolation()
         self.rng = np.random.default_rng(3)
+        self._white = white
+        self.covariance: NDArray[np.float64] | None = None
 
     def fix(
         self, t_s: float, north_m: float = 0.0, source: str = "gnss", sd_m: float = SD_M
@@ -38,7 +42,8 @@ class Bench:
         lat = float(NAV[0]) - y[0] * sd_m / (meridian_radius(float(NAV[0])) + 40.0)
         sd = (sd_m, sd_m, sd_m)
         lon = float(NAV[1]) - y[1] * sd_m / 5.5e6
-        return self._judge(PositionAid(source, round(t_s * S), GATE, lat, lon, 40.0, sd, LEVER), y)
+        aid = PositionAid(source, round(t_s * S), GATE, lat, lon, 40.0, sd, LEVER)
+        return self._judge(replace(aid, shares_nothing=self._white), y)
 
     def velocity(self, t_s: float, bias: float = 0.0, east_m_s: float = 3.0) -> Action:
         """A velocity of the receiver, `bias` sigma off, that says so or so much to the east."""
@@ -77,7 +82,8 @@ class Bench:
         name = "fused" if fused else "isolated"
         if not fused and self.isolation.believes(aid.source):
             name = "gated"
-        return self.isolation.judge(aid, Outcome(name, nis, 3, tuple(y.tolist())), NAV)
+        seen = Outcome(name, nis, 3, tuple(y.tolist()))
+        return self.isolation.judge(aid, seen, NAV, self.covariance)
 
     def both(self, seconds: range, north_m: float = 0.0) -> set[Action]:
         """Fix and velocity each second."""

@@ -144,6 +144,62 @@ def test_a_frozen_fix_while_moving_is_told_by_its_bits() -> None:
     assert not standing.isolation.excluded
 
 
+def test_a_receiver_that_hangs_repeats_its_velocity_too() -> None:
+    """The velocity is left out as soon as the position is, not when its bits tell by themselves;
+    and comes back with bits that change."""
+    bench = Bench()
+    bench.both(range(30))
+
+    def hangs(t: int, step: int) -> None:
+        lat = 0.53 + 1e-7 * step
+        fix = PositionAid("gnss", t * S, GATE, lat, 1.99, 40.0, (SD_M,) * 3, LEVER)
+        v = 8.0, 3.0 + 1e-3 * step, 0.0
+        moves = VelocityAid("gnss_velocity", t * S, GATE, v, (0.05,) * 3, LEVER)
+        for aid in (moves, fix):
+            bench.isolation.judge(aid, Outcome("fused", 0.0, 3, (0.0, 0.0, 0.0)), NAV)
+
+    for t in range(30, 34):
+        hangs(t, 0)
+    assert bench.isolation.excluded == dict.fromkeys(("gnss", "gnss_velocity"), "repeats itself")
+    for t in range(34, 39):
+        hangs(t, t)
+    assert bench.isolation.believes("gnss_velocity")
+
+
+def test_what_is_configured_to_share_nothing_is_told_as_soon_as_that_allows() -> None:
+    """A bias of nine tenths of a sigma: beyond the slow mean of white errors, and what others may
+    share."""
+    after = []
+    for white in (True, False):
+        bench = Bench(white)
+        bench.both(range(3600))
+        assert not bench.isolation.excluded
+        bench = Bench(white)
+        bench.both(range(60))
+        told = (t for t in range(60, 180) if bench.both(range(t, t + 1), 0.9) != {Action.NONE})
+        after.append(next(told, None))
+    soon, never = after
+    assert soon is not None
+    assert soon < 140
+    assert never is None
+
+
+@pytest.mark.parametrize("sd_m", [0.1, 1.5])
+def test_what_is_left_out_is_judged_by_what_the_filter_may_be_off(sd_m: float) -> None:
+    """The receiver is right again and the filter 2.5 m off: one that says so takes it back, even if
+    it does not follow then."""
+    bench = Bench(white=True)
+    bench.both(range(60))
+    bench.both(range(60, 90), north_m=500.0)
+    assert bench.isolation.excluded == {"gnss": "jumped"}
+    bench.covariance = np.diag([0.0] * 6 + [sd_m**2] * 3)
+    believed = False
+    for t in range(90, 150):
+        bench.both(range(t, t + 1), north_m=2.5)
+        believed |= bench.isolation.believes("gnss")
+    assert believed is (sd_m > 1.0)
+
+
 def test_position_and_velocity_that_go_together_put_the_filter_in_doubt() -> None:
     """What a wrong IMU looks like: first the velocity leaves, then the position, faster each
     second."""

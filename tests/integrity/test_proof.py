@@ -15,6 +15,7 @@ from fusiond.integrity.isolation import Action, Isolation
 from fusiond.integrity.proof import (
     DRIFT_SD_M_S,
     SETTLED_NS,
+    SLOWEST_M_S,
     UNPROVEN_SIGMAS,
     Proof,
     metres_a_radian,
@@ -108,6 +109,14 @@ def test_what_drifts_is_told_and_never_proven(drift_m_s: float) -> None:
         # Until the filter's velocity has settled a slow drift may be the filter's.
         assert early.drifts(LIMIT) is (drift_m_s > 0.4)
         assert late.drifts(LIMIT)
+
+
+def test_the_slowest_drift_that_shows_is_not_taken_for_none() -> None:
+    """As soon as one could be proven its slope is known to a fifth of that drift."""
+    for seed in range(60):
+        proof = Journey(seed).proof(16.5, SLOWEST_M_S)
+        assert proof.trend.slope[1] == pytest.approx(DRIFT_SD_M_S, rel=0.1)
+        assert not proof.proven
 
 
 class Returned:

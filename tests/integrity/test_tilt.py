@@ -75,3 +75,24 @@ def test_axes_that_tilt_by_themselves_are_noticed() -> None:
         assert sooner_s is not None
         assert sooner_s <= after_s <= 15.0
         assert sooner_s <= 6.0
+
+
+def test_a_heading_that_is_corrected_tilts_nothing() -> None:
+    """P's axes turn with it by 2 deg an update; of the two, one is known ten times better."""
+    rng, tilting, q = np.random.default_rng(7), Tilting(), quaternion_from_rpy(0.0, 0.0, 2.0)
+    p = np.diag([1e-2, 1e-3]) ** 2
+    for k in range(300):
+        nav = np.concatenate((np.zeros(Q0), q))
+        tilting.before(nav, p)
+        share = 0.01
+        d = np.linalg.cholesky(share * p) @ rng.standard_normal(2)
+        psi = math.radians(2.0) * rng.standard_normal()
+        turn = np.array(rotation_vector_to_quaternion(float(d[0]), float(d[1]), 0.0))
+        about = np.array(rotation_vector_to_quaternion(0.0, 0.0, psi))
+        q = multiplied(about, multiplied(turn, np.array(q)))
+        c, s = math.cos(psi), math.sin(psi)
+        axes = np.array([[c, -s], [s, c]])
+        p = axes @ ((1.0 - share) * p) @ axes.T
+        nav = np.concatenate((np.zeros(Q0), q))
+        assert not tilting.after(k * S // 5, nav, p, psi)
+        p = p / (1.0 - share)

@@ -88,16 +88,32 @@ def test_with_two_receivers_the_level_stays() -> None:
     )  # alarmed before the second fix
 
 
-def test_a_receiver_that_is_off_raises_the_level_beyond_its_error() -> None:
+def north_of(one: Navigator, other: Navigator) -> float:
+    """How far (m) two solutions are from each other, north."""
+    now = one.imu.latest_ns
+    return abs(other.solution(now).lat_rad - one.solution(now).lat_rad) * 6.37e6
+
+
+def test_the_level_is_beyond_the_error_of_a_receiver_that_is_off() -> None:
+    """By less than ten seconds tell of one whose fixes share no error."""
+    sound, _ = driven(20.0, two=True)
+    wrong, heard = driven(20.0, two=True, off_m=2.5)
+    assert not wrong.timeline.isolation.excluded
+    assert north_of(sound, wrong) > 0.5
+    assert wrong.solution(wrong.imu.latest_ns).bound.hpl_m > 3.0
+    assert heard in ([], ALARMED_AT_FIRST)
+
+
+def test_a_receiver_that_is_left_out_raises_the_level_beyond_its_error() -> None:
+    """By more: it is left out, and what is left of it is less; but nobody checks the other then."""
     sound, _ = driven(20.0, two=True)
     wrong, heard = driven(20.0, two=True, off_m=3.0)
-    now = sound.imu.latest_ns
-    a, b = sound.solution(now), wrong.solution(now)
-    apart = abs(b.lat_rad - a.lat_rad) * 6.37e6
-    assert apart > 0.5
-    assert b.bound.hpl_m >= a.bound.hpl_m
-    assert b.bound.hpl_m > 3.0
-    assert heard in ([], ALARMED_AT_FIRST)
+    assert wrong.timeline.isolation.excluded == {"gnss": "drifts"}
+    assert north_of(sound, wrong) < 0.5
+    a, b = (n.solution(n.imu.latest_ns).bound.hpl_m for n in (sound, wrong))
+    assert b >= a
+    assert b > 3.0
+    assert heard == 2 * ALARMED_AT_FIRST
 
 
 def test_before_the_start_the_levels_are_unknown() -> None:

@@ -177,12 +177,12 @@ class Left(Isolation):
     def __init__(self) -> None:
         super().__init__()
         self.since_ns: int | None = 0
-        self.supported = False
+        self.supported = self.returning = False
 
     def lost(self, t_ns: int) -> Lost | None:
         if self.since_ns is None:
             return None
-        return Lost(self.since_ns, "source", "gnss", "jumped", disputed=False)
+        return Lost(self.since_ns, "source", "gnss", "jumped", False, self.returning)
 
     def supported_by_another(self, device: str) -> bool:
         assert device == "gnss"
@@ -202,3 +202,13 @@ def test_a_start_from_a_receiver_that_had_jumped_away_coasts_until_another_devic
     assert standing.shaken(at(100_001), isolation) is None
     isolation.supported = False
     assert standing.shaken(at(100_002), isolation) is None
+
+
+def test_what_is_on_its_way_back_is_waited_for() -> None:
+    isolation, standing = Left(), Standing(150.0)
+    still = np.zeros(10)
+    isolation.returning = True
+    assert standing.failure(61 * S, isolation, still) is None
+    assert "nothing else can check it" in (standing.shaken(at(61.0), isolation) or "")
+    isolation.returning = False
+    assert standing.failure(62 * S, isolation, still) is not None

@@ -87,6 +87,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         time,
         rest,
         _phase_share(sd, o) if by_phase(m) else (1.0, 1.0, 1.0),
+        o.bias_sd_m == 0.0,
     )
     if m.v_ned_m_s is None or not o.use_velocity:
         return [position]
