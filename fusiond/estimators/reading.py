@@ -18,9 +18,11 @@ the filter's own t, and tau is by how much that clock, the IMU's, is off: nothin
 it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
 clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
 
-Attitude is that of the axes of the inertial unit that was configured. Once a spare has taken over,
-C_nb is of the spare's, and nothing says how the two sit against each other beyond `axes_sd_rad`,
-about each axis: cov(phi) grows by its square.
+Attitude is that of the nominal axes of the inertial unit that was configured. C_nb is of those that
+its gyros have, out of square by what the data sheet allows, or of a spare's once that has taken
+over: nothing says how they sit against the nominal ones beyond `axes_sd_rad`, about each axis, and
+cov(phi) grows by its square. The best turn to axes of which each pair of angles is off by m is off
+by m / sqrt(2); what a drive's bends make of the rest is as much.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ class TiltAxesFilter(KalmanEstimator):
         tilt = max(p(PHI, PHI), p(PHI + 1, PHI + 1))
         of_heading = STANDARD_GRAVITY_M_S2**2 * p(PHI + 2, PHI + 2)
         force = max(of_heading, *[p(slot, slot) for slot in self._slots])
-        return tilt * force > SLIGHT_M_S2**2
+        return bool(tilt * force > SLIGHT_M_S2**2)
 
     def _fold_in(self, aid: Linearised) -> Outcome:
         return super().update(aid)

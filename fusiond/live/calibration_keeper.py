@@ -11,6 +11,7 @@ from pathlib import Path
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.state_keeper import state_file
+from fusiond.navigator.imu_change import published_of_spare
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.saved_calibration import (
     SavedCalibration,
@@ -77,7 +78,7 @@ class CalibrationKeeper:
 
     def _of(self, navigator: Navigator) -> SavedCalibration | None:
         # How a spare sits on the vehicle says nothing of the unit that the next run begins with.
-        spare = navigator.estimator.published.axes_sd_rad > 0.0
+        spare = published_of_spare(navigator.estimator, navigator.config.imu)
         if navigator.started is None or navigator.on_trial or spare:
             return None
         return saved_calibration(navigator.calibrating.parameters, self._digest)

@@ -23,6 +23,7 @@ from fusiond.configuration.load import config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.imu_change import published_of_spare
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.state_file import (
     DamagedStateError,
@@ -126,7 +127,7 @@ class WarmKeeper:
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.on_trial or not usable:
             return None
-        if navigator.estimator.published.axes_sd_rad:
+        if published_of_spare(navigator.estimator, navigator.config.imu):
             return None
         try:
             state = warm_state(

@@ -30,7 +30,7 @@ from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.filters import estimator_of, imu_buffer_of, model_of, verdicts_of
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
-from fusiond.navigator.imu_change import hand_over, publish_first_axes
+from fusiond.navigator.imu_change import hand_over, publish_by_axes
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
@@ -79,6 +79,7 @@ class Navigator:
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         self.estimator = estimator(config, self.model)
+        publish_by_axes(self.estimator, imu)
         self.verdicts = verdicts_of(config, self._event)
         self.timeline = Timeline(
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
@@ -88,8 +89,7 @@ class Navigator:
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedAids(self._event)
         self._left_out = LeftOut(self.timeline, names, self._event)
-        wheeled = config.constraints.non_holonomic.enabled
-        self._standing = Standing(config.plausibility.max_speed_m_s, wheeled)
+        self._standing = Standing(config.plausibility.max_speed_m_s, bool(of_vehicle))
         self._protection = ProtectionWatch(config, self.estimator, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
@@ -137,7 +137,7 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
         self._units.change()
-        publish_first_axes(self.estimator, self.config.imu)
+        publish_by_axes(self.estimator, self.config.imu, spare=True)
         if self.started is not None:
             return hand_over(self.estimator, self.timeline, self.config.imu)
         return self._begin_anew("the spare IMU is used")
