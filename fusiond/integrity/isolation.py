@@ -143,6 +143,12 @@ class Isolation:
         """With how many times its stated sigma an aid counts, by how long its errors last."""
         return support.coarseness(self._records, aid)
 
+    def assumes(self, aid: Aid) -> bool:
+        """Whether the aid counts as coarser than it says by what is assumed of its like: what its
+        innovation says of the sigma that it states is then no one's."""
+        record = self._records.get(aid.source)
+        return aid.moves and record is not None and record.means.assuming
+
     def lost(self, t_ns: int) -> Lost | None:
         """Set while positions come and none is believed: since when, and who is to blame."""
         return support.lost(self._records, t_ns)

@@ -47,6 +47,9 @@ LEARN_COUNT, ASSUMED_COUNT = 300.0, 15.0
 # Before a series has shown it: half of its variance lasts, for two seconds. A choice, for receivers
 # say nothing of it: cars drawn with errors of that kind were looked at for it.
 LASTING_SHARE, LASTS_S, LIKELY_COUNT = 0.5, 2.0, 8.0
+# What is assumed says nothing of the sigma that was stated: a verdict on that waits until it is no
+# more than this of the variance, a quarter of the interval of a hundred innovations of three.
+ASSUMING = 0.05
 # Nobody sends more often than 50 times a second.
 LEAST_S = 0.02
 # How long errors last is a receiver's nature, which does not change while it drives: it is averaged
@@ -141,10 +144,12 @@ def _begun(assumed: float) -> Array:
 class Means:
     """Of one series. A changed dimension d begins the means anew, not what they have shown."""
 
-    __slots__ = ("_packed",)
+    __slots__ = ("_packed", "assuming")
 
     def __init__(self, packed: Array | None = None) -> None:
         self._packed = _begun(ASSUMED) if packed is None else packed
+        self.assuming = False
+        """Whether the measurement that `lasting` was last asked for counts with an assumption."""
 
     @staticmethod
     def begun(white: bool) -> Means:
@@ -198,8 +203,10 @@ class Means:
         `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
         heard = float(self._packed[_COUNT])
         shown = 1.0 + (float(self._packed[_SLOWLY]) / WHITE_SLOW - 1.0) * self._sureness
-        square = (LIKELY_COUNT * assumed(every_s) + heard * shown) / (LIKELY_COUNT + heard)
-        self._packed[_COARSE] = square = max(1.0, square)
+        likely = LIKELY_COUNT / (LIKELY_COUNT + heard)
+        beyond = likely * (assumed(every_s) - shown)
+        self._packed[_COARSE] = square = max(1.0, shown + beyond)
+        self.assuming = beyond > ASSUMING * square
         return math.sqrt(square)
 
     @property

@@ -382,7 +382,7 @@ class Navigator:
         if self.warm is not None and aid.locates:
             self.warm.judge(aid.source, name)
         if name == "fused":
-            if outcome.whitened and not entry.judged:
+            if outcome.whitened and not (entry.judged or entry.assumed):
                 entry.judged = True
                 self.verdicts.judge(aid, outcome)
             self.last_fused_ns[aid.source] = max(t_ns, self.last_fused_ns.get(aid.source, 0))

@@ -39,13 +39,15 @@ MOST_WAITING = 4096
 @dataclass(slots=True)
 class Entry:
     """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been looked at: a rewind applies it again. `error` is what made
-    it `failed`; `raw` is kept where the timeline `keeps_raw`."""
+    `judged` that its innovation has been looked at: a rewind applies it again. `assumed`: it counts
+    as coarser than it says, and its own errors have not shown that. `error` is what made it
+    `failed`; `raw` is kept where the timeline `keeps_raw`."""
 
     key: Key
     aid: Aid
     outcome: Outcome | None = None
     judged: bool = False
+    assumed: bool = False
     error: str = ""
     raw: RawInnovation | None = None
 
@@ -225,6 +227,7 @@ class Timeline:
             aid = entry.aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
             outcome = self._update(aid) if believed else estimator.look(aid)
+            entry.assumed = isolation.assumes(aid)
         except RAISED_BY_NUMBERS as error:
             entry.error = repr(error)
             return Outcome("failed")

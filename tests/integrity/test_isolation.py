@@ -108,6 +108,8 @@ def test_a_velocity_counts_as_coarse_as_its_errors_last(rho: float) -> None:
         y = rho * y + math.sqrt(1.0 - rho**2) * rng.standard_normal(3)
         said = replace(aid, t_ns=k * S // 5, v_ned=(8.0, 3.0 + 0.01 * (k % 7), 0.0))
         seen = y / isolation.coarseness(said)
+        if rho == 0.0 and 1 <= k < 1200:  # eight weigh 9.5 beyond white: a twentieth of 1,500
+            assert isolation.assumes(said)
         isolation.judge(said, Outcome("fused", float(seen @ seen), 3, tuple(seen.tolist())), NAV)
         if k == 14:
             seldom, often = (
@@ -121,8 +123,10 @@ def test_a_velocity_counts_as_coarse_as_its_errors_last(rho: float) -> None:
     shown = math.sqrt((1.0 + rho) / (1.0 - rho))
     now = replace(aid, t_ns=6000 * S // 5)
     assert isolation.coarseness(now) == pytest.approx(shown, rel=0.25)
+    assert not isolation.assumes(now)
     fix = PositionAid("gnss", 0, GATE, 0.53, 1.99, 40.0, (SD_M,) * 3, LEVER)
     assert isolation.coarseness(fix) == 1.0
+    assert not isolation.assumes(fix)
 
 
 def test_a_frozen_fix_while_moving_is_told_by_its_bits() -> None:

@@ -134,6 +134,17 @@ def test_the_reference_has_outliers_and_navigates() -> None:
     assert np.sqrt(np.diag(estimator.covariance)[6:8]).max() < 1.5
 
 
+def test_a_velocity_that_counts_by_an_assumption_is_no_witness_of_its_sigma() -> None:
+    d = drive()
+    timeline = d.timeline()
+    timeline.imu.append(d.times, d.samples)
+    entries = [timeline.insert(aid) for aid in d.aids]
+    timeline.run()
+    velocities = [entry.assumed for entry in entries if entry.aid.moves]
+    assert velocities == [False] + [True] * (len(velocities) - 1)  # half a minute of them
+    assert not any(entry.assumed for entry in entries if not entry.aid.moves)
+
+
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.data())
 def test_any_order_of_arrival_is_order_of_validity(data: st.DataObject) -> None:
