@@ -49,11 +49,11 @@ $(STAMP): requirements-dev.lock $(RUNTIME)
 demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 60 --headless"
 	$(BIN)/fusiond demo --dashboard $(ARGS)
 
-# One core compiles while the other installs the tools and lints; then all three at a time. Hardware
-# in the loop waits for real time more than it computes: the others take what it leaves, and are the
-# first to yield. Types are checked beside the tests: they need not wait for the answer.
+# One core compiles while the other installs the tools and lints; then two at a time, in this order.
+# Hardware in the loop waits for real time more than it computes: the others take what it leaves, and
+# are the first to yield.
 test: $(RUNTIME) ## everything that CI checks
-	$(MAKE) --jobs=3 --output-sync=line lint hil unit YIELDING="nice -n 19"
+	$(MAKE) --jobs=2 --output-sync=line lint hil unit YIELDING="nice -n 19"
 
 lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/ruff check
