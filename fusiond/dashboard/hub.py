@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,9 @@ LARGEST_BYTES = 65536
 MOST_VEHICLES = 32
 MOST_NAME = 64
 """Letters of a vehicle's name, as the configuration has it."""
+
+DEEPEST = 16
+"""Levels of a message; ours have five. What can just be read could not be written in a frame."""
 
 LinkState = Literal["connecting", "up", "lost", "ended"]
 
@@ -57,7 +61,7 @@ class Hub:
             return
         try:
             said = payload.decode() if topic == "online" else _parsed(payload)
-        except ValueError:
+        except (ValueError, RecursionError):
             self.counters["malformed"] += 1
             return
         one = self.vehicles.get(vehicle)
@@ -71,9 +75,25 @@ class Hub:
 
 
 def _parsed(payload: bytes) -> Any:
-    """JSON as browsers read it: no NaN. Raises ValueError."""
+    """JSON that can be written again for a browser: no NaN, nothing infinite, which 1e999 would be
+    read as. Raises ValueError, and RecursionError where it is far too deep."""
 
     def refuse(name: str) -> None:
         raise ValueError(name)
 
-    return json.loads(payload, parse_constant=refuse)
+    said = json.loads(payload, parse_constant=refuse, parse_float=_finite)
+    if _deeper(said, DEEPEST):
+        raise ValueError(f"nested deeper than {DEEPEST}")
+    return said
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text}: too large")
+    return value
+
+
+def _deeper(said: Any, levels: int) -> bool:
+    inside = said.values() if isinstance(said, dict) else said if isinstance(said, list) else ()
+    return any(levels == 0 or _deeper(each, levels - 1) for each in inside)

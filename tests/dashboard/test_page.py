@@ -261,11 +261,12 @@ async def test_every_file_of_the_page_is_served_and_asks_nobody_else() -> None:
 
 def test_what_cannot_be_read_is_counted_and_left() -> None:
     hub = make_hub()
-    for bad in (b"{", b"\xff", b'{"lat_deg": NaN}', b""):
+    too_deep = (b"[" * 60_000, b'{"a": ' + b"[" * 17 + b"]" * 17 + b"}")
+    for bad in (b"{", b"\xff", b'{"lat_deg": NaN}', b"", b'{"lat_deg": -1e999}', *too_deep):
         hub.take("truck", "nav", bad)
     hub.take("truck", "nav", b" " * (LARGEST_BYTES + 1))
     hub.take("t" * 65, "nav", b"{}")
-    assert hub.counters == {"malformed": 4, "too_large": 2}
+    assert hub.counters == {"malformed": 7, "too_large": 2}
     assert not hub.vehicles
     for k in range(MOST_VEHICLES + 3):
         hub.take(f"v{k}", "online", b"online")
