@@ -12,7 +12,9 @@ on a primed cache of compiled kernels.
 The IMU is on `vcan0` where that interface is up, else on python-can's `udp_multicast`, whose frames
 cost more: UDP, msgpack and a Python object for each.
 
-`--record` records all of it: what that costs is the difference to a run without. `--clients` has N
+`--record` records all of it, and not, in turns of 10 s within the one run, by MQTT commands:
+`recording_percent` is the mean of the differences between neighbours and its standard error, each
+turn without its first second, in which a log is opened or ended. `--clients` has N
 clients of MQTT, gpsd and NMEA each listen, at 10 Hz. `age_ms` is the time from the instant of a
 solution, that of its newest CAN frame, to the arrival of its `nav` at a client of the broker:
 median, 99 % and most. With many clients that is a matter of the machine as well, of which they
@@ -98,6 +100,9 @@ RECORDING = """
 [recording]
 directory = "{folder}/logs"
 """
+COMMANDS = """commands = ["start_recording", "stop_recording"]
+"""
+TURN_S, SKIPPED_S = 10.0, 1.0
 
 
 def _vehicle(folder: str, interface: str, channel: str, raw: bool) -> None:
@@ -125,6 +130,12 @@ def _cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def _running_s(pid: int) -> float:
+    """On a processor, all threads (proc(5): schedstat, ns) that have not ended."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(task.read_text().split()[0]) for task in tasks) * 1e-9
+
+
 def _resident_mb(pid: int) -> float:
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGESIZE") / 1e6
@@ -132,6 +143,28 @@ def _resident_mb(pid: int) -> float:
 
 def _recorded_mb(folder: Path) -> float:
     return round(sum(path.stat().st_size for path in folder.glob("logs/*")) * 1e-6, 2)
+
+
+async def _in_turns(pid: int, port: int, seconds: float) -> list[float]:
+    """Percent of a core of each turn: with the recording that is under way first, then without."""
+    shares: list[float] = []
+    async with aiomqtt.Client("127.0.0.1", port) as client:
+        for turn in range(round(seconds / TURN_S)):
+            if turn:
+                name = "stop_recording" if turn % 2 else "start_recording"
+                await client.publish(f"fusiond/load/cmd/{name}", json.dumps({"id": str(turn)}), 1)
+            await asyncio.sleep(SKIPPED_S)
+            start_s, used_s = time.monotonic(), _running_s(pid)
+            await asyncio.sleep(TURN_S - SKIPPED_S)
+            shares.append(100.0 * (_running_s(pid) - used_s) / (time.monotonic() - start_s))
+    return shares
+
+
+def _difference(shares: list[float]) -> list[float]:
+    """With less without: each turn against the mean of its neighbours; mean and standard error."""
+    sign = np.where(np.arange(1, len(shares) - 1) % 2 == 0, 1.0, -1.0)
+    more = sign * (np.array(shares[1:-1]) - 0.5 * (np.array(shares[:-2]) + np.array(shares[2:])))
+    return [round(float(more.mean()), 2), round(float(more.std(ddof=1) / np.sqrt(len(more))), 2)]
 
 
 @asynccontextmanager
@@ -192,7 +225,7 @@ async def measure(
             filter=name,
             kind="raw" if raw else "gnss",
         )
-        + (RECORDING.format(folder=folder) if record else "")
+        + (COMMANDS + RECORDING.format(folder=folder) if record else "")
         + (OUTPUTS.format(gpsd=gpsd, nmea=nmea) if clients else "")
     )
     vehicle = multiprocessing.get_context("spawn").Process(
@@ -217,7 +250,11 @@ async def measure(
                     ):
                         since, before = heard.count, await heard.until("health")
                         start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
-                        await asyncio.sleep(seconds)
+                        shares: list[float] = []
+                        if record:
+                            shares = await _in_turns(daemon.pid, broker.port, seconds)
+                        else:
+                            await asyncio.sleep(seconds)
                         elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
                         resident_mb = _resident_mb(daemon.pid)
                         after = await heard.until("health")
@@ -229,6 +266,8 @@ async def measure(
         "filter": name,
         "raw": raw,
         "recorded_mb": _recorded_mb(folder),
+        "recording_percent": _difference(shares) if shares else None,
+        "recording_and_not_percent": [round(share, 1) for share in shares],
         "cpu_percent": round(100.0 * used_s / elapsed_s, 1),
         "resident_mb": round(resident_mb, 1),
         "first_tick_s": round(first_tick_s, 2),
