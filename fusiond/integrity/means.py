@@ -202,7 +202,7 @@ class Means:
         shown; the measurement that comes next counts with it. What is assumed of measurements
         `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
         heard = float(self._packed[_COUNT])
-        shown = 1.0 + (float(self._packed[_SLOWLY]) / WHITE_SLOW - 1.0) * self._sureness
+        shown = 1.0 + self._beyond_chance
         likely = LIKELY_COUNT / (LIKELY_COUNT + heard)
         beyond = likely * (assumed(every_s) - shown)
         self._packed[_COARSE] = square = max(1.0, shown + beyond)
@@ -210,10 +210,16 @@ class Means:
         return math.sqrt(square)
 
     @property
-    def _sureness(self) -> float:
-        """How much (1) of what the slow mean has shown is taken for the series' nature."""
-        told = float(self._packed[_TOLD])
-        return told / (DOUBTED_COUNT + told)
+    def _beyond_chance(self) -> float:
+        """What the slow mean has shown beside white errors, as far as it is taken for the series'
+        nature: the part that chance explains is left out (James and Stein, 1961, positive part)."""
+        packed = self._packed
+        told = float(packed[_TOLD])
+        beyond = float(packed[_SLOWLY]) / WHITE_SLOW - 1.0
+        new = (packed.shape[0] - _HEAD) // 2 * told * SLOW  # degrees of freedom of its squares
+        if new * beyond * beyond <= 2.0:
+            return 0.0
+        return (beyond - 2.0 / (new * beyond)) * told / (DOUBTED_COUNT + told)
 
 
 def assumed(every_s: float) -> float:
