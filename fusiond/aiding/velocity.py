@@ -15,7 +15,7 @@ Source: Groves, 2nd ed., eq. 14.109.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -124,15 +124,17 @@ class VelocityAid(Aid):
         z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
         time, rest = model.slots_of_each((self.time,), (self.rest,))
         slots = model.column_of, time, rest
-        north, east, down = (*self.v_ned, 0.0)[:3]
-        sd_n, sd_e, sd_d = (*self.sd, 0.0)[:3]
+        north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
+        sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
         measured = north, east, down, sd_n, sd_e, sd_d
-        where = *self.lever, self.sd_time_s
-        _velocity(nav, xi, step, *slots, *measured, *where, z, h, r)
+        _velocity(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, z, h, r)
         return Innovation(z, h, r)
 
     def coarser(self, factor: float) -> VelocityAid:
-        return replace(self, sd=tuple(factor * each for each in self.sd))
+        sd = tuple([factor * each for each in self.sd])
+        of_device = self.lever, self.time, self.rest, self.sd_time_s
+        one = self.source, self.t_ns, self.gate, self.v_ned, sd
+        return VelocityAid(*one, *of_device, robust=self.robust)
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

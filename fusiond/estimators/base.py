@@ -14,6 +14,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -48,6 +49,7 @@ DOUBTED_RATE_RAD_S = math.radians(1.0)
 DOUBTED_FORCE_M_S2 = 0.5
 
 
+@lru_cache(maxsize=1024)
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
     return quantile(degrees, 1.0 - probability)
@@ -108,6 +110,8 @@ class Estimator(Protocol):
     step: Array
     published: Published
     """What solutions are published by: at first the clock of the model's receiver."""
+    turned: float
+    """By how much (rad) the last update that was fused turned the axes in which P has the tilt."""
 
     @property
     def covariance(self) -> Array:
@@ -198,6 +202,7 @@ class ErrorStateFilter:
         self._phi: Array = np.zeros((0, 0))
         self._holding = False
         self._carrying = False
+        self.turned = 0.0
         self._options = HOLD_HEIGHT if model.hold_height else 0
         self._kernel = propagate_for(width)
 

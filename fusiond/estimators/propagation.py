@@ -25,7 +25,8 @@ from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
 from fusiond.navigation.imu_buffer import ROW_SIZE
-from fusiond.navigation.strapdown import NAV_SIZE, STEP_DCM, STEP_SIZE, strapdown_step
+from fusiond.navigation.rotation import rpy_from_quaternion
+from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, strapdown_step
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -131,6 +132,31 @@ def turn_tilt(cov: Array, known: float) -> None:
         cov[1, 1] += grown * north
         cov[0, 1] -= grown * both
         cov[1, 0] = cov[0, 1]
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])")
+def published_ahead(
+    nav: Array,
+    xi: Array,
+    step: Array,
+    samples: Array,
+    newest: int,
+    estimate: Array,
+    ahead_s: float,
+    hold_height: bool,
+    time_slot: int,
+    out: Array,
+) -> None:
+    """Write `out` (13,): what `in_fix_time` makes of `nav` (10,) `ahead_s` later, while sample
+    `newest` less `estimate` (12,) holds, and its roll, pitch and yaw."""
+    if ahead_s > 0.0:
+        nav = nav.copy()
+        rate, force, zero = np.empty(3), np.empty(3), np.zeros(3)
+        compensate(samples, newest, estimate, rate, force)
+        strapdown_step(nav, rate, force, zero, zero, ahead_s, hold_height, np.zeros(STEP_SIZE))
+    published = out[:NAV_SIZE]
+    in_fix_time(nav, xi, step, time_slot, published)
+    out[NAV_SIZE], out[NAV_SIZE + 1], out[NAV_SIZE + 2] = rpy_from_quaternion(published[Q0:])
 
 
 @cache

@@ -104,58 +104,65 @@ def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indic
             m[slots[0], k] += left / new[8]
 
 
+@compiled("b1(f8[:, ::1], i8[::1])")
+def may_part(cov: Array, slots: Indices) -> bool:
+    """Whether an update may tell tilt and force biases, the `slots` (j,) of P, apart that nothing
+    has told apart."""
+    if slots.size == 0:
+        return False
+    tilt = max(cov[PHI, PHI], cov[PHI + 1, PHI + 1])
+    force = STANDARD_GRAVITY_M_S2**2 * cov[PHI + 2, PHI + 2]
+    for slot in slots:
+        force = max(force, cov[slot, slot])
+    apart: bool = tilt * force > SLIGHT_M_S2**2
+    return apart
+
+
+@compiled("f8(f8[:, :], f8[::1], f8[::1], i8[:, ::1])")
+def carry_over(p: Array, before: Array, after: Array, biases: Indices) -> float:
+    """P (n, n) after an update that has turned the attitude q_nb (4,) `before` to `after`, which is
+    by so much (rad) about the vertical."""
+    turn_rows(p, before, after, biases[0], biases[1])
+    turn_rows(p.T, before, after, biases[0], biases[1])
+    return heading_turn(before, after)
+
+
 class TiltAxesFilter(KalmanEstimator):
     """The centralised filter, in whose P the axes of a tilt turn with the heading."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         super().__init__(model, gap_s)
-        self.turned = 0.0
-        """By how much (rad) the last update turned the axes in which P has the tilt."""
         # Slots and axes, the vertical one first: without it there is none to take what is left.
         found = [
             (slot, axis) for axis in (2, 0, 1) for slot in model.parameters(FORCE_ERROR + axis)
         ]
         known = found if found and found[0][1] == 2 else []
         self._biases = np.array(known, dtype=np.int64).reshape(-1, 2).T.copy()
-        self._slots: list[int] = self._biases[0].tolist()
+        self._slots = self._biases[0]
         if known:
             self._options |= TURN_TILT
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
         self.turned = 0.0
-        if self._holding or not self._apart:
+        if self._holding or not may_part(self._covs[0], self._slots):
             return self._fold_in(aid)
         before = self.nav[Q0:].copy()
         outcome = self._fold_in(aid)
         if outcome.name == "fused":
-            self.turned = heading_turn(before, self.nav[Q0:])
             self._carry_over(before)
         return outcome
 
     def release(self) -> None:
         """Feed back what was carried."""
-        before, apart = self.nav[Q0:].copy(), self._apart
+        before, apart = self.nav[Q0:].copy(), may_part(self._covs[0], self._slots)
         super().release()
         if apart:
             self._carry_over(before)
-
-    @property
-    def _apart(self) -> bool:
-        """Whether an update may tell tilt and bias apart that nothing has told apart."""
-        if not self._slots:
-            return False
-        p = self._covs[0].item
-        tilt = max(p(PHI, PHI), p(PHI + 1, PHI + 1))
-        of_heading = STANDARD_GRAVITY_M_S2**2 * p(PHI + 2, PHI + 2)
-        force = max(of_heading, *[p(slot, slot) for slot in self._slots])
-        return bool(tilt * force > SLIGHT_M_S2**2)
 
     def _fold_in(self, aid: Linearised) -> Outcome:
         return super().update(aid)
 
     def _carry_over(self, before: Array) -> None:
         """P after an update that has turned the attitude q_nb (4,) `before`."""
-        p = self.covariance
-        for rows in (p, p.T):
-            turn_rows(rows, before, self.nav[Q0:], *self._biases)
+        self.turned = carry_over(self._covariance, before, self.nav[Q0:], self._biases)

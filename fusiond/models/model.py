@@ -156,6 +156,11 @@ class Model:
         return np.concatenate((self.active[6:9], self.active[3:6], self.active[:3]))
 
     @cached_property
+    def unstated(self) -> tuple[int, ...]:
+        """Where `stated` is not."""
+        return tuple(np.flatnonzero(~self.stated).tolist())
+
+    @cached_property
     def _slots_by_name(self) -> dict[str, list[int]]:
         return {block.name: slots for block, slots in self._slots()}
 

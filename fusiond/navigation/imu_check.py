@@ -204,7 +204,7 @@ def _take(memory: Array, samples: Array, i: int) -> None:
     memory[_REFUSED] = 0.0
 
 
-@compiled("UniTuple(i8, 2)(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1], i8[::1])")
+@compiled("UniTuple(i8, 3)(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1], i8[::1])")
 def _check(
     times: Stamps,
     samples: Array,
@@ -213,14 +213,14 @@ def _check(
     limits: Array,
     memory: Array,
     codes: Stamps,
-) -> tuple[int, int]:
-    """Write `codes` (m,); return how many samples are judged, the rest waits for more, and the
-    stamp that the next must be later than.
+) -> tuple[int, int, int]:
+    """Write `codes` (m,); return how many samples are judged, the rest waits for more, the stamp
+    that the next must be later than, and how many were refused.
 
     `limits`: rate in Hz, full scale of rate and force. Samples whose stamps do not go forward are
     left to whoever orders them.
     """
-    i, m = 0, len(times)
+    i, m, refused = 0, len(times), 0
     while i < m:
         codes[i] = TAKEN
         if memory[_SEEN] == 0.0:
@@ -238,10 +238,11 @@ def _check(
             while k < m and times[k] <= last_ns:
                 k += 1
             if k == m:
-                return i, last_ns
+                return i, last_ns, refused
         # A gap is real if the next sample goes on from here; else this stamp was wrong.
         if gap and times[k] <= times[i]:
             codes[i] = STAMP_AHEAD
+            refused += 1
             i += 1
             continue
         _count_repeats(memory, samples, i, limits[0])
@@ -255,9 +256,10 @@ def _check(
             _take(memory, samples, i)
         else:
             memory[_REFUSED] += 1.0
+            refused += 1
         last_ns = times[i]
         i += 1
-    return i, last_ns
+    return i, last_ns, refused
 
 
 class Checked(NamedTuple):
@@ -281,6 +283,8 @@ class ImuCheck:
         self._memory = np.zeros(_MEMORY)
         self._last_ns = _NEVER_NS
         self._waiting: tuple[Stamps, Array] | None = None
+        self.refused = 0
+        """How many of the samples last judged are not to be taken."""
 
     def restart(self) -> None:
         """Forget all: the next sample may have any stamp."""
@@ -294,8 +298,8 @@ class ImuCheck:
             times = np.concatenate((self._waiting[0], times))
             samples = np.concatenate((self._waiting[1], samples))
         times, samples = np.ascontiguousarray(times), np.ascontiguousarray(samples)
-        codes = np.zeros(len(times), dtype=np.int64)
-        done, self._last_ns = _check(
+        codes = np.empty(len(times), dtype=np.int64)
+        done, self._last_ns, self.refused = _check(
             times, samples, self._last_ns, hold_ns, self._limits, self._memory, codes
         )
         if done == len(times):

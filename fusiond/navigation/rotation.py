@@ -116,15 +116,23 @@ def rpy_from_dcm(dcm: Array) -> tuple[float, float, float]:
     )
 
 
+@compiled("UniTuple(f8, 3)(f8[:])")
+def rpy_from_quaternion(q: Array) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, rad, of a quaternion (4,)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    sine = 2.0 * (w * y - x * z)
+    return (
+        math.atan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
+        math.asin(math.copysign(1.0, sine) if abs(sine) > 1.0 else sine),
+        math.atan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z),
+    )
+
+
 @compiled("void(f8[:, :], f8[:, ::1])")
 def rpy_from_quaternions(q: Array, rpy: Array) -> None:
     """Write roll, pitch and yaw (m, 3), rad, of quaternions (m, 4)."""
     for i in range(q.shape[0]):
-        w, x, y, z = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
-        rpy[i, 0] = math.atan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
-        sine = 2.0 * (w * y - x * z)
-        rpy[i, 1] = math.asin(math.copysign(1.0, sine) if abs(sine) > 1.0 else sine)
-        rpy[i, 2] = math.atan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z)
+        rpy[i, 0], rpy[i, 1], rpy[i, 2] = rpy_from_quaternion(q[i])
 
 
 def rotation_vector_from_dcm(dcm: Array) -> Array:

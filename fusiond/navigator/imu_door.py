@@ -119,7 +119,7 @@ class ImuDoor:
             times, samples = times[good], samples[good]
         checked = self._check.feed(times, samples, imu.hold_ns)
         times, samples = checked.times, checked.samples
-        if checked.codes.any():
+        if self._check.refused:
             ends = self._refuse(checked, imu)
             taken = checked.codes == TAKEN
             times, samples = times[taken], samples[taken]
@@ -135,7 +135,8 @@ class ImuDoor:
             yield from self._parted(times, samples, before, most_s, imu)
         else:
             yield Run(times, samples)
-        self._recover(self._latest_ns)
+        if self._troubles:
+            self._recover(self._latest_ns)
 
     def _parted(
         self, times: Stamps, samples: Array, before: int, most_s: float, imu: ImuBuffer

@@ -40,6 +40,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -99,18 +100,22 @@ class WayTurns:
     def samples(self, times: NDArray[np.int64], yaw_rates: Array) -> bool:
         """Rates (m,) about the vertical, means until `times` (m,) ns; whether a chord has ended."""
         known = self._chords[-1] if self._chords else None
-        steps = np.diff(times, prepend=self._latest_ns or times[0])
-        if not 0 <= int(steps.min()) <= int(steps.max()) <= GAP_NS:
+        instants = times.tolist()
+        before_ns = self._latest_ns or instants[0]
+        steps = [now - then for then, now in pairwise((before_ns, *instants))]
+        if not 0 <= min(steps) <= max(steps) <= GAP_NS:
             self._break()
-            steps[:] = 0
-        turned = self._total + np.cumsum(yaw_rates * steps) * 1e-9
-        self._latest_ns, self._total = int(times[-1]), float(turned[-1])
+            steps = [0] * len(steps)
+        begin, angle, turn = self._total, self._total, 0.0
         last_ns = self._times[-1] if self._times else -KEPT_EVERY_NS
-        for t_ns, angle in zip(times.tolist(), turned.tolist(), strict=True):
+        for t_ns, step, rate in zip(instants, steps, yaw_rates.tolist(), strict=True):
+            turn += rate * step
+            angle = begin + turn * 1e-9
             if t_ns - last_ns >= KEPT_EVERY_NS:
                 self._times.append(t_ns)
                 self._turned.append(angle)
                 last_ns = t_ns
+        self._latest_ns, self._total = instants[-1], angle
         while self._waiting and self._waiting[0].t_ns <= last_ns:
             self._reach(self._waiting.popleft())
         return bool(self._chords) and self._chords[-1] is not known

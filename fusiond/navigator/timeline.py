@@ -20,7 +20,6 @@ import numpy as np
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -212,19 +211,19 @@ class Timeline:
         del self._entries[rows], self._keys[rows]
 
     def _apply(self, entry: Entry) -> Outcome:
-        estimator, isolation = self.estimator, self.isolation
-        match entry.aid.feedback:
+        estimator, isolation, aid = self.estimator, self.isolation, entry.aid
+        match aid.feedback:
             case "release":
                 estimator.release()
             case "hold":
                 estimator.hold()
-        believed = isolation.believes(entry.aid.source)
+        believed = isolation.believes(aid.source)
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
-        tilts = (entry.aid.locates or entry.aid.moves) and estimator.model.sensor_errors
+        tilts = (aid.locates or aid.moves) and estimator.model.sensor_errors
         if tilts:
             isolation.correcting(estimator.nav, estimator.covariance)
         try:
-            aid = entry.aid.at(estimator.nav)
+            aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
             outcome = self._update(aid) if believed else estimator.look(aid)
             entry.assumed = isolation.assumes(aid)
@@ -234,9 +233,8 @@ class Timeline:
         if outcome.name in JUDGED and not estimator.isolates:
             action = isolation.judge(aid, outcome, estimator.nav, estimator.covariance)
             if action is Action.NONE and outcome.name == "fused" and tilts:
-                turned = estimator.turned if isinstance(estimator, TiltAxesFilter) else 0.0
-                after = estimator.nav, estimator.covariance
-                action = isolation.corrected(aid.t_ns, *after, turned)
+                after = estimator.nav, estimator.covariance, estimator.turned
+                action = isolation.corrected(aid.t_ns, *after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION)
         return outcome

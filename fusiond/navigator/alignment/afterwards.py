@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.witnesses import Witnesses
-from fusiond.navigation.rotation import dcm_from_quaternion, wrap_angle
+from fusiond.navigation.rotation import dcm_elements, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
 from fusiond.navigator.alignment.headings import CLAIMS, COMPASS, CONFIGURED
 from fusiond.navigator.alignment.options import AlignmentOptions
@@ -53,10 +53,11 @@ class Afterwards:
     ) -> tuple[str, str] | None:
         """Code and text of the event, if the solution nav (10,) with P (n, n) at `t_ns` shows that
         the start was wrong. `doubted`: it has not fitted the aids since."""
-        axes = dcm_from_quaternion(nav[Q0:])
-        ahead = axes[:, 0]
-        backward = -float(ahead @ nav[VN : VN + 3])
+        axes = dcm_elements(nav[Q0:])
+        v_n, v_e, v_d = nav[VN : VN + 3].tolist()
+        backward = -(axes[0] * v_n + axes[3] * v_e + axes[6] * v_d)
         if backward > self._options.max_reverse_m_s:
+            ahead = np.array(axes[::3])
             sd = math.sqrt(max(float(ahead @ covariance[3:6, 3:6] @ ahead), 0.0))
             if backward - 3.0 * sd > self._options.max_reverse_m_s:
                 return "imu_backwards", (
@@ -71,14 +72,14 @@ class Afterwards:
             self._unproven = False
         velocity = measured.velocity(t_ns - COURSE_NS, t_ns)
         return velocity and self._heading(
-            t_ns, velocity, axes, math.sqrt(covariance[2, 2]), doubted
+            t_ns, velocity, math.atan2(axes[3], axes[0]), math.sqrt(covariance[2, 2]), doubted
         )
 
     def _heading(
         self,
         t_ns: int,
         velocity: tuple[float, float, float],
-        axes: Array,
+        yaw: float,
         sd_yaw: float,
         doubted: bool,
     ) -> tuple[str, str] | None:
@@ -91,8 +92,7 @@ class Afterwards:
         if speed < self._options.course_speed_m_s + 3.0 * sd_speed:
             self._since_ns = None
             return None
-        yaw, course = math.atan2(axes[1, 0], axes[0, 0]), math.atan2(east, north)
-        apart = abs(wrap_angle(course - yaw))
+        apart = abs(wrap_angle(math.atan2(east, north) - yaw))
         sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
         if doubted:
             return "heading_contradicted", (
