@@ -219,7 +219,8 @@ class Means:
         new = (packed.shape[0] - _HEAD) // 2 * told * SLOW  # degrees of freedom of its squares
         if new * beyond * beyond <= 2.0:
             return 0.0
-        return (beyond - 2.0 / (new * beyond)) * told / (DOUBTED_COUNT + told)
+        shown: float = (beyond - 2.0 / (new * beyond)) * told / (DOUBTED_COUNT + told)
+        return shown
 
 
 def assumed(every_s: float) -> float:
