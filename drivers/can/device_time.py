@@ -93,14 +93,15 @@ class DeviceTime:
     def _explain(self, raw: int, arrivals_ns: Arrivals) -> tuple[int, float, float]:
         """Ticks since the last sample, the lateness they mean, and what passed meanwhile."""
         assert self._ticks is not None
-        step = (raw - self._ticks) % self._modulus
+        modulus, slack = self._modulus, self._slack
+        step = (raw - self._ticks) % modulus
         found: tuple[int, float, float] | None = None
         for now, before in zip(arrivals_ns, self._arrivals_ns, strict=True):
             elapsed = (now - before) / self._tick
             drift = DEVICE_DRIFT * abs(elapsed)
-            most = self._late + elapsed + self._slack + drift
-            advance = step + self._modulus * int((most - step) // self._modulus)
-            late = max(self._late + elapsed - advance - drift, -self._slack)
+            due = self._late + elapsed
+            advance = step + modulus * int((due + slack + drift - step) // modulus)
+            late = max(due - advance - drift, -slack)
             if found is None or abs(late) < abs(found[1]):
                 found = advance, late, elapsed
         assert found is not None

@@ -195,9 +195,11 @@ class ErrorStateFilter:
         self.step: Array
         self.nav, self.xi, self.step, self._scratch = parts
         self._covs: Array = np.zeros((count, width, width))
-        self._covariance = self._covs[0, : model.size, : model.size]
+        self._cov: Array = self._covs[0]
+        self._covariance = self._cov[: model.size, : model.size]
         self._view = State(self.nav, self.xi, self.step, model, self._covariance)
         self._dxs: Array = np.zeros((count, model.size))
+        self._dx: Array = self._dxs[0]
         self._shares: Array = np.array(shares)
         self._phi: Array = np.zeros((0, 0))
         self._holding = False

@@ -29,14 +29,12 @@ class KalmanEstimator(ErrorStateFilter):
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
-        cov, dx = self._covs[0], self._dxs[0]
         if aid.screened:
             return self._update_by_rows(aid, innovation)
-        z, h, r = innovation
-        degrees = z.shape[0]
-        threshold = gate_threshold(aid.gate, degrees)
-        y = np.zeros(degrees)
-        nis = fuse(self.nav, self.xi, cov, dx, z, h, r, threshold, self._holding, y)
+        degrees = innovation.z.shape[0]
+        threshold, y = gate_threshold(aid.gate, degrees), np.empty(degrees)
+        state = self.nav, self.xi, self._cov, self._dx
+        nis = fuse(*state, *innovation, threshold, self._holding, y)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
@@ -45,7 +43,7 @@ class KalmanEstimator(ErrorStateFilter):
 
     def _update_by_rows(self, aid: Linearised, rows: Innovation) -> Outcome:
         """Rows that pass are folded in, or none."""
-        cov, dx = self._covs[0], self._dxs[0]
+        cov, dx = self._cov, self._dx
         s = self._screen(aid, rows, cov, dx)
         codes = tuple(s.codes.tolist())
         kept = codes.count(KEPT)
@@ -65,5 +63,5 @@ class KalmanEstimator(ErrorStateFilter):
     def release(self) -> None:
         """Feed back what was carried."""
         self._holding = False
-        self._feed_back(self._dxs[0])
-        self._dxs[0] = 0.0
+        self._feed_back(self._dx)
+        self._dx[:] = 0.0

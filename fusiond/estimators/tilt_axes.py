@@ -104,16 +104,16 @@ def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indic
             m[slots[0], k] += left / new[8]
 
 
-@compiled("b1(f8[:, ::1], i8[::1])")
-def may_part(cov: Array, slots: Indices) -> bool:
-    """Whether an update may tell tilt and force biases, the `slots` (j,) of P, apart that nothing
-    has told apart."""
+@compiled("b1(f8[:, :], i8[::1])")
+def may_part(p: Array, slots: Indices) -> bool:
+    """Whether an update may tell tilt and force biases, the `slots` (j,) of P (n, n), apart that
+    nothing has told apart."""
     if slots.size == 0:
         return False
-    tilt = max(cov[PHI, PHI], cov[PHI + 1, PHI + 1])
-    force = STANDARD_GRAVITY_M_S2**2 * cov[PHI + 2, PHI + 2]
+    tilt = max(p[PHI, PHI], p[PHI + 1, PHI + 1])
+    force = STANDARD_GRAVITY_M_S2**2 * p[PHI + 2, PHI + 2]
     for slot in slots:
-        force = max(force, cov[slot, slot])
+        force = max(force, p[slot, slot])
     apart: bool = tilt * force > SLIGHT_M_S2**2
     return apart
 
@@ -145,7 +145,7 @@ class TiltAxesFilter(KalmanEstimator):
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
         self.turned = 0.0
-        if self._holding or not may_part(self._covs[0], self._slots):
+        if self._holding or not may_part(self._covariance, self._slots):
             return self._fold_in(aid)
         before = self.nav[Q0:].copy()
         outcome = self._fold_in(aid)
@@ -155,7 +155,7 @@ class TiltAxesFilter(KalmanEstimator):
 
     def release(self) -> None:
         """Feed back what was carried."""
-        before, apart = self.nav[Q0:].copy(), may_part(self._covs[0], self._slots)
+        before, apart = self.nav[Q0:].copy(), may_part(self._covariance, self._slots)
         super().release()
         if apart:
             self._carry_over(before)

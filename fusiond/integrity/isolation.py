@@ -57,6 +57,7 @@ from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting
+from fusiond.navigation.strapdown import VD
 
 Array = NDArray[np.float64]
 
@@ -199,7 +200,7 @@ class Isolation:
         t_ns = aid.t_ns
         record = self._record(aid)
         passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-        lat, lon, _, v_n, v_e, *_ = nav.tolist()
+        lat, lon, _, v_n, v_e = nav[:VD].tolist()
         offer, velocity, value = said(aid.offers())
         offset = None
         if offer is not None:

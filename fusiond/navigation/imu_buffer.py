@@ -174,7 +174,8 @@ class ImuBuffer:
             times, samples = times[good], samples[good]
         if not len(times):
             return 0
-        times = times + self._offset_ns
+        if self._offset_ns:
+            times = times + self._offset_ns
         before_ns = self.latest_ns if self.end else int(times[0]) - 1
         intervals = np.empty(len(times), dtype=np.int64)
         shortest, longest = _steps(times, before_ns, intervals)

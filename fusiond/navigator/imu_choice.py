@@ -63,7 +63,8 @@ class ImuChoice:
         if item.source != self.used:
             self.counters["second_imu"] += 1
             return
-        self.counters["imu_queue_overflow"] += len(self._waiting) == IMU_QUEUE
+        if len(self._waiting) == IMU_QUEUE:
+            self.counters["imu_queue_overflow"] += 1
         self._waiting.append(row)
 
     def _turned(self, sample: tuple[float, ...]) -> tuple[float, ...]:

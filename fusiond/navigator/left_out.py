@@ -31,6 +31,8 @@ class LeftOut:
     def tell(self) -> None:
         """Events where the isolated sources are no longer those last told."""
         now = self._estimator.isolated | self._timeline.isolation.excluded
+        if now == self._told:
+            return
         for source, reason in now.items():
             if source not in self._told:
                 self._event("isolated", f"{source} is left out of the solution: {reason}")

@@ -351,8 +351,8 @@ class Navigator:
             return Mode.ALIGNING, self._aligner.reason
         if silent > self.config.imu.gap_s:
             return Mode.INVALID, self._door.silence(silent)
-        p = self.estimator.covariance
-        if not 0.0 <= (variance := p[6, 6] + p[7, 7]) <= self.config.estimator.invalid_sd_m**2:
+        p = self.estimator.covariance.item
+        if not 0.0 <= (variance := p(6, 6) + p(7, 7)) <= self.config.estimator.invalid_sd_m**2:
             return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
         if self.on_trial:
             return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"

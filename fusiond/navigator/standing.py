@@ -105,11 +105,12 @@ class Standing:
         `nav` (10,) at `t_ns`, the filter's instant.
         """
         self._shaken = None
-        self._watch(t_ns, isolation, nav)
-        speed = math.hypot(nav[VN], nav[VE])
+        v_n, v_e = nav[VN : VE + 1].tolist()
+        speed, doubts = math.hypot(v_n, v_e), isolation.doubts
+        self._watch(t_ns, isolation, speed)
         if speed > self._max_speed:
             return f"{speed:.0f} m/s is faster than this vehicle can be"
-        if sum(t_ns - doubt_ns <= DOUBTS_NS for doubt_ns in isolation.doubts) > MOST_DOUBTS:
+        if doubts and sum(t_ns - doubt_ns <= DOUBTS_NS for doubt_ns in doubts) > MOST_DOUBTS:
             return "IMU and aids do not fit each other"
         lost = isolation.lost(t_ns)
         # To begin anew from what is on its way back were to believe it before it has proven itself.
@@ -122,11 +123,10 @@ class Standing:
         self._left = lost.device if lost.cause == "source" else ""
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
-    def _watch(self, t_ns: int, isolation: Isolation, nav: Array) -> None:
-        """How far the speed has changed since the start or the last doubt, and since measured
+    def _watch(self, t_ns: int, isolation: Isolation, speed: float) -> None:
+        """How far the speed (m/s) has changed since the start or the last doubt, and since measured
         velocities go along: while one is left out nothing is proven."""
-        since_ns = max((self._started_ns, self._turned_ns, *isolation.doubts))
-        speed = math.hypot(nav[VN], nav[VE])
+        since_ns = max(self._started_ns, self._turned_ns, *isolation.doubts)
         if since_ns != self._since_ns or isolation.velocity_left_out(t_ns):
             self._since_ns, self._from, self._changed = since_ns, speed, 0.0
         self._changed = max(self._changed, abs(speed - self._from))

@@ -250,11 +250,12 @@ class Timeline:
         return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
-        counts = self.counters.outcomes[entry.aid.source]
-        if entry.outcome is not None:
-            counts[entry.outcome.name] -= 1
-        counts[outcome.name] += 1
-        entry.outcome = outcome
+        before, entry.outcome = entry.outcome, outcome
+        if before is None or before.name != outcome.name:
+            counts = self.counters.outcomes[entry.aid.source]
+            counts[outcome.name] += 1
+            if before is not None:
+                counts[before.name] -= 1
         if self._on_outcome is not None:
             self._on_outcome(entry)
 

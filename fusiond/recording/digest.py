@@ -34,7 +34,8 @@ def state_digest(navigator: Navigator, solution: Solution) -> bytes:
         e = navigator.estimator
         parts = _T_NS.pack(e.t_ns), e.nav.tobytes(), e.xi.tobytes(), e.covariance.tobytes()
         of += b"".join(parts)
-    found = blake2b(of[:_SLICE], digest_size=DIGEST_BYTES)
+    whole = memoryview(of)
+    found = blake2b(whole[:_SLICE], digest_size=DIGEST_BYTES)
     for at in range(_SLICE, len(of), _SLICE):
-        found.update(of[at : at + _SLICE])
+        found.update(whole[at : at + _SLICE])
     return found.digest()

@@ -173,11 +173,11 @@ class Replay:
 
     def _handle(self, record: Record) -> ReplayedTick | None:
         assert self.chain is not None
-        self._time.t_ns = record.t_ns
-        if record.readings:
-            self._readings.give(record.readings)
+        kind, _, t_ns, _, readings = record
+        self._time.t_ns = t_ns
+        if readings:
+            self._readings.give(readings)
         tick = None
-        kind = record.kind
         if kind is Kind.TICK:
             if self._navigate:
                 tick = self._tick(record)
@@ -190,7 +190,7 @@ class Replay:
         else:
             self._inputs += 1
             self._take(record)
-        if record.readings:
+        if readings:
             self._finish()
         return tick
 
