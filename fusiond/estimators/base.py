@@ -196,7 +196,7 @@ class ErrorStateFilter:
         self.nav, self.xi, self.step, self._scratch = parts
         self._covs: Array = np.zeros((count, width, width))
         self._cov: Array = self._covs[0]
-        self._covariance = self._cov[: model.size, : model.size]
+        self._covariance: Array = self._cov[: model.size, : model.size]
         self._view = State(self.nav, self.xi, self.step, model, self._covariance)
         self._dxs: Array = np.zeros((count, model.size))
         self._dx: Array = self._dxs[0]

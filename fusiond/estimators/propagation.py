@@ -156,7 +156,8 @@ def published_ahead(
         strapdown_step(nav, rate, force, zero, zero, ahead_s, hold_height, np.zeros(STEP_SIZE))
     published = out[:NAV_SIZE]
     in_fix_time(nav, xi, step, time_slot, published)
-    out[NAV_SIZE], out[NAV_SIZE + 1], out[NAV_SIZE + 2] = rpy_from_quaternion(published[Q0:])
+    w, x, y, z = out[Q0], out[Q0 + 1], out[Q0 + 2], out[Q0 + 3]
+    out[NAV_SIZE], out[NAV_SIZE + 1], out[NAV_SIZE + 2] = rpy_from_quaternion(w, x, y, z)
 
 
 @cache

@@ -54,6 +54,16 @@ def all_sound(samples: Array) -> bool:
     return True
 
 
+@compiled("f8(f8[:, ::1], i8, i8)")
+def squares(samples: Array, first: int, end: int) -> float:
+    """Sum of the squares of the rates of rows first ... end-1 of samples (m, 6)."""
+    total = 0.0
+    for i in range(first, end):
+        for j in range(3):
+            total += samples[i, j] * samples[i, j]
+    return total
+
+
 @compiled("UniTuple(i8, 2)(i8[:], i8, i8[::1])")
 def _steps(times: Stamps, before_ns: int, intervals: Stamps) -> tuple[int, int]:
     """Write the intervals (m,) between `before_ns` and times (m,), m > 0; shortest and longest."""

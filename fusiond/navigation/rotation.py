@@ -116,10 +116,9 @@ def rpy_from_dcm(dcm: Array) -> tuple[float, float, float]:
     )
 
 
-@compiled("UniTuple(f8, 3)(f8[:])")
-def rpy_from_quaternion(q: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw, rad, of a quaternion (4,)."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
+@compiled("UniTuple(f8, 3)(f8, f8, f8, f8)")
+def rpy_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, rad, of a quaternion."""
     sine = 2.0 * (w * y - x * z)
     return (
         math.atan2(2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
@@ -132,7 +131,8 @@ def rpy_from_quaternion(q: Array) -> tuple[float, float, float]:
 def rpy_from_quaternions(q: Array, rpy: Array) -> None:
     """Write roll, pitch and yaw (m, 3), rad, of quaternions (m, 4)."""
     for i in range(q.shape[0]):
-        rpy[i, 0], rpy[i, 1], rpy[i, 2] = rpy_from_quaternion(q[i])
+        found = rpy_from_quaternion(q[i, 0], q[i, 1], q[i, 2], q[i, 3])
+        rpy[i, 0], rpy[i, 1], rpy[i, 2] = found
 
 
 def rotation_vector_from_dcm(dcm: Array) -> Array:

@@ -50,21 +50,25 @@ def _follow(
             smallest = np.inf
             wanted = 1.0
             for level in range(memory.shape[0]):
-                m = memory[level, axis]
-                m[_SUM] += samples[i, axis]
-                m[_COUNT] += 1.0
-                if m[_COUNT] >= wanted:
-                    mean = m[_SUM] / wanted
-                    if m[_MEANS] >= 2.0:
+                # A row of its own would be counted in and out at each sample: five times the time.
+                memory[level, axis, _SUM] += samples[i, axis]
+                memory[level, axis, _COUNT] += 1.0
+                if memory[level, axis, _COUNT] >= wanted:
+                    mean = memory[level, axis, _SUM] / wanted
+                    last, before = memory[level, axis, _LAST], memory[level, axis, _BEFORE]
+                    means = memory[level, axis, _MEANS]
+                    if means >= 2.0:
                         tau = wanted * period_s
-                        found = (mean - 2.0 * m[_LAST] + m[_BEFORE]) ** 2 / 6.0 * tau
-                        gain = max(1.0 / (m[_MEANS] - 1.0), min(1.0, tau / memory_s))
-                        m[_DENSITY] += gain * (found - m[_DENSITY])
-                    m[_BEFORE], m[_LAST] = m[_LAST], mean
-                    m[_MEANS] += 1.0
-                    m[_SUM], m[_COUNT] = 0.0, 0.0
-                if m[_MEANS] >= FEWEST:
-                    smallest = min(smallest, m[_DENSITY])
+                        found = (mean - 2.0 * last + before) ** 2 / 6.0 * tau
+                        gain = max(1.0 / (means - 1.0), min(1.0, tau / memory_s))
+                        memory[level, axis, _DENSITY] += gain * (
+                            found - memory[level, axis, _DENSITY]
+                        )
+                    memory[level, axis, _BEFORE], memory[level, axis, _LAST] = last, mean
+                    memory[level, axis, _MEANS] = means + 1.0
+                    memory[level, axis, _SUM] = memory[level, axis, _COUNT] = 0.0
+                if memory[level, axis, _MEANS] >= FEWEST:
+                    smallest = min(smallest, memory[level, axis, _DENSITY])
                 wanted *= RATIO
             above = smallest < np.inf and smallest > EXCESS * sheet[axis]
             out[i, axis] = smallest - sheet[axis] if above else 0.0

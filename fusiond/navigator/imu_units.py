@@ -28,7 +28,7 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Estimator
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
-from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.imu_buffer import ImuBuffer, squares
 from fusiond.navigator.imu_way import PROOF, WayTurns
 
 Array = NDArray[np.float64]
@@ -161,18 +161,17 @@ class RateUnits:
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
         """The samples from row `new` on have come."""
-        rates = imu.samples[new : imu.end, :3]
-        if not len(rates):
+        count = imu.end - new
+        if not count:
             return
-        newest_ns = imu.latest_ns
         if not self._count:
             self._since_ns = int(imu.times[new])
         for way in () if self._fit else self._ways.values():
-            if way.samples(imu.times[new : imu.end], rates[:, 2]):
+            if way.samples(imu.times[new : imu.end], imu.samples[new : imu.end, 2]):
                 self._weigh(way)
-        self._squares += float(np.vdot(rates, rates))
-        self._count += len(rates)
-        if newest_ns - self._since_ns >= RMS_S * 1e9:
+        self._squares += squares(imu.samples, new, imu.end)
+        self._count += count
+        if imu.latest_ns - self._since_ns >= RMS_S * 1e9:
             self._tell(rms_unit(math.sqrt(self._squares / self._count)) or self.wrong)
             self._squares, self._count = 0.0, 0
 
