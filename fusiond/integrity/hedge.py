@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.series import Series
 from fusiond.integrity.support import FINE_M
-from fusiond.navigation.error_model import DR, DV, PHI
+from fusiond.navigation.error_model import DR, DV
 
 Array = NDArray[np.float64]
 Said = PositionOffer | VelocityOffer | None
@@ -49,22 +49,14 @@ class Hedge:
         self.wider = NOTHING
 
     def look(self, source: str, record: Series, said: Said, covariance: Array | None) -> None:
-        """A series has been fused, and is not biased; P (n, n) of the filter."""
+        """A mean of a series that is fused is beyond what is likely, or was; P (n, n) of the
+        filter. A coarse position cannot say that a fine one is wrong."""
         if not record.means.unlikely:
             self.drop(source)
-            return
-        variances = _variances(record, said, covariance)
-        # A coarse position cannot say that a fine one is wrong.
-        if covariance is None or not variances or (record.locates and record.sd_m > FINE_M):
-            return
-        first = DR if record.locates else DV
-        grown = np.zeros(9)
-        for axis, (excess, s) in enumerate(zip(record.means.excess(), variances, strict=False)):
-            if excess > 0.0 and (own := covariance[first + axis, first + axis]) > 0.0:
-                grown += excess * s * (covariance[:9, first + axis] / own) ** 2
-        tilt = grown[PHI] + grown[PHI + 1]  # of whichever axis roll and pitch are about
-        wider = np.concatenate((grown[DR:], grown[DV:DR], (tilt, tilt, grown[PHI + 2])))
-        self.wider = {**self.wider, source: wider}
+        elif said is not None and covariance is not None and record.sd_m <= FINE_M:
+            first = DR if record.locates else DV
+            wider = record.means.leaves_open(covariance, first, said.sd)
+            self.wider = {**self.wider, source: wider}
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""
@@ -74,16 +66,10 @@ class Hedge:
 
 
 def differ(record: Series, said: Said, covariance: Array | None) -> tuple[float, ...]:
-    """By how much (m or m/s) of each axis the means of a series are off."""
-    variances = _variances(record, said, covariance)
-    return tuple(m * math.sqrt(s) for m, s in zip(record.means.most(), variances, strict=False))
-
-
-def _variances(record: Series, said: Said, covariance: Array | None) -> list[float]:
-    """Of the innovations of a position or velocity, by axis; none where they are not known."""
+    """By how much (m or m/s) of each axis the means of a series are off; P (n, n) of the filter."""
     if said is None or covariance is None:
-        return []
-    first = DR if record.locates else DV
+        return ()
+    first, coarse = DR if record.locates else DV, record.means.coarse
     own: list[float] = covariance.diagonal()[first : first + 3].tolist()
-    coarse = record.means.coarse
-    return [p + (coarse * sd) ** 2 for p, sd in zip(own, said.sd, strict=False)]
+    axes = zip(record.means.most(), own, said.sd, strict=False)
+    return tuple(m * math.sqrt(p + (coarse * sd) ** 2) for m, p, sd in axes)

@@ -239,7 +239,8 @@ class Isolation:
         if outcome.whitened:
             record.means.add(outcome.whitened)
         if not self._biased(record, t_ns):
-            self.hedge.look(aid.source, record, offer or velocity, covariance)
+            if record.means.unlikely or aid.source in self.hedge.wider:
+                self.hedge.look(aid.source, record, offer or velocity, covariance)
             return Action.NONE
         self.shown = differ(record, offer or velocity, covariance)
         self.hedge.drop(aid.source)

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import DR, DV, PHI
 
 Array = NDArray[np.float64]
 
@@ -149,6 +150,28 @@ def _look(packed: Array, t_ns: int, limit: float, own: float) -> int:
     return _UNLIKELY if unlikely else _NOTHING
 
 
+@compiled("void(f8[::1], f8[:, :], i8, f8[::1], f8[::1])")
+def _open(packed: Array, p: Array, first: int, sd: Array, out: Array) -> None:
+    """Add to `out` (9,) what the excess of each component leaves open."""
+    d = (packed.shape[0] - _HEAD) // 2
+    for i in range(min(d, sd.shape[0])):
+        fast, slow, own = packed[_HEAD + i], packed[_HEAD + d + i], p[first + i, first + i]
+        excess = fast * fast - LIKELY * packed[_SPREAD]
+        excess = max(excess, slow * slow - LIKELY * packed[_SPREAD + 1])
+        if excess <= 0.0 or own <= 0.0:
+            continue
+        share = excess * (own + packed[_COARSE] * sd[i] * sd[i]) / (own * own)
+        for j in range(3):
+            with_position, with_velocity = p[DR + j, first + i], p[DV + j, first + i]
+            out[j] += share * with_position * with_position
+            out[3 + j] += share * with_velocity * with_velocity
+        north, east, yaw = p[PHI, first + i], p[PHI + 1, first + i], p[PHI + 2, first + i]
+        tilt = share * (north * north + east * east)  # of whichever axis roll and pitch are about
+        out[6] += tilt
+        out[7] += tilt
+        out[8] += share * yaw * yaw
+
+
 def _begun(assumed: float) -> Array:
     packed = np.zeros(_HEAD)
     packed[:1].view(np.int64)[0] = _LONG_AGO_NS
@@ -211,24 +234,19 @@ class Means:
         self.unlikely = found == _UNLIKELY
         return found == _BIASED
 
-    def excess(self) -> list[float]:
-        """What each component (d,) of the means has beyond what is likely, of an innovation's
-        variance (1): of the mean that has more."""
-        fast, slow = self._squares()
-        s_fast, s_slow = self._packed[_SPREAD : _SPREAD + 2].tolist()
-        return [
-            max(f - LIKELY * s_fast, s - LIKELY * s_slow, 0.0)
-            for f, s in zip(fast, slow, strict=True)
-        ]
+    def leaves_open(self, covariance: Array, first: int, sd: tuple[float, ...]) -> Array:
+        """Variances (9,) of what is published, position, velocity (n, e, d) and attitude, that the
+        excess of a mean leaves open (fusiond.integrity.hedge): of measurements with `sd` (d,) of
+        the states from `first` on, of which a filter holds P (n, n)."""
+        out = np.zeros(9)
+        _open(self._packed, covariance, first, np.array(sd), out)
+        return out
 
     def most(self) -> list[float]:
         """Each component (d,), of an innovation's sigma (1): of the mean where it is more."""
-        return [math.sqrt(max(f, s)) for f, s in zip(*self._squares(), strict=True)]
-
-    def _squares(self) -> tuple[list[float], list[float]]:
         d = (self._packed.shape[0] - _HEAD) // 2
         squares = (self._packed[_HEAD:] ** 2).tolist()
-        return squares[:d], squares[d:]
+        return [math.sqrt(max(f, s)) for f, s in zip(squares[:d], squares[d:], strict=True)]
 
     @property
     def coarse(self) -> float:

@@ -143,8 +143,7 @@ def coarseness(records: Records, aid: Aid) -> float:
     """With how many times its stated sigma a velocity counts: receivers filter theirs, so that its
     errors last for seconds (fusiond.integrity.means). A position has a state for what its fixes
     share. Both, where the device says the same to the bit again and again."""
-    record = records.get(aid.source)
-    if record is None:
+    if not (aid.moves or aid.locates) or (record := records.get(aid.source)) is None:
         return 1.0
     hangs = _hangs(records, record, aid) if record.alike else 1.0
     if not aid.moves:
@@ -154,18 +153,19 @@ def coarseness(records: Records, aid: Aid) -> float:
 
 def assumes(records: Records, aid: Aid) -> bool:
     """Whether an aid counts as coarser than it says, and its own errors have not shown that."""
-    record = records.get(aid.source)
-    if record is None:
+    if not (aid.moves or aid.locates) or (record := records.get(aid.source)) is None:
         return False
-    return record.means.assuming if aid.moves else aid.locates and record.alike > 0
+    return record.means.assuming if aid.moves else record.alike > 0
 
 
 def _hangs(records: Records, record: Series, aid: Aid) -> float:
     """With how many times its sigma one more value counts, after a run of the same, at rest as
     well. Speeds are printed coarser and may stay the same: they hang where the position of the same
     device does."""
-    positions = (r.alike for r in records.values() if r.locates and r.device == record.device)
-    alike = min(record.alike, max(positions, default=0))
+    alike = record.alike
+    if not record.locates:
+        positions = (r.alike for r in records.values() if r.locates and r.device == record.device)
+        alike = min(alike, max(positions, default=0))
     if not alike or said(aid.offers())[2] != record.value:
         return 1.0
     return HALVED ** min(alike, MOST_HALVES)

@@ -241,14 +241,14 @@ class Timeline:
                 action = isolation.corrected(aid.t_ns, *after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
-            self._hedge()
+            if isolation.hedge.wider is not self._wider:
+                self._hedge()
         return outcome
 
     def _hedge(self) -> None:
         """What the estimator publishes is as wide as the isolation has it now."""
-        wider = self.isolation.hedge.wider
-        if wider is not self._wider:
-            self._wider, self.estimator.wider[:] = wider, sum(wider.values())
+        self._wider = wider = self.isolation.hedge.wider
+        self.estimator.wider[:] = sum(wider.values())
 
     def _update(self, aid: Aid) -> Outcome:
         """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its

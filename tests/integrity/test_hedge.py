@@ -100,7 +100,12 @@ def test_excess_is_what_a_mean_has_beyond_chance() -> None:
         means.add((1.0, 0.0))
     assert not means.biased(S, math.inf)
     assert means.unlikely
-    assert means.excess() == pytest.approx([1.0 - LIKELY * WHITE_SLOW, 0.0], abs=1e-6)
+    p = np.diag([0.0] * 6 + [0.04] * 3)
+    p[3, 3], p[2, 2], p[3, 6], p[2, 6], p[1, 6] = 1.0, 1.0, 0.02, 0.01, 0.03
+    excess = (1.0 - LIKELY * WHITE_SLOW) * (0.04 + 2.25)
+    regression = [1.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.75, 0.75, 0.25]
+    found = means.leaves_open(p, 6, (1.5, 1.5, 1.5))
+    assert found == pytest.approx(excess * np.square(regression), abs=1e-6)
     assert means.most() == pytest.approx([1.0, 0.0], abs=1e-6)
     small = 0.5 * math.sqrt(LIKELY * min(WHITE_FAST, WHITE_SLOW))
     for _ in range(500):
