@@ -209,8 +209,8 @@ def _single(_: int) -> Callable[[], int]:
 
 
 def _fix(source: str, t_ns: int) -> PositionAid:
-    lever = (0.3, 0.0, -1.0)
-    return PositionAid(source, t_ns, 0.9999, LAT, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
+    lever, lat = (0.3, 0.0, -1.0), LAT + 1e-20 * t_ns  # a receiver that hangs takes another way
+    return PositionAid(source, t_ns, 0.9999, lat, LON, HEIGHT + 1.0, (2.0, 2.0, 4.0), lever)
 
 
 def _rewind(number: int) -> Callable[[], int]:

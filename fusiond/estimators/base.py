@@ -29,9 +29,9 @@ from fusiond.estimators.propagation import (
     scratch_size,
     sensor_estimates,
 )
-from fusiond.estimators.reading import Published, sigmas
+from fusiond.estimators.reading import WIDER, Published, sigmas, widen
 from fusiond.estimators.robust import reweighted
-from fusiond.estimators.screening import KEPT, Codes, screened_update
+from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
@@ -53,11 +53,6 @@ DOUBTED_FORCE_M_S2 = 0.5
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
     return quantile(degrees, 1.0 - probability)
-
-
-# Ranges that must fail together before a jump of the receiver's clock is a better explanation than
-# as many bad satellites.
-FEWEST_JUMPING = 3
 
 
 class Outcome(NamedTuple):
@@ -112,6 +107,8 @@ class Estimator(Protocol):
     """What solutions are published by: at first the clock of the model's receiver."""
     turned: float
     """By how much (rad) the last update that was fused turned the axes in which P has the tilt."""
+    wider: Array
+    """Variances (9,) that `sigmas` has beyond P's (fusiond.integrity.hedge)."""
 
     @property
     def covariance(self) -> Array:
@@ -144,8 +141,11 @@ class Estimator(Protocol):
     def look(self, aid: Linearised) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
 
-    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
-        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
+    def doubt(
+        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
+    ) -> None:
+        """Widen P: by an aid's innovation, or what its series is `apart` (m,) from the filter, what
+        it measures, or attitude and sensor errors."""
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""
@@ -163,17 +163,6 @@ class Estimator(Protocol):
         """Back to a snapshot, bit for bit."""
 
 
-def _jumped(codes: Codes, of_clock: Array) -> bool:
-    """Whether the better half of the ranges fails; of the rows, `codes` (m,) and what they have of
-    the clock's offsets (m, k)."""
-    if np.count_nonzero(codes != KEPT) < FEWEST_JUMPING:
-        return False
-    # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
-    ranges = (np.abs(of_clock) > 0.5).any(axis=1)
-    lost = np.count_nonzero(codes[ranges] != KEPT)
-    return bool(lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges))
-
-
 class ErrorStateFilter:
     """What the estimators share: the state, its propagation, feedback and snapshots.
 
@@ -187,13 +176,13 @@ class ErrorStateFilter:
         self.t_ns = 0
         self.sample = 0
         count, width = len(shares), model.width
-        sizes = (NAV_SIZE, model.size, STEP_SIZE, scratch_size(width))
+        sizes = (NAV_SIZE, model.size, STEP_SIZE, WIDER, scratch_size(width))
         self._state: Array = np.zeros(sum(sizes))  # one array for the kernel
         parts = np.split(self._state, np.cumsum(sizes)[:-1])
         self.nav: Array
         self.xi: Array
         self.step: Array
-        self.nav, self.xi, self.step, self._scratch = parts
+        self.nav, self.xi, self.step, self.wider, self._scratch = parts
         self._covs: Array = np.zeros((count, width, width))
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
@@ -237,7 +226,7 @@ class ErrorStateFilter:
         n = self.model.size
         self._covs[:] = 0.0
         self._covs[:, :n, :n] = p / self._shares[:, None, None]
-        self._dxs[:], self._holding = 0.0, False
+        self._dxs[:], self._holding, self.wider[:] = 0.0, False, 0.0
         self.step[:] = step_before(nav)
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
@@ -282,6 +271,7 @@ class ErrorStateFilter:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
         out = np.empty(9)
         sigmas(self._covs[0], self.nav, self.step, *self.published, out)
+        widen(self.wider, out)
         return out
 
     def _feed_back(self, dx: Array) -> None:
@@ -307,7 +297,7 @@ class ErrorStateFilter:
             codes, y = np.zeros(z.shape[0], dtype=np.int64), np.zeros(z.shape[0])
             cov_out, dx_out = np.empty_like(cov), np.empty_like(dx)
             nis = screened_update(cov, dx, z, h, r, threshold, codes, y, cov_out, dx_out)
-            if renew or not offsets or not _jumped(codes, h[:, offsets]):
+            if renew or not offsets or not jumped(codes, h[:, offsets]):
                 return Screened(codes, y, nis, cov_out, dx_out)
             renew = True
 
@@ -326,12 +316,16 @@ class ErrorStateFilter:
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
 
-    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+    def doubt(
+        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
+    ) -> None:
         """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return
         used = len(rows.z) if measured else 0
+        for row, least in enumerate(apart[:used]):
+            rows.z[row] = math.copysign(max(abs(rows.z[row]), least), rows.z[row])
         self._doubt(Innovation(rows.z[:used], rows.h[:used], rows.r[:used]), motion)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:

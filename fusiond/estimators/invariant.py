@@ -236,9 +236,11 @@ class InvariantFilter(TiltAxesFilter):
         super().initialise(t_ns, sample, nav, xi, covariance)
         self.turns = self._doubted = False
 
-    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+    def doubt(
+        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
+    ) -> None:
         """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
-        super().doubt(aid, measured, motion)
+        super().doubt(aid, measured, motion, apart)
         self._doubted |= motion
 
     def update(self, aid: Linearised) -> Outcome:

@@ -20,7 +20,7 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
-from fusiond.estimators.reading import in_fix_time, sigmas
+from fusiond.estimators.reading import WIDER, in_fix_time, sigmas, widen
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
@@ -191,13 +191,14 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         """Propagate from `now` to `target` (ns); return the next sample's index and the new time.
 
         A call costs a tenth of a microsecond an array, so what belongs together comes as one:
-        `state` is nav (10,), xi (n,), the last step (21,) and scratch_size(width) doubles, zero at
-        first; `model` and `imu` are `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows
-        `times` and `samples` (rate, force): sample i holds over (times[i-1], times[i]], with noise
-        of `densities` beyond `noise`. Samples first ... end-1 may be used; the last one only as far
-        as `target`, so a target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD,
-        with which the solution and the sigmas of covariance 0 at the end of each whole sample go
-        into the IMU's rows, CARRY, with which the error estimates `dxs` (k, n) are propagated too,
+        `state` is nav (10,), xi (n,), the last step (21,), the variances (9,) that what is
+        published is wider by, and scratch_size(width) doubles, zero at first; `model` and `imu` are
+        `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows `times` and `samples` (rate,
+        force): sample i holds over (times[i-1], times[i]], with noise of `densities` beyond
+        `noise`. Samples first ... end-1 may be used; the last one only as far as `target`, so a
+        target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD, with which the
+        solution and the sigmas of covariance 0 at the end of each whole sample go into the IMU's
+        rows, CARRY, with which the error estimates `dxs` (k, n) are propagated too,
         and TURN_TILT, with which a turn that is not known turns the axes of a tilt. `covs`
         (k, width, width) are covariances, their noise divided by `shares` (k,). `phi`
         (width, width) is propagated unless it is (0, 0).
@@ -208,7 +209,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         n, m = dxs.shape[1], imu.shape[0] // ROW_SIZE
         nav, xi = state[:NAV_SIZE], state[NAV_SIZE : NAV_SIZE + n]
         step = state[NAV_SIZE + n : NAV_SIZE + n + STEP_SIZE]
-        scratch = state[NAV_SIZE + n + STEP_SIZE :]
+        wider = state[NAV_SIZE + n + STEP_SIZE : NAV_SIZE + n + STEP_SIZE + WIDER]
+        scratch = state[NAV_SIZE + n + STEP_SIZE + WIDER :]
         noise = model[: 24 * n].view(np.float64).reshape((3, n))
         sensor_terms = model[24 * n : 24 * n + 192].view(np.int64).reshape((2, 12))
         rates = model[24 * n + 192 : model.shape[0] - n].view(np.int64)
@@ -271,6 +273,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if record:
                     in_fix_time(nav, xi, step, time_slot, nav_out[i])
                     sigmas(covs[0], nav, step, time_slot, clock_sd_s, axes_sd_rad, sigma_out[i])
+                    widen(wider, sigma_out[i])
                 i += 1
         return i, now
 

@@ -18,6 +18,9 @@ the filter's own t, and tau is by how much that clock, the IMU's, is off: nothin
 it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
 clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
 
+What a test has not told yet of a source is added to it: variances (9,) that are no part of P
+(fusiond.integrity.hedge).
+
 Attitude is that of the nominal axes of the inertial unit that was configured. C_nb is of those that
 its gyros have, out of square by what the data sheet allows, or of a spare's once that has taken
 over: nothing says how they sit against the nominal ones beyond `axes_sd_rad`, about each axis, and
@@ -49,6 +52,9 @@ from fusiond.navigation.strapdown import (
 )
 
 Array = NDArray[np.float64]
+
+WIDER = 9
+"""Variances of `widen`."""
 
 
 class Published(NamedTuple):
@@ -153,3 +159,11 @@ def sigmas(
     out[6] = math.sqrt(max(0.0, along)) / cp
     out[7] = math.sqrt(max(0.0, cross))
     out[8] = math.sqrt(max(0.0, tangent * tangent * along + c + 2.0 * tangent * (cy * e + sy * f)))
+
+
+@compiled("void(f8[::1], f8[::1])", forceinline=True)
+def widen(wider: Array, out: Array) -> None:
+    """`out` (9,), sigmas as of `sigmas`, with the variances `wider` (9,) added."""
+    for i in range(9):
+        if wider[i] > 0.0:
+            out[i] = math.sqrt(out[i] * out[i] + wider[i])

@@ -26,6 +26,8 @@ KEPT, GATED, RESIDUAL = 0, 1, 2
 # A residual whose variance is this small a part of r tells nothing: the row alone determines a
 # state.
 _DETERMINED = 1e-6
+# Ranges that must fail together before the receiver's clock is to blame, not as many satellites.
+FEWEST_JUMPING = 3
 
 
 @compiled(
@@ -118,3 +120,14 @@ def screened_update(
         if worst < 0:
             return nis
         codes[worst] = RESIDUAL
+
+
+def jumped(codes: Codes, of_clock: Array) -> bool:
+    """Whether the better half of the ranges fails; of the rows, `codes` (m,) and what they have of
+    the clock's offsets (m, k)."""
+    if np.count_nonzero(codes != KEPT) < FEWEST_JUMPING:
+        return False
+    # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
+    ranges = (np.abs(of_clock) > 0.5).any(axis=1)
+    lost = np.count_nonzero(codes[ranges] != KEPT)
+    return bool(lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges))

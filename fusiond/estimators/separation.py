@@ -83,10 +83,12 @@ class SeparatedEstimator(KalmanEstimator):
             self._fold_into_subsets(aid, innovation)
         return outcome
 
-    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+    def doubt(
+        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
+    ) -> None:
         """Widen P: by an aid's innovation what it measures, or attitude and sensor errors, which
         all share. What a device measures is no concern of the subset without it."""
-        super().doubt(aid, measured, motion)
+        super().doubt(aid, measured, motion, apart)
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return

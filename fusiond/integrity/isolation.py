@@ -34,14 +34,14 @@ that velocity and a bounded acceleration allow; a receiver's jump does not ask. 
 cause: `source` where the position left its own velocity, or leaves the filter while the velocity
 of the same device still agrees with it; `filter` where position and velocity went together.
 
-Source: Lowry, Woodall, Champ, Rigdon, A multivariate exponentially weighted moving average control
-chart, Technometrics 34 (1992), eq. 2.2; Bar-Shalom, Li, Kirubarajan (2001), section 5.4; Brumback,
+Source: as of fusiond.integrity.means; Bar-Shalom, Li, Kirubarajan (2001), section 5.4; Brumback,
 Srinath, IEEE Trans. AC 32 (1987), 1133.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from enum import Enum
 from typing import NamedTuple
 
@@ -52,6 +52,7 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
+from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.means import Means
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
@@ -107,6 +108,7 @@ class Memory(NamedTuple):
     records: dict[str, Series]
     doubts: tuple[int, ...]
     tilting: Tilting
+    wider: Mapping[str, Array]
 
 
 class Isolation:
@@ -118,6 +120,9 @@ class Isolation:
         """Series whose record a checkpoint has too: copied before it is changed."""
         self._doubts: tuple[int, ...] = ()
         self._tilting = Tilting()
+        self.hedge = Hedge()
+        self.shown: tuple[float, ...] = ()
+        """By how much (m, m/s) the series that was judged last was off, if it had a bias."""
         self._contradicted = False
         self._pass = 1.0 - false_alarm
 
@@ -145,10 +150,9 @@ class Isolation:
         return support.coarseness(self._records, aid)
 
     def assumes(self, aid: Aid) -> bool:
-        """Whether the aid counts as coarser than it says by what is assumed of its like: what its
-        innovation says of the sigma that it states is then no one's."""
-        record = self._records.get(aid.source)
-        return aid.moves and record is not None and record.means.assuming
+        """Whether the aid counts as coarser than it says by what is assumed, or as it hangs: what
+        its innovation says of the sigma that it states is then no one's."""
+        return support.assumes(self._records, aid)
 
     def lost(self, t_ns: int) -> Lost | None:
         """Set while positions come and none is believed: since when, and who is to blame."""
@@ -174,19 +178,21 @@ class Isolation:
     def snapshot(self) -> Memory:
         """A copy of everything."""
         self._shared = set(self._records)
-        return Memory(self._records.copy(), self._doubts, self._tilting.copied())
+        mine = self._records.copy(), self._doubts, self._tilting.copied(), self.hedge.wider
+        return Memory(*mine)
 
     def restore(self, memory: Memory) -> None:
         """Back to a snapshot."""
         self._records, self._shared = memory.records.copy(), set(memory.records)
         self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
+        self.hedge.wider = memory.wider
 
     def reset(self, contradicted: bool = False) -> None:
         """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
         their velocities are to prove themselves, as after an outage."""
         self._contradicted = contradicted
         self._records, self._shared = {}, set()
-        self._doubts, self._tilting = (), Tilting()
+        self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
 
     # ------------------------------------------------------------------ judgement
 
@@ -202,7 +208,7 @@ class Isolation:
         passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
         lat, lon, _, v_n, v_e = nav[:VD].tolist()
         offer, velocity, value = said(aid.offers())
-        offset = None
+        offset, self.shown = None, ()
         if offer is not None:
             offset = apart(offer, lat, lon, nav)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
@@ -211,6 +217,7 @@ class Isolation:
         moving = math.hypot(v_n, v_e) > MOVING_M_S
         repeats = value is not None and support.repeats(self._records, record, value, moving)
         if record.excluded:
+            self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
             self._look(record, t_ns, passed and not repeats, outcome.whitened, offset, own)
             return Action.NONE
@@ -233,7 +240,11 @@ class Isolation:
         if outcome.whitened:
             record.means.add(outcome.whitened)
         if not self._biased(record, t_ns):
+            if record.means.unlikely or aid.source in self.hedge.wider:
+                self.hedge.look(aid.source, record, offer or velocity, covariance)
             return Action.NONE
+        self.shown = differ(record, offer or velocity, covariance)
+        self.hedge.drop(aid.source)
         return self._doubted(self._blame(record, aid), t_ns)
 
     def correcting(self, nav: Array, covariance: Array) -> None:
@@ -358,10 +369,10 @@ class Isolation:
         if (
             record.passes >= READMIT_COUNT
             and t_ns - record.passing_ns >= READMIT_NS
-            and (offset is None or record.trend.steady(record.least_trend_sd))
+            and (offset is None or record.steady)
             and not self._biased(record, t_ns, own)
         ):
-            record.excluded, record.fused_ns = "", t_ns
+            record.excluded, record.fused_ns, record.back_ns = "", t_ns, t_ns
             record.refused, record.jumped, record.proof = 0, False, None
             record.means.restart()
 
@@ -382,7 +393,7 @@ class Isolation:
         sd_m = 0.5 * record.away_m if aid.locates else FINE_M
         source = support.others(self._records, record, aid.t_ns, sd_m)
         if not source and aid.locates:
-            source = self._supported(record.device, aid.t_ns)
+            source = support.vouched(self._records, record.device, aid.t_ns)
         if not source:
             return Action.DOUBT_FILTER
         self._exclude(record, aid.t_ns, DRIFTS, jumped=record.locates)

@@ -18,6 +18,10 @@ s / (a / (2 - a)) of the slow mean is c^2 where they last for less than its 59 i
 where they are white and the sigma honest. Once measurements count with c, s shows what is left of
 it: c^2 s is averaged. Where r is little beside H P H^T that leaves c as it is.
 
+A mean that is beyond what chance does once in twenty, and not yet what it does once in a million,
+says that series and filter differ, and not which of them is wrong. What it has beyond chance is
+the `excess`: a filter is not surer of what it says than that.
+
 Source: Lowry, Woodall, Champ, Rigdon, A multivariate exponentially weighted moving average control
 chart, Technometrics 34 (1992), eq. 2.2; Bar-Shalom, Li, Kirubarajan (2001), section 8.2 (errors
 that are not white).
@@ -31,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import DR, DV, PHI
 
 Array = NDArray[np.float64]
 
@@ -63,6 +68,8 @@ DOUBTED_COUNT = 40.0 / SLOW
 # What the means show lately may be the beginning of a fault: it counts once a period as long as it
 # has gone by without one. A drift of 0.1 m/s is found within twice this; longer ones hide nothing.
 LEARN_NS = 15_000_000_000
+# Chi-square of one that chance exceeds once in twenty: what a mean has beyond it is not chance's.
+LIKELY = 3.84
 # A mean over fewer innovations than this is left to the gate.
 FEWEST = 4
 
@@ -104,22 +111,32 @@ def _believe(packed: Array) -> None:
     packed[_LEARNED] = min(packed[_LEARNED] + n, LEARN_COUNT)
 
 
-@compiled("b1(f8[::1], i8, f8, f8)")
-def _biased(packed: Array, t_ns: int, limit: float, own: float) -> bool:
+# What a look at the means has shown.
+_NOTHING, _UNLIKELY, _BIASED = 0, 1, 2
+
+
+@compiled("i8(f8[::1], i8, f8, f8)")
+def _look(packed: Array, t_ns: int, limit: float, own: float) -> int:
     """Whether a mean is beyond `limit`, the quantile of chi-square of d, where `own` of each
-    innovation's variance is common to all; learn from it if not, and nothing is."""
+    innovation's variance is common to all, or one of its components unlikely; learn from it if it
+    is not beyond, and nothing is common."""
     d = (packed.shape[0] - _HEAD) // 2
-    fast = slow = 0.0
+    fast = slow = most_fast = most_slow = 0.0
     for i in range(d):
-        fast += packed[_HEAD + i] * packed[_HEAD + i]
-        slow += packed[_HEAD + d + i] * packed[_HEAD + d + i]
+        square = packed[_HEAD + i] * packed[_HEAD + i]
+        fast += square
+        most_fast = max(most_fast, square)
+        square = packed[_HEAD + d + i] * packed[_HEAD + d + i]
+        slow += square
+        most_slow = max(most_slow, square)
     if fast > limit * (packed[_SPREAD] + own) or slow > limit * (packed[_SPREAD + 1] + own):
         for k in range(_SHOWN, _HEAD):
             packed[k] = 0.0
         packed[:1].view(np.int64)[0] = _LONG_AGO_NS
-        return True
+        return _BIASED
     if own > 0.0:
-        return False
+        return _NOTHING
+    unlikely = most_fast > LIKELY * packed[_SPREAD] or most_slow > LIKELY * packed[_SPREAD + 1]
     if t_ns - packed[:1].view(np.int64)[0] >= LEARN_NS:
         _believe(packed)
         for k in range(_SUMS):
@@ -130,7 +147,29 @@ def _biased(packed: Array, t_ns: int, limit: float, own: float) -> bool:
     packed[_SHOWN + 1] += max(slow / d, WHITE_SLOW)
     packed[_SHOWN + 2] += packed[_COARSE] * slow / d
     packed[_SHOWN + 3] += 1.0
-    return False
+    return _UNLIKELY if unlikely else _NOTHING
+
+
+@compiled("void(f8[::1], f8[:, :], i8, f8[::1], f8[::1])")
+def _open(packed: Array, p: Array, first: int, sd: Array, out: Array) -> None:
+    """Add to `out` (9,) what the excess of each component leaves open."""
+    d = (packed.shape[0] - _HEAD) // 2
+    for i in range(min(d, sd.shape[0])):
+        fast, slow, own = packed[_HEAD + i], packed[_HEAD + d + i], p[first + i, first + i]
+        excess = fast * fast - LIKELY * packed[_SPREAD]
+        excess = max(excess, slow * slow - LIKELY * packed[_SPREAD + 1])
+        if excess <= 0.0 or own <= 0.0:
+            continue
+        share = excess * (own + packed[_COARSE] * sd[i] * sd[i]) / (own * own)
+        for j in range(3):
+            with_position, with_velocity = p[DR + j, first + i], p[DV + j, first + i]
+            out[j] += share * with_position * with_position
+            out[3 + j] += share * with_velocity * with_velocity
+        north, east, yaw = p[PHI, first + i], p[PHI + 1, first + i], p[PHI + 2, first + i]
+        tilt = share * (north * north + east * east)  # of whichever axis roll and pitch are about
+        out[6] += tilt
+        out[7] += tilt
+        out[8] += share * yaw * yaw
 
 
 def _begun(assumed: float) -> Array:
@@ -144,12 +183,14 @@ def _begun(assumed: float) -> Array:
 class Means:
     """Of one series. A changed dimension d begins the means anew, not what they have shown."""
 
-    __slots__ = ("_packed", "assuming")
+    __slots__ = ("_packed", "assuming", "unlikely")
 
     def __init__(self, packed: Array | None = None) -> None:
         self._packed = _begun(ASSUMED) if packed is None else packed
         self.assuming = False
         """Whether the measurement that `lasting` was last asked for counts with an assumption."""
+        self.unlikely = False
+        """Whether the last look that found no bias found a mean that chance hardly explains."""
 
     @staticmethod
     def begun(white: bool) -> Means:
@@ -189,7 +230,28 @@ class Means:
         """Whether a mean of the innovations until `t_ns` is beyond chance: `limit` is the quantile
         of chi-square of `degrees`, `own` the part (1) of each innovation's variance that is the
         filter's and common to all. If not, what it shows of the series is learned from."""
-        return _biased(self._packed, t_ns, limit, own)
+        found = _look(self._packed, t_ns, limit, own)
+        self.unlikely = found == _UNLIKELY
+        return found == _BIASED
+
+    def leaves_open(self, covariance: Array, first: int, sd: tuple[float, ...]) -> Array:
+        """Variances (9,) of what is published, position, velocity (n, e, d) and attitude, that the
+        excess of a mean leaves open (fusiond.integrity.hedge): of measurements with `sd` (d,) of
+        the states from `first` on, of which a filter holds P (n, n)."""
+        out = np.zeros(9)
+        _open(self._packed, covariance, first, np.array(sd), out)
+        return out
+
+    def most(self) -> list[float]:
+        """Each component (d,), of an innovation's sigma (1): of the mean where it is more."""
+        d = (self._packed.shape[0] - _HEAD) // 2
+        squares = (self._packed[_HEAD:] ** 2).tolist()
+        return [math.sqrt(max(f, s)) for f, s in zip(squares[:d], squares[d:], strict=True)]
+
+    @property
+    def coarse(self) -> float:
+        """The c that the last measurement counted with."""
+        return math.sqrt(float(self._packed[_COARSE]))
 
     @property
     def colour(self) -> float:

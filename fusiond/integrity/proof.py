@@ -103,10 +103,11 @@ class Trend(NamedTuple):
         east = (self.t_east - self.t * self.east / self.n) / spread
         return math.hypot(north, east), self.sd / math.sqrt(spread)
 
-    def steady(self, least_sd: float = TREND_SD_M_S) -> bool:
-        """Whether the slope of a line through them is known to `least_sd` (m/s), and zero."""
+    def steady(self, least_sd: float = TREND_SD_M_S, slowest: float = math.inf) -> bool:
+        """Whether the slope of a line through them is known to `least_sd` (m/s), and zero, and
+        three sigma from one of `slowest` (m/s)."""
         slope, sd = self.slope
-        return sd <= least_sd and slope <= 3.0 * least_sd
+        return sd <= least_sd and slope <= 3.0 * least_sd and slope + 3.0 * sd < slowest
 
     @property
     def runs_away(self) -> bool:

@@ -15,6 +15,7 @@ from fusiond.integrity.means import Means
 from fusiond.integrity.proof import (
     DRIFT_SD_M_S,
     NO_TREND,
+    SLOWEST_M_S,
     TREND_SD_M_S,
     Proof,
     Trend,
@@ -58,9 +59,13 @@ class Series:
     trend: Trend = NO_TREND
     ran: bool = False
     """While excluded: it was seen to run away, faster than any slow drift."""
+    back_ns: int = NEVER_NS
+    """When it was believed again last."""
     means: Means = field(default_factory=Means)
     """Of its innovations that were fused, or passed while it is left out."""
     value: tuple[float, ...] | None = None
+    alike: int = 0
+    """How many before the last value were the same, moving or not."""
     repeats: int = 0
     repeating: float = 1.0
     """Probability that a value repeats the one before it, as shown so far in motion."""
@@ -74,15 +79,29 @@ class Series:
         return copy
 
     @property
+    def drifted(self) -> bool:
+        """While excluded: whether it was for a drift that may be as slow as any."""
+        return self.excluded == DRIFTS and not self.ran
+
+    @property
     def least_trend_sd(self) -> float:
         """How well (m/s) it must be known that it does not run away before it comes back."""
-        return DRIFT_SD_M_S if self.excluded == DRIFTS and not self.ran else TREND_SD_M_S
+        return DRIFT_SD_M_S if self.drifted else TREND_SD_M_S
+
+    @property
+    def steady(self) -> bool:
+        """While excluded: whether it is known not to run away any more. What was left out because
+        it drifted may drift still, as slowly as a drift is told."""
+        slowest = SLOWEST_M_S if self.drifted else math.inf
+        return self.trend.steady(self.least_trend_sd, slowest)
 
     def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
         """Whether a new value, of a vehicle that may be `moving`, makes so many alike to the bit
         that it is no measurement."""
-        same = moving and value == self.value
-        self.value, self.repeats = value, self.repeats + 1 if same else 0
+        alike = value == self.value
+        same = moving and alike
+        self.value, self.alike = value, self.alike + 1 if alike else 0
+        self.repeats = self.repeats + 1 if same else 0
         if self.locates:
             return self.repeats >= REPEATED
         if same and self.repeats >= self._most_repeats():

@@ -6,11 +6,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
-from fusiond.integrity.series import NEVER_NS, REPEATED, Series
+from fusiond.integrity.series import NEVER_NS, REPEATED, Series, said
 
 # What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
 FORGET_NS = 5_000_000_000
@@ -25,6 +26,10 @@ SUPPORT_NS = 2_000_000_000
 # Two velocities in a row that the gate of 0.9999 refuses are no chance: an IMU that has turned is
 # wrong by the full acceleration from the first on, and of a receiver of 1 Hz the third comes late.
 REFUSED_TWICE = 2
+# A value that is the same to the bit has the same error: each more of a run of them counts with
+# half of the information of the one before, so that all of them together are not three
+# measurements. So many halves are as good as none.
+HALVED, MOST_HALVES = math.sqrt(2.0), 60
 # A coarse position contradicts one that is so many of its sigmas away; it is asked for seldom, and
 # an IMU keeps within the same for a minute.
 DISPUTE_SIGMAS, DISPUTE_NS = 6.0, 60_000_000_000
@@ -114,6 +119,15 @@ def supported(records: Records, device: str, t_ns: int) -> bool:
     )
 
 
+def vouched(records: Records, device: str, t_ns: int) -> bool:
+    """Whether a velocity of the device supports the filter that was not left out lately: what has
+    just come back does not speak against a position that was believed meanwhile."""
+    return supported(records, device, t_ns) and not any(
+        r.moves and r.device == device and r.believed and t_ns - r.back_ns <= OTHERS_NS
+        for r in records.values()
+    )
+
+
 def velocity_left_out(records: Records, t_ns: int) -> bool:
     """Whether a velocity that comes is not believed."""
     return any(r.moves and r.excluded and t_ns - r.heard_ns <= FORGET_NS for r in records.values())
@@ -128,13 +142,33 @@ def velocity_sd(records: Records, device: str) -> float:
 def coarseness(records: Records, aid: Aid) -> float:
     """With how many times its stated sigma a velocity counts: receivers filter theirs, so that its
     errors last for seconds (fusiond.integrity.means). A position has a state for what its fixes
-    share."""
+    share. Both, where the device says the same to the bit again and again."""
+    if not (aid.moves or aid.locates) or (record := records.get(aid.source)) is None:
+        return 1.0
+    hangs = _hangs(records, record, aid) if record.alike else 1.0
     if not aid.moves:
+        return hangs
+    return hangs * record.means.lasting((aid.t_ns - record.heard_ns) * 1e-9)
+
+
+def assumes(records: Records, aid: Aid) -> bool:
+    """Whether an aid counts as coarser than it says, and its own errors have not shown that."""
+    if not (aid.moves or aid.locates) or (record := records.get(aid.source)) is None:
+        return False
+    return record.means.assuming if aid.moves else record.alike > 0
+
+
+def _hangs(records: Records, record: Series, aid: Aid) -> float:
+    """With how many times its sigma one more value counts, after a run of the same, at rest as
+    well. Speeds are printed coarser and may stay the same: they hang where the position of the same
+    device does."""
+    alike = record.alike
+    if not record.locates:
+        positions = (r.alike for r in records.values() if r.locates and r.device == record.device)
+        alike = min(alike, max(positions, default=0))
+    if not alike or said(aid.offers())[2] != record.value:
         return 1.0
-    record = records.get(aid.source)
-    if record is None:
-        return 1.0
-    return record.means.lasting((aid.t_ns - record.heard_ns) * 1e-9)
+    return HALVED ** min(alike, MOST_HALVES)
 
 
 def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:

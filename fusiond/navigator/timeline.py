@@ -94,6 +94,7 @@ class Timeline:
         self._next = 0
         self._checkpoints: list[_Checkpoint] = []
         self.isolation = Isolation()
+        self._wider = self.isolation.hedge.wider
 
     def start(self, contradicted: bool = False, used: Collection[Offer] = ()) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
@@ -101,6 +102,7 @@ class Timeline:
         velocities."""
         self._next = 0
         self.isolation.reset(contradicted)
+        self._hedge()
         self._checkpoints = [
             _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())
         ]
@@ -188,6 +190,7 @@ class Timeline:
         checkpoint = next(c for c in reversed(self._checkpoints) if c.snapshot.t_ns <= t_ns)
         memory = self.isolation.snapshot()
         self.isolation.restore(checkpoint.memory)
+        self._hedge()
         estimator.restore(checkpoint.snapshot)
         try:
             for row in range(self._following(checkpoint), len(self._entries)):
@@ -202,6 +205,7 @@ class Timeline:
         finally:
             estimator.restore(present)
             self.isolation.restore(memory)
+            self._hedge()
 
     def _give_up(self, count: int, name: str) -> None:
         """Drop the first `count` of those that wait."""
@@ -236,8 +240,15 @@ class Timeline:
                 after = estimator.nav, estimator.covariance, estimator.turned
                 action = isolation.corrected(aid.t_ns, *after)
             if action is not Action.NONE:
-                estimator.doubt(aid, action in MEASURED, action in MOTION)
+                estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
+            if isolation.hedge.wider is not self._wider:
+                self._hedge()
         return outcome
+
+    def _hedge(self) -> None:
+        """What the estimator publishes is as wide as the isolation has it now."""
+        self._wider = wider = self.isolation.hedge.wider
+        self.estimator.wider[:] = sum(wider.values())
 
     def _update(self, aid: Aid) -> Outcome:
         """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its
@@ -275,6 +286,7 @@ class Timeline:
         checkpoint = self._checkpoints[-1]
         self.estimator.restore(checkpoint.snapshot)
         self.isolation.restore(checkpoint.memory)
+        self._hedge()
         self._next = self._following(checkpoint)
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])

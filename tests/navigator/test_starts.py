@@ -209,6 +209,35 @@ def test_an_uncalibrated_sensor_is_met_on_the_move() -> None:
     assert np.mean(rates) < high
 
 
+def test_velocities_that_are_none_are_no_start() -> None:
+    """Two of forty, of a receiver that said the opposite until then: their fit knows no heading,
+    and its tilt, wrong by ten degrees, is theirs. It waits until they are not asked any more."""
+    case = CASES["on the move"]
+    config = Config.model_validate({"imu": SHEET, "alignment": {"heading": ["gnss_course"]}})
+    navigator, rng, said = Navigator(config), np.random.default_rng(3), set[str]()
+    times, samples = runs.sample_times(_truth(case)), _run(case, 3).samples
+    for row in range(450, 2900, EVERY):
+        part = slice(row, row + EVERY)
+        navigator.add_imu(times[part], samples[part])
+        fix = _fix(case, row, rng)
+        assert fix.v_ned_m_s is not None
+        if row < 470:
+            north, east, down = fix.v_ned_m_s
+            fix = replace(fix, v_ned_m_s=(-north, -east, down))
+        navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+        navigator.advance()
+        if navigator.started is not None:
+            break
+        said.add(navigator.mode(navigator.imu.latest_ns)[1])
+    assert any("the velocities of the fixes do not fit what was felt" in why for why in said)
+    start = navigator.started
+    assert start is not None
+    true = runs.true_nav(_truth(case), np.array([start.t_ns * 1e-9]))[0]
+    error = runs.nav_error(start.nav, true)[:3]
+    assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(start.covariance)[:3]))
+    assert math.sqrt(start.covariance[2, 2]) < 10.0 * DEG
+
+
 def test_straight_on_at_constant_speed_nobody_knows_forward_from_backward() -> None:
     """Below the speed that one reverses at it waits, and says what to do."""
     case = Case((Leg(1), Leg(6, speed_m_s=5.0), Leg(60)), MOVING, 9.0)

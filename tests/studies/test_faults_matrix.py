@@ -42,6 +42,24 @@ def test_it_is_told_and_never_lied_about(
         assert found["recovered_s"] <= within_s
 
 
+@pytest.mark.parametrize(
+    ("fault", "phase", "drive"),
+    [
+        ("drift_0.1_m_s", "navigating", 65),
+        ("drift_0.1_m_s", "navigating", 62),
+        ("fix_frozen", "navigating", 65),
+        ("velocity_reversed", "coasting", 65),
+        ("gyro_bias_1_deg_s", "coasting", 61),
+    ],
+)
+def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) -> None:
+    """A slow drift before it can be told, and one that came back while it went on; a fix that is
+    the same to the bit at rest; a start of velocities of which two were reversed; a position that
+    was blamed by a velocity that had just come back. Town has none of them."""
+    found = run_row(Row(fault, phase), seed=drive % 65, drive=drive)  # type: ignore[arg-type]
+    assert found["verdict"] in {"degraded and said so", "survived"}, found
+
+
 def test_a_drawn_drive_meets_the_same_fault_elsewhere() -> None:
     """Of the same number it is the same drive; of another, another."""
     town, first, again, second = (

@@ -176,10 +176,12 @@ class TapedKalman(TiltAxesFilter):
             np.copyto(self._before, cov)
         return screened
 
-    def doubt(self, aid: Linearised, measured: bool, motion: bool) -> None:
+    def doubt(
+        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
+    ) -> None:
         """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
         self._close()  # with P as it was: what was before does not jump
-        super().doubt(aid, measured, motion)
+        super().doubt(aid, measured, motion, apart)
         self._close()
 
     def release(self) -> None:
