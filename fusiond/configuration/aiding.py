@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal, get_args
 
 from pydantic import (
@@ -20,6 +21,10 @@ Place = tuple[
 ]
 """Latitude, longitude (deg), ellipsoidal height (m) of a place on land."""
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+UNKNOWN_LEVER_SD_M = 1.0
+"""One sigma, each axis, of where the antenna of a car or a van is, of which nothing is said: some
+0.5 to 3 m from the IMU."""
 
 
 class Section(BaseModel):
@@ -65,9 +70,10 @@ class GnssAiding(Aiding):
     offsets that the filter estimates. A serial line's latency is known to 0.1 s. 0: none is."""
     time_sd_s: NonNegativeFloat = 0.0
     """Timing error of a single fix against the IMU; times the speed it adds to sigma."""
-    lever_arm_sd_m: NonNegativeFloat = 0.0
-    """One sigma of what `lever_arm_m` is wrong by, each axis, which the filter then estimates; RTK
-    fixes show it in bends, others do not. 0: it is as measured."""
+    lever_arm_sd_m: NonNegativeFloat | None = None
+    """One sigma of what `lever_arm_m` is wrong by, each axis, which the filter then estimates; 0:
+    it is as measured. Without it 1 m for the only receiver, if its `lever_arm_m` is not given, else
+    0."""
     bias_sd_m: NonNegativeFloat = 1.0
     """Error that fixes without carrier phase share for minutes (orbits, ionosphere), one sigma
     north and east: data sheets state 1.5 to 2 m for half of all fixes, noise included. Fixes by
@@ -254,3 +260,14 @@ AnyAiding = Annotated[
 AIDING_KINDS = tuple(
     section.model_fields["kind"].default for section in get_args(get_args(AnyAiding)[0])
 )
+
+
+def lever_sd_m(section: GnssAiding, aiding: Mapping[str, Aiding]) -> float:
+    """One sigma (m) of what a receiver's lever arm is wrong by, each axis, of the sections `aiding`
+    by source; 0 where it is not estimated. Two receivers' levers, which share one place, would be
+    more states than the kernels hold."""
+    if section.lever_arm_sd_m is not None:
+        return section.lever_arm_sd_m
+    receivers = sum(isinstance(each, GnssAiding) for each in aiding.values())
+    given = "lever_arm_m" in section.model_fields_set
+    return 0.0 if given or receivers > 1 else UNKNOWN_LEVER_SD_M

@@ -118,7 +118,11 @@ def _source(d: Draft, source: DraftSource) -> Iterator[str]:
         return
     arm = d.lever_arms_m.get(kind if kind == "rdss" else "gnss")
     yield "# From the IMU to the antenna: forward, right, down. Measure it to a few centimetres."
-    yield f"lever_arm_m = {_value(arm or (0.0, 0.0, 0.0))}"
+    if kind == "gnss" and arm is None:
+        yield "# Without it the filter looks for it, and says how poorly it is known."
+        yield "# lever_arm_m = [0.0, 0.0, -1.0]"
+    else:
+        yield f"lever_arm_m = {_value(arm or (0.0, 0.0, 0.0))}"
 
 
 def _value(value: Any) -> str:

@@ -49,6 +49,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
+from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT
@@ -57,7 +58,7 @@ from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, PHI
 from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import Q0
+from fusiond.navigation.strapdown import NAV_SIZE, Q0
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -128,7 +129,8 @@ def carry_over(p: Array, before: Array, after: Array, biases: Indices) -> float:
 
 
 class TiltAxesFilter(KalmanEstimator):
-    """The centralised filter, in whose P the axes of a tilt turn with the heading."""
+    """The centralised filter, in whose P the axes of a tilt turn with the heading, and the place of
+    an antenna stays where a lever arm is estimated (fusiond.estimators.antenna_place)."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         super().__init__(model, gap_s)
@@ -139,15 +141,17 @@ class TiltAxesFilter(KalmanEstimator):
         known = found if found and found[0][1] == 2 else []
         self._biases = np.array(known, dtype=np.int64).reshape(-1, 2).T.copy()
         self._slots = self._biases[0]
+        self._lever, self._late = antenna_slots(model)
+        self._astray = self._lever.size > 0
         if known:
             self._options |= TURN_TILT
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
         self.turned = 0.0
-        if self._holding or not may_part(self._covariance, self._slots):
+        if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
             return self._fold_in(aid)
-        before = self.nav[Q0:].copy()
+        before = self._estimate()
         outcome = self._fold_in(aid)
         if outcome.name == "fused":
             self._carry_over(before)
@@ -155,7 +159,8 @@ class TiltAxesFilter(KalmanEstimator):
 
     def release(self) -> None:
         """Feed back what was carried."""
-        before, apart = self.nav[Q0:].copy(), may_part(self._covariance, self._slots)
+        before = self._estimate()
+        apart = self._astray or may_part(self._covariance, self._slots)
         super().release()
         if apart:
             self._carry_over(before)
@@ -163,6 +168,19 @@ class TiltAxesFilter(KalmanEstimator):
     def _fold_in(self, aid: Linearised) -> Outcome:
         return super().update(aid)
 
+    def _estimate(self) -> Array:
+        """Nav (10,), and what is left of the lever arm (0 or 3,)."""
+        return np.concatenate([self.nav, self.xi[self._lever]]) if self._astray else self.nav.copy()
+
     def _carry_over(self, before: Array) -> None:
-        """P after an update that has turned the attitude q_nb (4,) `before`."""
-        self.turned = carry_over(self._covariance, before, self.nav[Q0:], self._biases)
+        """P after an update of the estimate `before` (10 or 13,)."""
+        p = self._covariance
+        self.turned = carry_over(p, before[Q0:NAV_SIZE], self.nav[Q0:], self._biases)
+        if self._astray:
+            for rows in (p, p.T):
+                self._keep_antenna(rows, before)
+
+    def _keep_antenna(self, rows: Array, before: Array) -> None:
+        """M (n, k) <- T M."""
+        arms = before[NAV_SIZE:], self.xi[self._lever]
+        keep_antenna(rows, before[:NAV_SIZE], self.nav, *arms, self._lever, self._late)

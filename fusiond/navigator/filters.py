@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from fusiond.configuration.aiding import GnssAiding
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
@@ -20,6 +21,7 @@ from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
+from fusiond.models.vehicle import ANTENNA_LEVER
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration
@@ -29,18 +31,30 @@ if TYPE_CHECKING:
 
 
 def model_of(config: Config, *extra: Block) -> Model:
-    """The error-state model of a configuration, with the blocks that its aids need.
+    """The error-state model of a configuration, with the blocks that its aids need; without that of
+    a lever arm that nobody asked for, where there is no room for it.
 
     Raises `ConfigError` where those are more states than the kernels hold.
     """
+    name, noise = config.estimator.model, imu_noise(config.imu)
     try:
-        return make_model(config.estimator.model, imu_noise(config.imu), *extra)
+        return make_model(name, noise, *extra)
     except TooManyStatesError as error:
+        asked = [block for block in extra if not _unasked(config, block)]
+        if len(asked) < len(extra):
+            return model_of(config, *asked)
         names = ", ".join(block.name for block in extra)
         raise ConfigError(
             f"estimator.model: {error}; the aids add {names}: choose a smaller model, such as"
             " 'ins15', or fewer aids"
         ) from error
+
+
+def _unasked(config: Config, block: Block) -> bool:
+    """Whether a block is that of a lever arm of which the configuration says nothing."""
+    receivers = [each for each in config.aiding.values() if isinstance(each, GnssAiding)]
+    silent = all(each.lever_arm_sd_m is None for each in receivers)
+    return silent and block.name.startswith(ANTENNA_LEVER)
 
 
 def estimator_of(config: Config, model: Model) -> Estimator:

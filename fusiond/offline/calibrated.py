@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.configuration.aiding import Aiding, GnssAiding, WheelAiding
+from fusiond.configuration.aiding import Aiding, GnssAiding, WheelAiding, lever_sd_m
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
 from fusiond.models.vehicle import (
@@ -83,7 +83,11 @@ def calibrated(config: Config, found: Mapping[str, Parameter]) -> Config:
     aiding = {}
     for name, section in config.aiding.items():
         mine = [p for p in seen.values() if source_of(config, p) == name]
-        aiding[name] = section.model_copy(update=_of_section(section, mine, turn, tau_s))
+        changed = _of_section(section, mine, turn, tau_s)
+        if isinstance(section, GnssAiding) and "lever_arm_m" in changed:
+            # Given from now on, and as poorly known as it was.
+            changed["lever_arm_sd_m"] = lever_sd_m(section, config.aiding)
+        aiding[name] = section.model_copy(update=changed)
     return config.model_copy(update={"imu": imu, "constraints": constraints, "aiding": aiding})
 
 
@@ -134,7 +138,12 @@ def fragment(
             keys = _changed(config.aiding[name], section, ("lever_arm_m", "velocity_delay_s"))
             times = (FIX_TIME, VELOCITY_TIME)
             keys |= _sigma("time_offset_sd_s", mine, times, section.time_offset_sd_s)
-            keys |= _sigma("lever_arm_sd_m", mine, (ANTENNA_LEVER,), section.lever_arm_sd_m)
+            if any(p.kind == ANTENNA_LEVER for p in mine):
+                # One sigma for three axes: of those not observed, too.
+                axes = [p for p in found.values() if source_of(now, p) == name]
+                before = lever_sd_m(section, now.aiding)
+                sd = _sigma("lever_arm_sd_m", axes, (ANTENNA_LEVER,), before)
+                keys |= sd or {"lever_arm_sd_m": before}
         if isinstance(section, WheelAiding):
             keys = _changed(config.aiding[name], section, ("scale", "latency_s"))
             keys |= _sigma("scale_sd", mine, (WHEEL_SCALE,), section.scale_sd)

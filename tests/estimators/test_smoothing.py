@@ -18,6 +18,7 @@ from fusiond.estimators.smoothing.taped import NEVER, TapedKalman, nodes_of
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
+from fusiond.models.vehicle import ANTENNA_LEVER, antenna_lever
 from fusiond.navigation.imu_buffer import ImuBuffer
 from tests.estimators import smoothed_drive, town_drive
 from tests.estimators.monte_carlo import interval
@@ -115,7 +116,9 @@ def _rauch_tung_striebel(
     return np.array(errors[::-1]), np.array(covariances[::-1])
 
 
-@pytest.mark.parametrize("kind", ["fixes", "robust", "poor heading", "clock that jumps"])
+@pytest.mark.parametrize(
+    "kind", ["fixes", "robust", "poor heading", "lever arm", "clock that jumps"]
+)
 def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
     """Bryson-Frazier against Rauch-Tung-Striebel, written with dense matrices."""
     jumps = kind == "clock that jumps"
@@ -125,7 +128,11 @@ def test_agrees_with_the_form_that_inverts_covariances(kind: str) -> None:
         aids = ranges(aids, jump_at=20)
     if kind == "robust":
         aids = [[replace(cast("Aid", aid), robust=True) for aid in epoch] for epoch in aids]
-    model = make_model(name, imu_noise(town_drive.IMU))
+    unknown = []
+    if kind == "lever arm":
+        aids = [[replace(cast("Aid", aid), rest=ANTENNA_LEVER) for aid in epoch] for epoch in aids]
+        unknown = [antenna_lever(ANTENNA_LEVER, 1.0)]
+    model = make_model(name, imu_noise(town_drive.IMU), *unknown)
     estimator = Logging(model, town_drive.IMU.gap_s)
     sd = model.initial.copy()
     yaw_deg = 4.0 if kind == "poor heading" else 2.0

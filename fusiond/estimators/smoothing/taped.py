@@ -22,7 +22,7 @@ from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.strapdown import Q0
+from fusiond.navigation.strapdown import NAV_SIZE, Q0
 
 Array = NDArray[np.float64]
 
@@ -151,10 +151,12 @@ class TapedKalman(TiltAxesFilter):
         return outcome
 
     def _carry_over(self, before: Array) -> None:
-        """P after an update that has turned the attitude q_nb (4,) `before`."""
+        """P after an update of the estimate `before` (10 or 13,)."""
         self._close()  # with P as it was: T begins the transition to the next node
         super()._carry_over(before)
-        turn_rows(self._phi, before, self.nav[Q0:], *self._biases)
+        turn_rows(self._phi, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
+        if self._astray:
+            self._keep_antenna(self._phi, before)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -9,7 +9,7 @@ from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import SUFFIX, VelocityAid
-from fusiond.configuration.aiding import GnssAiding, RawAiding
+from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
@@ -170,9 +170,10 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
         if section.use_velocity:
             name = sections.own(VELOCITY_TIME, source, section)
             found.append(time_offset(name, section.time_offset_sd_s))
-    if section.lever_arm_sd_m:
+    lever_sd = lever_sd_m(section, sections.aiding)
+    if lever_sd:
         name = sections.own(ANTENNA_LEVER, source, section)
-        found.append(antenna_lever(name, section.lever_arm_sd_m))
+        found.append(antenna_lever(name, lever_sd))
     names = _fix_bias(source, section, sections)
     if names:
         level, down = names
