@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.hil.logs import HANDED_OVER, check
+from tests.hil.standstill import FAILURES
 from tests.hil.uml import HarnessError, Result, run_in_uml, run_with_vcan
 
 INSIDE = Path(__file__).parent / "inside"
@@ -19,6 +20,10 @@ GROUPS = (
     ("test_daemon_drive.py", "test_daemon_raw.py", "test_daemon_rdss.py"),
 )
 """Each group has a guest of its own, side by side on two cores; about equally long."""
+RUNS = 3
+"""Of a test whose guest stood still each time that it failed."""
+TESTS_FAILED = 1
+"""Exit status of pytest."""
 TIMEOUT_S = 3600.0
 """A guest that hangs must not hold the build; the suite takes some minutes on two quiet cores."""
 
@@ -39,19 +44,31 @@ def test_hardware_in_the_loop(
     )
     with capfd.disabled(), ThreadPoolExecutor() as guests:  # the guests' reports, as they are made
         print()
-        runs = [guests.submit(_run, f"{k + 1}| ", group) for k, group in enumerate(GROUPS)]
+        files = [[str(INSIDE / name) for name in group] for group in GROUPS]
+        runs = [
+            guests.submit(run_group, f"{k + 1}| ", tests, tmp_path / f"failures-{k + 1}")
+            for k, tests in enumerate(files)
+        ]
         results = [run.result() for run in runs]
     for result in results:
         assert result.status == 0, f"failures in the report above (ran on: {result.where})"
     check(logs)
 
 
-def _run(mark: str, group: tuple[str, ...]) -> Result:
-    """The files of a group where there is a bus of its own; its report with a mark each line."""
+def run_group(mark: str, tests: list[str], failures: Path) -> Result:
+    """The tests where there is a bus of its own; their report with a mark each line.
+
+    Those that failed while the guest stood still are run again, in a guest of their own."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-v", "--durations=3"]
-    return run_with_vcan(
-        [*command, *(str(INSIDE / name) for name in group)], TIMEOUT_S, Marked(mark)
-    )
+    for _ in range(RUNS):
+        failures.unlink(missing_ok=True)
+        noting = ["env", f"{FAILURES}={failures}", *command]
+        result = run_with_vcan([*noting, *tests], TIMEOUT_S, Marked(mark))
+        notes = failures.read_text().splitlines() if failures.exists() else []
+        tests = [note.removeprefix("void ") for note in notes if note.startswith("void ")]
+        if result.status != TESTS_FAILED or not tests or len(tests) < len(notes):
+            break
+    return result
 
 
 class Marked(io.StringIO):

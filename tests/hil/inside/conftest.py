@@ -5,13 +5,40 @@ These tests run where `tests/hil/uml.py` puts them: `vcan0` is up, the loopback 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.broker import Broker
 from tests.hil.bench import SerialLine
+from tests.hil.standstill import FAILURES, STANDSTILL_S, watching
+
+LONGEST_S = pytest.StashKey[Callable[[], float]]()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Watch whether the guest stands still."""
+    with watching() as item.stash[LONGEST_S]:
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note what has failed, and whether the guest stood still meanwhile."""
+    report = yield
+    if report.failed:
+        longest_s = item.stash[LONGEST_S]()
+        report.sections.append(("guest", f"stood still for at most {longest_s:.2f} s"))
+        if FAILURES in os.environ:
+            word = "void" if longest_s > STANDSTILL_S else "failed"
+            with Path(os.environ[FAILURES]).open("a") as notes:
+                notes.write(f"{word} {item.nodeid}\n")
+    return report
 
 
 @pytest.fixture
