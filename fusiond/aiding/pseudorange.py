@@ -158,6 +158,68 @@ def _rows(
             row += 1
 
 
+# What is wrong with the values of an epoch.
+_SOUND, _VARIANCES, _CLOCKS = 0, 1, 2
+_WRONG = {
+    _VARIANCES: "variances must be positive and finite",
+    _CLOCKS: "rates of satellites with and without a clock in one epoch",
+}
+
+
+@compiled("UniTuple(i8, 3)(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])")
+def _measured(
+    ranges: Array,
+    rates: Array,
+    range_variance: Array,
+    rate_variance: Array,
+    clock: Indices,
+    r: Array,
+) -> tuple[int, int, int]:
+    """Write the variances of the finite ranges and then of the finite rates to r (2 n,); how many
+    ranges and rates those are, and what is wrong with them."""
+    n = ranges.shape[0]
+    row = finite = timed = 0
+    wrong = _SOUND
+    for i in range(n):
+        if math.isfinite(ranges[i]):
+            r[row] = range_variance[i]
+            row += 1
+    finite = row
+    for i in range(n):
+        if math.isfinite(rates[i]):
+            r[row] = rate_variance[i]
+            row += 1
+            timed += clock[i] >= 0
+    if 0 < timed < row - finite:
+        wrong = _CLOCKS
+    for a in range(row):
+        if not 0.0 < r[a] < math.inf:
+            wrong = _VARIANCES
+    return finite, row - finite, wrong
+
+
+@compiled("void(i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[:, :, ::1])")
+def _by_clock(
+    clock: Indices,
+    ranges: Array,
+    rates: Array,
+    kept: NDArray[np.bool_],
+    whitened: Array,
+    sums: Array,
+) -> None:
+    """Add up in `sums` (2, 2, k), zero before, what is `whitened` and `kept` (m,) of the ranges and
+    of the rates that have each of k clocks, and how many those are."""
+    row = 0
+    for kind in range(2):
+        for i in range(ranges.shape[0]):
+            if not math.isfinite(ranges[i] if kind == 0 else rates[i]):
+                continue
+            if kept[row] and clock[i] >= 0:
+                sums[kind, 0, clock[i]] += whitened[row]
+                sums[kind, 1, clock[i]] += 1.0
+            row += 1
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PseudorangeAid(Aid):
     """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
@@ -196,15 +258,12 @@ class PseudorangeAid(Aid):
         for name in ("rates", "range_variance", "rate_variance"):
             _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), (n,))
         _keep(self, "clock", np.ascontiguousarray(self.clock, dtype=np.int64), (n,))
-        ranges, rates = np.isfinite(self.ranges), np.isfinite(self.rates)
-        r = np.concatenate([self.range_variance[ranges], self.rate_variance[rates]])
-        if np.count_nonzero((r > 0.0) & np.isfinite(r)) < len(r):
-            raise ValueError("variances must be positive and finite")
-        timed = self.clock[rates] >= 0
-        if 0 < np.count_nonzero(timed) < len(timed):
-            raise ValueError("rates of satellites with and without a clock in one epoch")
-        object.__setattr__(self, "_r", r)
-        object.__setattr__(self, "_ranges", int(np.count_nonzero(ranges)))
+        r, variances = np.empty(2 * n), (self.range_variance, self.rate_variance)
+        ranges, rates, wrong = _measured(self.ranges, self.rates, *variances, self.clock, r)
+        if wrong != _SOUND:
+            raise ValueError(_WRONG[wrong])
+        object.__setattr__(self, "_r", r[: ranges + rates])
+        object.__setattr__(self, "_ranges", ranges)
 
     @property
     def labels(self) -> list[tuple[str, str]]:
@@ -242,19 +301,13 @@ class PseudorangeAid(Aid):
         White innovations give N(0, 1) whatever the number of satellites, so that epochs of any sky
         form one series. A system without a range or without a rate in the epoch has none.
         """
-        system_of = {k: s[0] for k, s in zip(self.clock.tolist(), self.satellites, strict=True)}
-        count = max(system_of) + 1
-        ranges, rates = self.clock[np.isfinite(self.ranges)], self.clock[np.isfinite(self.rates)]
-        used = np.flatnonzero(kept)
-        series = np.concatenate((ranges, rates + count))[used]
-        sums = np.bincount(series, np.array(whitened)[used], 2 * count)
-        numbers = np.bincount(series, minlength=2 * count)
-        figures = sums / np.sqrt(np.maximum(numbers, 1))
-        return {
-            system: np.array((figures[k], figures[count + k]))
-            for k, system in system_of.items()
-            if numbers[k] and numbers[count + k]
-        }
+        clocks = self.clock.tolist()
+        count = max(clocks, default=NO_CLOCK) + 1
+        sums = np.zeros((2, 2, count))
+        used = np.asarray(kept, dtype=bool)
+        _by_clock(self.clock, self.ranges, self.rates, used, np.array(whitened, float), sums)
+        first = sorted((clocks.index(k), k) for k in range(count) if sums[:, 1, k].all())
+        return {self.satellites[at][0]: sums[:, 0, k] / np.sqrt(sums[:, 1, k]) for at, k in first}
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model = state.model
@@ -262,7 +315,7 @@ class PseudorangeAid(Aid):
             return NotApplicable("no_satellites")
         offsets = model.slots_of(CLOCK_OFFSET) or [NO_CLOCK]
         drifts = model.slots_of(CLOCK_DRIFT)
-        greatest = int(self.clock.max())
+        greatest = max(self.clock.tolist())
         if greatest >= len(offsets) or (greatest >= 0 and not drifts):
             return NotApplicable("no_clock_state")
         # NO_CLOCK, which is -1, is the place of the last, too.

@@ -34,9 +34,14 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
+# Before the factors of `decays`: the interval that they are of.
+_KEPT = 1
+
+
 def work_size(width: int) -> int:
-    """Doubles of work space that the kernels of a row width need."""
-    return (6 + 9 + CORE_STRIDE) * width + (6 + 9) * CORE_STRIDE + 12
+    """Doubles of work space that the kernels of a row width need, zero at first; `decays` at its
+    end."""
+    return (6 + 9 + CORE_STRIDE) * width + (6 + 9) * CORE_STRIDE + 12 + _KEPT + width
 
 
 @cache
@@ -107,10 +112,25 @@ def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
             weight[i] = step[3 + i // 2]
 
 
+@compiled("f8[::1](f8, f8[::1], i8, f8[::1])", forceinline=True)
+def decays(h: float, decay_rate: Array, width: int, work: Array) -> Array:
+    """What each parameter (n,) decays by in h seconds, 1 where it does not.
+
+    Kept in `work` from one interval to the next, which is most often as long: an exponential a
+    state, and one more for its estimate, cost a tenth of an interval.
+    """
+    kept = work[work.shape[0] - width - _KEPT :]
+    if kept[0] != h:
+        kept[0] = h
+        for i in range(decay_rate.shape[0]):
+            kept[_KEPT + i] = math.exp(-h * decay_rate[i]) if decay_rate[i] > 0.0 else 1.0
+    return kept[_KEPT:]
+
+
 @cache
 def covariance_for(width: int) -> Callable[..., None]:
     """`propagate_covariance` for matrices of `width` rows."""
-    size, advance = work_size(width), _advance_for(width)
+    end, advance = work_size(width) - width - _KEPT - 12, _advance_for(width)
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8,"
@@ -137,14 +157,14 @@ def covariance_for(width: int) -> Callable[..., None]:
         sensor_slot = sensor_terms[0]
         n = white.shape[0]
         flat = cov.reshape(width * width)
-        weight = work[size - 12 :]
+        weight = work[end : end + 12]
         _weights(step, sensor_terms, weight)
         a = 6 * width
         b = a + 9 * width
         d = b + width * CORE_STRIDE
         e = d + 6 * CORE_STRIDE
         sensor, top, turned = work[:a], work[a:b], work[b:d]
-        core_sensor, core = work[d:e], work[e : size - 12]
+        core_sensor, core = work[d:e], work[e:end]
         half = 0.5 * h * q
         for i in range(CORE_SIZE):
             flat[i * width + i] += half * white[i]
@@ -172,10 +192,11 @@ def covariance_for(width: int) -> Callable[..., None]:
                 flat[offset * width + j] += h * flat[rate * width + j]
             for j in range(width):
                 flat[j * width + offset] += h * flat[j * width + rate]
+        factors = decays(h, decay_rate, width, work)
         for i in range(CORE_SIZE, n):
             variance = q * h * white[i]
             if decay_rate[i] > 0.0:
-                decay = math.exp(-h * decay_rate[i])
+                decay = factors[i]
                 for j in range(width):
                     flat[i * width + j] *= decay
                     flat[j * width + i] *= decay
@@ -188,7 +209,7 @@ def covariance_for(width: int) -> Callable[..., None]:
 @cache
 def transition_for(width: int) -> Callable[..., None]:
     """`propagate_transition` for matrices of `width` rows."""
-    size, advance = work_size(width), _advance_for(width)
+    end, advance = work_size(width) - width - _KEPT - 12, _advance_for(width)
 
     @compiled(
         "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
@@ -209,7 +230,7 @@ def transition_for(width: int) -> Callable[..., None]:
         """phi (width, width) <- transition over h seconds times phi."""
         decay_rate = noise[0]
         flat = phi.reshape(width * width)
-        weight = work[size - 12 :]
+        weight = work[end : end + 12]
         _weights(step, sensor_terms, weight)
         sensor, top = work[: 6 * width], work[6 * width : 15 * width]
         advance(flat, sensor_terms[0], weight, c, active, sensor, top)
@@ -219,9 +240,10 @@ def transition_for(width: int) -> Callable[..., None]:
             offset, rate = rate_terms[0, k], rate_terms[1, k]
             for j in range(width):
                 flat[offset * width + j] += h * flat[rate * width + j]
+        factors = decays(h, decay_rate, width, work)
         for i in range(CORE_SIZE, decay_rate.shape[0]):
             if decay_rate[i] > 0.0:
-                decay = math.exp(-h * decay_rate[i])
+                decay = factors[i]
                 for j in range(width):
                     flat[i * width + j] *= decay
 
@@ -229,16 +251,18 @@ def transition_for(width: int) -> Callable[..., None]:
 
 
 @compiled("void(f8[::1], f8, i8[:, ::1], f8[::1])", forceinline=True)
-def propagate_parameters(x: Array, h: float, rate_terms: Indices, decay_rate: Array) -> None:
-    """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay."""
+def propagate_parameters(x: Array, h: float, rate_terms: Indices, factors: Array) -> None:
+    """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay by
+    `factors` (`decays`)."""
     for k in range(rate_terms.shape[1]):
         x[rate_terms[0, k]] += h * x[rate_terms[1, k]]
     for i in range(CORE_SIZE, x.shape[0]):
-        if decay_rate[i] > 0.0:
-            x[i] *= math.exp(-h * decay_rate[i])
+        x[i] *= factors[i]
 
 
-@compiled("void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[::1], f8[::1])")
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[::1], i8, f8[::1])"
+)
 def propagate_error(
     dx: Array,
     step: Array,
@@ -248,9 +272,13 @@ def propagate_error(
     sensor_terms: Indices,
     rate_terms: Indices,
     decay_rate: Array,
+    width: int,
     work: Array,
 ) -> None:
-    """dx (n,) <- Phi dx over h seconds: an estimate that is not fed back yet (paper 000, 1.1)."""
+    """dx (n,) <- Phi dx over h seconds: an estimate that is not fed back yet (paper 000, 1.1).
+
+    `work` as for rows of `width`.
+    """
     sensor = work[: 6 * CORE_STRIDE]
     rows = work[6 * CORE_STRIDE : 15 * CORE_STRIDE]
     out = work[15 * CORE_STRIDE : 24 * CORE_STRIDE]
@@ -265,4 +293,4 @@ def propagate_error(
     apply_to_core(rows, sensor, c, out)
     for i in range(CORE_SIZE):
         dx[i] = out[i * CORE_STRIDE] if active[i] else 0.0
-    propagate_parameters(dx, h, rate_terms, decay_rate)
+    propagate_parameters(dx, h, rate_terms, decays(h, decay_rate, width, work))

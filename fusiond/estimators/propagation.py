@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.covariance import (
     covariance_for,
+    decays,
     propagate_error,
     propagate_parameters,
     transition_for,
@@ -263,10 +264,20 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if carry:
                     for k in range(dxs.shape[0]):
                         propagate_error(
-                            dxs[k], step, c, h, active, sensor_terms, rate_terms, decay_rate, work
+                            dxs[k],
+                            step,
+                            c,
+                            h,
+                            active,
+                            sensor_terms,
+                            rate_terms,
+                            decay_rate,
+                            width,
+                            work,
                         )
                 if decaying:
-                    propagate_parameters(xi, h, rate_terms, decay_rate)
+                    factors = decays(h, decay_rate, width, work)
+                    propagate_parameters(xi, h, rate_terms, factors)
                     sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
             now = stop
             if now == times[i]:

@@ -60,16 +60,20 @@ def screened_update(
             if h[a, i] != 0.0:
                 columns[a, counts[a]] = i
                 counts[a] += 1
+    u, k = np.empty(n), np.empty(n)
     for a in range(m):
         innovation, s = z[a], r[a]
+        u[:] = 0.0
         for p in range(counts[a]):
             i = columns[a, p]
-            innovation -= h[a, i] * dx[i]
-            for q in range(counts[a]):
-                s += h[a, i] * cov[i, columns[a, q]] * h[a, columns[a, q]]
+            c = h[a, i]
+            innovation -= c * dx[i]
+            for j in range(n):
+                u[j] += c * cov[i, j]
+        for p in range(counts[a]):
+            s += h[a, columns[a, p]] * u[columns[a, p]]
         if codes[a] == KEPT and not innovation * innovation <= threshold * s:
             codes[a] = GATED
-    u, k = np.empty(n), np.empty(n)
     while True:
         cov_out[:] = cov
         dx_out[:] = dx
@@ -110,11 +114,15 @@ def screened_update(
             if codes[a] != KEPT:
                 continue
             residual, variance = z[a], r[a]
+            u[:] = 0.0
             for p in range(counts[a]):
                 i = columns[a, p]
-                residual -= h[a, i] * dx_out[i]
-                for q in range(counts[a]):
-                    variance -= h[a, i] * cov_out[i, columns[a, q]] * h[a, columns[a, q]]
+                c = h[a, i]
+                residual -= c * dx_out[i]
+                for j in range(n):
+                    u[j] += c * cov_out[i, j]
+            for p in range(counts[a]):
+                variance -= h[a, columns[a, p]] * u[columns[a, p]]
             if variance > _DETERMINED * r[a] and residual * residual > greatest * variance:
                 worst, greatest = a, residual * residual / variance
         if worst < 0:

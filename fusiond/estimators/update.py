@@ -76,14 +76,14 @@ def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
     u, k = np.empty(n), np.empty(n)
     for a in range(z.shape[0]):
         u[:] = 0.0
-        innovation = z[a]
+        innovation, noise = z[a], r[a]
         for i in range(n):
             c = h[a, i]
             if c != 0.0:
                 innovation -= c * dx[i]
                 for j in range(n):
                     u[j] += c * cov[i, j]
-        s = r[a]
+        s = noise
         for i in range(n):
             s += h[a, i] * u[i]
         hk = 0.0
@@ -92,12 +92,23 @@ def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
             hk += h[a, i] * k[i]
             dx[i] += k[i] * innovation
         # T = (I - k h) P = P - k u^T;  T h^T = u (1 - h k);  P = T - T h^T k^T + k r k^T.
+        # By rows, which is vector code, and above the diagonal by the products of what is below it:
+        # the same bits. What is above it at first differs by what others have rounded.
+        if a == 0:
+            for i in range(n):
+                for j in range(i):
+                    cov[j, i] = cov[i, j]
         c = (1.0 - hk) * s
         for i in range(n):
-            for j in range(i + 1):
-                value = cov[i, j] - k[i] * u[j] - c * k[i] * k[j] + r[a] * k[i] * k[j]
-                cov[i, j] = value
-                cov[j, i] = value
+            k_i, u_i = k[i], u[i]
+            c_i, r_i = c * k_i, noise * k_i
+            for j in range(n):
+                k_j = k[j]
+                below = j <= i
+                t = k_i * u[j] if below else k_j * u_i
+                turned = c_i * k_j if below else c * k_j * k_i
+                of_noise = r_i * k_j if below else noise * k_j * k_i
+                cov[i, j] = cov[i, j] - t - turned + of_noise
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1])")

@@ -237,9 +237,7 @@ class Isolation:
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
-        if outcome.whitened:
-            record.means.add(outcome.whitened)
-        if not self._biased(record, t_ns):
+        if not record.means.tested(outcome.whitened, t_ns, self._pass):
             if record.means.unlikely or aid.source in self.hedge.wider:
                 self.hedge.look(aid.source, record, offer or velocity, covariance)
             return Action.NONE

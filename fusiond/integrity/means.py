@@ -34,6 +34,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.base import gate_threshold
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DR, DV, PHI
 
@@ -112,7 +113,7 @@ def _believe(packed: Array) -> None:
 
 
 # What a look at the means has shown.
-_NOTHING, _UNLIKELY, _BIASED = 0, 1, 2
+_NOTHING, _UNLIKELY, _BIASED, _TOO_FEW = 0, 1, 2, 3
 
 
 @compiled("i8(f8[::1], i8, f8, f8)")
@@ -172,6 +173,33 @@ def _open(packed: Array, p: Array, first: int, sd: Array, out: Array) -> None:
         out[8] += share * yaw * yaw
 
 
+@compiled("i8(f8[::1], f8[::1], i8, f8)")
+def _take(packed: Array, y: Array, t_ns: int, limit: float) -> int:
+    """`_add`, and `_look` at what has come of it; `_TOO_FEW` while there is no mean."""
+    _add(packed, y)
+    return _look(packed, t_ns, limit, 0.0) if packed[_COUNT] >= FEWEST else _TOO_FEW
+
+
+@compiled("UniTuple(f8, 2)(f8[::1], f8)")
+def _lasting(packed: Array, assumed: float) -> tuple[float, float]:
+    """c^2 of the measurement that comes next, `assumed` where nothing is known, and the part of it
+    that is no more than that.
+
+    What the slow mean has shown beside white errors counts as far as it is taken for the series'
+    nature: the part that chance explains is left out (James and Stein, 1961, positive part).
+    """
+    told = packed[_TOLD]
+    beyond = packed[_SLOWLY] / WHITE_SLOW - 1.0
+    new = (packed.shape[0] - _HEAD) // 2 * told * SLOW  # degrees of freedom of its squares
+    shown = 1.0
+    if new * beyond * beyond > 2.0:
+        shown += (beyond - 2.0 / (new * beyond)) * told / (DOUBTED_COUNT + told)
+    likely = LIKELY_COUNT / (LIKELY_COUNT + packed[_COUNT])
+    beyond = likely * (assumed - shown)
+    packed[_COARSE] = square = max(1.0, shown + beyond)
+    return square, beyond
+
+
 def _begun(assumed: float) -> Array:
     packed = np.zeros(_HEAD)
     packed[:1].view(np.int64)[0] = _LONG_AGO_NS
@@ -212,13 +240,29 @@ class Means:
 
     def add(self, whitened: tuple[float, ...]) -> None:
         """Take in an innovation (d,), whitened."""
-        packed, width = self._packed, _HEAD + 2 * len(whitened)
+        _add(self._ready(len(whitened)), np.array(whitened))
+
+    def tested(self, whitened: tuple[float, ...], t_ns: int, probability: float) -> bool:
+        """`add` and `biased` in one, of a series that is believed; the quantile is that of the
+        `probability`. Where nothing is `whitened` the means are as they were."""
+        if not whitened:
+            d = self.degrees
+            return d > 0 and self.biased(t_ns, gate_threshold(probability, d))
+        packed, limit = self._ready(len(whitened)), gate_threshold(probability, len(whitened))
+        found = _take(packed, np.array(whitened), t_ns, limit)
+        if found != _TOO_FEW:
+            self.unlikely = found == _UNLIKELY
+        return found == _BIASED
+
+    def _ready(self, degrees: int) -> Array:
+        """What the kernels read, for an innovation of that dimension."""
+        packed, width = self._packed, _HEAD + 2 * degrees
         if packed.shape[0] != width:
             packed = self._packed = np.concatenate((packed[:_HEAD], np.zeros(width - _HEAD)))
             packed[_COUNT] = 0.0
         elif packed[_COUNT] == 0.0:
             packed[_HEAD:] = 0.0
-        _add(packed, np.array(whitened))
+        return packed
 
     @property
     def degrees(self) -> int:
@@ -263,26 +307,9 @@ class Means:
         """c: by how much (1, at least) a sigma is too small for errors that last, as the series has
         shown; the measurement that comes next counts with it. What is assumed of measurements
         `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
-        heard = float(self._packed[_COUNT])
-        shown = 1.0 + self._beyond_chance
-        likely = LIKELY_COUNT / (LIKELY_COUNT + heard)
-        beyond = likely * (assumed(every_s) - shown)
-        self._packed[_COARSE] = square = max(1.0, shown + beyond)
+        square, beyond = _lasting(self._packed, assumed(every_s))
         self.assuming = beyond > ASSUMING * square
         return math.sqrt(square)
-
-    @property
-    def _beyond_chance(self) -> float:
-        """What the slow mean has shown beside white errors, as far as it is taken for the series'
-        nature: the part that chance explains is left out (James and Stein, 1961, positive part)."""
-        packed = self._packed
-        told = float(packed[_TOLD])
-        beyond = float(packed[_SLOWLY]) / WHITE_SLOW - 1.0
-        new = (packed.shape[0] - _HEAD) // 2 * told * SLOW  # degrees of freedom of its squares
-        if new * beyond * beyond <= 2.0:
-            return 0.0
-        shown: float = (beyond - 2.0 / (new * beyond)) * told / (DOUBTED_COUNT + told)
-        return shown
 
 
 def assumed(every_s: float) -> float:

@@ -201,7 +201,8 @@ def metres_a_radian(nav: Array) -> tuple[float, float]:
 def apart(offer: PositionOffer, lat: float, lon: float, nav: Array) -> Offset:
     """From the body's origin as measured to a place (rad, rad); `nav` (10,) turns the lever arm."""
     north, east = _apart(nav, lat - offer.lat_rad, lon - offer.lon_rad, *offer.lever)
-    return Offset(north, east, max(offer.sd[:2]))
+    sd_n, sd_e, _ = offer.sd
+    return Offset(north, east, max(sd_n, sd_e))
 
 
 def filters_own(offer: PositionOffer, covariance: Array) -> float:

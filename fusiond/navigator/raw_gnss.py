@@ -197,11 +197,11 @@ class RawGnss:
         if not codes or aid.t_ns <= self._counted_ns:
             return
         self._counted_ns = aid.t_ns
-        refused = [(k, code) for k, code in enumerate(codes) if code != KEPT]
-        labels = corrected.aid.labels if refused else []
-        for k, code in refused:
-            satellite, what = labels[k]
-            self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
+        if codes.count(KEPT) == len(codes):
+            return
+        for (satellite, what), code in zip(corrected.aid.labels, codes, strict=True):
+            if code != KEPT:
+                self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
     def _count(self, aid: RawEpochAid, rows: Rows) -> None:
         """Satellites that do not serve, once an epoch."""

@@ -30,7 +30,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.covariance import covariance_for, propagate_parameters
+from fusiond.estimators.covariance import covariance_for, decays, propagate_parameters
 from fusiond.estimators.propagation import (
     compensate,
     sensor_estimates,
@@ -229,6 +229,7 @@ def propagate_points(
             else:
                 _covariance_widest(cov, step, c, h, *terms)
 
+            factors = decays(h, decay_rate, width, work)
             # Point 0 is the mean, 2 k + 1 and 2 k + 2 are the pair along L_k.
             for point in range(2 * POINTS + 1):
                 k, which = (point - 1) // 2, (point - 1) % 2 + 1
@@ -261,7 +262,7 @@ def propagate_points(
                     if not active[j]:
                         odd[k, j] = 0.0
                         even[k, j] = 0.0
-                propagate_parameters(odd[k, :n], h, rate_terms, decay_rate)
+                propagate_parameters(odd[k, :n], h, rate_terms, factors)
 
             mean[:] = 0.0
             for j in range(CORE_SIZE):
@@ -277,11 +278,11 @@ def propagate_points(
                     mean[a] += factor / spread
                     for b in range(CORE_SIZE):
                         cov[a, b] += factor * even[k, b]
-            propagate_parameters(xi, h, rate_terms, decay_rate)
+            propagate_parameters(xi, h, rate_terms, factors)
             if carry:
                 for j in range(CORE_SIZE):
                     dx[j] = mean[j]
-                propagate_parameters(dx, h, rate_terms, decay_rate)
+                propagate_parameters(dx, h, rate_terms, factors)
             else:
                 feed_back(nav, xi, mean)
             shake(cov, active, step, densities[i], h)
