@@ -140,7 +140,7 @@ class ZeroVelocity(Section):
     accel_sd_m_s2: PositiveFloat = 0.15
     """The same for specific force."""
     max_rate_deg_s: PositiveFloat = 2.0
-    """Quiet below this mean rate."""
+    """Quiet below this mean rate, beyond three sigma of the gyro's bias."""
     max_speed_m_s: PositiveFloat = 0.5
     """A quiet sensor means standstill only below this computed speed."""
     velocity_sd_m_s: PositiveFloat = 0.05

@@ -15,7 +15,7 @@ from fusiond.configuration.schema import Imu, ZeroVelocity
 from fusiond.models.blocks import ClockNoise, ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.rotation import dcm_from_rpy
-from fusiond.navigation.standstill import QuietLimits
+from fusiond.navigation.standstill import BIAS_SIGMAS, QuietLimits
 
 DEG = math.pi / 180.0
 DEG_PER_HOUR = DEG / 3600.0
@@ -69,11 +69,13 @@ def sensor_to_body(imu: Imu) -> NDArray[np.float64]:
     return dcm_from_rpy(roll, pitch, yaw) @ nominal
 
 
-def quiet_limits(zero_velocity: ZeroVelocity) -> QuietLimits:
-    """Thresholds of the standstill detector."""
+def quiet_limits(zero_velocity: ZeroVelocity, noise: ImuNoise) -> QuietLimits:
+    """Thresholds of the standstill detector. A gyro's bias, which its mean rate at rest is, takes
+    nothing from the rate below which it is quiet."""
+    bias = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
     return QuietLimits(
         window_ns=round(zero_velocity.window_s * 1e9),
         rate_sd=zero_velocity.gyro_sd_deg_s * DEG,
         force_sd=zero_velocity.accel_sd_m_s2,
-        mean_rate=zero_velocity.max_rate_deg_s * DEG,
+        mean_rate=zero_velocity.max_rate_deg_s * DEG + BIAS_SIGMAS * bias,
     )

@@ -23,7 +23,7 @@ from drivers.raw.messages import Ephemeris, Klobuchar
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.configuration.settings import quiet_limits, sensor_to_body
+from fusiond.configuration.settings import imu_noise, quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
 from fusiond.doctor.values import KEPT, Values
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
@@ -229,7 +229,8 @@ def _imu(heard: Heard, config: Config, report: Report) -> None:
             f"{rate:.1f} samples a second, but [imu] rate_hz = {wanted:g}: correct one of them"
         )
     values = np.array(heard.imu)
-    mean, limits = values.mean(axis=0), quiet_limits(config.constraints.zero_velocity)
+    mean = values.mean(axis=0)
+    limits = quiet_limits(config.constraints.zero_velocity, imu_noise(config.imu))
     sd = values.std(axis=0)
     force = float(np.linalg.norm(mean[3:]))
     turn = float(np.degrees(np.linalg.norm(mean[:3])))
@@ -255,7 +256,7 @@ def _imu(heard: Heard, config: Config, report: Report) -> None:
             f"gravity lies {tilt:.0f} deg off the body's down axis: the sensor axis that points "
             f"down is {down}, so [imu] axes must end with {down!r} (now {config.imu.axes[2]!r})"
         )
-    if turn > config.constraints.zero_velocity.max_rate_deg_s:
+    if turn > np.degrees(limits.mean_rate):
         report.findings.append(
             f"it says {turn:.2f} deg/s at rest: is the gyro's unit right (gyro_unit of "
             f"[sources.{heard.name}], or the DBC), and is the unit warm?"

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 # A window with fewer samples says nothing about a standard deviation.
 FEWEST_SAMPLES = 10
+# Sigmas at which a rate is no bias of the gyro's data sheet.
+BIAS_SIGMAS = 3.0
 # Quiet windows in a row that are averaged: ten seconds, in which the rocking of a vehicle at rest
 # averages out and a slow turn does not.
 LONGEST_RUN = 10

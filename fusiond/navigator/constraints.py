@@ -11,7 +11,7 @@ from fusiond.aiding.standstill import Rest, ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.witnesses import Witnesses
 from fusiond.configuration.schema import Constraints, NonHolonomic
 from fusiond.configuration.settings import DEG, quiet_limits
-from fusiond.models.blocks import Block
+from fusiond.models.blocks import Block, ImuNoise
 from fusiond.models.vehicle import SIDE_DRIFT, axle_lever, drift, mounting
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import StandstillDetector, Window, next_cell
@@ -44,13 +44,13 @@ def vehicle_blocks(options: NonHolonomic) -> list[Block]:
 class ConstraintMaker:
     """Makes the constraints of `[constraints]` out of samples, whatever the chunks they come in.
 
-    `rate_noise` (rad/s/sqrt(Hz)) is the gyro's; `witnesses` hears of what is measured.
+    `noise` is the IMU's; `witnesses` hears of what is measured.
     """
 
-    def __init__(self, options: Constraints, rate_noise: float) -> None:
-        self._options, self._rate_noise = options, rate_noise
+    def __init__(self, options: Constraints, noise: ImuNoise) -> None:
+        self._options, self._rate_noise = options, noise.rate_noise
         self.witnesses = Witnesses()
-        self._detector = StandstillDetector(quiet_limits(options.zero_velocity))
+        self._detector = StandstillDetector(quiet_limits(options.zero_velocity, noise))
         self._last_cell = -1
 
     def feed(self, imu: ImuBuffer, new: int) -> Felt:

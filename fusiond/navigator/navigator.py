@@ -85,7 +85,7 @@ class Navigator:
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
         self._on_outcome = on_outcome
-        self._constraints = ConstraintMaker(config.constraints, self._noise.rate_noise)
+        self._constraints = ConstraintMaker(config.constraints, self._noise)
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedAids(self._event)
         self._left_out = LeftOut(self.timeline, names, self._event)

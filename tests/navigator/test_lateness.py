@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusiond.navigator.alignment import motion
+from fusiond.navigator.alignment import motion_fit
 from fusiond.navigator.alignment.lateness import SETTLED_SD_S, Lateness
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.navigator import Navigator
@@ -89,13 +89,13 @@ def test_late_from_the_first_fix_on() -> None:
 
 
 def test_no_tick_waits_for_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    fits, fit = [0], motion.fit
+    fits, fit = [0], motion_fit.fit
 
-    def counted(*args: Any) -> motion.Fit:
+    def counted(*args: Any) -> motion_fit.Fit:
         fits[-1] += 1
         return fit(*args)
 
-    monkeypatch.setattr(motion, "fit", counted)
+    monkeypatch.setattr(motion_fit, "fit", counted)
     told: list[str] = []
     navigator = Navigator(VEHICLE, on_event=lambda code, text: told.append(code))
     given = taken = 0

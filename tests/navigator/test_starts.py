@@ -209,6 +209,28 @@ def test_an_uncalibrated_sensor_is_met_on_the_move() -> None:
     assert np.mean(rates) < high
 
 
+def test_an_uncalibrated_sensor_is_met_at_rest() -> None:
+    """3 deg/s of bias is no motion: what the gyros say at rest is what they say of no rate, and
+    the start is not one on the move, of which a bend that is none would tell tilt from bias."""
+    case = CASES["straight"]
+    truth, tilts, rates, most = _truth(case), [], [], 0.0
+    imu = {**SHEET, "sensor_class": "consumer"}
+    for seed in range(12):
+        start = _started(case, seed, imu=imu).started
+        assert start is not None
+        assert start.how == case.how
+        biases = _run(case, seed, imu).biases[round(start.t_ns * 1e-9 * RATE_HZ) - 1]
+        most = max(most, float(np.abs(biases[:3]).max()))
+        rates.append(biases[:3] - start.xi[9:12])
+        true = runs.true_nav(truth, np.array([start.t_ns * 1e-9]))[0]
+        error, p = runs.nav_error(start.nav, true)[:2], start.covariance[:2, :2]
+        tilts.append(error @ np.linalg.solve(p, error))
+        assert np.sqrt(np.diag(start.covariance)[9:12]).max() < 0.2 * DEG
+    assert most > 5.0 * DEG
+    assert np.abs(rates).max() < 0.2 * DEG
+    assert np.mean(tilts) < float(chi2.ppf(0.999, 2 * len(tilts))) / len(tilts)
+
+
 def test_velocities_that_are_none_are_no_start() -> None:
     """Two of forty, of a receiver that said the opposite until then: their fit knows no heading,
     and its tilt, wrong by ten degrees, is theirs. It waits until they are not asked any more."""

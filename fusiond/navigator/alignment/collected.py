@@ -17,7 +17,7 @@ from fusiond.aiding.witnesses import LEAST_SD_M_S, Witnesses
 from fusiond.integrity.proof import NO_TREND, Offset
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
-from fusiond.navigation.standstill import FEWEST_SAMPLES, Window
+from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Place, as_geodetic, velocity_of
 from fusiond.navigator.saved_state import SavedState
@@ -32,9 +32,7 @@ MOST_FIXES, FIXES_NS = 400, 20_000_000_000
 MOST_POSITIONS = 60
 # A vehicle that drives for long drives faster (m/s).
 SLOWEST_M_S = 3.0
-# Sigmas at which a rate is no bias of the gyro's data sheet, and at which position and velocity of
-# a receiver contradict each other.
-BIAS_SIGMAS = 3.0
+# Sigmas at which position and velocity of a receiver contradict each other.
 CONTRADICTION_SIGMAS = 4.0
 # Of the way by velocity (scale): what the trapezoids between fixes leave out.
 WAY_SCALE = 0.05

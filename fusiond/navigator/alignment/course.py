@@ -11,7 +11,7 @@ Moving off from rest the IMU has felt the velocity itself, and its direction in 
 
 which needs no assumption about slip, but that it was at rest: felt and measured speed must agree in
 size. Where they do not, quiet was not rest, and the start is one on the move, where the changes of
-velocity tell forward from backward (fusiond.navigator.alignment.motion).
+velocity tell forward from backward (fusiond.navigator.alignment.motion_fit).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from fusiond.navigation.rotation import (
     rpy_from_dcm,
     wrap_angle,
 )
-from fusiond.navigator.alignment import motion
+from fusiond.navigator.alignment import motion, motion_fit
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import Fix, Standing, place_of
 from fusiond.navigator.alignment.options import AlignmentOptions
@@ -245,14 +245,14 @@ class Ways:
     _g: float
     _sd_late_s: float
 
-    def fit(self, backward: bool) -> motion.Fit:
+    def fit(self, backward: bool) -> motion_fit.Fit:
         """The best fit of a vehicle that drives forward, or backward."""
         velocity = self._latest
         course = math.atan2(velocity.v_ned[1], velocity.v_ned[0])
         along = _along(self._options, velocity, self.felt.rates[-1], backward)
         yaw = course - along.angle
         given = self._past, self.felt, self._measured, self._noise, self._g
-        return motion.fit(*given, yaw, along.sd, self._sd_late_s)
+        return motion_fit.fit(*given, yaw, along.sd, self._sd_late_s)
 
 
 def ways(
@@ -293,6 +293,9 @@ def _on_the_move(by: Basis, imu: ImuBuffer, latest: Fix, place: Place) -> Start 
     missed_m_s = math.sqrt(doubt) * float(np.max(velocity_of(velocity)[1][:2]))
     if missed_m_s > MISSED * by.options.course_speed_m_s:
         by.known.doubted("the velocities of the fixes do not fit what was felt")
+        return None
+    if not (forward_fit.converged and backward_fit.converged):
+        by.known.doubted("moving: no attitude found yet that fits what was felt")
         return None
     speed = math.hypot(*velocity.v_ned[:2])
     if ratio < -DECIDED:
@@ -338,7 +341,7 @@ def _sd_late_s(by: Basis, velocity: VelocityOffer) -> float:
     return float(sum(by.model.initial[slot] for slot in by.model.slots_of(velocity.time)))
 
 
-def _fitted(fit: motion.Fit, doubt: float) -> Fitted:
+def _fitted(fit: motion_fit.Fit, doubt: float) -> Fitted:
     return Fitted(fit.biases, fit.late_s, doubt * fit.covariance)
 
 

@@ -1,8 +1,8 @@
 r"""How much later than its stamps a receiver's fixes are valid, told by the IMU alone.
 
 The velocities of the last seconds are compared with what the IMU has felt
-(fusiond.navigator.alignment.motion), as if each had been true by tau before its stamp. Attitude,
-sensor errors and the first velocity are free within their priors, so that
+(fusiond.navigator.alignment.motion_fit), as if each had been true by tau before its stamp.
+Attitude, sensor errors and the first velocity are free within their priors, so that
 
     J(tau) = min cost,   J(tau) - J(tau*) = (tau - tau*)^2 / s^2    near the best tau*
 

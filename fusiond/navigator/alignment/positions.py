@@ -37,7 +37,7 @@ from fusiond.navigator.alignment.bank import CELL_SD_RAD, YAWS_RAD, Cell, Headin
 from fusiond.navigator.alignment.basis import Basis, rest_bias
 from fusiond.navigator.alignment.collected import FIXES_NS, Standing
 from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
-from fusiond.navigator.alignment.motion import TILT_SD_RAD
+from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
 

@@ -1,0 +1,270 @@
+r"""Which way a moving vehicle faces: felt against measured changes of velocity, by least squares.
+
+    v(t_k) = v_0 + C_0 a_k + g t_k + C_k (w_k x l) + (C_k (f_k - b_f) + g) tau
+    a_k = int C(0, t) (f - b_f) dt
+
+C_0 attitude at the first fix, C(0, t) its change by the gyros (less b_w), l the antenna's lever,
+tau how much later than their stamps the velocities are valid. v_0, the rotation vector phi of
+C_0 = exp(phi) R_z(yaw_0), b_f, b_w and tau are sought, with the data sheet's biases, a road's
+slope, the course's sigma and that of the receiver's offset as priors (pulling away by 3 m/s^2 with
+velocities that are 0.1 s late gains 0.3 m/s too much, in 5 s a third of a degree of tilt); C(0, t)
+is integrated anew with the rate bias found, for 3 deg/s turn the axes by a radian in 20 s. At the
+last fix the attitude is C_T = C_0 C(0, T), and its error follows from those of C_0 and b_w,
+
+    phi_T = phi + C_0 D db_w,   D = d C(0, T) / d b_w as a rotation vector (3, 3)
+
+so what is sought is phi_T in place of phi: a vehicle that stood before it drove off tells nothing
+of its yaw rate's bias until then, and a C_0 that is held would turn all that came after. Tilt and
+biases come with the covariance that they share: straight on, a tilt is known no better than the
+accelerometers' bias, and the sum of both far better. The cost J of the best fit is twice
+the negative log likelihood, up to a constant that forward (yaw_0 by the course) and backward (half
+a turn more) share, so that
+
+    ln L_forward - ln L_backward = (J_backward - J_forward) / 2
+
+tells them apart: braking, accelerating and bends do; straight on at constant speed does not.
+
+From no bias to 6 deg/s, which turn the axes by 100 deg in 17 s, Gauss-Newton goes astray now and
+then (tilts 39 deg off at a stated 0.7). So the last seconds are fitted first, and over spans that
+double the fit of each is where the next begins; and a fit that has not converged starts nothing.
+
+Source: Wu and Pan, Velocity/position integration formula part I, IEEE T-AES 49 (2013), for the
+integral form of an alignment in motion; Groves, 2nd ed., section 5.6.3.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.models.blocks import ImuNoise
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.rotation import (
+    dcm_from_quaternion,
+    dcm_from_rpy,
+    rotation_vector_to_quaternion,
+    wrap_angle,
+)
+from fusiond.navigator.alignment.motion import Felt, Measured, Past, felt
+
+Array = NDArray[np.float64]
+
+# One sigma (rad) of how a road and a vehicle's body on it slope: 10 %, beyond which streets are
+# signposted.
+TILT_SD_RAD = 0.1
+# Steps of Gauss-Newton at most, and the one, in sigmas, that ends them; how often one is halved,
+# and the one that ends them where no part of it is any better, for the valley is bent.
+ITERATIONS, CONVERGED, HALVINGS, STALLED = 16, 0.1, 6, 1.0
+# Three sigma of a rate bias turn the axes by so much (rad) over the last fixes, which are fitted
+# first: half its square, a tenth, is what a linearisation about no bias leaves out.
+FIRST_RAD = 0.5
+# The integrals are made anew where the biases found would turn or tilt the axes by more (rad) than
+# those that they were made with: half its square is left out, a cm/s of what gravity gains in 20 s,
+# and what the slopes by the rate bias have of the force bias (a twelfth for 5 deg).
+BENT_RAD = 0.01
+# (a x b)_i = CROSS_ijk a_j b_k.
+CROSS = np.zeros((3, 3, 3))
+CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
+
+
+class Fit(NamedTuple):
+    """The best fit under one hypothesis: cost, degrees of freedom, attitude C_nb (3, 3) at the last
+    fix, biases (6,) of force and rate, the velocities' offset in time (s), covariance (10, 10) of
+    them all. `converged`: it is the best; else the cost is no less than that of the best."""
+
+    cost: float
+    degrees: int
+    dcm: Array
+    biases: Array
+    late_s: float
+    covariance: Array
+    converged: bool
+
+
+def fit(
+    past: Past,
+    f: Felt,
+    m: Measured,
+    noise: ImuNoise,
+    g: float,
+    yaw: float,
+    sd_yaw: float,
+    sd_late_s: float = 0.0,
+) -> Fit:
+    """The best fit with `yaw` (rad) at the last fix, to within `sd_yaw`, and velocities that are
+    late by 0, to within `sd_late_s`, begun at `f`."""
+    force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
+    rate = math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)
+    # The offset in its sigmas: one that is known has a column of zeros.
+    prior = np.array([TILT_SD_RAD] * 2 + [sd_yaw] + [force] * 3 + [rate] * 3 + [1.0])
+    asked = Asked(noise, g, yaw, prior, sd_late_s)
+    here = Guess(dcm_from_rpy(0.0, 0.0, yaw), f.biases, 0.0, m.velocity[0])
+    for part in _parts(m, rate):
+        begun = felt(past, part.instants, here.biases[3:], here.biases[:3])
+        here = _descend(past, begun, part, asked, here.since(part)).here
+    found = _descend(past, f, m, asked, here.since(m))
+    here, scale = found.here, np.array([1.0] * 9 + [sd_late_s])
+    known = np.asarray(np.linalg.inv(found.rows.T @ found.rows), np.float64)[:10, :10]
+    return Fit(
+        cost=float(found.z @ found.z),
+        degrees=max(1, m.velocity.size - 3),
+        dcm=here.last,
+        biases=here.biases,
+        late_s=sd_late_s * here.late,
+        covariance=known * np.outer(scale, scale),
+        converged=found.converged,
+    )
+
+
+class Asked(NamedTuple):
+    """The IMU's noise, gravity, heading (rad) at the last fix, one sigma of the priors (10,) and of
+    the velocities' offset in time (s)."""
+
+    noise: ImuNoise
+    g: float
+    yaw: float
+    prior: Array
+    sd_late_s: float
+
+
+class Descent(NamedTuple):
+    """Where Gauss-Newton has come to: the guess, its slopes (3 k + 10, 13) and what is left (3 k +
+    10,), in sigmas."""
+
+    here: Guess
+    rows: Array
+    z: Array
+    converged: bool
+
+
+def _parts(m: Measured, rate_sd: float) -> list[Measured]:
+    """The last of the fixes over spans that double, from one in which a rate bias turns the axes by
+    `FIRST_RAD` at most, as long as they are shorter than that of all."""
+    found: list[Measured] = []
+    span_s = FIRST_RAD / (3.0 * rate_sd) if rate_sd > 0.0 else math.inf
+    since_s = (m.instants[-1] - m.instants) * 1e-9
+    while span_s < since_s[0]:
+        rows = since_s <= span_s
+        if rows.sum() > 1:
+            found.append(Measured(*(column[rows] for column in m)))
+        span_s *= 2.0
+    return found
+
+
+def _descend(past: Past, f: Felt, m: Measured, asked: Asked, here: Guess) -> Descent:
+    """By Gauss-Newton from a guess, begun at `f`; a step that makes the fit worse is halved."""
+    f = _about(past, f, m, here)
+    z = _left(f, m, asked, here)
+    rows, converged = np.empty((z.size, 13)), False
+    for _ in range(ITERATIONS):
+        rows = _slopes(f, m, asked, here)
+        step = np.asarray(np.linalg.lstsq(rows, z, rcond=None)[0], np.float64)
+        size = float(np.linalg.norm(rows @ step))
+        converged = size < CONVERGED
+        for _ in range(HALVINGS):
+            there = here.moved(step)
+            about = _about(past, f, m, there)
+            left = _left(about, m, asked, there)
+            if converged or left @ left < z @ z:
+                here, f, z = there, about, left
+                break
+            step = 0.5 * step
+        else:
+            converged = size < STALLED
+            break
+        if converged:
+            break
+    return Descent(here, rows, z, converged)
+
+
+def _about(past: Past, f: Felt, m: Measured, here: Guess) -> Felt:
+    """The integrals, made anew where the biases are others by now."""
+    force, rate = np.abs(here.biases - f.biases).reshape(2, 3).max(axis=1).tolist()
+    if max(rate * f.t_s[-1], force / STANDARD_GRAVITY_M_S2) > BENT_RAD:
+        return felt(past, m.instants, here.biases[3:], here.biases[:3])
+    return f
+
+
+def _weights(f: Felt, m: Measured, asked: Asked) -> Array:
+    """One over the sigmas (k, 3) of the velocities, with the white noise of what was felt."""
+    n = asked.noise
+    white = n.force_noise**2 * f.t_s
+    white += (STANDARD_GRAVITY_M_S2 * n.rate_noise) ** 2 * f.t_s**3 / 3.0
+    weights: Array = 1.0 / np.sqrt(m.sd**2 + white[:, None])
+    return weights
+
+
+def _left(f: Felt, m: Measured, asked: Asked, here: Guess) -> Array:
+    """What a guess leaves (3 k + 10,), in sigmas."""
+    dcm, there = _since_first(f, m, here)
+    while_late = asked.sd_late_s * _accelerations(f, dcm, here, asked.g)
+    gained = m.velocity - np.outer(f.t_s, [0.0, 0.0, asked.g])
+    z = (gained - here.first - there - here.late * while_late) * _weights(f, m, asked)
+    return np.concatenate([z.ravel(), here.apart(asked.yaw) / asked.prior])
+
+
+def _slopes(f: Felt, m: Measured, asked: Asked, here: Guess) -> Array:
+    """Slopes (3 k + 10, 13) of what a guess says by its steps, in sigmas."""
+    dcm, there = _since_first(f, m, here)
+    h = np.zeros((len(there), 3, 13))
+    h[:, :, :3] = np.einsum("ijk,mk->mij", CROSS, there)  # d(exp(phi) u) = dphi x u
+    h[:, :, 3:9] = dcm @ f.slopes
+    h[:, :, 6:9] -= h[:, :, :3] @ (dcm @ f.turns)
+    h[:, :, 6:9] += dcm @ f.turned @ np.einsum("ijk,mj->mik", CROSS, m.levers)
+    h[:, :, 9] = asked.sd_late_s * _accelerations(f, dcm, here, asked.g)
+    h[:, :, 10:] = np.eye(3)
+    h *= _weights(f, m, asked)[:, :, None]
+    of_priors = np.hstack([np.diag(1.0 / asked.prior), np.zeros((10, 3))])
+    return np.vstack([h.reshape(-1, 13), of_priors])
+
+
+class Guess(NamedTuple):
+    """Attitude C_nb (3, 3) at the last fix, biases (6,) of force and rate, offset in time in
+    sigmas, velocity (3,) at the first fix."""
+
+    last: Array
+    biases: Array
+    late: float
+    first: Array
+
+    def since(self, m: Measured) -> Guess:
+        """As a guess of what began with the first of `m`."""
+        return self._replace(first=m.velocity[0])
+
+    def moved(self, step: Array) -> Guess:
+        """By a step (13,)."""
+        last = _turn(step[:3]) @ self.last
+        late = self.late + float(step[9])
+        return Guess(last, self.biases + step[3:9], late, self.first + step[10:])
+
+    def apart(self, yaw: float) -> Array:
+        """How far the priors (10,) are: level, `yaw` (rad), no biases, no offset."""
+        c = self.last
+        apart = wrap_angle(yaw - math.atan2(c[1, 0], c[0, 0]))
+        return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases, [-self.late]])
+
+
+def _since_first(f: Felt, m: Measured, here: Guess) -> tuple[Array, Array]:
+    """C_0 (3, 3), and the velocity (k, 3) gained since the first fix but for gravity's, with the
+    antenna's about the IMU."""
+    more = here.biases - f.biases
+    dcm = here.last @ (_turn(f.turns @ more[3:]) @ f.turned[-1]).T
+    levers = np.einsum("ijk,mj,mk->mi", CROSS, f.rates - more[3:], m.levers)
+    arms = (f.turned @ levers[:, :, None])[:, :, 0]
+    return dcm, (f.gained + f.slopes @ more + arms) @ dcm.T
+
+
+def _accelerations(f: Felt, dcm: Array, here: Guess, g: float) -> Array:
+    """Of the body, NED (k, 3) at the fixes, with C_0 (3, 3)."""
+    forces = (dcm @ f.turned) @ (f.forces - here.biases[:3])[:, :, None]
+    accelerations: Array = forces[:, :, 0] + [0.0, 0.0, g]
+    return accelerations
+
+
+def _turn(phi: Array) -> Array:
+    x, y, z = (float(v) for v in phi)
+    return dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z)))
