@@ -28,11 +28,7 @@ c no less: a filter that has gone astray by one of its sigmas could never be cor
 an outage of all positions the first that comes back is taken at once, but counts less until it is
 seen to go with the motion (fusiond.integrity.proof).
 
-With all series of position refused nobody can say who is wrong from innovations alone; how it began
-can. An IMU's fault reaches the velocity before the position, and moves the position by no more than
-that velocity and a bounded acceleration allow; a receiver's jump does not ask. So `lost` names a
-cause: `source` where the position left its own velocity, or leaves the filter while the velocity
-of the same device still agrees with it; `filter` where position and velocity went together.
+With all series of position refused, how it began tells who is wrong (fusiond.integrity.jumps).
 
 Source: as of fusiond.integrity.means; Bar-Shalom, Li, Kirubarajan (2001), section 5.4; Brumback,
 Srinath, IEEE Trans. AC 32 (1987), 1133.
@@ -53,6 +49,7 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
+from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
@@ -72,13 +69,6 @@ READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 FALSE_ALARM = 1e-6
 # Faster than this (m/s) the vehicle moves: what is measured of it changes.
 MOVING_M_S = 1.0
-# Beyond what gravity on the wrong axis can do to a position in the time (m/s^2).
-IMU_FAULT_M_S2 = 10.0
-# Without a velocity of the same device, the velocity error that an unnoticed IMU fault may have
-# brought before (m/s): ten times what an aided filter states, 0.1 to 1 m/s.
-IMU_FAULT_M_S = 10.0
-# A jump is beyond so many sigmas of its innovation, on top of the above.
-JUMP_SIGMAS = 6.0
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
 # its constraint is refused. A corner taken too fast is over by then.
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
@@ -313,7 +303,7 @@ class Isolation:
         record.refused += 1
         if record.refused == 1:
             record.refused_ns = t_ns
-            record.jumped = self._jumps(record, t_ns, nis, away)
+            record.jumped = jumps(record, t_ns, nis, away, self._supported(record.device, t_ns))
         if record.refused < REFUSED_IN_A_ROW:
             return Action.NONE
         reason = "jumped" if record.jumped else "disagrees"
@@ -324,18 +314,6 @@ class Isolation:
         if record.jumped or not (record.locates or record.moves):
             return Action.NONE
         return Action.DOUBT_MOTION
-
-    def _jumps(self, record: Series, t_ns: int, nis: float, away: float) -> bool:
-        """Whether a refused position or velocity left the filter faster than an IMU's fault can
-        explain."""
-        if not math.isfinite(nis) or t_ns - record.fused_ns > FORGET_NS:
-            return False
-        apart_s = (t_ns - record.fused_ns) * 1e-9
-        felt = IMU_FAULT_M_S2 * apart_s
-        if record.locates:
-            before = 0.0 if self._supported(record.device, t_ns) else IMU_FAULT_M_S
-            felt = (before + 0.5 * felt) * apart_s
-        return away > JUMP_SIGMAS * away / math.sqrt(nis) + felt
 
     @staticmethod
     def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
