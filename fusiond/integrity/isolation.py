@@ -26,7 +26,8 @@ filter's own bound, grown as the IMU's errors let it, or another source then sup
 does not. The filter's error, P / (P + R) of a position's variance, is the same in all of them, and
 c no less: a filter that has gone astray by one of its sigmas could never be corrected else. After
 an outage of all positions the first that comes back is taken at once, but counts less until it is
-seen to go with the motion (fusiond.integrity.proof).
+seen to go with the motion (fusiond.integrity.proof), and, where it lies behind the filter by more
+than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.punctual).
 
 With all series of position refused, how it began tells who is wrong (fusiond.integrity.jumps).
 
@@ -52,10 +53,11 @@ from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
+from fusiond.integrity.punctual import Punctual
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
-from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
+from fusiond.integrity.support import FINE_M, FORGET_NS, MOVING_M_S, Lost
 from fusiond.integrity.tilt import Tilting
-from fusiond.navigation.strapdown import VD
+from fusiond.navigation.strapdown import LAT, LON, VD, VE, VN
 
 Array = NDArray[np.float64]
 
@@ -67,8 +69,9 @@ REFUSED_IN_A_ROW = 3
 READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 # Probability of a false alarm of one mean test.
 FALSE_ALARM = 1e-6
-# Faster than this (m/s) the vehicle moves: what is measured of it changes.
-MOVING_M_S = 1.0
+# A fix that comes back after an outage, farther from the filter than chance has it once in twenty
+# (fusiond.integrity.hedge), and behind it: one in forty of a sound receiver.
+SURPRISES = 0.95
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
 # its constraint is refused. A corner taken too fast is over by then.
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
@@ -222,7 +225,7 @@ class Isolation:
                 return Action.NONE
             away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
-        runs = offer is not None and self._prove(record, offer, nav)
+        runs = offer is not None and self._prove(record, offer, outcome, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
@@ -270,11 +273,20 @@ class Isolation:
         record.heard_ns = t_ns
         return record
 
-    def _prove(self, record: Series, offer: PositionOffer, nav: Array) -> bool:
+    def _prove(self, record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
         """A position is fused; whether it runs away from the motion since an outage, which a
         velocity of the same device supports."""
         suspect = self._contradicted and record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
-        if suspect or support.outage(self._records, offer.t_ns):
+        out = support.outage(self._records, offer.t_ns)
+        if out:
+            record.punctual = (
+                Punctual(offer.t_ns) if self._behind(record, offer, outcome, nav) else None
+            )
+        if record.punctual is not None:
+            v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
+            since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
+            record.punctual = None if since.told else since
+        if suspect or out:
             record.proof = Proof.begun(offer, nav, record.means.colour, suspect)
         elif record.proof is not None:
             sd_m_s = support.velocity_sd(self._records, record.device)
@@ -283,6 +295,14 @@ class Isolation:
             limit = gate_threshold(self._pass, 2)
             return proof.drifts(limit) and self._supported(record.device, offer.t_ns)
         return False
+
+    @staticmethod
+    def _behind(record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
+        """Whether a fine position that is back lies behind the filter, by more than is likely."""
+        if record.sd_m > FINE_M or outcome.nis <= gate_threshold(SURPRISES, outcome.degrees):
+            return False
+        offset = apart(offer, float(nav[LAT]), float(nav[LON]), nav)
+        return offset.north * float(nav[VN]) + offset.east * float(nav[VE]) > 0.0
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:
