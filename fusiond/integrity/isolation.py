@@ -26,13 +26,10 @@ filter's own bound, grown as the IMU's errors let it, or another source then sup
 does not. The filter's error, P / (P + R) of a position's variance, is the same in all of them, and
 c no less: a filter that has gone astray by one of its sigmas could never be corrected else. After
 an outage of all positions the first that comes back is taken at once, but counts less until it is
-seen to go with the motion (fusiond.integrity.proof).
+seen to go with the motion (fusiond.integrity.proof), and, where it lies behind the filter by more
+than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.punctual).
 
-With all series of position refused nobody can say who is wrong from innovations alone; how it began
-can. An IMU's fault reaches the velocity before the position, and moves the position by no more than
-that velocity and a bounded acceleration allow; a receiver's jump does not ask. So `lost` names a
-cause: `source` where the position left its own velocity, or leaves the filter while the velocity
-of the same device still agrees with it; `filter` where position and velocity went together.
+With all series of position refused, how it began tells who is wrong (fusiond.integrity.jumps).
 
 Source: as of fusiond.integrity.means; Bar-Shalom, Li, Kirubarajan (2001), section 5.4; Brumback,
 Srinath, IEEE Trans. AC 32 (1987), 1133.
@@ -53,12 +50,14 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
+from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
+from fusiond.integrity.punctual import Punctual
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
-from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
+from fusiond.integrity.support import FINE_M, FORGET_NS, MOVING_M_S, Lost
 from fusiond.integrity.tilt import Tilting
-from fusiond.navigation.strapdown import VD
+from fusiond.navigation.strapdown import LAT, LON, VD, VE, VN
 
 Array = NDArray[np.float64]
 
@@ -70,15 +69,9 @@ REFUSED_IN_A_ROW = 3
 READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 # Probability of a false alarm of one mean test.
 FALSE_ALARM = 1e-6
-# Faster than this (m/s) the vehicle moves: what is measured of it changes.
-MOVING_M_S = 1.0
-# Beyond what gravity on the wrong axis can do to a position in the time (m/s^2).
-IMU_FAULT_M_S2 = 10.0
-# Without a velocity of the same device, the velocity error that an unnoticed IMU fault may have
-# brought before (m/s): ten times what an aided filter states, 0.1 to 1 m/s.
-IMU_FAULT_M_S = 10.0
-# A jump is beyond so many sigmas of its innovation, on top of the above.
-JUMP_SIGMAS = 6.0
+# A fix that comes back after an outage, farther from the filter than chance has it once in twenty
+# (fusiond.integrity.hedge), and behind it: one in forty of a sound receiver.
+SURPRISES = 0.95
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
 # its constraint is refused. A corner taken too fast is over by then.
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
@@ -232,7 +225,7 @@ class Isolation:
                 return Action.NONE
             away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
-        runs = offer is not None and self._prove(record, offer, nav)
+        runs = offer is not None and self._prove(record, offer, outcome, nav)
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
@@ -278,11 +271,20 @@ class Isolation:
         record.heard_ns = t_ns
         return record
 
-    def _prove(self, record: Series, offer: PositionOffer, nav: Array) -> bool:
+    def _prove(self, record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
         """A position is fused; whether it runs away from the motion since an outage, which a
         velocity of the same device supports."""
         suspect = self._contradicted and record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
-        if suspect or support.outage(self._records, offer.t_ns):
+        out = support.outage(self._records, offer.t_ns)
+        if out:
+            record.punctual = (
+                Punctual(offer.t_ns) if self._behind(record, offer, outcome, nav) else None
+            )
+        if record.punctual is not None:
+            v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
+            since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
+            record.punctual = None if since.told else since
+        if suspect or out:
             record.proof = Proof.begun(offer, nav, record.means.colour, suspect)
         elif record.proof is not None:
             sd_m_s = support.velocity_sd(self._records, record.device)
@@ -291,6 +293,14 @@ class Isolation:
             limit = gate_threshold(self._pass, 2)
             return proof.drifts(limit) and self._supported(record.device, offer.t_ns)
         return False
+
+    @staticmethod
+    def _behind(record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
+        """Whether a fine position that is back lies behind the filter, by more than is likely."""
+        if record.sd_m > FINE_M or outcome.nis <= gate_threshold(SURPRISES, outcome.degrees):
+            return False
+        offset = apart(offer, float(nav[LAT]), float(nav[LON]), nav)
+        return offset.north * float(nav[VN]) + offset.east * float(nav[VE]) > 0.0
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:
@@ -311,7 +321,7 @@ class Isolation:
         record.refused += 1
         if record.refused == 1:
             record.refused_ns = t_ns
-            record.jumped = self._jumps(record, t_ns, nis, away)
+            record.jumped = jumps(record, t_ns, nis, away, self._supported(record.device, t_ns))
         if record.refused < REFUSED_IN_A_ROW:
             return Action.NONE
         reason = "jumped" if record.jumped else "disagrees"
@@ -322,18 +332,6 @@ class Isolation:
         if record.jumped or not (record.locates or record.moves):
             return Action.NONE
         return Action.DOUBT_MOTION
-
-    def _jumps(self, record: Series, t_ns: int, nis: float, away: float) -> bool:
-        """Whether a refused position or velocity left the filter faster than an IMU's fault can
-        explain."""
-        if not math.isfinite(nis) or t_ns - record.fused_ns > FORGET_NS:
-            return False
-        apart_s = (t_ns - record.fused_ns) * 1e-9
-        felt = IMU_FAULT_M_S2 * apart_s
-        if record.locates:
-            before = 0.0 if self._supported(record.device, t_ns) else IMU_FAULT_M_S
-            felt = (before + 0.5 * felt) * apart_s
-        return away > JUMP_SIGMAS * away / math.sqrt(nis) + felt
 
     @staticmethod
     def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:

@@ -20,6 +20,7 @@ from fusiond.integrity.proof import (
     Proof,
     Trend,
 )
+from fusiond.integrity.punctual import Punctual
 
 DRIFTS, REPEATS = "drifts", "repeats itself"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
@@ -71,6 +72,8 @@ class Series:
     """Probability that a value repeats the one before it, as shown so far in motion."""
     proof: Proof | None = None
     """Of a position that came back after an outage: what is seen of it until it is proven."""
+    punctual: Punctual | None = None
+    """Of one that came back behind the filter: until it would have shown that it is late."""
 
     def copied(self) -> Series:
         """A copy for a checkpoint."""

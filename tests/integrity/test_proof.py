@@ -204,3 +204,35 @@ def test_without_a_velocity_nobody_can_say_that_it_drifts() -> None:
     returned.fixes(BACK, BACK + 150, drift_m_s=0.15)
     assert not returned.isolation.excluded
     assert returned.isolation.contested((BACK + 149) * S // round(RATE_HZ)) is not None
+
+
+@pytest.mark.parametrize(
+    ("late_m", "surprising", "waits"), [(1.0, True, True), (1.0, False, False), (-1.0, True, False)]
+)
+def test_one_that_comes_back_behind_the_filter_waits_for_a_change_of_velocity(
+    late_m: float, surprising: bool, waits: bool
+) -> None:
+    """Its first fix lies behind, by more than is likely: on a straight nobody can tell whether it
+    is late."""
+    isolation, journey = Isolation(), Journey(1)
+    rng = np.random.default_rng(2)
+    told = []
+    for k in [*range(LAST), *range(BACK, BACK + 300)]:
+        offer, nav = journey.at(k, 0.0)
+        v = np.array((8.0, 3.0))
+        if k >= BACK + 200:  # speeds up
+            v = v * (1.0 + (k - BACK - 200) / (10.0 * RATE_HZ))
+        nav[VN], nav[VE] = v
+        along = late_m / float(np.hypot(*v))
+        nav[LAT] = offer.lat_rad + along * v[0] / metres_a_radian(nav)[0]
+        nav[LON] = offer.lon_rad + along * v[1] / metres_a_radian(nav)[1]
+        place = offer.lat_rad, offer.lon_rad, offer.height_m
+        aid = PositionAid("gnss", offer.t_ns, 0.9999, *place, offer.sd, offer.lever)
+        nis = 12.0 if surprising and k == BACK else 1.0
+        y = tuple(rng.standard_normal(3).tolist()) if k < LAST else ()
+        isolation.judge(aid, Outcome("fused", nis, 3, y), nav)
+        told.append("on time" in (isolation.contested(aid.t_ns) or ""))
+    assert not any(told[:LAST])
+    assert any(told[LAST:]) is waits
+    assert told[LAST + 199] is waits
+    assert not told[-1]

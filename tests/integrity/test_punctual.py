@@ -1,0 +1,81 @@
+"""Whether it would have shown that a receiver is late since it came back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusiond.integrity.punctual import LATE_S, TOLD, Punctual
+
+Array = NDArray[np.float64]
+RATE_HZ, SD_M, S = 5.0, 0.6, 1_000_000_000
+Motion = Callable[[float], tuple[float, float]]
+
+
+def _after(seconds: float, velocity: Motion) -> Punctual:
+    punctual = Punctual(100 * S)
+    for k in range(round(seconds * RATE_HZ)):
+        t_s = k / RATE_HZ
+        punctual = punctual.with_one(100 * S + round(t_s * S), *velocity(t_s), SD_M)
+    return punctual
+
+
+def _straight(t_s: float) -> tuple[float, float]:
+    return 20.0, -12.0
+
+
+def _braking(t_s: float) -> tuple[float, float]:
+    return 20.0 - 0.6 * t_s, -12.0 + 0.36 * t_s
+
+
+def _bend(t_s: float) -> tuple[float, float]:
+    yaw = math.radians(10.0) * max(0.0, t_s - 10.0)
+    return 15.0 * math.cos(yaw), 15.0 * math.sin(yaw)
+
+
+def _ends_braking(t_s: float) -> tuple[float, float]:
+    return 20.0 - 1.5 * min(t_s, 6.0), 0.0
+
+
+@pytest.mark.parametrize("motion", [_straight, _braking])
+def test_an_even_acceleration_tells_nothing(motion: Motion) -> None:
+    """What is late is then another motion of the same acceleration."""
+    punctual = _after(30.0, motion)
+    assert punctual.left == pytest.approx(0.0, abs=1e-6)
+    assert not punctual.told
+
+
+@pytest.mark.parametrize("motion", [_bend, _ends_braking])
+def test_a_change_of_acceleration_tells(motion: Motion) -> None:
+    assert _after(20.0, motion).told
+
+
+@pytest.mark.parametrize("motion", [_bend, _ends_braking])
+def test_what_is_left_is_what_least_squares_finds(motion: Motion) -> None:
+    """Of fixes that are late by tau the estimate, beside a place and a constant velocity, has the
+    sigma that is claimed."""
+    n = 100
+    t = np.arange(n) / RATE_HZ
+    v = np.array([motion(s) for s in t.tolist()])
+    line = np.column_stack((np.ones(n), t))
+    w = v - line @ np.linalg.lstsq(line, v, rcond=None)[0]
+    punctual = _after(n / RATE_HZ, motion)
+    assert punctual.left == pytest.approx(float(np.sum(w**2)))
+    rng = np.random.default_rng(4)
+    found = []
+    for _ in range(400):
+        z = -LATE_S * v + SD_M * rng.standard_normal((n, 2))
+        found.append(-float(np.sum(w * z) / np.sum(w**2)))
+    claimed = SD_M / math.sqrt(punctual.left)
+    assert np.mean(found) == pytest.approx(LATE_S, abs=4.0 * claimed / 20.0)
+    assert np.std(found) == pytest.approx(claimed, rel=0.15)
+    assert punctual.told is (claimed * TOLD <= LATE_S)
+
+
+def test_nothing_is_told_before_the_second_fix() -> None:
+    assert not Punctual(0).told
+    assert not Punctual(0).with_one(0, 20.0, 0.0, SD_M).told
