@@ -151,12 +151,11 @@ class TapedKalman(TiltAxesFilter):
         return outcome
 
     def _carry_over(self, before: Array) -> None:
-        """P after an update of the estimate `before` (10 or 13,)."""
+        """P after an update of an `_estimate` `before`."""
         self._close()  # with P as it was: T begins the transition to the next node
         super()._carry_over(before)
         turn_rows(self._phi, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
-        if self._astray:
-            self._keep_antenna(self._phi, before)
+        self._keep(self._phi, before)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
