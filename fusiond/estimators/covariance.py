@@ -34,14 +34,14 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-# Before the factors of `decays`: the interval that they are of.
-_KEPT = 1
+# Where the factors of `decays` begin, behind the interval that they are of.
+KEPT = 1
 
 
 def work_size(width: int) -> int:
     """Doubles of work space that the kernels of a row width need, zero at first; `decays` at its
     end."""
-    return (6 + 9 + CORE_STRIDE) * width + (6 + 9) * CORE_STRIDE + 12 + _KEPT + width
+    return (6 + 9 + CORE_STRIDE) * width + (6 + 9) * CORE_STRIDE + 12 + KEPT + width
 
 
 @cache
@@ -112,95 +112,109 @@ def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
             weight[i] = step[3 + i // 2]
 
 
-@compiled("f8[::1](f8, f8[::1], i8, f8[::1])", forceinline=True)
-def decays(h: float, decay_rate: Array, width: int, work: Array) -> Array:
-    """What each parameter (n,) decays by in h seconds, 1 where it does not.
+@compiled("UniTuple(f8[::1], 7)(f8[::1], i8)")
+def work_parts(work: Array, width: int) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """The parts of `work` (work_size(width),) that the kernels of a row width take: `sensor`,
+    `top`, `turned`, `core_sensor`, `core`, `weight` and, for `decays`, `kept`.
 
-    Kept in `work` from one interval to the next, which is most often as long: an exponential a
+    Made once for many intervals: a slice counts the references to its memory, atomically, and
+    those of an interval took a third of its time.
+    """
+    a = 6 * width
+    b = a + 9 * width
+    c = b + width * CORE_STRIDE
+    d = c + 6 * CORE_STRIDE
+    e = d + 9 * CORE_STRIDE
+    f = e + 12
+    return work[:a], work[a:b], work[b:c], work[c:d], work[d:e], work[e:f], work[f:]
+
+
+@compiled("void(f8, f8[:, ::1], f8[::1])", forceinline=True)
+def decays(h: float, noise: Array, kept: Array) -> None:
+    """Write what each parameter decays by in h seconds, 1 where it does not, to `kept` (1 + n,)
+    from its `KEPT` on; `noise` (3, n) as of the model.
+
+    They are kept from one interval to the next, which is most often as long: an exponential a
     state, and one more for its estimate, cost a tenth of an interval.
     """
-    kept = work[work.shape[0] - width - _KEPT :]
     if kept[0] != h:
         kept[0] = h
-        for i in range(decay_rate.shape[0]):
-            kept[_KEPT + i] = math.exp(-h * decay_rate[i]) if decay_rate[i] > 0.0 else 1.0
-    return kept[_KEPT:]
+        for i in range(noise.shape[1]):
+            kept[KEPT + i] = math.exp(-h * noise[0, i]) if noise[0, i] > 0.0 else 1.0
 
 
 @cache
 def covariance_for(width: int) -> Callable[..., None]:
     """`propagate_covariance` for matrices of `width` rows."""
-    end, advance = work_size(width) - width - _KEPT - 12, _advance_for(width)
+    advance = _advance_for(width)
 
     @compiled(
-        "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8,"
-        "f8[::1])",
+        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1],"
+        "f8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
         variant=width,
     )
     def propagate_covariance(
-        cov: Array,
+        flat: Array,
         step: Array,
         c: Array,
         h: float,
         active: NDArray[np.bool_],
         sensor_terms: Indices,
+        sensor_slot: Indices,
         rate_terms: Indices,
         noise: Array,
         q: float,
-        work: Array,
+        sensor: Array,
+        top: Array,
+        turned: Array,
+        core_sensor: Array,
+        core: Array,
+        weight: Array,
+        kept: Array,
     ) -> None:
-        """Advance `cov` (width, width) in place by h seconds with transition coefficients `c`.
+        """Advance the covariance (width, width), `flat` (width^2,), in place by h seconds with
+        transition coefficients `c`.
 
-        The model's arrays are (n,); rows and columns of `cov` from n on are zero and stay so.
+        The model's arrays are (n,), `sensor_slot` the first row of its `sensor_terms`; rows and
+        columns from n on are zero and stay so. From `sensor` on what `work_parts` gives.
         """
-        decay_rate, white, steady_variance = noise[0], noise[1], noise[2]
-        sensor_slot = sensor_terms[0]
-        n = white.shape[0]
-        flat = cov.reshape(width * width)
-        weight = work[end : end + 12]
+        n = noise.shape[1]
         _weights(step, sensor_terms, weight)
-        a = 6 * width
-        b = a + 9 * width
-        d = b + width * CORE_STRIDE
-        e = d + 6 * CORE_STRIDE
-        sensor, top, turned = work[:a], work[a:b], work[b:d]
-        core_sensor, core = work[d:e], work[e:end]
         half = 0.5 * h * q
         for i in range(CORE_SIZE):
-            flat[i * width + i] += half * white[i]
+            flat[i * width + i] += half * noise[1, i]
 
         advance(flat, sensor_slot, weight, c, active, sensor, top)
-        for j in range(width):
-            for i in range(CORE_SIZE):
-                turned[j * CORE_STRIDE + i] = top[i * width + j]
-        # Written back before `turned` is read again: its scalar stores are done by then.
+        # As rows and as columns at once, and the rest of the columns from what then lies together.
         for i in range(CORE_SIZE):
             for j in range(width):
-                flat[i * width + j] = top[i * width + j]
+                value = top[i * width + j]
+                turned[j * CORE_STRIDE + i] = value
+                flat[i * width + j] = value
         for j in range(CORE_SIZE, width):
             for i in range(CORE_SIZE):
-                flat[j * width + i] = top[i * width + j]
+                flat[j * width + i] = turned[j * CORE_STRIDE + i]
         _advance_core(turned, sensor_slot, weight, c, active, core_sensor, core)
         for i in range(CORE_SIZE):
             for j in range(CORE_SIZE):
                 lower, upper = core[i * CORE_STRIDE + j], core[j * CORE_STRIDE + i]
                 flat[i * width + j] = 0.5 * (lower + upper)
-            flat[i * width + i] += half * white[i]
+            flat[i * width + i] += half * noise[1, i]
         for k in range(rate_terms.shape[1]):
             offset, rate = rate_terms[0, k], rate_terms[1, k]
             for j in range(width):
                 flat[offset * width + j] += h * flat[rate * width + j]
             for j in range(width):
                 flat[j * width + offset] += h * flat[j * width + rate]
-        factors = decays(h, decay_rate, width, work)
+        decays(h, noise, kept)
         for i in range(CORE_SIZE, n):
-            variance = q * h * white[i]
-            if decay_rate[i] > 0.0:
-                decay = factors[i]
+            variance = q * h * noise[1, i]
+            if noise[0, i] > 0.0:
+                decay = kept[KEPT + i]
                 for j in range(width):
                     flat[i * width + j] *= decay
                     flat[j * width + i] *= decay
-                variance += q * steady_variance[i] * (1.0 - decay * decay)
+                variance += q * noise[2, i] * (1.0 - decay * decay)
             flat[i * width + i] += variance
 
     return propagate_covariance
@@ -209,41 +223,42 @@ def covariance_for(width: int) -> Callable[..., None]:
 @cache
 def transition_for(width: int) -> Callable[..., None]:
     """`propagate_transition` for matrices of `width` rows."""
-    end, advance = work_size(width) - width - _KEPT - 12, _advance_for(width)
+    advance = _advance_for(width)
 
     @compiled(
-        "void(f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "f8[::1])",
+        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1],"
+        "f8[::1], f8[::1], f8[::1], f8[::1])",
         variant=width,
     )
     def propagate_transition(
-        phi: Array,
+        flat: Array,
         step: Array,
         c: Array,
         h: float,
         active: NDArray[np.bool_],
         sensor_terms: Indices,
+        sensor_slot: Indices,
         rate_terms: Indices,
         noise: Array,
-        work: Array,
+        sensor: Array,
+        top: Array,
+        weight: Array,
+        kept: Array,
     ) -> None:
-        """phi (width, width) <- transition over h seconds times phi."""
-        decay_rate = noise[0]
-        flat = phi.reshape(width * width)
-        weight = work[end : end + 12]
+        """phi (width, width), `flat` (width^2,) <- transition over h seconds times phi; arguments
+        as of `propagate_covariance`."""
         _weights(step, sensor_terms, weight)
-        sensor, top = work[: 6 * width], work[6 * width : 15 * width]
-        advance(flat, sensor_terms[0], weight, c, active, sensor, top)
+        advance(flat, sensor_slot, weight, c, active, sensor, top)
         for i in range(CORE_SIZE * width):
             flat[i] = top[i]
         for k in range(rate_terms.shape[1]):
             offset, rate = rate_terms[0, k], rate_terms[1, k]
             for j in range(width):
                 flat[offset * width + j] += h * flat[rate * width + j]
-        factors = decays(h, decay_rate, width, work)
-        for i in range(CORE_SIZE, decay_rate.shape[0]):
-            if decay_rate[i] > 0.0:
-                decay = factors[i]
+        decays(h, noise, kept)
+        for i in range(CORE_SIZE, noise.shape[1]):
+            if noise[0, i] > 0.0:
+                decay = kept[KEPT + i]
                 for j in range(width):
                     flat[i * width + j] *= decay
 
@@ -251,18 +266,16 @@ def transition_for(width: int) -> Callable[..., None]:
 
 
 @compiled("void(f8[::1], f8, i8[:, ::1], f8[::1])", forceinline=True)
-def propagate_parameters(x: Array, h: float, rate_terms: Indices, factors: Array) -> None:
-    """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay by
-    `factors` (`decays`)."""
+def propagate_parameters(x: Array, h: float, rate_terms: Indices, kept: Array) -> None:
+    """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay by what
+    `decays` has `kept` for it."""
     for k in range(rate_terms.shape[1]):
         x[rate_terms[0, k]] += h * x[rate_terms[1, k]]
     for i in range(CORE_SIZE, x.shape[0]):
-        x[i] *= factors[i]
+        x[i] *= kept[KEPT + i]
 
 
-@compiled(
-    "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[::1], i8, f8[::1])"
-)
+@compiled("void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[::1], f8[::1])")
 def propagate_error(
     dx: Array,
     step: Array,
@@ -271,14 +284,11 @@ def propagate_error(
     active: NDArray[np.bool_],
     sensor_terms: Indices,
     rate_terms: Indices,
-    decay_rate: Array,
-    width: int,
+    kept: Array,
     work: Array,
 ) -> None:
-    """dx (n,) <- Phi dx over h seconds: an estimate that is not fed back yet (paper 000, 1.1).
-
-    `work` as for rows of `width`.
-    """
+    """dx (n,) <- Phi dx over h seconds, which `decays` has `kept`: an estimate that is not fed back
+    yet (paper 000, 1.1)."""
     sensor = work[: 6 * CORE_STRIDE]
     rows = work[6 * CORE_STRIDE : 15 * CORE_STRIDE]
     out = work[15 * CORE_STRIDE : 24 * CORE_STRIDE]
@@ -293,4 +303,4 @@ def propagate_error(
     apply_to_core(rows, sensor, c, out)
     for i in range(CORE_SIZE):
         dx[i] = out[i * CORE_STRIDE] if active[i] else 0.0
-    propagate_parameters(dx, h, rate_terms, decays(h, decay_rate, width, work))
+    propagate_parameters(dx, h, rate_terms, kept)

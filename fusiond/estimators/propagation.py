@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.covariance import (
     covariance_for,
-    decays,
     propagate_error,
     propagate_parameters,
     transition_for,
+    work_parts,
     work_size,
 )
 from fusiond.estimators.reading import WIDER, in_fix_time, sigmas, widen
@@ -92,25 +92,38 @@ def slopes(
     return silent
 
 
-@compiled("void(f8[:, ::1], b1[::1], f8, f8)", forceinline=True)
-def widen_for_gap(cov: Array, active: NDArray[np.bool_], whole: float, h: float) -> None:
-    """Add to `cov` what h seconds of an IMU silence of `whole` seconds leave unknown."""
+@compiled("void(f8[::1], i8, b1[::1], f8, f8)", forceinline=True)
+def widen_for_gap(
+    cov: Array, width: int, active: NDArray[np.bool_], whole: float, h: float
+) -> None:
+    """Add to `cov`, flat and of `width` rows, what h seconds of an IMU silence of `whole` seconds
+    leave unknown."""
     for r in range(CORE_SIZE):
         if not active[r]:
             continue
+        at = r * width + r
         if r < 3:
-            cov[r, r] += GAP_RATE_RAD_S**2 * whole * h
+            cov[at] += GAP_RATE_RAD_S**2 * whole * h
         elif r < 6:
-            cov[r, r] += GAP_FORCE_M_S2**2 * whole * h
+            cov[at] += GAP_FORCE_M_S2**2 * whole * h
         else:
-            cov[r, r] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
+            cov[at] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
 
 
-@compiled("void(f8[:, ::1], b1[::1], f8[::1], f8[::1], f8)", forceinline=True)
-def shake(cov: Array, active: NDArray[np.bool_], step: Array, density: Array, h: float) -> None:
-    """Add to `cov` what h seconds of noise of `density` (6,), body axes, leave: C diag(n) C^T h."""
+@compiled("void(f8[::1], i8, b1[::1], f8[::1], f8[:, ::1], i8, f8)", forceinline=True)
+def shake(
+    cov: Array,
+    width: int,
+    active: NDArray[np.bool_],
+    step: Array,
+    densities: Array,
+    row: int,
+    h: float,
+) -> None:
+    """Add to `cov`, flat and of `width` rows, what h seconds of noise of a row of `densities`
+    (m, 6), body axes, leave: C diag(n) C^T h."""
     for first in (0, 3):
-        if density[first] + density[first + 1] + density[first + 2] == 0.0:
+        if densities[row, first] + densities[row, first + 1] + densities[row, first + 2] == 0.0:
             continue
         for i in range(3):
             for j in range(3):
@@ -118,21 +131,22 @@ def shake(cov: Array, active: NDArray[np.bool_], step: Array, density: Array, h:
                     total = 0.0
                     for k in range(3):
                         a, b = step[STEP_DCM + 3 * i + k], step[STEP_DCM + 3 * j + k]
-                        total += a * b * density[first + k]
-                    cov[first + i, first + j] += h * total
+                        total += a * b * densities[row, first + k]
+                    cov[(first + i) * width + first + j] += h * total
 
 
-@compiled("void(f8[:, ::1], f8)", forceinline=True)
-def turn_tilt(cov: Array, known: float) -> None:
-    """Add to `cov` what a turn does to the axes of a tilt, if nobody knows whether it was one: the
-    heading's variance was `known` (rad^2) before it (fusiond.estimators.tilt_axes)."""
-    grown = cov[2, 2] - known
+@compiled("void(f8[::1], i8, f8)", forceinline=True)
+def turn_tilt(cov: Array, width: int, known: float) -> None:
+    """Add to `cov`, flat and of `width` rows, what a turn does to the axes of a tilt, if nobody
+    knows whether it was one: the heading's variance was `known` (rad^2) before it
+    (fusiond.estimators.tilt_axes)."""
+    grown = cov[2 * width + 2] - known
     if grown > 0.0:
-        north, east, both = cov[0, 0], cov[1, 1], cov[0, 1]
-        cov[0, 0] += grown * east
-        cov[1, 1] += grown * north
-        cov[0, 1] -= grown * both
-        cov[1, 0] = cov[0, 1]
+        north, east, both = cov[0], cov[width + 1], cov[1]
+        cov[0] += grown * east
+        cov[width + 1] += grown * north
+        cov[1] -= grown * both
+        cov[width] = cov[1]
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])")
@@ -221,9 +235,12 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         samples, densities = imu[m : 7 * m].reshape((m, 6)), imu[7 * m : 13 * m].reshape((m, 6))
         nav_out = imu[13 * m : 23 * m].reshape((m, 10))
         sigma_out = imu[23 * m :].reshape((m, 9))
-        decay_rate = noise[0]
         sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
         c, work = scratch[:COEFFICIENTS], scratch[COEFFICIENTS + 24 :]
+        parts = work_parts(work, width)
+        sensor, top, turned, core_sensor, core, weight, kept = parts
+        flats, first_cov = covs.reshape((covs.shape[0], width * width)), covs[0]
+        flat_phi = phi.reshape(phi.size)
         rate, force = (
             scratch[COEFFICIENTS : COEFFICIENTS + 3],
             scratch[COEFFICIENTS + 3 : COEFFICIENTS + 6],
@@ -233,7 +250,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         estimate = scratch[COEFFICIENTS + 12 : COEFFICIENTS + 24]
         decaying = rate_terms.shape[1] > 0
         for j in range(CORE_SIZE, xi.shape[0]):
-            decaying = decaying or decay_rate[j] > 0.0
+            decaying = decaying or noise[0, j] > 0.0
         sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
         i = first
         while i < end and now < target:
@@ -247,19 +264,47 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 # The held sample of a gap is a guess: its error acts over the whole of it.
                 whole = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
                 for k in range(covs.shape[0]):
-                    cov, q = covs[k], 1.0 / shares[k]
-                    known = cov[2, 2]
+                    cov, q = flats[k], 1.0 / shares[k]
+                    known = cov[2 * width + 2]
                     propagate_covariance(
-                        cov, step, c, h, active, sensor_terms, rate_terms, noise, q, work
+                        cov,
+                        step,
+                        c,
+                        h,
+                        active,
+                        sensor_terms,
+                        sensor_slot,
+                        rate_terms,
+                        noise,
+                        q,
+                        sensor,
+                        top,
+                        turned,
+                        core_sensor,
+                        core,
+                        weight,
+                        kept,
                     )
-                    shake(cov, active, step, densities[i], h / shares[k])
+                    shake(cov, width, active, step, densities, i, h / shares[k])
                     if silent:
-                        widen_for_gap(cov, active, whole, h / shares[k])
+                        widen_for_gap(cov, width, active, whole, h / shares[k])
                     if turning:
-                        turn_tilt(cov, known)
+                        turn_tilt(cov, width, known)
                 if phi.shape[0]:
                     propagate_transition(
-                        phi, step, c, h, active, sensor_terms, rate_terms, noise, work
+                        flat_phi,
+                        step,
+                        c,
+                        h,
+                        active,
+                        sensor_terms,
+                        sensor_slot,
+                        rate_terms,
+                        noise,
+                        sensor,
+                        top,
+                        weight,
+                        kept,
                     )
                 if carry:
                     for k in range(dxs.shape[0]):
@@ -271,20 +316,19 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                             active,
                             sensor_terms,
                             rate_terms,
-                            decay_rate,
-                            width,
+                            kept,
                             work,
                         )
                 if decaying:
-                    factors = decays(h, decay_rate, width, work)
-                    propagate_parameters(xi, h, rate_terms, factors)
+                    propagate_parameters(xi, h, rate_terms, kept)
                     sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
             now = stop
             if now == times[i]:
                 if record:
                     in_fix_time(nav, xi, step, time_slot, nav_out[i])
-                    sigmas(covs[0], nav, step, time_slot, clock_sd_s, axes_sd_rad, sigma_out[i])
-                    widen(wider, sigma_out[i])
+                    out = sigma_out[i]
+                    sigmas(first_cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
+                    widen(wider, out)
                 i += 1
         return i, now
 

@@ -30,7 +30,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.covariance import covariance_for, decays, propagate_parameters
+from fusiond.estimators.covariance import covariance_for, propagate_parameters, work_parts
 from fusiond.estimators.propagation import (
     compensate,
     sensor_estimates,
@@ -192,7 +192,8 @@ def propagate_points(
     work_size(width) doubles.
     """
     n, width = xi.shape[0], cov.shape[0]
-    decay_rate = noise[0]
+    flat, parts = cov.reshape(width * width), work_parts(work, width)
+    kept = parts[6]
     sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
     root, odd = np.empty((POINTS, width)), np.empty((POINTS, width))
     even = np.empty((POINTS, CORE_SIZE))
@@ -219,17 +220,16 @@ def propagate_points(
             scale[1] = (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT])
 
             coefficients(nav, step, h, c)
-            terms = (active, sensor_terms, rate_terms, noise, 1.0, work)
+            terms = (active, sensor_terms, sensor_slot, rate_terms, noise, 1.0)
             if width == WIDTHS[0]:
-                _covariance_narrow(cov, step, c, h, *terms)
+                _covariance_narrow(flat, step, c, h, *terms, *parts)
             elif width == WIDTHS[1]:
-                _covariance_middle(cov, step, c, h, *terms)
+                _covariance_middle(flat, step, c, h, *terms, *parts)
             elif width == WIDTHS[2]:
-                _covariance_wide(cov, step, c, h, *terms)
+                _covariance_wide(flat, step, c, h, *terms, *parts)
             else:
-                _covariance_widest(cov, step, c, h, *terms)
+                _covariance_widest(flat, step, c, h, *terms, *parts)
 
-            factors = decays(h, decay_rate, width, work)
             # Point 0 is the mean, 2 k + 1 and 2 k + 2 are the pair along L_k.
             for point in range(2 * POINTS + 1):
                 k, which = (point - 1) // 2, (point - 1) % 2 + 1
@@ -262,7 +262,7 @@ def propagate_points(
                     if not active[j]:
                         odd[k, j] = 0.0
                         even[k, j] = 0.0
-                propagate_parameters(odd[k, :n], h, rate_terms, factors)
+                propagate_parameters(odd[k, :n], h, rate_terms, kept)
 
             mean[:] = 0.0
             for j in range(CORE_SIZE):
@@ -278,17 +278,17 @@ def propagate_points(
                     mean[a] += factor / spread
                     for b in range(CORE_SIZE):
                         cov[a, b] += factor * even[k, b]
-            propagate_parameters(xi, h, rate_terms, factors)
+            propagate_parameters(xi, h, rate_terms, kept)
             if carry:
                 for j in range(CORE_SIZE):
                     dx[j] = mean[j]
-                propagate_parameters(dx, h, rate_terms, factors)
+                propagate_parameters(dx, h, rate_terms, kept)
             else:
                 feed_back(nav, xi, mean)
-            shake(cov, active, step, densities[i], h)
+            shake(flat, width, active, step, densities, i, h)
             if silent:
                 # The held sample is a guess: its error acts over the whole of the gap.
-                widen_for_gap(cov, active, (times[i] - times[i - 1]) * 1e-9, h)
+                widen_for_gap(flat, width, active, (times[i] - times[i - 1]) * 1e-9, h)
         now = stop
         if now == times[i]:
             if record:
