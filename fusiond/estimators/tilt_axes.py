@@ -53,7 +53,6 @@ from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT
-from fusiond.estimators.turn_rate import gyro_slots, keep_turn
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
@@ -130,9 +129,8 @@ def carry_over(p: Array, before: Array, after: Array, biases: Indices) -> float:
 
 
 class TiltAxesFilter(KalmanEstimator):
-    """The centralised filter, in whose P the axes of a tilt turn with the heading, what is known of
-    the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
-    of an antenna where a lever arm is estimated (fusiond.estimators.antenna_place)."""
+    """The centralised filter, in whose P the axes of a tilt turn with the heading, and the place of
+    an antenna stays where a lever arm is estimated (fusiond.estimators.antenna_place)."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         super().__init__(model, gap_s)
@@ -143,7 +141,6 @@ class TiltAxesFilter(KalmanEstimator):
         known = found if found and found[0][1] == 2 else []
         self._biases = np.array(known, dtype=np.int64).reshape(-1, 2).T.copy()
         self._slots = self._biases[0]
-        self._gyros = gyro_slots(model) if known else self._slots
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
         if known:
@@ -172,23 +169,18 @@ class TiltAxesFilter(KalmanEstimator):
         return super().update(aid)
 
     def _estimate(self) -> Array:
-        """Nav (10,), the gyros' biases (0 or 3,), what is left of the lever arm (0 or 3,)."""
-        return np.concatenate([self.nav, self.xi[self._gyros], self.xi[self._lever]])
+        """Nav (10,), and what is left of the lever arm (0 or 3,)."""
+        return np.concatenate([self.nav, self.xi[self._lever]]) if self._astray else self.nav.copy()
 
     def _carry_over(self, before: Array) -> None:
-        """P after an update of an `_estimate` `before`."""
+        """P after an update of the estimate `before` (10 or 13,)."""
         p = self._covariance
         self.turned = carry_over(p, before[Q0:NAV_SIZE], self.nav[Q0:], self._biases)
-        for rows in (p, p.T):
-            self._keep(rows, before)
-
-    def _keep(self, rows: Array, before: Array) -> None:
-        """M (n, k) <- T M: what is known of the gyros, and of the antenna's place."""
-        end = NAV_SIZE + self._gyros.size
-        if self._gyros.size:
-            told = self.xi[self._gyros] - before[NAV_SIZE:end]
-            turned = before[Q0:NAV_SIZE], self.nav[Q0:], self.turned
-            keep_turn(rows, *turned, told, self._gyros)
         if self._astray:
-            arms = before[end:], self.xi[self._lever]
-            keep_antenna(rows, before[:NAV_SIZE], self.nav, *arms, self._lever, self._late)
+            for rows in (p, p.T):
+                self._keep_antenna(rows, before)
+
+    def _keep_antenna(self, rows: Array, before: Array) -> None:
+        """M (n, k) <- T M."""
+        arms = before[NAV_SIZE:], self.xi[self._lever]
+        keep_antenna(rows, before[:NAV_SIZE], self.nav, *arms, self._lever, self._late)

@@ -151,11 +151,12 @@ class TapedKalman(TiltAxesFilter):
         return outcome
 
     def _carry_over(self, before: Array) -> None:
-        """P after an update of an `_estimate` `before`."""
+        """P after an update of the estimate `before` (10 or 13,)."""
         self._close()  # with P as it was: T begins the transition to the next node
         super()._carry_over(before)
         turn_rows(self._phi, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
-        self._keep(self._phi, before)
+        if self._astray:
+            self._keep_antenna(self._phi, before)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
