@@ -53,9 +53,9 @@ from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
 from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
-from fusiond.integrity.punctual import Punctual
+from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
-from fusiond.integrity.support import FINE_M, FORGET_NS, MOVING_M_S, Lost
+from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting
 from fusiond.navigation.strapdown import LAT, LON, VD, VE, VN
 
@@ -116,7 +116,7 @@ class Isolation:
         self.hedge = Hedge()
         self.shown: tuple[float, ...] = ()
         """By how much (m, m/s) the series that was judged last was off, if it had a bias."""
-        self._contradicted = False
+        self._contradicted = self._failed = False
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -180,10 +180,11 @@ class Isolation:
         self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
         self.hedge.wider = memory.wider
 
-    def reset(self, contradicted: bool = False) -> None:
+    def reset(self, contradicted: bool = False, failed: bool = False) -> None:
         """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
-        their velocities are to prove themselves, as after an outage."""
-        self._contradicted = contradicted
+        their velocities are to prove themselves, as after an outage; and where one before it has
+        `failed`, that they are on time."""
+        self._contradicted, self._failed = contradicted, failed
         self._records, self._shared = {}, set()
         self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
 
@@ -274,12 +275,14 @@ class Isolation:
     def _prove(self, record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
         """A position is fused; whether it runs away from the motion since an outage, which a
         velocity of the same device supports."""
-        suspect = self._contradicted and record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
+        first = record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
+        suspect = self._contradicted and first
+        if self._failed and first:
+            record.punctual = Punctual(offer.t_ns, started=True)
         out = support.outage(self._records, offer.t_ns)
         if out:
-            record.punctual = (
-                Punctual(offer.t_ns) if self._behind(record, offer, outcome, nav) else None
-            )
+            behind = self._behind(record, offer, outcome, nav)
+            record.punctual = Punctual(offer.t_ns) if behind else None
         if record.punctual is not None:
             v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
             since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)

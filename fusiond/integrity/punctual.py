@@ -12,6 +12,10 @@ Until a lateness of `LATE_S` is beyond `TOLD` of this, nobody can tell. A receiv
 where the filter was is believed; of one whose first fix lies behind it by more than is likely
 (fusiond.integrity.isolation) the mode says so meanwhile. Sigma does not: it would have to be tau v.
 
+So of one whose fixes a filter was started from after a failure: nothing is known of it but those
+fixes, and braking evenly goes with late ones as well as with good ones. The heading of such a start
+is theirs too, and in an even bend late fixes are a heading: there only the speed tells.
+
 Source: least squares; as of fusiond.navigator.alignment.lateness, which finds tau itself.
 """
 
@@ -25,6 +29,8 @@ from typing import NamedTuple
 LATE_S = 0.3
 # What is told with a false alarm in a million, in half of the cases (sqrt of 27.6).
 TOLD = 5.25
+# Faster than this (m/s) the vehicle moves: what is measured of it changes.
+MOVING_M_S = 1.0
 
 
 class Punctual(NamedTuple):
@@ -43,10 +49,21 @@ class Punctual(NamedTuple):
     sd: float = 0.0
     speed: float = 0.0
     """At the last of them (m/s)."""
+    started: bool = False
+    """The filter was started from them: only the speed counts."""
+
+    @property
+    def matters(self) -> bool:
+        """Whether a lateness would be worse than a fix: of a start, or it moves it by less than
+        what one fix is good to; of what came back, whether the vehicle moves at all."""
+        least_m_s = self.sd / LATE_S if self.started else MOVING_M_S
+        return self.speed > least_m_s
 
     def with_one(self, t_ns: int, north: float, east: float, sd: float) -> Punctual:
         """With one fix more at `t_ns`, of sigma `sd` (m), of a filter with that velocity (m/s)."""
-        t_s = (t_ns - self.begin_ns) * 1e-9
+        t_s, speed = (t_ns - self.begin_ns) * 1e-9, math.hypot(north, east)
+        if self.started:
+            north, east = speed, 0.0
         return Punctual(
             self.begin_ns,
             self.n + 1,
@@ -58,7 +75,8 @@ class Punctual(NamedTuple):
             self.t_east + t_s * east,
             self.square + north * north + east * east,
             max(self.sd, sd),
-            math.hypot(north, east),
+            speed,
+            self.started,
         )
 
     @property

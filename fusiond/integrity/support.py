@@ -17,8 +17,6 @@ from fusiond.integrity.series import NEVER_NS, REPEATED, Series, said
 FORGET_NS = 5_000_000_000
 # Another position supports the filter for as long as `coasting` is not said.
 OTHERS_NS = 10_000_000_000
-# Faster than this (m/s) the vehicle moves: what is measured of it changes.
-MOVING_M_S = 1.0
 # A position of this sigma (m) sees within seconds what a wrong velocity does to the filter.
 FINE_M = 3.0
 # A position says nothing of what is finer than it by more than this.
@@ -100,11 +98,12 @@ def contested(records: Records, t_ns: int) -> str | None:
             return f"{name} is back and not yet seen to go with the motion"
         if (
             r.punctual
-            and r.punctual.speed > MOVING_M_S
+            and r.punctual.matters
             and r.believed
             and not others(records, r, t_ns, FINE_M)
         ):
-            return f"{name} is back, and no change of velocity has shown yet that it is on time"
+            came = "began anew after a failure" if r.punctual.started else "is back"
+            return f"{name} {came}, and no change of velocity has shown yet that it is on time"
     return None
 
 

@@ -16,7 +16,9 @@ what follows for the operator:
 A filter that was given up and aligned anew is on trial for a while: its mode stays `invalid` until
 it has gone on without a doubt. What made it fail may be there still, and driving on at one speed
 shows neither a wrong IMU nor stamps that are late: on a straight they are late by a way, in a
-bend of rate w by a heading of w times as much. It coasts until its speed has changed.
+bend of rate w by a heading of w times as much. It coasts until its speed has changed, and until the
+positions would have shown that they are late (fusiond.integrity.punctual): that the speed changes
+evenly shows nothing of it.
 """
 
 from __future__ import annotations
@@ -86,6 +88,11 @@ class Standing:
         """A navigation has begun."""
         self._started_ns, self._turned_ns, self._turned = t_ns, NEVER_NS, False
         self._shaken = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether a navigation was given up before this one."""
+        return self._trial_ns > 0
 
     def turned(self, t_ns: int) -> None:
         """The gyros have felt a turn of a vehicle that stands."""

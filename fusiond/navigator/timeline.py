@@ -96,12 +96,14 @@ class Timeline:
         self.isolation = Isolation()
         self._wider = self.isolation.hedge.wider
 
-    def start(self, contradicted: bool = False, used: Collection[Offer] = ()) -> None:
+    def start(
+        self, contradicted: bool = False, used: Collection[Offer] = (), failed: bool = False
+    ) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
         it was made of, `used`, once more. `contradicted`: positions have moved otherwise than their
-        velocities."""
+        velocities; `failed`: the navigation before this one was given up."""
         self._next = 0
-        self.isolation.reset(contradicted)
+        self.isolation.reset(contradicted, failed)
         self._hedge()
         self._checkpoints = [
             _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())

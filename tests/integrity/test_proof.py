@@ -236,3 +236,20 @@ def test_one_that_comes_back_behind_the_filter_waits_for_a_change_of_velocity(
     assert any(told[LAST:]) is waits
     assert told[LAST + 199] is waits
     assert not told[-1]
+
+
+@pytest.mark.parametrize("failed", [True, False])
+def test_a_start_after_a_failure_waits_until_an_even_braking_ends(failed: bool) -> None:
+    """By then its speed has changed by 10 m/s, which says nothing of how late its fixes are."""
+    isolation, journey, told = Isolation(), Journey(1), []
+    isolation.reset(failed=failed)
+    for k in range(150):
+        offer, nav = journey.at(k)
+        nav[VN], nav[VE] = 10.0 + max(0.65 * (75 - k), 3.0 * (k - 75)) / RATE_HZ, 0.0
+        nav[LAT], nav[LON] = offer.lat_rad, offer.lon_rad
+        place = offer.lat_rad, offer.lon_rad, offer.height_m
+        aid = PositionAid("gnss", offer.t_ns, 0.9999, *place, offer.sd, offer.lever)
+        isolation.judge(aid, Outcome("fused", 1.0, 3), nav)
+        told.append("began anew" in (isolation.contested(aid.t_ns) or ""))
+    assert told[:76] == [failed] * 76
+    assert not told[-1]

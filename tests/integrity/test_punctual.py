@@ -14,10 +14,11 @@ from fusiond.integrity.punctual import LATE_S, TOLD, Punctual
 Array = NDArray[np.float64]
 RATE_HZ, SD_M, S = 5.0, 0.6, 1_000_000_000
 Motion = Callable[[float], tuple[float, float]]
+BEGUN = Punctual(100 * S)
 
 
-def _after(seconds: float, velocity: Motion) -> Punctual:
-    punctual = Punctual(100 * S)
+def _after(seconds: float, velocity: Motion, begun: Punctual = BEGUN) -> Punctual:
+    punctual = begun
     for k in range(round(seconds * RATE_HZ)):
         t_s = k / RATE_HZ
         punctual = punctual.with_one(100 * S + round(t_s * S), *velocity(t_s), SD_M)
@@ -35,6 +36,10 @@ def _braking(t_s: float) -> tuple[float, float]:
 def _bend(t_s: float) -> tuple[float, float]:
     yaw = math.radians(10.0) * max(0.0, t_s - 10.0)
     return 15.0 * math.cos(yaw), 15.0 * math.sin(yaw)
+
+
+def _steady(t_s: float) -> tuple[float, float]:
+    return 15.0 * math.cos(0.1 * t_s), 15.0 * math.sin(0.1 * t_s)
 
 
 def _ends_braking(t_s: float) -> tuple[float, float]:
@@ -74,6 +79,20 @@ def test_what_is_left_is_what_least_squares_finds(motion: Motion) -> None:
     assert np.mean(found) == pytest.approx(LATE_S, abs=4.0 * claimed / 20.0)
     assert np.std(found) == pytest.approx(claimed, rel=0.15)
     assert punctual.told is (claimed * TOLD <= LATE_S)
+
+
+def test_of_a_start_only_the_speed_tells() -> None:
+    """Its heading is that of the fixes; and what drives slowly is not off by more than a fix."""
+    bend, braking = (
+        _after(40.0, motion, Punctual(100 * S, started=True)) for motion in (_steady, _ends_braking)
+    )
+    assert bend.left == pytest.approx(0.0, abs=1e-6)
+    assert not bend.told
+    assert bend.matters
+    assert braking.told
+    slow = Punctual(0, started=True).with_one(0, 0.9 * SD_M / LATE_S, 0.0, SD_M)
+    assert not slow.matters
+    assert slow._replace(started=False).matters
 
 
 def test_nothing_is_told_before_the_second_fix() -> None:

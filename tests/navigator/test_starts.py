@@ -260,6 +260,42 @@ def test_velocities_that_are_none_are_no_start() -> None:
     assert math.sqrt(start.covariance[2, 2]) < 10.0 * DEG
 
 
+def test_no_start_is_made_of_velocities_that_the_positions_contradicted() -> None:
+    """They were 6 m/s off until a bend had begun, in which a jump of the velocity looks much like a
+    force bias of 1 m/s^2: fits of all of them were accepted with tilts 10 deg off at an NEES of 50
+    and more."""
+    legs = (Leg(1), Leg(6, speed_m_s=20.0), Leg(4), Leg(16, turn_deg=93.0), Leg(60))
+    case, five = CASES["on the move"]._replace(legs=legs), []
+    config = Config.model_validate({"imu": SHEET, "alignment": {"heading": ["gnss_course"]}})
+    for seed in range(8):
+        navigator, rng = Navigator(config), np.random.default_rng(seed)
+        times, run = runs.sample_times(_truth(case)), _run(case, seed)
+        wrong = 6.0 * np.array([math.cos(0.5 * math.pi * seed), math.sin(0.5 * math.pi * seed)])
+        for row in range(450, 2900, EVERY):
+            part = slice(row, row + EVERY)
+            navigator.add_imu(times[part], run.samples[part])
+            fix = _fix(case, row, rng)
+            if row < 700:
+                assert fix.v_ned_m_s is not None
+                north, east = (np.array(fix.v_ned_m_s[:2]) + wrong).tolist()
+                fix = replace(fix, v_ned_m_s=(north, east, fix.v_ned_m_s[2]))
+            navigator.add(fix, fix.t_seen_ns, seen_ns=fix.t_seen_ns)
+            navigator.advance()
+            if navigator.started is not None:
+                break
+        start = navigator.started
+        assert start is not None
+        assert start.contradicted
+        row = round(start.t_ns * 1e-9 * RATE_HZ) - 1
+        true = runs.true_nav(_truth(case), np.array([start.t_ns * 1e-9]))[0]
+        tilt = runs.nav_error(start.nav, true)[:2]
+        both = np.concatenate((tilt, run.biases[row, 3:] - start.xi[12:15]))
+        p = start.covariance[np.ix_(TILT_AND_FORCE, TILT_AND_FORCE)]
+        five.append(both @ np.linalg.solve(p, both))
+    print(f"mean NEES of tilt and force biases {np.mean(five):.2f} of 5")
+    assert np.mean(five) < float(chi2.ppf(0.999, 5 * len(five))) / len(five)
+
+
 def test_straight_on_at_constant_speed_nobody_knows_forward_from_backward() -> None:
     """Below the speed that one reverses at it waits, and says what to do."""
     case = Case((Leg(1), Leg(6, speed_m_s=5.0), Leg(60)), MOVING, 9.0)

@@ -94,7 +94,7 @@ class Aligner:
             sources = (HEADING_SOURCES[name] for name in self._basis.options.heading)
             found = (source(self._basis, imu, place) for source in sources)
             start = next((s for s in found if s is not None), None)
-            if start is not None and self.known.contradicted:
+            if start is not None and self.known.contradicted_ns is not None:
                 start = replace(start, contradicted=True)
         if start is None:
             latitude = None if place is None else float(place[1][0])

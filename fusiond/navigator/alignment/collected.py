@@ -104,8 +104,9 @@ class Collected:
         self.compass: HeadingOffer | None = None
         self.fixes: list[Fix] = []
         """The last measurements that offered both, velocity and position."""
-        self.contradicted = False
-        """Whether positions have moved otherwise than the velocities of their receiver."""
+        self.contradicted_ns: int | None = None
+        """The last fix at which positions had moved otherwise than the velocities of their
+        receiver: which of those before it were wrong nobody knows."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
@@ -263,13 +264,13 @@ class Collected:
         sd = math.hypot(max(first.sd[:2]), max(latest.position.sd[:2]), WAY_SCALE * size)
         sd = math.hypot(sd, sd_v * span_s)
         if math.hypot(*(moved - way)) > CONTRADICTION_SIGMAS * sd:
-            self.contradicted = True
+            self.contradicted_ns = latest.velocity.t_ns
             return False
         slope, sd_slope = trend.slope
         lag = LAG_SD_S * math.hypot(*latest.velocity.v_ned[:2]) / max(span_s, 1.0)
         sd_slope = math.hypot(sd_slope, max(sd_v / math.sqrt(count), LEAST_SD_M_S), lag)
         if slope > CONTRADICTION_SIGMAS * sd_slope:
-            self.contradicted = True
+            self.contradicted_ns = latest.velocity.t_ns
             return False
         return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_s >= CONFIRMED_S
 
