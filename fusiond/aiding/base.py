@@ -113,6 +113,11 @@ class Aid:
         return self.source
 
     @property
+    def across_sd_m_s(self) -> float:
+        """Sigma of what an aid without slip (`no_slip`) knows of the velocity across; else 0."""
+        return 0.0
+
+    @property
     def white(self) -> bool:
         """Whether its errors are configured to share nothing from one to the next."""
         return False

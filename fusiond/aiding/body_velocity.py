@@ -187,6 +187,10 @@ class NonHolonomicAid(Aid):
     min_speed_m_s: float
     lever: Vector3
 
+    @property
+    def across_sd_m_s(self) -> float:
+        return self.sd_m_s
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")

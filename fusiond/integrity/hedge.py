@@ -13,6 +13,20 @@ of what the series measures; and of all that P says goes with it, by the square 
 it, P_ix / P_xx. P is not touched: the solution is the same, and as sure as before once
 the mean is. One window in twenty of a sound series is a little wider.
 
+P is that of sound sensors; of what an inertial unit that has changed does to an attitude it knows
+nothing. Two equations do. A velocity that is corrected by K m sqrt(S) each interval T, and is off
+by as much again, is accelerated by that over T, which gravity makes of a tilt:
+
+    sigma_tilt^2 + (K / (g T))^2 S m^2        K = P / R, P after the update
+
+A tilt is known better than some seconds of velocities tell it, so that this counts beyond what
+chance does once in a thousand. The tilt is a sum of rates: it stays wrong when the mean passes
+through zero on its way back, and what was left open of it fades as the slow mean forgets. And a
+vehicle that does not slip faces its velocity, which is measured: of what goes across at a speed v
+a slip is one cause, a heading the other, for a mounting does not change,
+
+    sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
+
 Once the series is left out, P is: by S m^2, which is what the filter and the series were apart for
 as long as the mean looks back. The last innovation alone is mostly noise.
 
@@ -28,13 +42,23 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.integrity.means import SLOW
 from fusiond.integrity.series import Series
-from fusiond.integrity.support import FINE_M
-from fusiond.navigation.error_model import DR, DV
+from fusiond.integrity.support import FINE_M, MOVING_M_S
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.error_model import DR, DV, PHI
+from fusiond.navigation.strapdown import VE, VN
 
 Array = NDArray[np.float64]
 Said = PositionOffer | VelocityOffer | None
+
+# Of a chi-square of one, by chance once in a thousand.
+SELDOM = 10.83
+# What is left open of a tilt fades by this with each innovation, as the slow mean's square; below a
+# hundredth of P's variance, half a percent of sigma, it is nothing. It is kept under its own name.
+FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -48,21 +72,72 @@ class Hedge:
     def __init__(self) -> None:
         self.wider = NOTHING
 
-    def look(self, source: str, record: Series, said: Said, covariance: Array | None) -> None:
-        """A mean of a series that is fused is beyond what is likely, or was; P (n, n) of the
-        filter. A coarse position cannot say that a fine one is wrong."""
-        if not record.means.unlikely:
-            self.drop(source)
-        elif said is not None and covariance is not None and record.sd_m <= FINE_M:
+    def holds(self, source: str) -> bool:
+        """Whether a series has left anything open."""
+        return source in self.wider or source + TILT in self.wider
+
+    def look(
+        self, aid: Aid, record: Series, said: Said, nav: Array, covariance: Array | None
+    ) -> None:
+        """A mean of a series that is fused is beyond what is likely, or was; the state `nav` (10,)
+        and P (n, n) of the filter. A coarse position cannot say that a fine one is wrong."""
+        source, unlikely = aid.source, record.means.unlikely
+        if covariance is None or record.sd_m > FINE_M:
+            return
+        if said is not None:
             first = DR if record.locates else DV
-            wider = record.means.leaves_open(covariance, first, said.sd)
-            self.wider = {**self.wider, source: wider}
+            wider = record.means.leaves_open(covariance, first, said.sd) if unlikely else None
+            self._put(source, wider)
+            if record.moves and not record.locates:
+                self._put(source + TILT, self._tilts(source + TILT, record, said, covariance))
+        elif aid.across_sd_m_s > 0.0:
+            self._put(source, _turns(aid, record, nav, covariance) if unlikely else None)
+
+    def _tilts(
+        self, name: str, record: Series, said: PositionOffer | VelocityOffer, covariance: Array
+    ) -> Array | None:
+        """What a velocity leaves open of roll and pitch; None where it is nothing."""
+        before = self.wider.get(name)
+        kept = 0.0 if before is None else FADES * float(before[6])
+        now = _tilt(record, said, covariance) if record.means.unlikely else 0.0
+        tilt = max(kept, now)
+        if tilt <= LEAST * min(covariance[PHI, PHI], covariance[PHI + 1, PHI + 1]):
+            return None
+        wider = np.zeros(9)
+        wider[6:8] = tilt
+        return wider
+
+    def _put(self, name: str, wider: Array | None) -> None:
+        if wider is not None:
+            self.wider = {**self.wider, name: wider}
+        elif name in self.wider:
+            rest = {other: each for other, each in self.wider.items() if other != name}
+            self.wider = rest or NOTHING
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""
-        if source in self.wider:
-            rest = {name: each for name, each in self.wider.items() if name != source}
-            self.wider = rest or NOTHING
+        self._put(source, None)
+        self._put(source + TILT, None)
+
+
+def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:
+    """The square (rad^2) of the tilt that accelerates as a velocity has it."""
+    means = record.means
+    own: list[float] = covariance.diagonal()[DV : DV + 2].tolist()
+    axes = zip(means.beyond(SELDOM), own, said.sd, strict=False)
+    changes = 0.0
+    for square, p, sd in axes:
+        r = (means.coarse * sd) ** 2
+        changes += square * (p + r) * (p / r) ** 2
+    return changes / (record.every_ns * 1e-9 * STANDARD_GRAVITY_M_S2) ** 2
+
+
+def _turns(aid: Aid, record: Series, nav: Array, covariance: Array) -> Array:
+    """What a velocity across leaves open of the heading (9,)."""
+    wider, speed = np.zeros(9), max(math.hypot(nav[VN], nav[VE]), MOVING_M_S)
+    yaw = float(covariance[PHI + 2, PHI + 2])
+    wider[8] = record.means.excess[0] * ((aid.across_sd_m_s / speed) ** 2 + yaw)
+    return wider
 
 
 def differ(record: Series, said: Said, covariance: Array | None) -> tuple[float, ...]:

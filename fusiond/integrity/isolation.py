@@ -232,8 +232,8 @@ class Isolation:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
         if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            if record.means.unlikely or aid.source in self.hedge.wider:
-                self.hedge.look(aid.source, record, offer or velocity, covariance)
+            if record.means.unlikely or self.hedge.holds(aid.source):
+                self.hedge.look(aid, record, offer or velocity, nav, covariance)
             return Action.NONE
         self.shown = differ(record, offer or velocity, covariance)
         self.hedge.drop(aid.source)
@@ -264,7 +264,8 @@ class Isolation:
         if aid.source in self._shared:
             self._shared.discard(aid.source)
             record = self._records[aid.source] = record.copied()
-        if t_ns - record.heard_ns > FORGET_NS:
+        record.every_ns = t_ns - record.heard_ns
+        if record.every_ns > FORGET_NS:
             record.repeats = record.passes = 0
             record.means.restart()
             if not record.excluded:

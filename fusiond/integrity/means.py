@@ -286,6 +286,25 @@ class Means:
         _open(self._packed, covariance, first, np.array(sd), out)
         return out
 
+    def beyond(self, chance: float) -> list[float]:
+        """Of each component (d,), of an innovation's variance (1), the larger square of its means
+        that is beyond `chance`, a chi-square of one; 0 where none is."""
+        d = (self._packed.shape[0] - _HEAD) // 2
+        squares = (self._packed[_HEAD:] ** 2).tolist()
+        fast, slow = (chance * self._packed[_SPREAD : _SPREAD + 2]).tolist()
+        pairs = zip(squares[:d], squares[d:], strict=True)
+        return [max(f if f > fast else 0.0, s if s > slow else 0.0) for f, s in pairs]
+
+    @property
+    def excess(self) -> list[float]:
+        """Of each component (d,), of an innovation's variance (1), what a mean has beyond what
+        chance does once in twenty."""
+        d = (self._packed.shape[0] - _HEAD) // 2
+        squares = (self._packed[_HEAD:] ** 2).tolist()
+        fast, slow = (LIKELY * self._packed[_SPREAD : _SPREAD + 2]).tolist()
+        pairs = zip(squares[:d], squares[d:], strict=True)
+        return [max(0.0, f - fast, s - slow) for f, s in pairs]
+
     def most(self) -> list[float]:
         """Each component (d,), of an innovation's sigma (1): of the mean where it is more."""
         d = (self._packed.shape[0] - _HEAD) // 2
