@@ -45,8 +45,9 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.means import SLOW
+from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import Series
-from fusiond.integrity.support import FINE_M, MOVING_M_S
+from fusiond.integrity.support import FINE_M
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.strapdown import VE, VN
@@ -99,7 +100,8 @@ class Hedge:
         """What a velocity leaves open of roll and pitch; None where it is nothing."""
         before = self.wider.get(name)
         kept = 0.0 if before is None else FADES * float(before[6])
-        now = _tilt(record, said, covariance) if record.means.unlikely else 0.0
+        told = record.means.unlikely and record.every_ns > 0
+        now = _tilt(record, said, covariance) if told else 0.0
         tilt = max(kept, now)
         if tilt <= LEAST * min(covariance[PHI, PHI], covariance[PHI + 1, PHI + 1]):
             return None

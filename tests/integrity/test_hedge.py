@@ -251,6 +251,8 @@ def test_a_velocity_that_is_corrected_again_and_again_leaves_a_tilt_open() -> No
     r = (0.05 * made.isolation._records["gnss_velocity"].means.coarse) ** 2
     step = OWN_M_S**2 / r * math.hypot(OWN_M_S, math.sqrt(r))  # of a mean of one sigma
     assert 0.5 < math.sqrt(wider[6]) / (step / (0.5 * 9.8)) < 2.0
+    made.velocity(t - 0.5, 1.5)  # of the same instant: no time to be accelerated in
+    assert 0.9 * wider[6] < made.isolation.hedge.wider[name][6] <= wider[6]
     for k in range(300):
         before = made.isolation.hedge.wider.get(name)
         made.velocity(t + 0.5 * k)
