@@ -84,6 +84,8 @@ class Hedge:
         and P (n, n) of the filter. A coarse position cannot say that a fine one is wrong."""
         source, unlikely = aid.source, record.means.unlikely
         if covariance is None or record.sd_m > FINE_M:
+            if not unlikely:
+                self.drop(source)
             return
         if said is not None:
             first = DR if record.locates else DV

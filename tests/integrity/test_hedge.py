@@ -91,6 +91,9 @@ def test_a_coarse_position_leaves_nothing_open_and_a_checkpoint_keeps_it() -> No
     made.both(range(t, t + 60))
     made.isolation.restore(kept)
     assert made.isolation.hedge.wider is wider
+    for k in range(120):  # it has become coarse, and nothing of it is beyond chance any more
+        made.fix(t + k, sd_m=20.0)
+    assert "gnss" not in made.isolation.hedge.wider
     made.isolation.reset()
     assert made.isolation.hedge.wider is NOTHING
 
