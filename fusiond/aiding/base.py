@@ -123,6 +123,11 @@ class Aid:
         return False
 
     @property
+    def shares(self) -> tuple[str, ...]:
+        """Blocks of the model whose states are an error that successive ones share."""
+        return ()
+
+    @property
     def feedback(self) -> Feedback:
         """When the estimate that it leads to is fed back."""
         return "at_once"

@@ -29,10 +29,16 @@ from fusiond.navigation.strapdown import HEIGHT, VE, VN
 
 @dataclass(frozen=True, slots=True)
 class HeightAid(Aid):
-    """Ellipsoidal height (m) with `sd_m`."""
+    """Ellipsoidal height (m) with `sd_m`. What successive ones share is not estimated: it is of the
+    same origin as the error of the blocks `of`, those of the position that came with it."""
 
     height_m: float
     sd_m: float
+    of: tuple[str, ...] = ()
+
+    @property
+    def shares(self) -> tuple[str, ...]:
+        return self.of
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.model.hold_height:

@@ -195,6 +195,10 @@ class PositionAid(Aid):
     def white(self) -> bool:
         return self.shares_nothing
 
+    @property
+    def shares(self) -> tuple[str, ...]:
+        return self.bias
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p = state
         rows = 2 if self.height_m is None or model.hold_height else 3

@@ -58,6 +58,10 @@ class RdssPositionAid(Aid):
     holds: bool = False
 
     @property
+    def shares(self) -> tuple[str, ...]:
+        return (BIAS_BLOCK,)
+
+    @property
     def feedback(self) -> Feedback:
         return "hold" if self.holds else "at_once"
 

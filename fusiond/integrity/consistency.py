@@ -52,7 +52,7 @@ from fusiond.navigation.distributions import (
 )
 
 Array = NDArray[np.float64]
-Verdict = Literal["consistent", "optimistic", "pessimistic", "coloured", "too_few"]
+Verdict = Literal["consistent", "optimistic", "pessimistic", "cannot_tell", "coloured", "too_few"]
 Interval = tuple[float, float]
 
 LAGS = 8
@@ -78,6 +78,9 @@ class ConsistencyOptions:
     """Probability with which a consistent innovation passed the gate; 1: none is left out."""
     whitened: bool = True
     """False: rho of the innovations as they are, as the paper has it; `add` then needs S."""
+    shared: bool = False
+    """Successive measurements share an error that the filter follows. The solution takes it over,
+    so that innovations show nothing of it: small ones are `cannot_tell`, not `pessimistic`."""
 
     def __post_init__(self) -> None:
         if self.window < FEWEST:
@@ -105,7 +108,7 @@ class Consistency:
     nis_interval: Interval
     """At INTERVAL_LEVEL."""
     nis_limits: Interval
-    """Outside these the verdict is `pessimistic` or `optimistic`."""
+    """Outside these the verdict is `pessimistic` or `cannot_tell`, or `optimistic`."""
     nis_p: float
     """Two-sided p-value of the average."""
     rho: tuple[float, ...]
@@ -236,6 +239,7 @@ def judge(
     alpha: float = 0.01,
     gate: float = 1.0,
     whitened: bool = True,
+    shared: bool = False,
 ) -> Consistency:
     """Judge given figures: K, K m, the average per degree of freedom and rho(1..8) by (8).
 
@@ -252,7 +256,7 @@ def judge(
     q = float(limits.weights @ (values * values))
     tails = gamma_tails(limits.shape, average / limits.scale)
     d, nu = limits.freedom
-    verdict = verdict_of(average, q, limits)
+    verdict = verdict_of(average, q, limits, shared)
     return Consistency(
         verdict=verdict,
         window_verdict=verdict,
@@ -273,13 +277,13 @@ def judge(
     )
 
 
-def verdict_of(average: float, q: float, limits: Limits) -> Verdict:
+def verdict_of(average: float, q: float, limits: Limits, shared: bool = False) -> Verdict:
     """The average goes first: a covariance that is too small is worse than colour."""
     low, high = limits.nis_limits
     if average > high:
         return "optimistic"
     if average < low:
-        return "pessimistic"
+        return "cannot_tell" if shared else "pessimistic"
     return "coloured" if q > limits.portmanteau else "consistent"
 
 

@@ -183,7 +183,7 @@ class ConsistencyMonitor:
             return
         dof = k * self._m
         self._average = float(self._sums[0]) / dof
-        self.window_verdict = verdict_of(self._average, q, self._limits)
+        self.window_verdict = verdict_of(self._average, q, self._limits, o.shared)
         self._contradicted = self._contradicted + 1 if self.window_verdict != self.verdict else 0
         if self._contradicted >= k // 2:
             self.verdict, self._contradicted = self.window_verdict, 0
@@ -194,5 +194,14 @@ class ConsistencyMonitor:
         if k < FEWEST:
             return replace(TOO_FEW, k=k, dof=k * self._m, alpha=o.alpha)
         average, rho = float(self._average), self._rho.tolist()
-        found = judge(k, k * self._m, average, rho, alpha=o.alpha, gate=o.gate, whitened=o.whitened)
+        found = judge(
+            k,
+            k * self._m,
+            average,
+            rho,
+            alpha=o.alpha,
+            gate=o.gate,
+            whitened=o.whitened,
+            shared=o.shared,
+        )
         return replace(found, verdict=self.verdict)

@@ -18,6 +18,7 @@ from fusiond.integrity.consistency import (
     Verdict,
 )
 from fusiond.integrity.monitor import ConsistencyMonitor
+from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
@@ -28,11 +29,14 @@ class Verdicts:
     An aid may hold several series (`Aid.series`), each with a monitor of its own: a receiver's raw
     epochs have one for each satellite system, `<source>_<system>`.
 
-    `on_change(source, verdict)` hears when a verdict turns. Constraints are not judged.
+    `on_change(source, verdict)` hears when a verdict turns. Constraints are not judged. What the
+    aids of a source share by the states of `model` no innovation shows (`Aid.shares`).
     """
 
-    def __init__(self, window: int, alpha: float, on_change: Callable[[str, str], None]) -> None:
-        self._window, self._alpha = window, alpha
+    def __init__(
+        self, window: int, alpha: float, model: Model, on_change: Callable[[str, str], None]
+    ) -> None:
+        self._window, self._alpha, self._model = window, alpha, model
         self._on_change = on_change
         self._monitors: dict[str, ConsistencyMonitor] = {}
 
@@ -51,7 +55,8 @@ class Verdicts:
         monitor = self._monitors.get(source)
         if monitor is None:
             window = max(FEWEST, self._window // 2) if aid.late else self._window
-            options = ConsistencyOptions(window, self._alpha, gate=aid.gate)
+            shared = self._model.slots_of_all(aid.shares).size > 0
+            options = ConsistencyOptions(window, self._alpha, gate=aid.gate, shared=shared)
             monitor = self._monitors[source] = ConsistencyMonitor(options)
         before = monitor.verdict
         monitor.add_whitened(row, nis)

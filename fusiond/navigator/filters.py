@@ -93,11 +93,11 @@ def imu_buffer_of(config: Config) -> ImuBuffer:
     )
 
 
-def verdicts_of(config: Config, on_event: Callable[[str, str], None]) -> Verdicts:
+def verdicts_of(config: Config, model: Model, on_event: Callable[[str, str], None]) -> Verdicts:
     """The verdicts on each source's sigma, told as they change."""
     test = config.consistency
     return Verdicts(
-        test.window, test.alpha, lambda s, v: on_event(f"verdict_{v}", f"innovations of {s}")
+        test.window, test.alpha, model, lambda s, v: on_event(f"verdict_{v}", f"innovations of {s}")
     )
 
 

@@ -80,7 +80,7 @@ class Navigator:
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
         self.estimator = estimator(config, self.model)
         publish_by_axes(self.estimator, imu)
-        self.verdicts = verdicts_of(config, self._event)
+        self.verdicts = verdicts_of(config, self.model, self._event)
         self.timeline = Timeline(
             self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
         )
@@ -113,7 +113,7 @@ class Navigator:
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section of `aiding`; verdicts, which hold for one, begin anew."""
         self._intake.set_gates(gates)
-        self.verdicts = verdicts_of(self.config, self._event)
+        self.verdicts = verdicts_of(self.config, self.model, self._event)
 
     def add_imu(self, times: NDArray[np.int64], samples: Array) -> int:
         """IMU samples (m,) ns of validity, (m, 6) rate and force in sensor axes; how many count.

@@ -7,6 +7,7 @@ const WORDS = {
   consistent: "consistent",
   optimistic: "sigma too small",
   pessimistic: "sigma too large",
+  cannot_tell: "cannot tell: errors shared",
   coloured: "errors alike",
   too_few: "too few yet",
 };

@@ -63,7 +63,7 @@ def aids(m: DelayedFix, sections: Sections, when: Instants) -> list[Aid] | str:
         found.append(FeedBackAid(f"{m.source}_feedback", arrival_ns, gate))
     if o.fix_height_sd_m is not None and not m.height_given:
         sd_m = o.fix_height_sd_m * o.sigma_scale
-        found.append(HeightAid(f"{m.source}_height", t_ns, gate, m.height_m, sd_m))
+        found.append(HeightAid(f"{m.source}_height", t_ns, gate, m.height_m, sd_m, (BIAS_BLOCK,)))
     return found
 
 

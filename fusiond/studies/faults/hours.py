@@ -14,7 +14,7 @@ protection            `false_alarm_per_hour` of `[integrity]`
 
 Tests at successive innovations share most of what they look at, so their false alarms come in
 clusters: the bounds are loose. Wheels have the drift that the filter allows for. RDSS is no matched
-source: it is simulated with less than its configured bias and height error, so that `pessimistic`
+source: it is simulated with less than its configured bias and height error, so that `cannot_tell`
 is true of it; what is told of its innovations is not counted as an alarm.
 """
 
