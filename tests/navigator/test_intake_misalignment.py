@@ -135,6 +135,31 @@ def test_fixes_share_an_error_of_which_those_by_phase_have_a_part() -> None:
         assert aid.bias_share == pytest.approx(shares)
 
 
+def _bias_share(intake: Intake, sd_m: float, quality: int, source: str = "gnss") -> float:
+    sd = (sd_m, sd_m, sd_m)
+    stamp = MonotonicStamp(7)
+    fix = PositionFix(source, 0, stamp, 0.5, 1.9, 10.0, quality=quality, sd_ned_m=sd)
+    (aid,) = intake.aids(fix, 7, 0.0)
+    assert isinstance(aid, PositionAid)
+    return aid.bias_share[0]
+
+
+def test_a_stated_sigma_that_collapses_makes_no_fix_one_by_carrier_phase() -> None:
+    """A receiver of code that suddenly states a centimetre is as wrong as before by what its fixes
+    share. One that says by its quality that it is by phase is believed, and one whose quality says
+    nothing as long as no sigma of code has come with it."""
+    intake = Intake({"gnss": GnssAiding(), "post": GnssAiding()})
+    by_phase = math.sqrt(0.5) * 0.3
+    assert _bias_share(intake, 0.01, 1, "post") == pytest.approx(by_phase)
+    assert _bias_share(intake, 0.2, 1, "post") == 1.0
+    assert _bias_share(intake, 0.01, 1, "post") == pytest.approx(by_phase)
+    assert _bias_share(intake, 1.5, 1) == 1.0
+    assert _bias_share(intake, 0.01, 1) == 1.0
+    assert _bias_share(intake, 0.01, 2) == pytest.approx(by_phase)
+    assert _bias_share(intake, 0.01, 4) == pytest.approx(math.sqrt(0.5) * 0.02)
+    assert _bias_share(intake, 0.01, 1) == 1.0
+
+
 def test_the_navigators_model_has_the_states() -> None:
     config = Config.model_validate(
         {"estimator": {"model": "ins15"}, "aiding": {"star_tracker": {}, "sar": {}}}

@@ -86,7 +86,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         _fix_bias(m.source, o, sections),
         time,
         rest,
-        _phase_share(sd, o) if by_phase(m) else (1.0, 1.0, 1.0),
+        _phase_share(sd, o) if _by_phase(m, sections) else (1.0, 1.0, 1.0),
         o.bias_sd_m == 0.0,
     )
     if m.v_ned_m_s is None or not o.use_velocity:
@@ -106,11 +106,18 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     return [position, velocity]
 
 
-def by_phase(m: PositionFix) -> bool:
-    """Whether the fix is one by carrier phase: it says so, or states a sigma that code cannot
-    have."""
-    stated = m.sd_ned_m
-    return m.quality in RTK or (stated is not None and max(stated[:2]) < PHASE_SD_M)
+def _by_phase(m: PositionFix, sections: Sections) -> bool:
+    """Whether the fix is one by carrier phase: its quality says so, or it states a sigma that code
+    cannot have; but for a receiver that has stated one of code under the same quality, which would
+    have changed with the ambiguities."""
+    if m.quality in RTK:
+        return True
+    if m.sd_ned_m is None:
+        return False
+    stated, told = max(m.sd_ned_m[:2]), (m.source, m.quality)
+    if stated >= CODE_FLOOR_M:
+        sections.by_code.add(told)
+    return stated < PHASE_SD_M and told not in sections.by_code
 
 
 def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:

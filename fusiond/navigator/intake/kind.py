@@ -36,6 +36,8 @@ class Sections:
         }
         self.place: tuple[float, float] | None = None
         """Latitude and longitude (rad) of the last fix."""
+        self.by_code: set[tuple[str, int]] = set()
+        """Receivers and the qualities under which they have stated a sigma of code."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
