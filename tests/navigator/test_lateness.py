@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fusiond.configuration.schema import Config
 from fusiond.navigator.alignment import motion_fit
 from fusiond.navigator.alignment.lateness import SETTLED_SD_S, Lateness
 from fusiond.navigator.alignment.options import alignment_options
@@ -23,13 +24,13 @@ ALWAYS_LATE = aid_faults.late(ON_TIME, 0.0, math.inf)
 
 
 def looked(
-    recording: Recording, until_s: tuple[float, ...]
+    recording: Recording, until_s: tuple[float, ...], config: Config = VEHICLE
 ) -> tuple[list[str], Lateness, Navigator]:
     """What looks at some instants have told."""
     told: list[str] = []
-    navigator = Navigator(VEHICLE)
+    navigator = Navigator(config)
     late = Lateness(
-        alignment_options(VEHICLE),
+        alignment_options(config),
         navigator._noise,
         navigator.model,
         lambda code, text: told.append(code),
@@ -73,6 +74,27 @@ def test_lateness_is_found_when_the_vehicle_drives_off() -> None:
 )
 def test_nothing_else_is_taken_for_lateness(recording: Recording) -> None:
     told, late, _ = looked(recording, (20.0, 30.0, 42.0, 43.5, 45.0))
+    assert not told
+    assert not late.suspects
+
+
+def test_a_receiver_that_was_late_for_a_while_is_not_late_now() -> None:
+    """A phone's inertial unit leaves so much open that one lateness fits what was late and what is
+    on time again: 1.2 s for 0.8 and 0, and 33 m at 30 m/s."""
+    phone = Config.model_validate(
+        {
+            **VEHICLE.model_dump(exclude_unset=True),
+            "imu": {
+                "axes": VEHICLE.imu.axes,
+                "rate_hz": VEHICLE.imu.rate_hz,
+                "sensor_class": "consumer",
+            },
+        }
+    )
+    _, on_time = Drive(duration_s=120.0).recorded(phone, seed=5)
+    end_s = 42.0
+    recording = aid_faults.late(on_time, 30.0, end_s - 30.0)
+    told, late, _ = looked(recording, tuple(end_s + 1.0 + 1.5 * k for k in range(10)), phone)
     assert not told
     assert not late.suspects
 

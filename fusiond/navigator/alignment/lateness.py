@@ -18,7 +18,7 @@ is late by tau* where
     J(now) - J(tau*) > EVIDENCE             chi-square of one: 4.5 sigma, one in 130,000
     |tau* - now| > PRIOR_SIGMAS s_0         s_0 of the filter's own state for it
 
-in some looks that agree. On drive_0708 and css_164, which have no late fixes, two of 452 looks met
+in some looks that agree, by fixes of one lateness (fusiond.navigator.alignment.leaps). On drive_0708 and css_164, which have no late fixes, two of 452 looks met
 all but the first; the smoothing of receivers moves tau* by 0.1 s.
 
 What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
@@ -48,6 +48,7 @@ from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.course import ways
+from fusiond.navigator.alignment.leaps import Epoch, since_leap
 from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.options import AlignmentOptions
 
@@ -297,16 +298,20 @@ def _fixes(
     heard: Iterable[Sequence[Aid]], first_ns: int, last_ns: int
 ) -> tuple[list[VelocityOffer], PositionOffer | None]:
     """Velocities of a span in their order, and a position. What repeats the one before to the bit
-    is no measurement, but of a vehicle that stands."""
-    found, place = [], None
+    is no measurement, but of a vehicle that stands; and of stamps that have leapt only what came
+    after it says how late they are."""
+    epochs, place = [], None
     for aids in heard:
-        for aid in aids:
-            for offer in aid.offers():
-                if isinstance(offer, PositionOffer):
-                    place = offer
-                elif isinstance(offer, VelocityOffer) and first_ns <= offer.t_ns <= last_ns:
-                    found.append(offer)
-    found.sort(key=lambda o: o.t_ns)
+        offers = [offer for aid in aids for offer in aid.offers()]
+        position = next((o for o in offers if isinstance(o, PositionOffer)), None)
+        place = position or place
+        epochs += [
+            Epoch(offer, position)
+            for offer in offers
+            if isinstance(offer, VelocityOffer) and first_ns <= offer.t_ns <= last_ns
+        ]
+    epochs.sort(key=lambda epoch: epoch.velocity.t_ns)
+    found = [epoch.velocity for epoch in since_leap(epochs)]
     new = (not k or o.v_ned != found[k - 1].v_ned or not any(o.v_ned) for k, o in enumerate(found))
     return list(compress(found, new)), place
 

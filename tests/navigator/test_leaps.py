@@ -1,0 +1,82 @@
+"""Where a receiver's positions leap against its own velocities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.navigator.alignment.leaps import Epoch, since_leap
+
+SD, NO_LEVER = (1.0, 1.0, 2.0), (0.0, 0.0, 0.0)
+RADIUS_M = 6_371_000.0
+SPEED_M_S, TURN_RAD_S = 14.0, 0.1
+
+
+def epochs(
+    late_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    noise_m: float = 0.3,
+    rate_hz: float = 2.0,
+    lon_rad: float = 1.9,
+    speed_m_s: float = SPEED_M_S,
+) -> list[Epoch]:
+    """Thirty seconds round a bend; how late the fixes are from 0, 10 and 20 s on."""
+    rng = np.random.default_rng(3)
+    found = []
+    for k in range(round(30.0 * rate_hz)):
+        t_s = k / rate_hz
+        true_s = t_s - late_s[int(t_s // 10.0)]
+        course = TURN_RAD_S * true_s
+        north = speed_m_s / TURN_RAD_S * math.sin(course) + noise_m * rng.standard_normal()
+        east = -speed_m_s / TURN_RAD_S * math.cos(course) + noise_m * rng.standard_normal()
+        v = speed_m_s * math.cos(course), speed_m_s * math.sin(course), 0.0
+        lon = math.remainder(lon_rad + east / (RADIUS_M * math.cos(0.5)), 2.0 * math.pi)
+        place = 0.5 + north / RADIUS_M, lon, 40.0
+        t_ns = round(t_s * 1e9)
+        velocity = VelocityOffer(t_ns, v, (0.05, 0.05, 0.1), NO_LEVER)
+        found.append(Epoch(velocity, PositionOffer(t_ns, *place, SD, NO_LEVER)))
+    return found
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 2.0, 10.0])
+@pytest.mark.parametrize("noise_m", [0.0, 0.05, 1.0])
+def test_a_receiver_that_is_as_late_all_the_time_leaps_nowhere(
+    rate_hz: float, noise_m: float
+) -> None:
+    for late_s in (0.0, 0.8):
+        all_of_them = epochs((late_s,) * 3, noise_m=noise_m, rate_hz=rate_hz)
+        assert len(since_leap(all_of_them)) == len(all_of_them)
+
+
+@pytest.mark.parametrize(
+    ("late_s", "since_s"),
+    [((0.0, 0.8, 0.8), 10.0), ((0.0, 0.8, 0.0), 20.0), ((0.8, 0.0, 0.0), 10.0)],
+)
+@pytest.mark.parametrize("lon_rad", [1.9, math.pi])
+def test_only_what_came_after_the_last_change_of_lateness_is_left(
+    late_s: tuple[float, float, float], since_s: float, lon_rad: float
+) -> None:
+    left = since_leap(epochs(late_s, lon_rad=lon_rad))
+    assert left[0].velocity.t_ns == round(since_s * 1e9)
+
+
+def test_a_change_that_is_within_what_is_told_of_a_lateness_is_none() -> None:
+    slightly = epochs((0.0, 0.04, 0.04), noise_m=0.01, rate_hz=10.0)
+    assert len(since_leap(slightly)) == len(slightly)
+
+
+def test_a_vehicle_that_stands_leaps_nowhere() -> None:
+    standing = epochs((0.0, 0.8, 0.0), speed_m_s=0.0)
+    assert len(since_leap(standing)) == len(standing)
+
+
+def test_an_interval_that_is_too_long_to_tell_and_velocities_alone_are_left_whole() -> None:
+    gap = [e for e in epochs((0.0, 0.8, 0.8)) if not 7.0 <= e.velocity.t_ns * 1e-9 < 12.0]
+    assert len(since_leap(gap)) == len(gap)
+    alone = [e._replace(position=None) for e in epochs((0.0, 0.8, 0.0))]
+    assert len(since_leap(alone)) == len(alone)
+    assert len(since_leap(alone[:1])) == 1
+    assert since_leap([]) == []
