@@ -2,14 +2,16 @@
 not."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Config
-from fusiond.navigator.alignment import motion_fit
+from fusiond.navigator.alignment import lateness, motion_fit
 from fusiond.navigator.alignment.lateness import SETTLED_SD_S, Lateness
+from fusiond.navigator.alignment.leaps import Epoch
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults import aid_faults, imu_faults
@@ -61,6 +63,22 @@ def test_lateness_is_found_when_the_vehicle_drives_off() -> None:
     assert not isinstance(aids, str)
     shifted_s = (aids[0].t_ns - late.hear(source, aids)[0].t_ns) * 1e-9
     assert shifted_s == pytest.approx(LATE_S, abs=4.0 * SETTLED_SD_S)
+
+
+def test_a_receiver_that_cannot_have_become_late_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What else fits is told by none of its fixes: a phone that was turned for 15 s on a motorway
+    fitted velocities of 1 s before."""
+    asked: list[float] = []
+
+    def unchanged(epochs: Sequence[Epoch], by_s: float) -> bool:
+        asked.append(by_s)
+        return len(epochs) > 0
+
+    monkeypatch.setattr(lateness, "unchanged", unchanged)
+    told, late, _ = looked(ALWAYS_LATE, (19.0, 20.5, 22.0, 23.5, 25.0))
+    assert not told
+    assert not late.suspects
+    assert asked == pytest.approx([LATE_S] * len(asked), abs=0.2)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
-from fusiond.navigator.alignment.leaps import Epoch, since_leap
+from fusiond.navigator.alignment.leaps import LOOKED_NS, Epoch, since_leap, unchanged
 
 SD, NO_LEVER = (1.0, 1.0, 2.0), (0.0, 0.0, 0.0)
 RADIUS_M = 6_371_000.0
@@ -80,3 +80,59 @@ def test_an_interval_that_is_too_long_to_tell_and_velocities_alone_are_left_whol
     assert len(since_leap(alone)) == len(alone)
     assert len(since_leap(alone[:1])) == 1
     assert since_leap([]) == []
+
+
+# --------------------------------------------------------------------------- nothing has changed
+
+
+def road(
+    *,
+    seconds: int = 90,
+    late_s: float = 0.0,
+    since_s: float = 60.0,
+    accelerates: bool = True,
+    slow_from_s: float = math.inf,
+    rate_hz: float = 2.0,
+) -> list[Epoch]:
+    """A road straight to the north; the fixes are late from `since_s` on."""
+    rng = np.random.default_rng(4)
+    found, north, before_s = [], 0.0, 0.0
+    for k in range(round(seconds * rate_hz)):
+        t_s = k / rate_hz
+        speed = 20.0 + (8.0 if accelerates and t_s > 20.0 else 0.0)
+        speed = 1.0 if t_s > slow_from_s else speed
+        north += speed * (t_s - before_s)
+        before_s = t_s
+        seen = north - speed * (late_s if t_s >= since_s else 0.0) + 0.5 * rng.standard_normal()
+        t_ns = round(t_s * 1e9)
+        place = 0.5 + seen / RADIUS_M, 1.9, 40.0
+        velocity = VelocityOffer(t_ns, (speed, 0.0, 0.0), (0.05, 0.05, 0.1), NO_LEVER)
+        found.append(Epoch(velocity, PositionOffer(t_ns, *place, SD, NO_LEVER)))
+    return found
+
+
+def test_positions_that_have_followed_the_velocities_since_it_was_shown_are_as_late_as_then() -> (
+    None
+):
+    assert unchanged(road(), 0.8)
+    assert unchanged(road(rate_hz=5.0), 0.8)
+    assert not unchanged(road(), 0.1)
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        road(late_s=0.8),
+        road(late_s=-0.8),
+        road(late_s=0.8, since_s=10.0),
+        road(accelerates=False),
+        road(slow_from_s=70.0),
+        [e for e in road() if not 62e9 <= e.velocity.t_ns < 68e9],
+        [e for e in road() if e.velocity.t_ns > 90e9 - LOOKED_NS],
+        [e._replace(position=None) for e in road()],
+        [],
+    ],
+    ids=["late", "early", "long ago", "steady", "slow", "gap", "short", "no positions", "none"],
+)
+def test_what_cannot_be_seen_may_have_changed(seen: list[Epoch]) -> None:
+    assert not unchanged(seen, 0.8)

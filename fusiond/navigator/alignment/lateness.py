@@ -18,8 +18,10 @@ is late by tau* where
     J(now) - J(tau*) > EVIDENCE             chi-square of one: 4.5 sigma, one in 130,000
     |tau* - now| > PRIOR_SIGMAS s_0         s_0 of the filter's own state for it
 
-in some looks that agree, by fixes of one lateness (fusiond.navigator.alignment.leaps). On drive_0708 and css_164, which have no late fixes, two of 452 looks met
-all but the first; the smoothing of receivers moves tau* by 0.1 s.
+in some looks that agree, by fixes of one lateness, unless the positions have followed the
+velocities all the way since it was known (fusiond.navigator.alignment.leaps). On drive_0708 and
+css_164, which have no late fixes, two of 452 looks met all but the first; the smoothing of
+receivers moves tau* by 0.1 s.
 
 What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
 fixes that are late, and not the vehicle that is ahead. From then on that clock is what solutions
@@ -48,7 +50,7 @@ from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.course import ways
-from fusiond.navigator.alignment.leaps import Epoch, since_leap
+from fusiond.navigator.alignment.leaps import Epoch, since_leap, unchanged
 from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.options import AlignmentOptions
 
@@ -65,8 +67,9 @@ EVIDENCE = 20.0
 PRIOR_SIGMAS = 3.0
 # Of a receiver whose offset in time the filter does not estimate (s).
 LEAST_PRIOR_S = 0.05
-# Fixes of so long are looked at, of a receiver of 20 Hz, and so many at least.
-KEPT_NS, MOST_KEPT, FEWEST = 15_000_000_000, 300, 5
+# Fixes of so long are looked at, and so many at least; kept are a minute's of a receiver of 10 Hz,
+# and handed on the last of them.
+KEPT_NS, MOST_KEPT, HANDED_ON, FEWEST = 15_000_000_000, 600, 300, 5
 # The valley is sought with `motion.MOST_FIXES`, its bottom with all of a receiver of 5 Hz.
 ALL_FIXES = 75
 # A lateness that is known worse (s) is waited for so long (ns) to be known better: half the sigma
@@ -173,7 +176,7 @@ class Lateness:
         return [
             _earlier(aid, receiver.late_ns)
             for receiver in self._receivers.values()
-            for aids in receiver.heard
+            for aids in tuple(receiver.heard)[-HANDED_ON:]
             for aid in aids
         ]
 
@@ -246,7 +249,8 @@ class Lateness:
     ) -> Generator[None, None, None]:
         """What the fixes of a span say of a receiver's lateness; the best that they have said
         counts."""
-        fixes, place = _fixes(receiver.heard, first_ns, t_ns)
+        epochs = _epochs(receiver.heard)
+        fixes, place = _fixes([e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns])
         # The last must have a course.
         while fixes and math.hypot(*fixes[-1].v_ned[:2]) < self._options.course_speed_m_s:
             fixes.pop()
@@ -288,30 +292,30 @@ class Lateness:
             least > gate_threshold(FITS, degrees)
             or now - least <= EVIDENCE
             or abs(late.seconds - now_s) <= PRIOR_SIGMAS * prior
+            or unchanged(epochs, abs(late.seconds - now_s))
         ):
             return
         self._due_ns = t_ns + EVERY_NS
         receiver.suspect(Late(max(0.0, late.seconds), late.sd), t_ns)
 
 
-def _fixes(
-    heard: Iterable[Sequence[Aid]], first_ns: int, last_ns: int
-) -> tuple[list[VelocityOffer], PositionOffer | None]:
-    """Velocities of a span in their order, and a position. What repeats the one before to the bit
-    is no measurement, but of a vehicle that stands; and of stamps that have leapt only what came
-    after it says how late they are."""
-    epochs, place = [], None
+def _epochs(heard: Iterable[Sequence[Aid]]) -> list[Epoch]:
+    """Measurements that have a velocity, in order of its instant."""
+    found = []
     for aids in heard:
         offers = [offer for aid in aids for offer in aid.offers()]
         position = next((o for o in offers if isinstance(o, PositionOffer)), None)
-        place = position or place
-        epochs += [
-            Epoch(offer, position)
-            for offer in offers
-            if isinstance(offer, VelocityOffer) and first_ns <= offer.t_ns <= last_ns
-        ]
-    epochs.sort(key=lambda epoch: epoch.velocity.t_ns)
-    found = [epoch.velocity for epoch in since_leap(epochs)]
+        found += [Epoch(o, position) for o in offers if isinstance(o, VelocityOffer)]
+    found.sort(key=lambda epoch: epoch.velocity.t_ns)
+    return found
+
+
+def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityOffer], PositionOffer | None]:
+    """Velocities of one lateness, and a position. What repeats the one before to the bit is no
+    measurement, but of a vehicle that stands."""
+    left = since_leap(epochs)
+    found = [epoch.velocity for epoch in left]
+    place = next((e.position for e in reversed(left) if e.position is not None), None)
     new = (not k or o.v_ned != found[k - 1].v_ned or not any(o.v_ned) for k, o in enumerate(found))
     return list(compress(found, new)), place
 
