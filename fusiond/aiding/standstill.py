@@ -98,8 +98,9 @@ class Rest:
         if square > quantile(rows, VELOCITY_PROBABILITY) or measured.contradicts:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
-        if self._turns(state, p, w.mean_rate, 1) or self._turns(state, p, w.run_rate, w.run):
-            sure = known and self._turns(state, p, w.mean_rate, 1, SURE_SIGMAS)
+        means = (w.mean_rate, 1), (w.run_rate, w.run)
+        if any(self._turns(state, p, *mean, RATE_SIGMAS) for mean in means):
+            sure = known and any(self._turns(state, p, *mean, SURE_SIGMAS) for mean in means)
             return TURNS_AT_REST if sure else "turning"
         if not known and self.witnesses.smooth_ride(w.end_ns):
             return "quiet_at_speed"
@@ -111,7 +112,7 @@ class Rest:
         p: Array,
         mean_rate: Array,
         count: int,
-        sigmas: float = RATE_SIGMAS,
+        sigmas: float,
     ) -> bool:
         error = _rate_error(state, mean_rate)
         free = (self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2) / count

@@ -97,6 +97,16 @@ def test_a_turn_on_the_spot_is_told_apart_where_the_speed_is_known_to_be_zero() 
     assert known.doubt(_state(0.0, 0.5)) == "turns_at_rest"
 
 
+def test_a_slow_turn_on_the_spot_is_told_by_a_run_of_windows() -> None:
+    """A gyro that is off by 0.25 deg/s at a red light: one window says nothing, ten say it."""
+    mean_rate = (0.0, 0.0, 0.25 * DEG)
+    known = _state(0.0, 0.02)
+    assert runs.rest(mean_rate=mean_rate).doubt(known) is None
+    assert runs.rest(mean_rate=mean_rate, run=3).doubt(known) == "turning"
+    assert runs.rest(mean_rate=mean_rate, run=10).doubt(known) == "turns_at_rest"
+    assert runs.rest(mean_rate=mean_rate, run=10).doubt(_state(0.0, 0.5)) == "turning"
+
+
 def test_quiet_proves_nothing_on_a_smooth_ride() -> None:
     """Once quiet windows at speed have been seen, rest takes evidence as good as its claim."""
     witnesses = Witnesses()
