@@ -27,6 +27,16 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
+What is published is the attitude of the axes that were configured, and the vehicle's as far as the
+unit sits on it so. A mounting that is found off by more than chance has it in one vehicle of a
+thousand is not the one that was configured: pitch and yaw are open by what it has beyond that,
+
+    sigma^2 + max(0, m^2 - 10.83 sigma_m^2)          sigma_m as configured
+
+A position that is back after an outage has no means yet: it leaves open what its slope has beyond
+chance (fusiond.integrity.proof). What a source left open that has fallen silent stays, for silence
+answers nothing, until another that measures the same, about as finely, has a mean of its own.
+
 Once the series is left out, P is: by S m^2, which is what the filter and the series were apart for
 as long as the mean looks back. The last innovation alone is mostly noise.
 
@@ -37,7 +47,7 @@ solution is off by no more than it is apart from one without the fault, and that
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,9 +55,11 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.means import SLOW
+from fusiond.integrity.proof import Proof
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import Series
-from fusiond.integrity.support import FINE_M
+from fusiond.integrity.support import COARSER, FINE_M, FORGET_NS
+from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.strapdown import VE, VN
@@ -117,6 +129,44 @@ class Hedge:
         elif name in self.wider:
             rest = {other: each for other, each in self.wider.items() if other != name}
             self.wider = rest or NOTHING
+
+    def returns(self, source: str, proof: Proof, covariance: Array | None) -> None:
+        """A position that is back, and whether it drifts, is not known yet; P (n, n) of the
+        filter."""
+        if covariance is None:
+            return self.drop(source)
+        owns: list[float] = covariance.diagonal()[DR : DR + 2].tolist()
+        opened = proof.leaves_open(owns)
+        if not any(opened):
+            return self.drop(source)
+        wider = np.zeros(9)
+        for axis, variance, own in zip((DR, DR + 1), opened, owns, strict=True):
+            wider[:3] += variance * (covariance[DR : DR + 3, axis] / own) ** 2
+            wider[3:6] += variance * (covariance[DV : DV + 3, axis] / own) ** 2
+        return self._put(source, wider)
+
+    def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
+        """A series is fused, and what others left open that are silent may be its to tell now."""
+        if not self.wider or not record.means.degrees:
+            return
+        for name in self.wider:
+            other = records.get(source := name.removesuffix(TILT))
+            if other is None or other is record or t_ns - other.heard_ns <= FORGET_NS:
+                continue
+            fine = 0.0 < record.sd_m <= max(FINE_M, COARSER * other.sd_m)
+            if fine if other.locates else other.moves and record.moves:
+                self.drop(source)
+
+    def sits(self, angles: Sequence[float], sd: float) -> None:
+        """The mounting's pitch and yaw (rad) as found so far, beyond what was configured with one
+        sigma `sd` (rad)."""
+        chance = SELDOM * sd * sd
+        pitch, yaw = (max(0.0, angle * angle - chance) for angle in angles)
+        wider = None
+        if pitch or yaw:
+            wider = np.zeros(9)
+            wider[7:] = pitch, yaw
+        self._put(MOUNTING, wider)
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""

@@ -27,7 +27,7 @@ does not. The filter's error, P / (P + R) of a position's variance, is the same 
 c no less: a filter that has gone astray by one of its sigmas could never be corrected else. After
 an outage of all positions the first that comes back is taken at once, but counts less until it is
 seen to go with the motion (fusiond.integrity.proof), and, where it lies behind the filter by more
-than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.punctual).
+than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.returns).
 
 With all series of position refused, how it began tells who is wrong (fusiond.integrity.jumps).
 
@@ -45,19 +45,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.integrity import support
+from fusiond.integrity import returns, support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
-from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
-from fusiond.integrity.punctual import MOVING_M_S, Punctual
-from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
+from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own
+from fusiond.integrity.punctual import MOVING_M_S
+from fusiond.integrity.returns import Begun
+from fusiond.integrity.series import DRIFTS, REPEATS, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting
-from fusiond.navigation.strapdown import LAT, LON, VD, VE, VN
+from fusiond.navigation.strapdown import VD
 
 Array = NDArray[np.float64]
 
@@ -69,9 +69,6 @@ REFUSED_IN_A_ROW = 3
 READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 # Probability of a false alarm of one mean test.
 FALSE_ALARM = 1e-6
-# A fix that comes back after an outage, farther from the filter than chance has it once in twenty
-# (fusiond.integrity.hedge), and behind it: one in forty of a sound receiver.
-SURPRISES = 0.95
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
 # its constraint is refused. A corner taken too fast is over by then.
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
@@ -116,7 +113,7 @@ class Isolation:
         self.hedge = Hedge()
         self.shown: tuple[float, ...] = ()
         """By how much (m, m/s) the series that was judged last was off, if it had a bias."""
-        self._contradicted = self._failed = False
+        self._begun, self._comes = Begun(), returns.NOTHING
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -184,7 +181,7 @@ class Isolation:
         """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
         their velocities are to prove themselves, as after an outage; and where one before it has
         `failed`, that they are on time."""
-        self._contradicted, self._failed = contradicted, failed
+        self._begun, self._comes = Begun(contradicted, failed), returns.NOTHING
         self._records, self._shared = {}, set()
         self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
 
@@ -226,18 +223,29 @@ class Isolation:
                 return Action.NONE
             away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
-        runs = offer is not None and self._prove(record, offer, outcome, nav)
+        begun, comes, self._comes = self._begun, self._comes, returns.NOTHING
+        runs = offer is not None and returns.prove(
+            self._records, record, offer, nav, begun, comes, self._pass
+        )
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
         if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            if record.means.unlikely or self.hedge.holds(aid.source):
+            if record.proof is not None:
+                self.hedge.returns(aid.source, record.proof, covariance)
+            elif record.means.unlikely or self.hedge.holds(aid.source):
                 self.hedge.look(aid, record, offer or velocity, nav, covariance)
+            self.hedge.answered(self._records, record, t_ns)
             return Action.NONE
         self.shown = differ(record, offer or velocity, covariance)
         self.hedge.drop(aid.source)
         return self._doubted(self._blame(record, aid), t_ns)
+
+    def comes(self, aid: Aid, state: State, covariance: Array) -> None:
+        """A position that is not yet seen to go with the motion is about to be fused into a filter
+        with that state and P (n, n)."""
+        self._comes = returns.coming(aid, state, covariance)
 
     def correcting(self, nav: Array, covariance: Array) -> None:
         """A position or velocity is about to be fused into a filter with the state `nav` (10,) and
@@ -272,39 +280,6 @@ class Isolation:
                 record.refused, record.jumped = 0, False
         record.heard_ns = t_ns
         return record
-
-    def _prove(self, record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
-        """A position is fused; whether it runs away from the motion since an outage, which a
-        velocity of the same device supports."""
-        first = record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
-        suspect = self._contradicted and first
-        if self._failed and first:
-            record.punctual = Punctual(offer.t_ns, started=True)
-        out = support.outage(self._records, offer.t_ns)
-        if out:
-            behind = self._behind(record, offer, outcome, nav)
-            record.punctual = Punctual(offer.t_ns) if behind else None
-        if record.punctual is not None:
-            v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
-            since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
-            record.punctual = None if since.told else since
-        if suspect or out:
-            record.proof = Proof.begun(offer, nav, record.means.colour, suspect)
-        elif record.proof is not None:
-            sd_m_s = support.velocity_sd(self._records, record.device)
-            proof = record.proof.with_one(offer, nav, sd_m_s)
-            record.proof = None if proof.proven else proof
-            limit = gate_threshold(self._pass, 2)
-            return proof.drifts(limit) and self._supported(record.device, offer.t_ns)
-        return False
-
-    @staticmethod
-    def _behind(record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
-        """Whether a fine position that is back lies behind the filter, by more than is likely."""
-        if record.sd_m > FINE_M or outcome.nis <= gate_threshold(SURPRISES, outcome.degrees):
-            return False
-        offset = apart(offer, float(nav[LAT]), float(nav[LON]), nav)
-        return offset.north * float(nav[VN]) + offset.east * float(nav[VE]) > 0.0
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:

@@ -246,12 +246,11 @@ class Means:
         """`add` and `biased` in one, of a series that is believed; the quantile is that of the
         `probability`. Where nothing is `whitened` the means are as they were."""
         if not whitened:
-            d = self.degrees
+            self.unlikely, d = False, self.degrees
             return d > 0 and self.biased(t_ns, gate_threshold(probability, d))
         packed, limit = self._ready(len(whitened)), gate_threshold(probability, len(whitened))
         found = _take(packed, np.array(whitened), t_ns, limit)
-        if found != _TOO_FEW:
-            self.unlikely = found == _UNLIKELY
+        self.unlikely = found == _UNLIKELY
         return found == _BIASED
 
     def _ready(self, degrees: int) -> Array:

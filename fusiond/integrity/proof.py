@@ -16,6 +16,20 @@ better than the line knows it. Fixes count with `UNPROVEN_SIGMAS` times their si
 has the sigma of the line, and the slope is beyond chance (5.3 sigma, one in a million) before an
 error that it causes is beyond 5 sigma: that is at a slope of 5.8.
 
+A filter that knows its way less well forgets the first fixes and is taken along by more than T / 2,
+and a slope beside such a way is told later; one that knew its place well is hardly taken along.
+With the gain K of each fix it is off by d g,
+
+    g <- g + K (t - g)
+
+What is published is never surer than that the above holds still, which is what an estimate knows
+that admits a drift; and it is open by what the slope has beyond what chance does once in twenty
+(fusiond.integrity.hedge). For a sigma of the slope sigma_b and its estimate b
+
+    max(P, (2^2 / 3) sigma_b^2 g^2) + max(0, b^2 - 3.84 sigma_b^2) g^2
+
+The first is P of white errors and a way without any: sigma_b T / 2 = sqrt(3) s / sqrt(n).
+
 Errors that last make means and slopes less certain than white ones would: by the `colour` that the
 series has shown before. The way has errors of its own: of velocities of sigma s_v, of which a slope
 gets sqrt(1.2) s_v / sqrt(n).
@@ -26,12 +40,14 @@ Source: least squares; Brumback, Srinath, IEEE Trans. AC 32 (1987), 1133.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import PositionOffer
+from fusiond.integrity.means import LIKELY
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.error_model import DR
@@ -93,15 +109,21 @@ class Trend(NamedTuple):
         )
 
     @property
-    def slope(self) -> tuple[float, float]:
-        """How fast they run away (m/s), and the sigma of one of its axes; infinite where nothing is
-        known."""
+    def line(self) -> Offset:
+        """How fast they run away, north and east (m/s), and one sigma of it (m/s); infinite where
+        nothing is known."""
         spread = self.tt - self.t * self.t / self.n if self.n else 0.0
         if spread <= 0.0:
-            return 0.0, math.inf
+            return Offset(0.0, 0.0, math.inf)
         north = (self.t_north - self.t * self.north / self.n) / spread
         east = (self.t_east - self.t * self.east / self.n) / spread
-        return math.hypot(north, east), self.sd / math.sqrt(spread)
+        return Offset(north, east, self.sd / math.sqrt(spread))
+
+    @property
+    def slope(self) -> tuple[float, float]:
+        """How fast they run away (m/s), and the sigma of one of its axes."""
+        north, east, sd = self.line
+        return math.hypot(north, east), sd
 
     def steady(self, least_sd: float = TREND_SD_M_S, slowest: float = math.inf) -> bool:
         """Whether the slope of a line through them is known to `least_sd` (m/s), and zero, and
@@ -123,7 +145,8 @@ class Proof(NamedTuple):
     """What is seen of a position that came back: where the body's origin was at its first fix (rad,
     rad; ns), the way since then by the filter's velocity, north and east (m), that velocity (m/s)
     and instant (ns), the sigma (m/s) of a velocity as a mean of many shows it, the trend of what is
-    between both ways, and the series' `colour` (1).
+    between both ways, the series' `colour` (1), and by how much a drift of 1 m/s has taken away the
+    filter, which `follows` it (s).
     """
 
     lat_rad: float
@@ -136,6 +159,7 @@ class Proof(NamedTuple):
     way: tuple[float, float] = (0.0, 0.0)
     trend: Trend = NO_TREND
     suspect: bool = False
+    follows: float = 0.0
 
     @staticmethod
     def begun(offer: PositionOffer, nav: Array, colour: float, suspect: bool = False) -> Proof:
@@ -148,17 +172,20 @@ class Proof(NamedTuple):
         v = float(nav[VN]), float(nav[VE])
         return Proof(*place, offer.t_ns, offer.t_ns, v, colour, suspect=suspect)
 
-    def with_one(self, offer: PositionOffer, nav: Array, sd_m_s: float) -> Proof:
-        """With one fix more, and the sigma of the velocities that there are now."""
+    def with_one(self, offer: PositionOffer, nav: Array, sd_m_s: float, gain: float) -> Proof:
+        """With one fix more, of which the filter has taken `gain` of what was between them, and the
+        sigma of the velocities that there are now."""
         v = float(nav[VN]), float(nav[VE])
         half_s = 0.5e-9 * (offer.t_ns - self.t_ns)
         north = self.way[0] + half_s * (v[0] + self.velocity[0])
         east = self.way[1] + half_s * (v[1] + self.velocity[1])
         moved = apart(offer, self.lat_rad, self.lon_rad, nav)
         z = Offset(moved.north + north, moved.east + east, moved.sd)
-        trend = self.trend.with_one(z, (offer.t_ns - self.begin_ns) * 1e-9)
+        t_s = (offer.t_ns - self.begin_ns) * 1e-9
+        follows = self.follows + gain * (t_s - self.follows)
+        trend, way = self.trend.with_one(z, t_s), (north, east)
         return self._replace(
-            t_ns=offer.t_ns, velocity=v, sd_m_s=sd_m_s, way=(north, east), trend=trend
+            t_ns=offer.t_ns, velocity=v, sd_m_s=sd_m_s, way=way, trend=trend, follows=follows
         )
 
     @property
@@ -166,6 +193,16 @@ class Proof(NamedTuple):
         """Of one axis of the slope (m/s)."""
         walked = WALKED * self.sd_m_s / math.sqrt(max(self.trend.n, 1))
         return math.hypot(self.trend.slope[1] * self.colour, walked)
+
+    def leaves_open(self, own: Sequence[float]) -> tuple[float, ...]:
+        """What of a position, north and east (m^2), is open beside the variances that the filter
+        has of its `own`, until it is known whether it drifts."""
+        variance = self.sigma**2
+        if not math.isfinite(variance):
+            return 0.0, 0.0
+        least = UNPROVEN_SIGMAS**2 / 3.0 * variance * self.follows**2
+        open_by = (max(0.0, b * b - LIKELY * variance) * self.follows**2 for b in self.trend.line)
+        return tuple(max(0.0, least - p) + more for p, more in zip(own, open_by, strict=False))
 
     @property
     def goes_along(self) -> bool:

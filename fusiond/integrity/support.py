@@ -91,7 +91,7 @@ def contested(records: Records, t_ns: int) -> str | None:
             return f"{name} is left out ({wrong}), or the IMU is wrong"
         if (
             r.proof
-            and not r.proof.goes_along
+            and not _goes_along(records, r)
             and r.believed
             and not others(records, r, t_ns, FINE_M)
         ):
@@ -186,10 +186,25 @@ def others(records: Records, record: Series, t_ns: int, sd_m: float) -> bool:
         r.locates
         and r is not record
         and r.believed
-        and (r.proof is None or r.proof.goes_along)
+        and (r.proof is None or _goes_along(records, r))
         and r.sd_m <= sd_m
         and t_ns - r.fused_ns <= OTHERS_NS
         for r in records.values()
+    )
+
+
+def _goes_along(records: Records, record: Series) -> bool:
+    """Whether a position that is back goes with the motion as far as is known. Of a device whose
+    own velocity was left out since, nothing but the whole proof says so: late fixes take a filter
+    along, and the velocities that had contradicted it with it."""
+    proof = record.proof
+    return (
+        proof is not None
+        and proof.goes_along
+        and not any(
+            r.moves and r.device == record.device and (r.excluded or r.back_ns >= proof.begin_ns)
+            for r in records.values()
+        )
     )
 
 

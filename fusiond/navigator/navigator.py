@@ -245,7 +245,7 @@ class Navigator:
             return
         due = self._lateness.due(e.t_ns)
         doubtful = due and self._standing.doubtful(e, self.timeline.isolation)
-        if (doubtful or self._lateness.looking) and self._late():
+        if (doubtful or self._lateness.pending) and self._late():
             return
         self._left_out.tell()
         if self.warm is not None and self.warm.refused_by is not None:
@@ -351,7 +351,7 @@ class Navigator:
             return Mode.ALIGNING, self._aligner.reason
         if silent > self.config.imu.gap_s:
             return Mode.INVALID, self._door.silence(silent)
-        p = self.estimator.covariance.item
+        e, p = self.estimator, self.estimator.covariance.item
         if not 0.0 <= (variance := p(6, 6) + p(7, 7)) <= self.config.estimator.invalid_sd_m**2:
             return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
         if self.on_trial:
@@ -360,8 +360,8 @@ class Navigator:
             return Mode.COASTING, f"heading from {self.started.how}; {hangs}"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why
-        shaken = self._standing.shaken(self.estimator, self.timeline.isolation)
-        if (why := shaken or self._units.unproven(self.estimator)) is not None:
+        shaken = self._standing.shaken(e, self.timeline.isolation) or self._lateness.suspects
+        if (why := shaken or self._units.unproven(e)) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - self._last_position_ns) * 1e-9
         if unaided > self.config.estimator.coast_after_s:

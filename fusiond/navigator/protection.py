@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.load import ConfigError
@@ -112,9 +114,9 @@ class ProtectionWatch:
 
     def _levels(self, e: SeparatedEstimator) -> _Levels:
         vertical = not e.model.hold_height
-        of_filter = filter_protection(
-            e.covariances(), e.separations(), self._risk, vertical=vertical
-        )
+        # What is not told yet may be the IMU's fault, which no mode stands for.
+        covariances = e.covariances() + np.diag(e.wider[:3])
+        of_filter = filter_protection(covariances, e.separations(), self._risk, vertical=vertical)
         names = zip(e.devices, of_filter.apart.tolist(), strict=True)
         blamed = [f"the solution without {name} is apart" for name, apart in names if apart]
         hpl, vpl = [of_filter.hpl_m], [math.inf if of_filter.vpl_m is None else of_filter.vpl_m]

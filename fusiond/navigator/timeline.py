@@ -17,11 +17,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import Offer
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
+from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
@@ -95,6 +96,8 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.isolation = Isolation()
         self._wider = self.isolation.hedge.wider
+        self._mounting = estimator.model.slots_of(MOUNTING)
+        self._mounting_sd = max(estimator.model.initial[self._mounting].tolist(), default=0.0)
 
     def start(
         self, contradicted: bool = False, used: Collection[Offer] = (), failed: bool = False
@@ -243,6 +246,9 @@ class Timeline:
                 action = isolation.corrected(aid.t_ns, *after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
+            if aid.constraint and self._mounting:
+                angle = estimator.xi.item
+                isolation.hedge.sits([angle(slot) for slot in self._mounting], self._mounting_sd)
             if isolation.hedge.wider is not self._wider:
                 self._hedge()
         return outcome
@@ -258,6 +264,9 @@ class Timeline:
         if self.estimator.isolates:
             return self.estimator.update(aid)
         if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
+            e = self.estimator
+            state = State(e.nav, e.xi, e.step, e.model, e.covariance)
+            self.isolation.comes(aid, state, e.covariance)
             return self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
         lasting = self.isolation.coarseness(aid)
         return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))

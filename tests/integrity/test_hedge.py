@@ -98,6 +98,76 @@ def test_a_coarse_position_leaves_nothing_open_and_a_checkpoint_keeps_it() -> No
     assert made.isolation.hedge.wider is NOTHING
 
 
+def _left_open() -> tuple[Bench, int]:
+    """A receiver that has left something open, and the next second."""
+    made = bench()
+    made.both(range(60))
+    t = 60
+    while "gnss" not in made.isolation.hedge.wider:
+        made.fix(t, 1.0)
+        t += 1
+    return made, t
+
+
+def test_what_a_silent_source_left_open_is_another_s_to_tell() -> None:
+    """Silence answers nothing, nor does a coarse fix; one as fine does, with a mean of its own."""
+    made, t = _left_open()
+    wider = made.isolation.hedge.wider["gnss"]
+    for k in range(t, t + 30):
+        made.velocity(k)
+        made.fix(k, source="rdss", sd_m=20.0)
+        assert made.isolation.hedge.wider["gnss"] is wider
+    for k in range(t + 30, t + 33):
+        made.fix(k, source="second", sd_m=2.0)
+        assert made.isolation.hedge.wider["gnss"] is wider
+    made.fix(t + 33, source="second", sd_m=2.0)
+    assert "gnss" not in made.isolation.hedge.wider
+    other, t = _left_open()
+    for k in range(t, t + 4):  # not silent: two that disagree
+        other.fix(k, 1.0)
+        other.fix(k + 0.5, source="second", sd_m=2.0)
+    assert "gnss" in other.isolation.hedge.wider
+
+
+def test_a_velocity_answers_for_a_silent_velocity() -> None:
+    """For its tilt as well."""
+    made = bench()
+    for k in range(200):
+        made.velocity(0.5 * k)
+    t = 100.0
+    while "gnss_velocity tilt" not in made.isolation.hedge.wider:
+        made.velocity(t, 1.5)
+        t += 0.5
+    for k in range(20):
+        made.fix(t + 6 + k)
+    assert "gnss_velocity tilt" in made.isolation.hedge.wider
+    for k in range(4):
+        aid = VelocityAid(
+            "second_velocity", round((t + 30 + k) * S), GATE, (8.0, 3.0, 0.0), (0.05,) * 3, LEVER
+        )
+        made.isolation.judge(aid, Outcome("fused", 0.0, 3, (0.0, 0.0, 0.0)), NAV, made.covariance)
+    assert "gnss_velocity tilt" not in made.isolation.hedge.wider
+
+
+def test_one_that_is_back_leaves_open_what_it_shows_then() -> None:
+    """Its means begin anew, and so does what is unlikely."""
+    made, t = _left_open()
+    made.fix(t + 6)
+    assert "gnss" not in made.isolation.hedge.wider
+
+
+def test_a_mounting_that_is_not_the_configured_one_is_open_by_what_chance_has_not() -> None:
+    made, sd = bench(), math.radians(5.0)
+    made.isolation.hedge.sits((math.radians(3.0), math.radians(-16.0)), sd)
+    assert made.isolation.hedge.wider is NOTHING
+    made.isolation.hedge.sits((math.radians(3.0), math.radians(-19.0)), sd)
+    (wider,) = made.isolation.hedge.wider.values()
+    assert not wider[:8].any()
+    assert math.degrees(math.sqrt(wider[8])) == pytest.approx(math.sqrt(19.0**2 - 10.83 * 25.0))
+    made.isolation.hedge.sits((math.radians(3.0), math.radians(-15.0)), sd)
+    assert made.isolation.hedge.wider is NOTHING
+
+
 def test_excess_is_what_a_mean_has_beyond_chance() -> None:
     means = Means.begun(white=True)
     for _ in range(500):

@@ -116,6 +116,19 @@ def test_a_receiver_that_is_left_out_raises_the_level_beyond_its_error() -> None
     assert heard == 2 * ALARMED_AT_FIRST
 
 
+def test_the_level_bounds_what_is_published_with_all_that_is_open() -> None:
+    """What no test has told yet may be the IMU's fault, for which no mode of the level stands."""
+    navigator, _ = driven(20.0, two=True)
+    now, estimator = navigator.imu.latest_ns, navigator.estimator
+    before = navigator.solution(now)
+    estimator.wider[:3] = 4.0, 4.0, 9.0
+    navigator._protection.tell()
+    after = navigator.solution(now)
+    assert after.bound.hpl_m > before.bound.hpl_m + 3.0
+    assert after.bound.vpl_m > before.bound.vpl_m + 3.0
+    assert after.bound.hpl_m > 5.0 * max(after.sd_ned_m[:2])
+
+
 def test_before_the_start_the_levels_are_unknown() -> None:
     navigator = Navigator(Config.model_validate(settings(20.0)))
     bound = navigator.solution(0).bound

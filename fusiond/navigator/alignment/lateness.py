@@ -189,6 +189,11 @@ class Lateness:
         """Whether a look has begun and not ended."""
         return self._looking is not None
 
+    @property
+    def pending(self) -> bool:
+        """Whether a look has begun and not ended, or has left a suspicion: nothing else ends it."""
+        return self.looking or bool(self.suspects)
+
     def stop(self) -> None:
         """A look that has not ended is given up: what was made of the fixes is."""
         self._looking, self._due_ns = None, 0

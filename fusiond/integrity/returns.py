@@ -1,0 +1,112 @@
+r"""What a position is asked once it is back after an outage, or a filter was started from it anew.
+
+That it goes with the motion (fusiond.integrity.proof), always; and that it is on time
+(fusiond.integrity.punctual), where its first fix lies behind the filter by more than is likely, or
+the start was one after a failure: nothing else is known of it then, and an outage more does not
+tell either.
+
+A fix that is late by tau lies behind by tau v, along the track and nowhere else. So with the
+innovation z = estimate - fix, S its covariance and u the direction of the velocity, it is
+
+    u^T z > SURPRISE sqrt(u^T S u)
+
+that is asked: of all three axes together, a vehicle's height and what is across the track would
+hide by their own noise what is along it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid, NotApplicable, State
+from fusiond.aiding.offers import PositionOffer
+from fusiond.estimators.base import gate_threshold
+from fusiond.integrity import support
+from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof
+from fusiond.integrity.punctual import MOVING_M_S, Punctual
+from fusiond.integrity.series import NEVER_NS, Series
+from fusiond.integrity.support import FINE_M
+from fusiond.navigation.error_model import DR
+from fusiond.navigation.strapdown import VE, VN
+
+Array = NDArray[np.float64]
+
+# Behind by so many sigmas a sound receiver is one time in forty.
+SURPRISE = 1.96
+
+
+class Begun(NamedTuple):
+    """How the filter was started: positions had been `contradicted` by their velocities; a filter
+    before it had `failed`."""
+
+    contradicted: bool = False
+    failed: bool = False
+
+
+class Coming(NamedTuple):
+    """Of a position that is about to be fused: whether it lies `behind` by more than is likely, and
+    the `gain` that the filter follows it with, the horizontal axes' mean."""
+
+    behind: bool = False
+    gain: float = 0.0
+
+
+NOTHING = Coming()
+
+
+def coming(aid: Aid, state: State, covariance: Array) -> Coming:
+    """Of a position, about to be fused into a filter of that state and P (n, n), and to count with
+    `UNPROVEN_SIGMAS` times its sigma."""
+    rows = NotApplicable("") if aid.screened else aid.innovation(state)
+    if isinstance(rows, NotApplicable) or not np.array_equal(rows.h[:2, DR : DR + 2], np.eye(2)):
+        return NOTHING
+    with_all = rows.h[:2] @ covariance
+    own, r = with_all @ rows.h[:2].T, np.diag(rows.r[:2])
+    gain = np.linalg.solve(own + UNPROVEN_SIGMAS**2 * r, with_all[:, DR : DR + 2])
+    followed = max(0.0, 0.5 * float(np.trace(gain)))
+    v_n, v_e = float(state.nav[VN]), float(state.nav[VE])
+    speed = math.hypot(v_n, v_e)
+    if speed <= MOVING_M_S:
+        return Coming(gain=followed)
+    along = np.array([v_n, v_e]) / speed
+    variance = float(along @ (own + r) @ along)
+    return Coming(float(along @ rows.z[:2]) > SURPRISE * math.sqrt(variance), followed)
+
+
+def prove(
+    records: Mapping[str, Series],
+    record: Series,
+    offer: PositionOffer,
+    nav: Array,
+    begun: Begun,
+    comes: Coming,
+    probability: float,
+) -> bool:
+    """A position was fused into a filter with the state `nav` (10,); whether it runs away, beyond a
+    chi-square of that `probability`, from the motion since an outage, which a velocity of the same
+    device supports. `comes`: what was seen of it before."""
+    first = record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
+    suspect = begun.contradicted and first
+    if begun.failed and first:
+        record.punctual = Punctual(offer.t_ns, started=True)
+    out = support.outage(records, offer.t_ns)
+    if out and not (record.punctual and record.punctual.started):
+        record.punctual = Punctual(offer.t_ns) if comes.behind and record.sd_m <= FINE_M else None
+    if record.punctual is not None:
+        v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
+        since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
+        record.punctual = None if since.told else since
+    if suspect or out:
+        record.proof = Proof.begun(offer, nav, record.means.colour, suspect)
+    elif record.proof is not None:
+        sd_m_s = support.velocity_sd(records, record.device)
+        proof = record.proof.with_one(offer, nav, sd_m_s, comes.gain)
+        record.proof = None if proof.proven else proof
+        limit = gate_threshold(probability, 2)
+        return proof.drifts(limit) and support.supported(records, record.device, offer.t_ns)
+    return False
