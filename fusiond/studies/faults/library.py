@@ -114,6 +114,10 @@ def _axes(x: str, y: str, z: str, config: Config) -> Config:
     return config.model_copy(update={"imu": section})
 
 
+sideways = partial(_axes, "+y", "+x", "-z")
+"""As if the unit's forward axis pointed to the right."""
+
+
 def _heading_off(config: Config) -> Config:
     """The town drive starts with a heading of 40 deg."""
     update = {"heading": ("config",), "heading_deg": 130.0, "heading_sd_deg": 5.0}
