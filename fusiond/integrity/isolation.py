@@ -45,19 +45,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
-from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, filters_own
+from fusiond.integrity.proof import NO_TREND, Offset, Proof, apart, behind, filters_own, settled
 from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import DRIFTS, NEVER_NS, REPEATS, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting
-from fusiond.navigation.strapdown import LAT, LON, VD, VE, VN
+from fusiond.navigation.strapdown import VD, VE, VN
 
 Array = NDArray[np.float64]
 
@@ -191,11 +191,16 @@ class Isolation:
     # ------------------------------------------------------------------ judgement
 
     def judge(
-        self, aid: Aid, outcome: Outcome, nav: Array, covariance: Array | None = None
+        self,
+        aid: Aid,
+        outcome: Outcome,
+        nav: Array,
+        covariance: Array | None = None,
+        state: State | None = None,
     ) -> Action:
         """Take in how an aid ended, fused, gated or only looked at; what the filter shall do.
 
-        `nav` (10,): the navigation state that it was compared with; P (n, n), where it is known.
+        `nav` (10,): what it was compared with; P (n, n) and the whole `state`, where known.
         """
         t_ns = aid.t_ns
         record = self._record(aid)
@@ -204,6 +209,7 @@ class Isolation:
         offer, velocity, value = said(aid.offers())
         offset, self.shown = None, ()
         if offer is not None:
+            offer = offer if state is None else settled(offer, state)
             offset = apart(offer, lat, lon, nav)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
         elif record.moves:
@@ -282,8 +288,9 @@ class Isolation:
             record.punctual = Punctual(offer.t_ns, started=True)
         out = support.outage(self._records, offer.t_ns)
         if out:
-            behind = self._behind(record, offer, outcome, nav)
-            record.punctual = Punctual(offer.t_ns) if behind else None
+            unlikely = outcome.nis > gate_threshold(SURPRISES, outcome.degrees)
+            late = unlikely and record.sd_m <= FINE_M and behind(offer, nav)
+            record.punctual = Punctual(offer.t_ns) if late else None
         if record.punctual is not None:
             v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
             since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
@@ -297,14 +304,6 @@ class Isolation:
             limit = gate_threshold(self._pass, 2)
             return proof.drifts(limit) and self._supported(record.device, offer.t_ns)
         return False
-
-    @staticmethod
-    def _behind(record: Series, offer: PositionOffer, outcome: Outcome, nav: Array) -> bool:
-        """Whether a fine position that is back lies behind the filter, by more than is likely."""
-        if record.sd_m > FINE_M or outcome.nis <= gate_threshold(SURPRISES, outcome.degrees):
-            return False
-        offset = apart(offer, float(nav[LAT]), float(nav[LON]), nav)
-        return offset.north * float(nav[VN]) + offset.east * float(nav[VE]) > 0.0
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:
