@@ -236,15 +236,15 @@ class Navigator:
             return
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
-        e = self.estimator
-        failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav)
+        e, isolation = self.estimator, self.timeline.isolation
+        failure = self.calibrating.turned or self._standing.failure(e.t_ns, isolation, e.nav)
         if failure is not None:
             self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
         due = self._lateness.due(e.t_ns)
-        doubtful = due and self._standing.doubtful(e, self.timeline.isolation)
+        doubtful = due and self._standing.doubtful(e, isolation)
         if (doubtful or self._lateness.looking) and self._late():
             return
         self._left_out.tell()

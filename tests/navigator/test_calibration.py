@@ -239,6 +239,33 @@ def test_what_wanders_by_nature_may_move_so_far() -> None:
         assert watched(lambda t_s, step=step: t_s * step / STAYS_S, 1e-6, walk=True) is state
 
 
+@pytest.mark.parametrize("turned_deg", [0.0, 5.0])
+def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg: float) -> None:
+    """The mean of noisy looks at a constant moves by what its variance shrinks by, for ever; once
+    the constant changes it moves by more, though a mean of so many moves slowly."""
+    model = Model("watched", (mounting(math.radians(5.0)),))
+    told = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        watch = CalibrationWatch(model, lambda code, text: None)
+        prior, noise = math.radians(5.0), math.radians(1.0)
+        yaw = rng.normal(0.0, prior)
+        estimate, variance = 0.0, prior**2
+        for k in range(120):
+            turned = math.radians(turned_deg) * (k >= 60)
+            gain = variance / (variance + noise**2)
+            estimate += gain * (yaw + turned + rng.normal(0.0, noise) - estimate)
+            variance *= 1.0 - gain
+            watch.look(k * LOOK_NS, np.full(model.size, estimate), np.eye(model.size) * variance)
+            if watch.turned:
+                told.append(k)
+                break
+        watch.restart()
+        assert watch.turned is None
+    assert len(told) == (30 if turned_deg else 0)
+    assert all(60 <= k <= 110 for k in told)
+
+
 def test_nothing_is_settled_before_a_minute_has_passed() -> None:
     model = Model("watched", (mounting(1.0),))
     watch = CalibrationWatch(model, lambda code, text: None)

@@ -204,7 +204,7 @@ def test_stamps_and_rate_of_the_imu() -> None:
     pairs = whole.samples[99:149].reshape(25, 2, 6)
     np.testing.assert_allclose(halved.samples[inside], pairs.mean(axis=1))
     assert np.array_equal(halved.stamps[inside], whole.stamps[100:149:2])
-    fast = imu_faults.clock_fast(whole, 10.0, 20.0, ppm=200.0)
+    fast = imu_faults.clock_fast(whole, 10.0, 30.0, ppm=200.0)
     assert fast.stamps[-1] - whole.stamps[-1] == pytest.approx(200e-6 * 20e9, rel=0.01)
     behind = imu_faults.stamps_off(whole, 10.0, 5.0, -0.9)
     assert (whole.stamps - behind.stamps).max() == 900_000_000

@@ -27,6 +27,7 @@ def _both(first: Alter, second: Alter) -> Alter:
 _of_imu = partial(Fault, of_imu=True, phases=UNDER_WAY)
 _of_fixes = partial(Fault, phases=UNDER_WAY)
 _of_wheels = partial(Fault, of_imu=True, phases=UNDER_WAY, drive=Drive(wheels=True))
+_silences = partial(Fault, phases=("navigating",))
 _at_once = partial(Fault, phases=("navigating",), drive=Drive(wheels=True))
 _slip = partial(aid.wheels_scaled, factor=1.5)
 
@@ -45,7 +46,9 @@ MORE: dict[str, Fault] = {
     "force_bias_0.5_m_s2": _of_imu(partial(imu.bias_step, size=0.5, axis=FORWARD)),
     "gyro_scale_10%": _of_imu(partial(imu.scaled_axis, axis=imu.YAW_AXIS, factor=1.1)),
     "force_scale_10%": _of_imu(partial(imu.scaled_axis, axis=UP, factor=1.1)),
-    "mount_turned_10_deg": _of_imu(partial(imu.mount_turned, angle_rad=10.0 * DEG)),
+    "mount_turned_10_deg": _of_imu(
+        partial(imu.mount_turned, angle_rad=10.0 * DEG), turned_rad=-10.0 * DEG
+    ),
     "imu_noise_x10": _of_imu(partial(imu.noisy, times=10.0), 60.0),
     "imu_lost_0.3s": _of_imu(imu.silent, 0.3),
     "imu_lost_1s": _of_imu(imu.silent, 1.0),
@@ -81,21 +84,21 @@ MORE: dict[str, Fault] = {
         60.0,
     ),
     "step_and_locked": _at_once(_both(partial(aid.step, north_m=50.0), aid.wheels_locked), 10.0),
-    "step_and_gyro_bias": _at_once(_both(partial(aid.step, north_m=50.0), imu.bias_step), 20.0),
-    "no_fixes": _at_once(
+    "step_and_gyro_bias": _silences(_both(partial(aid.step, north_m=50.0), imu.bias_step), 20.0),
+    "no_fixes": _silences(
         lambda r, begin_s, length_s: aid.absent(r, begin_s, length_s, PositionFix, DelayedFix), 60.0
     ),
     "no_wheels": _at_once(
         lambda r, begin_s, length_s: aid.absent(r, begin_s, length_s, WheelSpeed), 60.0
     ),
-    "no_aids": _at_once(aid.absent, 60.0),
-    "no_aids_and_gyro_bias": _at_once(_both(aid.absent, imu.bias_step), 30.0),
-    "no_aids_and_imu_noise": _at_once(_both(aid.absent, partial(imu.noisy, times=10.0)), 30.0),
+    "no_aids": _silences(aid.absent, 60.0),
+    "no_aids_and_gyro_bias": _silences(_both(aid.absent, imu.bias_step), 30.0),
+    "no_aids_and_imu_noise": _silences(_both(aid.absent, partial(imu.noisy, times=10.0)), 30.0),
     "no_fixes_and_slip": _at_once(
         _both(lambda r, begin_s, length_s: aid.absent(r, begin_s, length_s, PositionFix), _slip),
         20.0,
     ),
-    "all_silent": _at_once(_both(aid.absent, imu.silent), 5.0),
+    "all_silent": _silences(_both(aid.absent, imu.silent), 5.0),
 }
 
 EVERY = {**FAULTS, **MORE}

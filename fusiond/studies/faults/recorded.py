@@ -9,6 +9,8 @@ Were both optimal, the variance of the difference would be that of the fault's l
 smoothed, which uses all that the other uses: so that the ratio is too small, by little where the
 smoothed one is much the surer. An error that both share, a receiver's that lasts, is not seen.
 
+Where a fault turns the unit in the vehicle its yaw is compared with that of either.
+
 The recording is cut: a run begins `LEAD_S` before the instant of a fault, on the move or at rest as
 it is, in phase `aligning` 5 s before it, and ends `AFTER_S` behind it.
 """
@@ -36,7 +38,7 @@ from fusiond.offline.aid_files import READERS, Arrival, source_of
 from fusiond.offline.can_log import read_can_log
 from fusiond.offline.process import process
 from fusiond.simulation.imu_truth import States
-from fusiond.studies.faults.judge import Course, Sample, judge
+from fusiond.studies.faults.judge import QUANTITIES, Course, Sample, judge
 from fusiond.studies.faults.library import Fault, PhaseName
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.recording import Received, Recording, town
@@ -50,6 +52,7 @@ OUTAGE_S = 20.0
 """Before and behind the instant of a fault in phase `coasting`."""
 ALIGNING_S = 5.0
 FUSED = (PositionFix, WheelSpeed, DelayedFix, Height)
+YAW = QUANTITIES.index("yaw")
 KINDS = ("gnss", "wheel", "rdss", "barometer")
 """Tables of a folder that are fused where they are there."""
 
@@ -166,8 +169,14 @@ def _run(place: Place, part: _Part, fault: Fault, begin_s: float) -> Course:
         config = fault.configure(config)
     states, sd = _smoothed(place, part.from_s, part.duration_s)
 
+    turned = replace(states, rpy=states.rpy + np.array([0.0, 0.0, fault.turned_rad]))
+
     def look(solution: Solution, row: int) -> Sample:
-        return compared(solution, states, row, sd[row].tolist())
+        found = compared(solution, states, row, sd[row].tolist())
+        if fault.turned_rad and solution.t_ns >= begin_s * 1e9:
+            other = compared(solution, turned, row, sd[row].tolist())
+            return min(found, other, key=lambda sample: sample.ratios[YAW : YAW + 1])
+        return found
 
     return driven(config, recording, part.duration_s, look)
 
