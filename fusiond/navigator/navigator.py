@@ -137,6 +137,7 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
         self._units.change()
+        self.calibrating.restart()  # of the first unit
         publish_by_axes(self.estimator, self.config.imu, spare=True)
         if self.started is not None:
             return hand_over(self.estimator, self.timeline, self.config.imu)
@@ -189,11 +190,10 @@ class Navigator:
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
-        self.started = None
         self._lateness.stop()
         self.timeline.clear()
         self._protection.restart()
-        self._saved, self.warm = saved, None
+        self.started, self._saved, self.warm = None, saved, None
         self._aligner = self._new_aligner()
         self._aligner.reason = why
 

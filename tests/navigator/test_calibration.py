@@ -110,15 +110,22 @@ def run(
     calibration: SavedCalibration | None = None,
     on_event: Callable[[str, str], None] = lambda code, text: None,
     heading: str = "config",
+    spare_s: float = math.inf,
 ) -> Navigator:
-    """A navigator after the first seconds of the drive."""
+    """A navigator after the first seconds of the drive; from `spare_s` on by the spare IMU, which
+    sits as the first."""
     d = drive()
-    settings = {**CONFIG, "alignment": {**CONFIG["alignment"], "heading": [heading]}}
+    aligned = {**CONFIG["alignment"], "heading": [heading]}
+    settings: dict[str, Any] = {**CONFIG, "alignment": aligned}
+    if spare_s < seconds:
+        settings["imu"] = {**CONFIG["imu"], "spare": {"source": "spare"}}
     navigator = Navigator(Config.model_validate(settings), on_event=on_event)
     navigator.calibration = calibration
     waiting = list(d.measurements)
     step = round(RATE_HZ / 2.0)
     for first in range(0, round(seconds * RATE_HZ), step):
+        if first == round(spare_s * RATE_HZ if spare_s < seconds else -1.0):
+            navigator.change_imu()
         navigator.add_imu(d.times[first : first + step], d.samples[first : first + step])
         while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
             m = waiting.pop(0)
@@ -264,6 +271,15 @@ def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg:
         assert watch.turned is None
     assert len(told) == (30 if turned_deg else 0)
     assert all(60 <= k <= 110 for k in told)
+
+
+def test_a_spare_is_another_mounting_and_no_turn() -> None:
+    events: list[str] = []
+    navigator = run(125.0, on_event=lambda code, _: events.append(code), spare_s=100.0)
+    assert "diverged" not in events
+    assert navigator.started is not None
+    found = {p.name: p.value for p in navigator.calibrating.parameters}
+    assert abs(found["mounting_yaw_deg"]) < YAW_DEG + 1.0  # found anew
 
 
 def test_nothing_is_settled_before_a_minute_has_passed() -> None:
