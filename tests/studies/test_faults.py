@@ -245,6 +245,10 @@ def test_multipath_jumps_again_behind_the_tunnel() -> None:
         if isinstance(item.measurement, PositionFix | DelayedFix)
     }
     assert fixes == {*range(1, 11), *range(20, 30)}
+    ends = aid_faults.multipath_tunnel_jump(recording(), 10.0, 25.0)
+    assert not any(
+        item.t_ns > 11 * 10**9 for item in ends.received if item.measurement.source == "gnss"
+    )
 
 
 def test_every_fault_has_rows_and_begins_inside_the_drive() -> None:

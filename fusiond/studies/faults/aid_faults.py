@@ -234,7 +234,10 @@ def multipath_tunnel_jump(r: Recording, begin_s: float, length_s: float) -> Reco
     burst = _changed(r, begin_s, MULTIPATH_S, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M))
     out_s = begin_s + length_s
     tunnel = burst.withheld(begin_s + MULTIPATH_S, out_s)
-    first_s = _fixes(tunnel, out_s, math.inf)[0].t_ns * 1e-9
+    behind = _fixes(tunnel, out_s, math.inf)
+    if not behind:  # a recording that ends in it
+        return tunnel
+    first_s = behind[0].t_ns * 1e-9
     return _changed(
         tunnel, first_s - 1e-6, 2e-6, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M)
     )
