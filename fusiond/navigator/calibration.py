@@ -74,6 +74,9 @@ LOOK_NS = 10_000_000_000
 # cars (50 minutes) the yaw moved by 1.9 at most of the sigmas that it may move by.
 TURN_LOOKS = 30
 TURNED_SIGMAS = 5.0
+# What was configured may be wrong by more than it says, which is no turn: looks count from half of
+# its sigma on, where three quarters of it are forgotten.
+KNOWN_SHARE = 0.5
 # A sigma of what moves the yaw of a mounting that is firm: a slip that lasts for minutes (crown of
 # the road, side wind) is some tenths of a degree.
 FIRM_RAD = math.radians(0.2)
@@ -167,6 +170,7 @@ class CalibrationWatch:
         self._slots = calibration_slots(model)
         self._least_sd = np.array([askew_rad * (s.kind == MOUNTING) for s in self._slots])
         self._indices = np.array([s.index for s in self._slots], dtype=np.int64)
+        self._prior = np.array([s.prior_sd / s.factor for s in self._slots])
         yaws = (k for k, s in enumerate(self._slots) if s.kind == MOUNTING and "yaw" in s.name)
         self._yaws = tuple(yaws)
         self._event = on_event
@@ -179,7 +183,7 @@ class CalibrationWatch:
         self._past: deque[tuple[int, Array]] = deque()
         self._learned = np.zeros(len(self._slots))
         self._variance = np.zeros(0)
-        self._looks: deque[tuple[Array, Array]] = deque(maxlen=TURN_LOOKS)
+        self._looks: deque[tuple[Array, Array, NDArray[np.bool_]]] = deque(maxlen=TURN_LOOKS)
         self.turned: str | None = None
         """Set once the IMU has turned in the vehicle: why nothing before counts any more."""
         self.parameters: tuple[Parameter, ...] = ()
@@ -222,13 +226,16 @@ class CalibrationWatch:
             self._learned = self._learned + np.maximum(self._variance - variance, 0.0)
         self._variance = variance.copy()
         for k in self._yaws:
-            for before, learned in self._looks:
+            for before, learned, known in self._looks:
+                if not known[k]:
+                    continue
                 moved = float(now[k] - before[k])
                 may = math.sqrt(self._learned[k] - learned[k] + FIRM_RAD**2)
                 if abs(moved) > TURNED_SIGMAS * may:
                     by = f"{math.degrees(moved):+.1f} deg, {abs(moved) / may:.0f} sigma"
                     self.turned = f"the IMU has turned in the vehicle: its yaw has moved by {by}"
-        self._looks.append((now, self._learned))
+        known = np.sqrt(variance) <= KNOWN_SHARE * self._prior
+        self._looks.append((now, self._learned, known))
 
     def _tell(self) -> None:
         for p in self.parameters:

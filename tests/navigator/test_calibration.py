@@ -273,6 +273,20 @@ def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg:
     assert all(60 <= k <= 110 for k in told)
 
 
+def test_what_was_configured_wrongly_is_no_turn() -> None:
+    """Seven of its sigmas: the state says so, and starting anew would not change it."""
+    prior, noise, yaw = math.radians(5.0), math.radians(1.0), math.radians(35.0)
+    model = Model("watched", (mounting(prior),))
+    watch = CalibrationWatch(model, lambda code, text: None)
+    estimate, variance = 0.0, prior**2
+    for k in range(200):
+        watch.look(k * LOOK_NS, np.full(model.size, estimate), np.eye(model.size) * variance)
+        gain = variance / (variance + (5.0 * noise) ** 2)
+        estimate += gain * (yaw - estimate)
+        variance *= 1.0 - gain
+    assert watch.turned is None
+
+
 def test_a_spare_is_another_mounting_and_no_turn() -> None:
     events: list[str] = []
     navigator = run(125.0, on_event=lambda code, _: events.append(code), spare_s=100.0)
