@@ -111,6 +111,10 @@ class Estimator(Protocol):
     """Variances (9,) that `sigmas` has beyond P's (fusiond.integrity.hedge)."""
 
     @property
+    def state(self) -> State:
+        """What an aid may look at."""
+
+    @property
     def covariance(self) -> Array:
         """P (n, n) of the published error state."""
 

@@ -51,7 +51,7 @@ from fusiond.integrity import returns, support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
-from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own
+from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own, settled
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Series, said, velocity_away
@@ -188,11 +188,16 @@ class Isolation:
     # ------------------------------------------------------------------ judgement
 
     def judge(
-        self, aid: Aid, outcome: Outcome, nav: Array, covariance: Array | None = None
+        self,
+        aid: Aid,
+        outcome: Outcome,
+        nav: Array,
+        covariance: Array | None = None,
+        state: State | None = None,
     ) -> Action:
         """Take in how an aid ended, fused, gated or only looked at; what the filter shall do.
 
-        `nav` (10,): the navigation state that it was compared with; P (n, n), where it is known.
+        `nav` (10,): what it was compared with; P (n, n) and the whole `state`, where known.
         """
         t_ns = aid.t_ns
         record = self._record(aid)
@@ -201,6 +206,7 @@ class Isolation:
         offer, velocity, value = said(aid.offers())
         offset, self.shown = None, ()
         if offer is not None:
+            offer = offer if state is None else settled(offer, state)
             offset = apart(offer, lat, lon, nav)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
         elif record.moves:

@@ -46,6 +46,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.base import State
 from fusiond.aiding.offers import PositionOffer
 from fusiond.integrity.means import LIKELY
 from fusiond.navigation.compiled import compiled
@@ -240,6 +241,24 @@ def apart(offer: PositionOffer, lat: float, lon: float, nav: Array) -> Offset:
     north, east = _apart(nav, lat - offer.lat_rad, lon - offer.lon_rad, *offer.lever)
     sd_n, sd_e, _ = offer.sd
     return Offset(north, east, max(sd_n, sd_e))
+
+
+def settled(offer: PositionOffer, state: State) -> PositionOffer:
+    """Without what the filter has found of its offset in time and of its lever arm: where a vehicle
+    turns or brakes these move it by v tau and C dl, which is no drift. What the fixes share stays
+    in: a drift goes into it. Of the lever arm's own motion, w x l tau, there is a centimetre."""
+    time, rest = state.model.slots_of_each((offer.time,), (offer.rest,))
+    if not (time.size or rest.size):
+        return offer
+    nav, xi = state.nav, state.xi
+    late_s = float(xi[time[0]]) if time.size else 0.0
+    x, y, z = xi[rest].tolist() if rest.size else (0.0, 0.0, 0.0)
+    north, east = _apart(nav, 0.0, 0.0, x, y, z)
+    north += float(nav[VN]) * late_s
+    east += float(nav[VE]) * late_s
+    to_north, to_east = metres_a_radian(nav)
+    lat, lon = offer.lat_rad - north / to_north, offer.lon_rad - east / to_east
+    return offer._replace(lat_rad=lat, lon_rad=lon)
 
 
 def filters_own(offer: PositionOffer, covariance: Array) -> float:

@@ -10,6 +10,12 @@ beyond the value configured there, with one sigma and one of three states:
 An estimate of sigma s from a prior of sigma p holds the share (s / p)^2 of the prior's mean: at a
 fifth 4 %, so a settled value is the drive's and not the owner's. Where s is above 0.9 p, the drive
 has said less than a quarter of what the prior had said already.
+
+The estimates of a constant are a martingale: from one instant to a later one they move by an amount
+of variance P_1 - P_2, what has been learned meanwhile, and not more. An angle of the mounting that
+has moved by `TURNED_SIGMAS` of that is none: the unit has turned in the vehicle, and P of attitude
+and mounting knows nothing of it. Only the yaw is judged so. A turn about the other axes takes
+gravity along, which is felt at once.
 """
 
 from __future__ import annotations
@@ -64,6 +70,16 @@ SETTLED_SHARE = 0.2
 STAYS_S = 60.0
 LOOK_NS = 10_000_000_000
 """The watch looks so often (ns of the filter's time)."""
+# The watch compares a mounting with those of so many looks before: five minutes. On three recorded
+# cars (50 minutes) the yaw moved by 1.9 at most of the sigmas that it may move by.
+TURN_LOOKS = 30
+TURNED_SIGMAS = 5.0
+# What was configured may be wrong by more than it says, which is no turn: looks count from half of
+# its sigma on, where three quarters of it are forgotten.
+KNOWN_SHARE = 0.5
+# A sigma of what moves the yaw of a mounting that is firm: a slip that lasts for minutes (crown of
+# the road, side wind) is some tenths of a degree.
+FIRM_RAD = math.radians(0.2)
 
 
 class CalibrationState(StrEnum):
@@ -154,6 +170,9 @@ class CalibrationWatch:
         self._slots = calibration_slots(model)
         self._least_sd = np.array([askew_rad * (s.kind == MOUNTING) for s in self._slots])
         self._indices = np.array([s.index for s in self._slots], dtype=np.int64)
+        self._prior = np.array([s.prior_sd / s.factor for s in self._slots])
+        yaws = (k for k, s in enumerate(self._slots) if s.kind == MOUNTING and "yaw" in s.name)
+        self._yaws = tuple(yaws)
         self._event = on_event
         self._told: set[str] = set()
         self.restart()
@@ -162,6 +181,11 @@ class CalibrationWatch:
         """The filter has been started anew."""
         self._cell = -1
         self._past: deque[tuple[int, Array]] = deque()
+        self._learned = np.zeros(len(self._slots))
+        self._variance = np.zeros(0)
+        self._looks: deque[tuple[Array, Array, NDArray[np.bool_]]] = deque(maxlen=TURN_LOOKS)
+        self.turned: str | None = None
+        """Set once the IMU has turned in the vehicle: why nothing before counts any more."""
         self.parameters: tuple[Parameter, ...] = ()
         """As last looked at; empty before the filter has run."""
 
@@ -185,7 +209,9 @@ class CalibrationWatch:
         before = None
         if self._past and t_ns - self._past[0][0] >= STAYS_S * 1e9:
             before = self._past[0][1]
-        sd = np.maximum(np.sqrt(covariance[self._indices, self._indices]), self._least_sd)
+        variance = covariance[self._indices, self._indices]
+        self._compare(now, variance)
+        sd = np.maximum(np.sqrt(variance), self._least_sd)
         self._past.append((t_ns, now))
         self.parameters = tuple(
             _parameter(s, float(now[i]), float(sd[i]), None if before is None else before[i])
@@ -193,6 +219,23 @@ class CalibrationWatch:
         )
         self._tell()
         return True
+
+    def _compare(self, now: Array, variance: Array) -> None:
+        """Whether the mounting's yaw has moved by more than what was learned of it since a look."""
+        if len(self._variance):
+            self._learned = self._learned + np.maximum(self._variance - variance, 0.0)
+        self._variance = variance.copy()
+        for k in self._yaws:
+            for before, learned, known in self._looks:
+                if not known[k]:
+                    continue
+                moved = float(now[k] - before[k])
+                may = math.sqrt(self._learned[k] - learned[k] + FIRM_RAD**2)
+                if abs(moved) > TURNED_SIGMAS * may:
+                    by = f"{math.degrees(moved):+.1f} deg, {abs(moved) / may:.0f} sigma"
+                    self.turned = f"the IMU has turned in the vehicle: its yaw has moved by {by}"
+        known = np.sqrt(variance) <= KNOWN_SHARE * self._prior
+        self._looks.append((now, self._learned, known))
 
     def _tell(self) -> None:
         for p in self.parameters:

@@ -137,6 +137,7 @@ class Navigator:
         """The samples from now on are the spare's (fusiond.navigator.imu_change)."""
         self._door.change()
         self._units.change()
+        self.calibrating.restart()  # of the first unit
         publish_by_axes(self.estimator, self.config.imu, spare=True)
         if self.started is not None:
             return hand_over(self.estimator, self.timeline, self.config.imu)
@@ -189,11 +190,10 @@ class Navigator:
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
-        self.started = None
         self._lateness.stop()
         self.timeline.clear()
         self._protection.restart()
-        self._saved, self.warm = saved, None
+        self.started, self._saved, self.warm = None, saved, None
         self._aligner = self._new_aligner()
         self._aligner.reason = why
 
@@ -236,15 +236,15 @@ class Navigator:
             return
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
-        e = self.estimator
-        failure = self._standing.failure(e.t_ns, self.timeline.isolation, e.nav)
+        e, isolation = self.estimator, self.timeline.isolation
+        failure = self.calibrating.turned or self._standing.failure(e.t_ns, isolation, e.nav)
         if failure is not None:
             self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
         due = self._lateness.due(e.t_ns)
-        doubtful = due and self._standing.doubtful(e, self.timeline.isolation)
+        doubtful = due and self._standing.doubtful(e, isolation)
         if (doubtful or self._lateness.pending) and self._late():
             return
         self._left_out.tell()

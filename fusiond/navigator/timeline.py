@@ -240,7 +240,8 @@ class Timeline:
             entry.error = repr(error)
             return Outcome("failed")
         if outcome.name in JUDGED and not estimator.isolates:
-            action = isolation.judge(aid, outcome, estimator.nav, estimator.covariance)
+            known = estimator.nav, estimator.covariance, estimator.state
+            action = isolation.judge(aid, outcome, *known)
             if action is Action.NONE and outcome.name == "fused" and tilts:
                 after = estimator.nav, estimator.covariance, estimator.turned
                 action = isolation.corrected(aid.t_ns, *after)

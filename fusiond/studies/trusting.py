@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome
 from fusiond.integrity.isolation import Action, Isolation
 
@@ -16,7 +16,12 @@ class Trusting(Isolation):
     """Leaves all to the filter: its gate, and what detects faults in a federated one."""
 
     def judge(
-        self, aid: Aid, outcome: Outcome, nav: Array, covariance: Array | None = None
+        self,
+        aid: Aid,
+        outcome: Outcome,
+        nav: Array,
+        covariance: Array | None = None,
+        state: State | None = None,
     ) -> Action:
         """Nobody is ever suspected."""
         return Action.NONE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,13 +22,24 @@ from fusiond.integrity.proof import (
     SLOWEST_M_S,
     UNPROVEN_SIGMAS,
     Proof,
+    apart,
     metres_a_radian,
+    settled,
 )
 from fusiond.integrity.returns import coming
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model
+from fusiond.models.vehicle import ANTENNA_LEVER, FIX_TIME
 from fusiond.navigation.rotation import quaternion_from_rpy
 from fusiond.navigation.strapdown import LAT, LON, Q0, STEP_SIZE, VE, VN
+from tests.aiding.aid_bench import (
+    RPY,
+    VELOCITY,
+    innovation_of,
+    position_aid,
+    state_of,
+    vehicle_model,
+)
 
 S = 1_000_000_000
 RATE_HZ = 5.0
@@ -303,6 +315,57 @@ def test_one_that_ran_away_before_the_start_is_to_prove_itself() -> None:
     drifting = Returned(velocities=True, contradicted=True)
     drifting.fixes(0, 110, drift_m_s=0.3)
     assert drifting.isolation.excluded == {"gnss": "drifts"}
+
+
+def test_what_is_known_of_a_fix_is_taken_out_of_it() -> None:
+    """But for the antenna's turn meanwhile and the square of the offset in time it is then as far
+    from the filter as its innovation says."""
+    model = vehicle_model()
+    nav, xi = START.copy(), np.zeros(model.size)
+    nav[VN : VE + 1] = VELOCITY[:2]
+    nav[Q0:] = quaternion_from_rpy(*RPY)
+    xi[list(model.slots_of(FIX_TIME))] = 0.12
+    xi[list(model.slots_of(ANTENNA_LEVER))] = -0.1, 0.05, 0.2
+    aid = replace(position_aid(nav), time=FIX_TIME, rest=ANTENNA_LEVER)
+    state = state_of(model, nav, xi)
+    (offer,) = aid.offers()
+    z = innovation_of(aid, state).z[:2]
+    known = apart(settled(offer, state), nav[LAT], nav[LON], nav)
+    assert np.hypot(known.north - z[0], known.east - z[1]) < 0.1
+    plain = apart(offer, nav[LAT], nav[LON], nav)
+    assert np.hypot(plain.north - z[0], plain.east - z[1]) > 1.5
+    assert settled(replace(aid, time="", rest="").offers()[0], state) == offer._replace(
+        time="", rest=""
+    )
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_drift_does_not_hide_behind_an_offset_in_time(known: bool) -> None:
+    """A receiver that is 0.1 s late and a vehicle that gets faster by 1 m/s^2 move a fix by 0.1 m/s
+    against what the filter knows of the offset: a drift as fast as that looked like none."""
+    isolation, model, sd_m = Isolation(), vehicle_model(), 0.3
+    to_north, _ = metres_a_radian(START)
+    xi = np.zeros(model.size)
+    xi[list(model.slots_of(FIX_TIME))] = 0.1
+    for k in range(200):
+        t_s = k / RATE_HZ
+        nav = START.copy()
+        nav[VN], nav[VE] = 5.0 + t_s, 0.0
+        drift_m = 0.1 * max(0.0, t_s - 10.0)
+        lat = START[LAT] - (drift_m - 0.1 * nav[VN]) / to_north
+        place = lat, START[LON] + 1e-12 * k, 40.0
+        aid = PositionAid("gnss", round(t_s * S), 0.9999, *place, (sd_m,) * 3, (0.0,) * 3)
+        state = state_of(model, nav, xi) if known else None
+        biased = 10.0 <= t_s < 14.0
+        y = (2.5, 0.0, 0.0) if biased else (0.01 * (-1) ** k, 0.0, 0.0)
+        name = "fused" if isolation.believes("gnss") else "isolated"
+        outcome = Outcome(name, 1.0, 3, y)
+        aid = replace(aid, time=FIX_TIME, shares_nothing=True)
+        isolation.judge(aid, outcome, nav, None, state)
+        v = 5.0 + t_s, 1e-9 * k
+        moving = VelocityAid("gnss_velocity", aid.t_ns, 0.9999, v, (SD_M_S,) * 2, (0.0,) * 3)
+        isolation.judge(moving, Outcome("fused", 1.0, 2, (0.0, 0.0)), nav)
+    assert isolation.excluded == ({"gnss": "drifts"} if known else {})
 
 
 def test_without_a_velocity_nobody_can_say_that_it_drifts() -> None:

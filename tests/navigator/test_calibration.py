@@ -110,15 +110,22 @@ def run(
     calibration: SavedCalibration | None = None,
     on_event: Callable[[str, str], None] = lambda code, text: None,
     heading: str = "config",
+    spare_s: float = math.inf,
 ) -> Navigator:
-    """A navigator after the first seconds of the drive."""
+    """A navigator after the first seconds of the drive; from `spare_s` on by the spare IMU, which
+    sits as the first."""
     d = drive()
-    settings = {**CONFIG, "alignment": {**CONFIG["alignment"], "heading": [heading]}}
+    aligned = {**CONFIG["alignment"], "heading": [heading]}
+    settings: dict[str, Any] = {**CONFIG, "alignment": aligned}
+    if spare_s < seconds:
+        settings["imu"] = {**CONFIG["imu"], "spare": {"source": "spare"}}
     navigator = Navigator(Config.model_validate(settings), on_event=on_event)
     navigator.calibration = calibration
     waiting = list(d.measurements)
     step = round(RATE_HZ / 2.0)
     for first in range(0, round(seconds * RATE_HZ), step):
+        if first == round(spare_s * RATE_HZ if spare_s < seconds else -1.0):
+            navigator.change_imu()
         navigator.add_imu(d.times[first : first + step], d.samples[first : first + step])
         while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
             m = waiting.pop(0)
@@ -237,6 +244,56 @@ def test_what_wanders_by_nature_may_move_so_far() -> None:
     for fast, state in ((0.5, SETTLED), (2.0, OBSERVED)):
         step = fast * 1e-3 * math.sqrt(STAYS_S)  # of the block's random walk
         assert watched(lambda t_s, step=step: t_s * step / STAYS_S, 1e-6, walk=True) is state
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 5.0])
+def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg: float) -> None:
+    """The mean of noisy looks at a constant moves by what its variance shrinks by, for ever; once
+    the constant changes it moves by more, though a mean of so many moves slowly."""
+    model = Model("watched", (mounting(math.radians(5.0)),))
+    told = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        watch = CalibrationWatch(model, lambda code, text: None)
+        prior, noise = math.radians(5.0), math.radians(1.0)
+        yaw = rng.normal(0.0, prior)
+        estimate, variance = 0.0, prior**2
+        for k in range(120):
+            turned = math.radians(turned_deg) * (k >= 60)
+            gain = variance / (variance + noise**2)
+            estimate += gain * (yaw + turned + rng.normal(0.0, noise) - estimate)
+            variance *= 1.0 - gain
+            watch.look(k * LOOK_NS, np.full(model.size, estimate), np.eye(model.size) * variance)
+            if watch.turned:
+                told.append(k)
+                break
+        watch.restart()
+        assert watch.turned is None
+    assert len(told) == (30 if turned_deg else 0)
+    assert all(60 <= k <= 110 for k in told)
+
+
+def test_what_was_configured_wrongly_is_no_turn() -> None:
+    """Seven of its sigmas: the state says so, and starting anew would not change it."""
+    prior, noise, yaw = math.radians(5.0), math.radians(1.0), math.radians(35.0)
+    model = Model("watched", (mounting(prior),))
+    watch = CalibrationWatch(model, lambda code, text: None)
+    estimate, variance = 0.0, prior**2
+    for k in range(200):
+        watch.look(k * LOOK_NS, np.full(model.size, estimate), np.eye(model.size) * variance)
+        gain = variance / (variance + (5.0 * noise) ** 2)
+        estimate += gain * (yaw - estimate)
+        variance *= 1.0 - gain
+    assert watch.turned is None
+
+
+def test_a_spare_is_another_mounting_and_no_turn() -> None:
+    events: list[str] = []
+    navigator = run(125.0, on_event=lambda code, _: events.append(code), spare_s=100.0)
+    assert "diverged" not in events
+    assert navigator.started is not None
+    found = {p.name: p.value for p in navigator.calibrating.parameters}
+    assert abs(found["mounting_yaw_deg"]) < YAW_DEG + 1.0  # found anew
 
 
 def test_nothing_is_settled_before_a_minute_has_passed() -> None:

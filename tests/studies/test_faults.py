@@ -23,6 +23,7 @@ from fusiond.studies.faults.judge import (
     recovered_s,
 )
 from fusiond.studies.faults.library import FAULTS, PHASES
+from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.recording import Drive, Received, Recording
 from fusiond.studies.faults.runs import VEHICLE, Row, rows, run, run_row
 
@@ -146,14 +147,14 @@ def recording() -> Recording:
     return Recording(stamps, stamps, samples, tuple(received))
 
 
-@pytest.mark.parametrize("name", sorted(FAULTS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 def test_a_fault_alters_nothing_before_it_begins(name: str) -> None:
-    alter = FAULTS[name].alter
+    alter = EVERY[name].alter
     if alter is None:
         assert (
-            FAULTS[name].configure is not None
+            EVERY[name].configure is not None
             or name in {"none", "start_in_reverse"}
-            or (FAULTS[name].drive != FAULTS["none"].drive)
+            or (EVERY[name].drive != EVERY["none"].drive)
         )
         return
     whole = recording()
@@ -196,6 +197,40 @@ def test_silence_is_a_gap_and_a_turned_mount_keeps_lengths() -> None:
         np.testing.assert_allclose(lengths, np.linalg.norm(whole.samples[:, part], axis=1))
 
 
+def test_stamps_and_rate_of_the_imu() -> None:
+    whole = recording()
+    halved = imu_faults.half_rate(whole, 10.0, 5.0)
+    inside = (halved.imu_seen >= 10_000_000_000) & (halved.imu_seen < 15_000_000_000)
+    pairs = whole.samples[99:149].reshape(25, 2, 6)
+    np.testing.assert_allclose(halved.samples[inside], pairs.mean(axis=1))
+    assert np.array_equal(halved.stamps[inside], whole.stamps[100:149:2])
+    fast = imu_faults.clock_fast(whole, 10.0, 30.0, ppm=200.0)
+    assert fast.stamps[-1] - whole.stamps[-1] == pytest.approx(200e-6 * 20e9, rel=0.01)
+    behind = imu_faults.stamps_off(whole, 10.0, 5.0, -0.9)
+    assert (whole.stamps - behind.stamps).max() == 900_000_000
+    assert np.array_equal(behind.imu_seen, whole.imu_seen)
+
+
+def test_noise_is_so_many_times_what_there_was() -> None:
+    found = imu_faults.noisy(recording(), 0.0, 30.0, times=10.0)
+    np.testing.assert_allclose(found.samples.std(axis=0), math.sqrt(101.0), rtol=0.2)
+
+
+def test_absent_and_late_are_of_their_kinds() -> None:
+    whole = recording()
+    assert len(aid_faults.absent(whole, 10.0, 5.0).received) == len(whole.received) - 15
+    wheels = aid_faults.absent(whole, 10.0, 5.0, WheelSpeed).received
+    assert len(wheels) == len(whole.received) - 5
+    assert len(aid_faults.now_and_then(whole, 10.0, 10.0, WheelSpeed).received) == 81
+    late = [
+        item
+        for item in aid_faults.wheels_late(whole, 10.0, 5.0, late_s=0.5).received
+        if item.t_ns % 1_000_000_000
+    ]
+    assert [item.t_ns for item in late] == [s * 1_000_000_000 + 500_000_000 for s in range(10, 15)]
+    assert all(isinstance(item.measurement, WheelSpeed) for item in late)
+
+
 def test_multipath_jumps_again_behind_the_tunnel() -> None:
     found = aid_faults.multipath_tunnel_jump(recording(), 10.0, 10.0)
     moved = [
@@ -210,6 +245,10 @@ def test_multipath_jumps_again_behind_the_tunnel() -> None:
         if isinstance(item.measurement, PositionFix | DelayedFix)
     }
     assert fixes == {*range(1, 11), *range(20, 30)}
+    ends = aid_faults.multipath_tunnel_jump(recording(), 10.0, 25.0)
+    assert not any(
+        item.t_ns > 11 * 10**9 for item in ends.received if item.measurement.source == "gnss"
+    )
 
 
 def test_every_fault_has_rows_and_begins_inside_the_drive() -> None:

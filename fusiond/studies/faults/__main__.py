@@ -8,11 +8,14 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from fusiond.studies.faults.hours import hour_of
 from fusiond.studies.faults.library import ALL, FAULTS
+from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import jobs, power_run
+from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
 from fusiond.studies.faults.runs import rows, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
 from fusiond.studies.monte_carlo import over, runs_on, step_counter
@@ -22,18 +25,27 @@ from fusiond.workers.pool import Pool, processors
 def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m fusiond.studies.faults", description=__doc__)
-    parser.add_argument("--only", choices=tuple(FAULTS), metavar="NAME", help="one fault")
+    parser.add_argument("--only", choices=tuple(EVERY), metavar="NAME", help="one fault")
     parser.add_argument("--phase", choices=ALL, help="one phase")
     parser.add_argument("--power", type=int, metavar="RUNS", help="detection, so many runs a size")
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
+    parser.add_argument("--recording", type=Path, metavar="P", help="tables or a CAN log, instead")
+    parser.add_argument("--config", type=Path, metavar="F.toml", help="that of the recording")
+    parser.add_argument(
+        "--at", type=float, nargs="+", metavar="S", help="faults begin so long after the recording"
+    )
     parser.add_argument("--workers", type=int, default=processors(), help="processes")
     parser.add_argument("--json", type=Path, metavar="F.json")
     parser.add_argument("--table", type=Path, metavar="F.md")
     parser.add_argument("--page", type=Path, metavar="F.md", help="put the table into this page")
     asked = parser.parse_args()
-    if asked.power is not None:
+    if asked.recording is not None:
+        if asked.config is None or not asked.at:
+            parser.error("--recording needs --config and --at")
+        kind, found = "recorded", _recorded(asked)
+    elif asked.power is not None:
         kind = "power"
         found = _run(power_run, jobs(asked.power, asked.seed), asked.workers)
     elif asked.alarms is not None:
@@ -41,6 +53,8 @@ def main() -> int:
         found = _run(hour_of, range(asked.seed, asked.seed + asked.alarms), asked.workers)
     else:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
+        if asked.only not in {None, *FAULTS}:
+            parser.error(f"{asked.only} is for a --recording")
         if not wanted:
             parser.error(f"{asked.only} has the phases {', '.join(FAULTS[asked.only].phases)}")
         found = _run(partial(run_row, seed=asked.seed, drive=asked.drive), wanted, asked.workers)
@@ -54,6 +68,14 @@ def main() -> int:
         put_into(asked.page, kind, text)
     print(text, end="")
     return 0
+
+
+def _recorded(asked: argparse.Namespace) -> list[dict[str, Any]]:
+    with TemporaryDirectory() as folder:
+        place = Place(asked.config, asked.recording, Path(folder) / "smoothed.csv")
+        smooth(place)
+        wanted = recorded_rows(place, asked.at, asked.only, asked.phase)
+        return _run(partial(run_recorded, place=place), wanted, asked.workers)
 
 
 def _run(

@@ -151,10 +151,10 @@ def false_burst(r: Recording, begin_s: float, length_s: float) -> Recording:
     return r.with_received([*r.received, *false])
 
 
-def tiny_sigma(r: Recording, begin_s: float, length_s: float) -> Recording:
+def tiny_sigma(r: Recording, begin_s: float, length_s: float, sd_m: float = TINY_SD_M) -> Recording:
     """Errors as always, and a stated sigma of 1e-9 m."""
     return _changed(
-        r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(TINY_SD_M,) * 3)
+        r, begin_s, length_s, PositionFix, lambda fix, _: replace(fix, sd_ned_m=(sd_m,) * 3)
     )
 
 
@@ -234,7 +234,10 @@ def multipath_tunnel_jump(r: Recording, begin_s: float, length_s: float) -> Reco
     burst = _changed(r, begin_s, MULTIPATH_S, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M))
     out_s = begin_s + length_s
     tunnel = burst.withheld(begin_s + MULTIPATH_S, out_s)
-    first_s = _fixes(tunnel, out_s, math.inf)[0].t_ns * 1e-9
+    behind = _fixes(tunnel, out_s, math.inf)
+    if not behind:  # a recording that ends in it
+        return tunnel
+    first_s = behind[0].t_ns * 1e-9
     return _changed(
         tunnel, first_s - 1e-6, 2e-6, PositionFix, lambda fix, _: _north(fix, MULTIPATH_M)
     )
@@ -276,9 +279,72 @@ def _wheels_times(r: Recording, begin_s: float, length_s: float, factor: float) 
     )
 
 
-def wheels_scaled(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Speeds a fifth too large."""
-    return _wheels_times(r, begin_s, length_s, WHEEL_SCALE)
+def wheels_scaled(
+    r: Recording, begin_s: float, length_s: float, factor: float = WHEEL_SCALE
+) -> Recording:
+    """Speeds too large by a factor, by a fifth."""
+    return _wheels_times(r, begin_s, length_s, factor)
+
+
+def wheels_locked(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """The wheels stand still."""
+    return _wheels_times(r, begin_s, length_s, 0.0)
+
+
+def wheels_late(r: Recording, begin_s: float, length_s: float, late_s: float) -> Recording:
+    """Speeds that are older than their stamps."""
+    ns = round(late_s * 1e9)
+    begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
+    received = []
+    for item in r.received:
+        m = item.measurement
+        if isinstance(m, WheelSpeed) and begin <= item.t_ns < end:
+            t = item.t_ns + ns
+            m = replace(m, stamp=MonotonicStamp(t), t_seen_ns=item.seen_ns + ns)
+            received.append(Received(t, item.seen_ns + ns, m))
+        else:
+            received.append(item)
+    return r.with_received(received)
+
+
+def absent(r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]) -> Recording:
+    """No measurement of these kinds, of none at all without them."""
+    begin, end = begin_s * 1e9, (begin_s + length_s) * 1e9
+    return r.with_received(
+        [
+            item
+            for item in r.received
+            if not begin <= item.t_ns < end or (kinds and not isinstance(item.measurement, kinds))
+        ]
+    )
+
+
+def now_and_then(
+    r: Recording, begin_s: float, length_s: float, *kinds: type[Measurement]
+) -> Recording:
+    """Three seconds of each five without these kinds."""
+    for start_s in np.arange(begin_s, begin_s + length_s, 5.0).tolist():
+        r = absent(r, start_s, 3.0, *kinds)
+    return r
+
+
+def scattered(r: Recording, begin_s: float, length_s: float, sd_m: float) -> Recording:
+    """Positions scatter by `sd_m` to the north more than they say."""
+    rng = np.random.default_rng(0)
+    return _changed(
+        r, begin_s, length_s, PositionFix, lambda fix, _: _north(fix, sd_m * rng.standard_normal())
+    )
+
+
+def too_high(r: Recording, begin_s: float, length_s: float, up_m: float) -> Recording:
+    """Heights too large."""
+    return _changed(
+        r,
+        begin_s,
+        length_s,
+        PositionFix,
+        lambda fix, _: replace(fix, height_m=(fix.height_m or 0.0) + up_m),
+    )
 
 
 def wheels_reversed(r: Recording, begin_s: float, length_s: float) -> Recording:

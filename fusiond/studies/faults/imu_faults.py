@@ -64,9 +64,53 @@ def bias_step(
     return replace(r, samples=samples)
 
 
-def mount_turned(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """The unit has turned by 30 deg about its vertical axis."""
-    c, s = math.cos(TURNED_RAD), math.sin(TURNED_RAD)
+def scaled_axis(
+    r: Recording, begin_s: float, length_s: float, axis: int, factor: float
+) -> Recording:
+    """An axis, numbered as in `bias_step`, says `factor` times what it should."""
+    samples = r.samples.copy()
+    samples[r.window(begin_s, length_s), axis] *= factor
+    return replace(r, samples=samples)
+
+
+def noisy(r: Recording, begin_s: float, length_s: float, times: float) -> Recording:
+    """White noise, `times` what there is from sample to sample in the window."""
+    samples, window = r.samples.copy(), r.window(begin_s, length_s)
+    sd = np.diff(samples[window], axis=0).std(axis=0) / math.sqrt(2.0)
+    noise = np.random.default_rng(0).standard_normal((int(window.sum()), 6))
+    samples[window] += times * sd * noise
+    return replace(r, samples=samples)
+
+
+def half_rate(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """A sample for each two, the mean of them."""
+    samples, window = r.samples.copy(), r.window(begin_s, length_s)
+    second = np.flatnonzero(window)[1::2]
+    samples[second] = 0.5 * (samples[second] + samples[second - 1])
+    lost = np.zeros_like(window)
+    lost[second - 1] = True
+    return replace(r, samples=samples).without(lost)
+
+
+def stamps_off(r: Recording, begin_s: float, length_s: float, off_s: float) -> Recording:
+    """All stamps of the window lie so far ahead, behind where it is negative."""
+    stamps = r.stamps.copy()
+    stamps[r.window(begin_s, length_s)] += round(off_s * 1e9)
+    return replace(r, stamps=stamps)
+
+
+def clock_fast(r: Recording, begin_s: float, length_s: float, ppm: float) -> Recording:
+    """The clock of the stamps goes faster from the begin of the window on."""
+    stamps, window = r.stamps.copy(), r.window(begin_s, length_s)
+    stamps[window] += np.rint((stamps[window] - begin_s * 1e9) * ppm * 1e-6).astype(np.int64)
+    return replace(r, stamps=stamps)
+
+
+def mount_turned(
+    r: Recording, begin_s: float, length_s: float, angle_rad: float = TURNED_RAD
+) -> Recording:
+    """The unit has turned about its vertical axis, by 30 deg."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     samples, window = r.samples.copy(), r.window(begin_s, length_s)
     samples[window] = np.hstack((samples[window, :3] @ turn.T, samples[window, 3:] @ turn.T))

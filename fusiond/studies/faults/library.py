@@ -59,6 +59,9 @@ class Fault:
     begin_s: float | None = None
     configure: Configure | None = None
     drive: Drive = TOWN
+    turned_rad: float = 0.0
+    """By how much the IMU's forward axis is turned: its attitude is no less right than the
+    vehicle's, where a recording's is compared."""
 
     def begins_s(self, phase: PhaseName) -> float:
         """When it begins, s of the drive."""
@@ -112,6 +115,10 @@ def _smooth(duration_s: float) -> Path:
 def _axes(x: str, y: str, z: str, config: Config) -> Config:
     section = type(config.imu).model_validate({**config.imu.model_dump(), "axes": (x, y, z)})
     return config.model_copy(update={"imu": section})
+
+
+sideways = partial(_axes, "+y", "+x", "-z")
+"""As if the unit's forward axis pointed to the right."""
 
 
 def _heading_off(config: Config) -> Config:
@@ -177,7 +184,7 @@ FAULTS: dict[str, Fault] = {
     "imu_zero_15s": _of_imu(imu.all_zero, 15.0),
     "gyro_axis_dead": _of_imu(imu.dead_axis),
     "gyro_bias_1_deg_s": _of_imu(imu.bias_step),
-    "mount_turned_30_deg": _of_imu(imu.mount_turned),
+    "mount_turned_30_deg": _of_imu(imu.mount_turned, turned_rad=-imu.TURNED_RAD),
     "imu_nan_1s": _of_imu(imu.not_numbers, 1.0),
     "gyro_spike": _of_imu(imu.gyro_spike, 0.1),
     "gyro_spike_in_range": _of_imu(imu.small_spike, 0.1),

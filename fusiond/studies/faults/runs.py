@@ -122,6 +122,23 @@ def navigate(
 ) -> Course:
     """Feed a navigator with a recording; compare it with the truth at every second, when `watch`
     may look at it."""
+    # Of all seconds at once: one by one it takes as long as the navigation.
+    track = truth.at(np.arange(1.0, truth.duration_s + 0.5))
+
+    def look(solution: Solution, row: int) -> Sample:
+        return compared(solution, track, row)
+
+    return driven(config, recording, truth.duration_s, look, watch)
+
+
+def driven(
+    config: Config,
+    recording: Recording,
+    duration_s: float,
+    look: Callable[[Solution, int], Sample],
+    watch: Callable[[Navigator], None] | None = None,
+) -> Course:
+    """Feed a navigator with a recording; `look` at its solution at second 1, row 0, and on."""
     samples: list[Sample] = []
     events: list[Event] = []
     now_s = 0.0
@@ -133,9 +150,7 @@ def navigate(
     units = _Units(config, recording, lambda source, code, text: hear(code, text))
     taken = 0
     received = recording.received
-    # Of all seconds at once: one by one it takes as long as the navigation.
-    track = truth.at(np.arange(1.0, truth.duration_s + 0.5))
-    for tick in range(1, round(truth.duration_s * TICKS_PER_S) + 1):
+    for tick in range(1, round(duration_s * TICKS_PER_S) + 1):
         now_s = tick / TICKS_PER_S
         now_ns = round(now_s * 1e9)
         try:
@@ -146,7 +161,7 @@ def navigate(
                 navigator.add(item.measurement, item.t_ns, 0.0, item.seen_ns)
             navigator.advance()
             if tick % TICKS_PER_S == 0:
-                samples.append(compared(navigator.solution(now_ns), track, tick // TICKS_PER_S - 1))
+                samples.append(look(navigator.solution(now_ns), tick // TICKS_PER_S - 1))
                 if watch is not None:
                     watch(navigator)
         except Exception as error:  # whatever leaves the navigator ends the daemon: a finding
@@ -195,8 +210,10 @@ def _said(source: str, r: Recording) -> list[ImuSample]:
     ]
 
 
-def compared(solution: Solution, true: States, row: int = 0) -> Sample:
-    """A solution against that row of true states."""
+def compared(
+    solution: Solution, true: States, row: int = 0, true_sd: Sequence[float] = (0.0,) * 9
+) -> Sample:
+    """A solution against that row of true states, which are known to `true_sd` (m, m/s, rad)."""
     t_s = solution.t_ns * 1e-9
     if solution.mode in (Mode.WAITING, Mode.ALIGNING):
         return Sample(t_s, str(solution.mode))
@@ -204,12 +221,14 @@ def compared(solution: Solution, true: States, row: int = 0) -> Sample:
     place = _position_error_m(solution, true.position[row])
     velocity = [v - w for v, w in zip(solution.v_ned_m_s, v_ned, strict=True)]
     turn = [_wrapped(a - b) for a, b in zip(solution.rpy_rad, rpy, strict=True)]
+    stated = (*solution.sd_ned_m, *solution.sd_v_ned_m_s, *solution.sd_rpy_rad)
+    sd = [math.hypot(a, b) for a, b in zip(stated, true_sd, strict=True)]
     ratios = (
-        _ratio(place[:2], solution.sd_ned_m[:2]),
-        _ratio(place[2:], solution.sd_ned_m[2:]),
-        _ratio(velocity[:2], solution.sd_v_ned_m_s[:2]),
-        _ratio(turn[2:], solution.sd_rpy_rad[2:]),
-        _ratio(turn[:2], solution.sd_rpy_rad[:2]),
+        _ratio(place[:2], sd[:2]),
+        _ratio(place[2:], sd[2:3]),
+        _ratio(velocity[:2], sd[3:5]),
+        _ratio(turn[2:], sd[8:]),
+        _ratio(turn[:2], sd[6:8]),
     )
     horizontal_m = math.hypot(place[0], place[1])
     return Sample(t_s, str(solution.mode), ratios, horizontal_m, math.degrees(turn[2]))

@@ -40,6 +40,23 @@ POWER = (
 ALARMS = ("vehicle", "hours", "alarm", "times", "in 24 h", "99 % interval", "stated in 24 h")
 
 
+SLOW_S = 60.0
+"""Nothing takes longer to recover from what is over."""
+
+
+def recorded(found: Rows) -> str:
+    """A line a fault, phase and instant that lied, was not over a minute behind its end, or ended
+    the navigator; and the count of each verdict."""
+    named = [{**row, "fault": f"{row['fault']}, at {row['at_s']:g} s"} for row in found]
+    return matrix([row for row in named if _failed(row)]).rpartition("\n\n")[0] + _count(found)
+
+
+def _failed(row: Mapping[str, Any]) -> bool:
+    late = row["recovered_s"] is None or row["recovered_s"] > SLOW_S
+    over = row["end_s"] + SLOW_S <= row["duration_s"]
+    return row["verdict"] in {"crashed", "silent lie"} or (late and over)
+
+
 def matrix(found: Rows) -> str:
     """A line a row, and the count of each verdict."""
     lines = []
@@ -60,9 +77,13 @@ def matrix(found: Rows) -> str:
                 _number(row["recovered_s"], "never"),
             )
         )
+    return _table(MATRIX, lines) + _count(found)
+
+
+def _count(found: Rows) -> str:
     counts = Counter(row["verdict"] for row in found).most_common()
     counted = ", ".join(f"{n} {v}" for v, n in counts)
-    return f"{_table(MATRIX, lines)}\n\n{len(found)} rows: {counted}.\n"
+    return f"\n\n{len(found)} rows: {counted}.\n"
 
 
 def power(found: Rows) -> str:
@@ -110,7 +131,12 @@ def alarms(found: Rows) -> str:
     )
 
 
-TABLES: Mapping[str, Callable[[Rows], str]] = {"matrix": matrix, "power": power, "alarms": alarms}
+TABLES: Mapping[str, Callable[[Rows], str]] = {
+    "matrix": matrix,
+    "power": power,
+    "alarms": alarms,
+    "recorded": recorded,
+}
 
 
 def put_into(page: Path, kind: str, text: str) -> None:

@@ -1,0 +1,67 @@
+"""The faults of the matrix put into a recording: where they begin, and what it is compared with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusiond.studies.faults.more import EVERY
+from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
+from fusiond.studies.faults.tables import TABLES
+from tests.places import DATA, REPOSITORY
+
+DRIVE = DATA / "drive_0708"
+
+pytestmark = pytest.mark.skipif(
+    not DRIVE.is_dir(), reason=f"real drive drive_0708 is absent: {DRIVE} (set FUSIOND_DATA)"
+)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    smoothed = tmp_path_factory.mktemp("recorded") / "smoothed.csv"
+    found = Place(REPOSITORY / "config" / "drive_0708.toml", DRIVE, smoothed)
+    smooth(found)
+    return found
+
+
+def test_what_the_recording_has_not_is_not_put_in(place: Place) -> None:
+    found = recorded_rows(place, [230.0, 350.0], None, None)
+    named = {row.fault for row in found}
+    assert named < set(EVERY)
+    assert {"step_500m", "gyro_bias_1_deg_s", "imu_clock_200ppm", "no_aids"} <= named
+    assert not any(name.startswith(("wheels", "rdss", "creeping")) for name in named)
+    assert {row.at_s for row in found} == {230.0, 350.0}
+    assert recorded_rows(place, [1.0], "wheels_slip", None) == []
+
+
+def test_nothing_wrong_is_inside_and_a_step_is_told(place: Place) -> None:
+    """The solution of one part and that of all measurements agree within their sigmas."""
+    [none] = recorded_rows(place, [230.0], "none", "navigating")
+    quiet = run_recorded(none, place)
+    assert quiet["verdict"] == "survived", quiet
+    assert quiet["longest_lie_s"] <= 1.0  # a bump
+    assert 0.0 < quiet["largest_horizontal_m"] < 0.1
+    [step] = recorded_rows(place, [230.0], "step_50m", "navigating")
+    found = run_recorded(step, place)
+    assert found["verdict"] == "degraded and said so", found
+    assert found["noticed_s"] < 2.0
+    assert "isolated" in {event["code"] for event in found["events"]}
+    text = TABLES["recorded"]([quiet, {**found, "verdict": "silent lie"}])
+    assert "| step_50m, at 230 s | navigating | silent lie |" in text
+    assert "none, at" not in text
+    assert text.endswith("2 rows: 1 survived, 1 silent lie.\n")
+    assert np.isfinite(found["recovered_s"])
+
+
+@pytest.mark.parametrize(
+    ("fault", "event"), [("drift_0.1_m_s", "isolated"), ("mount_turned_10_deg", "diverged")]
+)
+def test_what_lied_on_it_does_not(place: Place, fault: str, event: str) -> None:
+    """A drift came back while it went on, hidden by the receiver's offset in time and a vehicle
+    that braked; a unit that had turned was vouched for with a yaw between old and new."""
+    [row] = recorded_rows(place, [230.0], fault, "navigating")
+    found = run_recorded(row, place)
+    assert found["verdict"] == "degraded and said so", found
+    assert event in {e["code"] for e in found["events"]}
+    assert found["longest_lie_s"] <= 2.0
