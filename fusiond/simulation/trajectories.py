@@ -1,14 +1,15 @@
 r"""Motion as smooth functions of time: speed, course and climb angle of a vehicle on a path.
 
     v_n = s [cos(gamma) cos(chi), cos(gamma) sin(chi), -sin(gamma)]
-    roll = k atan(s chi' / g),   pitch = gamma + alpha,   yaw = chi
+    roll = k atan(s chi' / g),   pitch = gamma + alpha,   yaw = chi + c |s| chi'
 
 s speed (m/s), chi course and gamma climb angle (rad), each a chain of minimum-jerk steps
 10 x^3 - 15 x^4 + 6 x^5 between knots: twice continuously differentiable, and exactly constant where
 two knots hold the same value, so that a stop is a real standstill. k is 1 for an aircraft in
 coordinated turns and slightly negative for a car, which leans outwards; alpha is the incidence.
 v_n is the velocity of the point that follows the path; for a car that is the middle of the rear
-axle, where it lies along the forward axis (alpha = 0, no side slip). The IMU sits at l from it:
+axle, where it lies along the forward axis (alpha = 0) but for the slip angle c |s chi'| of the rear
+tyres, outwards and in proportion to the force that they give. The IMU sits at l from it:
 
     v = v_n + C_nb (w x l),   v' = v_n' + C_nb (w' x l + w x (w x l)),   w = w_nb^b
 
@@ -73,7 +74,8 @@ class Kinematics:
 class Path:
     """Speed (m/s), course and climb angle (rad) over time.
 
-    `bank_ratio` is k and `arm_m` is l (body axes: forward, right, down) of the module's text.
+    `bank_ratio` is k, `slip_rad_s2_m` is c and `arm_m` is l (body axes: forward, right, down) of the
+    module's text.
     """
 
     speed: Profile
@@ -82,6 +84,7 @@ class Path:
     bank_ratio: float = 0.0
     incidence_rad: float = 0.0
     arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slip_rad_s2_m: float = 0.0
 
     def kinematics(self, t_s: Array) -> Kinematics:
         """Motion of the IMU at the instants `t_s` (any shape); yaw is not wrapped."""
@@ -103,12 +106,15 @@ class Path:
         u = s * chi1 / g
         u1 = (s1 * chi1 + s * chi2) / g
         w = 1.0 + u * u
-        rpy = np.stack((self.bank_ratio * np.arctan(u), gamma + self.incidence_rad, chi), axis=-1)
-        rpy_rate = np.stack((self.bank_ratio * u1 / w, gamma1, chi1), axis=-1)
+        slip = np.copysign(self.slip_rad_s2_m * g, s)
+        bank, pitch, yaw = self.bank_ratio * np.arctan(u), gamma + self.incidence_rad, chi + slip * u
+        rpy = np.stack((bank, pitch, yaw), axis=-1)
+        rpy_rate = np.stack((self.bank_ratio * u1 / w, gamma1, chi1 + slip * u1), axis=-1)
         if any(self.arm_m):
             u2 = (s2 * chi1 + 2.0 * s1 * chi2 + s * chi3) / g
             roll2 = self.bank_ratio * (u2 / w - 2.0 * u * u1 * u1 / (w * w))
-            rate, acceleration = body_rate(rpy, rpy_rate, np.stack((roll2, gamma2, chi2), axis=-1))
+            turning = np.stack((roll2, gamma2, chi2 + slip * u2), axis=-1)
+            rate, acceleration = body_rate(rpy, rpy_rate, turning)
             arm = np.asarray(self.arm_m, dtype=np.float64)
             across = np.cross(rate, arm)
             dcm = dcm_from_rpy(rpy)

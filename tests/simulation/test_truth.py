@@ -190,6 +190,26 @@ def test_car_does_not_slip_and_stays_drivable() -> None:
     assert 20.0 < v_body[:, 0].max() < 30.0
 
 
+def test_tyres_slip_outwards_as_far_as_they_are_pushed() -> None:
+    """And the body turns and feels as its attitude and velocity have it, forward and back."""
+    slip = math.radians(0.5)
+    ahead = Leg(5), Leg(6, 12.0), Leg(8, turn_deg=70.0), Leg(8, 0.0)
+    path = follow([*ahead, Leg(4, -2.0), Leg(6, turn_deg=30.0)], 37.0, bank_ratio=-0.08)
+    path = replace(path, arm_m=ARM, slip_rad_s2_m=slip)
+    truth = Truth(path, ORIGIN, RATE_HZ, 37.0)
+    states = truth.at(truth.t_s, (-ARM[0], -ARM[1], -ARM[2]))
+    forward, right = np.einsum("nji,nj->ni", dcm_from_rpy(states.rpy), states.v_ned)[:, :2].T
+    speed, course = path.speed(truth.t_s)[0], path.course(truth.t_s)[1]
+    pushed = speed * course
+    assert pushed.max() > 1.5
+    assert speed.min() < -1.9
+    np.testing.assert_allclose(np.arctan2(right, np.abs(forward)), -slip * pushed, atol=3e-4)
+    position, velocity, attitude = _closing_error(path, 37.0)
+    assert position < 1e-5
+    assert velocity < 1e-7
+    assert attitude < 1e-9
+
+
 def test_flight_reaches_cruise_and_banks_into_turns() -> None:
     truth = Truth(flight(4000.0), ORIGIN, 50.0, 4000.0)
     states = truth.at(truth.t_s)
