@@ -6,6 +6,8 @@ l is the lever arm from the IMU, w the rate of the body against the Earth, whose
 lever is under 1 mm/s per 10 m. e is the error of the rate (computed minus true), dl that of the
 lever arm's rest, an estimate (true minus estimated).
 
+The slope by dl takes what of w is no noise (fusiond.aiding.felt).
+
 Source: Groves, 2nd ed., eq. 14.109.
 """
 
@@ -14,9 +16,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.felt import turning
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
-from fusiond.navigation.strapdown import STEP_RATE_B, VN
+from fusiond.navigation.strapdown import VN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -24,7 +27,7 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @compiled(
-    "void(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(f8, 9), f8, f8, f8, f8[::1], f8[:, ::1])",
+    "void(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(f8, 9), f8, f8, f8, i8, f8[::1],f8[:, ::1])",
     forceinline=True,
 )
 def antenna_velocity(
@@ -36,15 +39,16 @@ def antenna_velocity(
     l0: float,
     l1: float,
     l2: float,
+    rate: int,
     v: Array,
     of_v: Array,
 ) -> None:
     """Write v_a (m,) and d v_a (m, n), zero before: the first m of north, east, down.
 
     `c` C_nb by rows, l0 to l2 the lever arm with the estimate of its rest, `rest` (0 or 3,) the
-    slots of that.
+    slots of that; `rate` where in `step` the rate of v_a stands.
     """
-    w0, w1, w2 = step[STEP_RATE_B], step[STEP_RATE_B + 1], step[STEP_RATE_B + 2]
+    w0, w1, w2 = step[rate], step[rate + 1], step[rate + 2]
     u0, u1, u2 = w1 * l2 - w2 * l1, w2 * l0 - w0 * l2, w0 * l1 - w1 * l0
     x = c[0] * u0 + c[1] * u1 + c[2] * u2
     y = c[3] * u0 + c[4] * u1 + c[5] * u2
@@ -68,6 +72,7 @@ def antenna_velocity(
             elif axis == 2:
                 of_v[i, slot] = b * l0 - a * l1
         if rest.size:
+            w0, w1, w2 = turning(step, 0), turning(step, 1), turning(step, 2)
             of_v[i, rest[0]] = e * w1 - b * w2
             of_v[i, rest[1]] = a * w2 - e * w0
             of_v[i, rest[2]] = b * w0 - a * w1

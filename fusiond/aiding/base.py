@@ -30,7 +30,7 @@ aid says so; or now, all that was held."""
 
 
 class State(NamedTuple):
-    """What an aid may look at: navigation state (10,), parameters (n,), last step (21,), model, and
+    """What an aid may look at: navigation state (10,), parameters (n,), last step (27,), model, and
     the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth)."""
 
     nav: Array

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
-from fusiond.aiding.felt import add_of_force
+from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import SpeedOffer
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
@@ -43,7 +43,14 @@ from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements, rotation_vector_to_quaternion
-from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_RATE_B, STEP_SMOOTH_N, VN
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    Q0,
+    STEP_RATE_B,
+    STEP_SMOOTH_N,
+    VN,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -141,7 +148,7 @@ def _rows(
             h[i, slot[PITCH]] = -0.5 * q * x + (1.0 - q * q / 6.0) * y + p * q / 6.0 * w
             h[i, slot[YAW]] = 0.5 * p * x + p * q / 6.0 * y + (1.0 - p * p / 6.0) * w
         if slot[LEVER] >= 0:
-            h[i, slot[LEVER]] = t2 * w1 - t1 * w2
+            h[i, slot[LEVER]] = t2 * turning(step, 1) - t1 * turning(step, 2)
         if axis == RIGHT and slot[DRIFT] >= 0:
             z[i] -= xi[slot[DRIFT]]
             h[i, slot[DRIFT]] = 1.0

@@ -47,7 +47,15 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, STEP_SMOOTH_N, VN
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    LON,
+    Q0,
+    STEP_SMOOTH_N,
+    STEP_SMOOTH_RATE_B,
+    VN,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -137,7 +145,7 @@ def _position(
     for slot in time:
         late_s = xi[slot]
         v, of_v = np.empty(m), np.zeros((m, n))
-        antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, v, of_v)
+        antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, STEP_SMOOTH_RATE_B, v, of_v)
         f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
         a = (f0, f1, f2 + gravity(nav[LAT], nav[HEIGHT]))
         turned = ((0.0, -f2, f1), (f2, 0.0, -f0), (-f1, f0, 0.0))

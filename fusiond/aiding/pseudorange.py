@@ -266,10 +266,6 @@ class PseudorangeAid(Aid):
         object.__setattr__(self, "_ranges", ranges)
 
     @property
-    def shares(self) -> tuple[str, ...]:
-        return RANGE_BIAS
-
-    @property
     def labels(self) -> list[tuple[str, str]]:
         """Satellite and `range` or `rate` of each row."""
         return [

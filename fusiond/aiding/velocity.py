@@ -28,7 +28,7 @@ from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N
+from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_RATE_B, STEP_SMOOTH_N
 
 Array = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def _velocity(
     if rest.size:
         l0, l1, l2 = l0 + xi[rest[0]], l1 + xi[rest[1]], l2 + xi[rest[2]]
     c = dcm_elements(nav[Q0:])
-    antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, z, h)
+    antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, STEP_RATE_B, z, h)
     f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
     down = f2 + gravity(nav[LAT], nav[HEIGHT])
     for slot in time:

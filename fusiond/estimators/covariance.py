@@ -103,7 +103,7 @@ _advance_core = _advance_for(CORE_STRIDE)
 
 @compiled("void(f8[::1], i8[:, ::1], f8[::1])", forceinline=True)
 def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
-    """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (21,)."""
+    """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (27,)."""
     for i in range(12):
         weight[i] = 0.0
         if sensor_terms[1, i] == PLAIN:

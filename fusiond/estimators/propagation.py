@@ -206,7 +206,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         """Propagate from `now` to `target` (ns); return the next sample's index and the new time.
 
         A call costs a tenth of a microsecond an array, so what belongs together comes as one:
-        `state` is nav (10,), xi (n,), the last step (21,), the variances (9,) that what is
+        `state` is nav (10,), xi (n,), the last step (27,), the variances (9,) that what is
         published is wider by, and scratch_size(width) doubles, zero at first; `model` and `imu` are
         `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows `times` and `samples` (rate,
         force): sample i holds over (times[i-1], times[i]], with noise of `densities` beyond

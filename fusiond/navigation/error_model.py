@@ -63,7 +63,7 @@ CORE_STRIDE = 16
 def coefficients(nav: Array, step: Array, h: float, c: Array) -> None:
     """Write `c` (58,) for the interval of `h` seconds that ends at `nav` (10,).
 
-    `step` (21,) as strapdown_step leaves it.
+    `step` (27,) as strapdown_step leaves it.
     """
     lat, height = nav[LAT], nav[HEIGHT]
     vn, ve, vd = nav[VN], nav[VE], nav[VD]

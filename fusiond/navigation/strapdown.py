@@ -34,12 +34,18 @@ Array = NDArray[np.float64]
 LAT, LON, HEIGHT, VN, VE, VD, Q0 = 0, 1, 2, 3, 4, 5, 6
 NAV_SIZE = 10
 # What a step leaves for the error model (STEP_SIZE,): mean specific force in NED (m/s^2), mean
-# compensated rate and specific force in body axes, C_nb in the middle of the interval by rows, and
-# the specific force in NED smoothed over the steps.
+# compensated rate and specific force in body axes, C_nb in the middle of the interval by rows, the
+# specific force in NED and the rate in body axes, each smoothed over the steps, and the variance of
+# the noise that the latter has left.
 STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM, STEP_SMOOTH_N = 0, 3, 6, 9, 18
-STEP_SIZE = 21
-# Time constant (s) of that: a car's acceleration changes in a second, an engine shakes in 50 ms.
+STEP_SMOOTH_RATE_B, STEP_NOISE_B = 21, 24
+STEP_SIZE = 27
+# Time constant (s) of both: a car's acceleration changes in a second, an engine shakes in 50 ms.
 SMOOTH_S = 0.25
+# Seconds that the variance looks back, as fusiond.navigation.vibration does. Samples that differ
+# from the smoothed rate before by d have d^2 (1 - g / 2) of noise each, if it is white, and what is
+# smoothed with gain g has g / (2 - g) of that; a rate that changes adds to it.
+NOISE_S = 10.0
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, b1, f8[::1])", forceinline=True)
@@ -53,7 +59,7 @@ def strapdown_step(
     hold_height: bool,
     step: Array,
 ) -> None:
-    """Advance `nav` (10,) in place by `h` seconds; write `step` (21,) for the error model.
+    """Advance `nav` (10,) in place by `h` seconds; write `step` (27,) for the error model.
 
     `rate` (rad/s) and `force` (m/s^2) are the interval's means in body axes after compensation,
     the slopes their time derivatives. `hold_height` keeps height and v_D = 0 (planar models).
@@ -141,7 +147,10 @@ def strapdown_step(
     gain = h / (h + SMOOTH_S) if begun else 1.0
     for j in range(3):
         step[STEP_SMOOTH_N + j] += gain * (step[j] - step[STEP_SMOOTH_N + j])
-    for j in range(3):
+        d = rate[j] - step[STEP_SMOOTH_RATE_B + j]
+        step[STEP_SMOOTH_RATE_B + j] += gain * d
+        forgotten = h / (h + NOISE_S) if begun else 1.0
+        step[STEP_NOISE_B + j] += forgotten * (0.5 * gain * d * d - step[STEP_NOISE_B + j])
         step[STEP_RATE_B + j] = rate[j]
         step[STEP_FORCE_B + j] = force[j]
     n00, n01, n02, n10, n11, n12, n20, n21, n22 = dcm_elements(q)

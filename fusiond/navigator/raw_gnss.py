@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
-from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
+from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
@@ -88,6 +88,10 @@ class RawEpochAid(Aid):
     epoch: RawGnssEpoch
     picked: Picked
     memory: _Memory = field(default_factory=_Memory)
+
+    @property
+    def shares(self) -> tuple[str, ...]:
+        return RANGE_BIAS
 
     def at(self, nav: Array) -> PseudorangeAid:
         """The epoch's ranges for a vehicle there; it may have no satellites left."""

@@ -107,7 +107,11 @@ class Path:
         u1 = (s1 * chi1 + s * chi2) / g
         w = 1.0 + u * u
         slip = np.copysign(self.slip_rad_s2_m * g, s)
-        bank, pitch, yaw = self.bank_ratio * np.arctan(u), gamma + self.incidence_rad, chi + slip * u
+        bank, pitch, yaw = (
+            self.bank_ratio * np.arctan(u),
+            gamma + self.incidence_rad,
+            chi + slip * u,
+        )
         rpy = np.stack((bank, pitch, yaw), axis=-1)
         rpy_rate = np.stack((self.bank_ratio * u1 / w, gamma1, chi1 + slip * u1), axis=-1)
         if any(self.arm_m):

@@ -93,7 +93,8 @@ def state_of(model: Model, nav: Array, xi: Array) -> State:
     for axis in range(3):
         force[axis] -= sum(xi[s] for s in model.parameters(12 + axis))
         force[axis] /= 1.0 + sum(xi[s] for s in model.parameters(18 + axis))
-    step[18:] = dcm_from_quaternion(nav[6:]) @ force
+    step[18:21] = dcm_from_quaternion(nav[6:]) @ force
+    step[21:24] = step[3:6]
     return State(nav, xi, step, model)
 
 

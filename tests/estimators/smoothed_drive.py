@@ -133,7 +133,7 @@ def nominal_aids(holding: bool = False) -> tuple[Late, ...]:
 
 @lru_cache(maxsize=2)
 def _true_states(unknown: bool, holding: bool) -> tuple[tuple[Array, Array], ...]:
-    """True navigation state (10,) and last step (21,) at each aid of `nominal_aids`."""
+    """True navigation state (10,) and last step (27,) at each aid of `nominal_aids`."""
     without_errors = TapedKalman(model(unknown), IMU.gap_s)
     times = runs.sample_times(truth())
     buffer = runs.filled_buffer(IMU, times, np.hstack([truth().gyro, truth().accel]))

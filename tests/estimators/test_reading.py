@@ -30,7 +30,7 @@ SIZES = np.array([*(1e-6,) * 3, *(1e-4,) * 3, *(1e-3,) * 3, *(1e-6,) * 3])
 
 
 def bend() -> tuple[Array, Array, Array]:
-    """nav (10,), parameters (n,) and step (21,) of a bend at 20 m/s and 20 deg/s."""
+    """nav (10,), parameters (n,) and step (27,) of a bend at 20 m/s and 20 deg/s."""
     nav, xi, step = np.zeros(NAV_SIZE), np.zeros(STATES), np.zeros(STEP_SIZE)
     nav[:6] = LAT, 2.0, HEIGHT, 15.0, -12.0, 0.4
     nav[6:] = quaternion_from_rpy(-0.06, 0.05, 0.7)

@@ -113,6 +113,9 @@ def test_all_systems(all_in_view: tuple[dict[str, Any], TrajectoryTable]) -> Non
     verdicts = {name: report["verdict"] for name, report in result["consistency"].items()}
     assert {"raw_G", "raw_E", "raw_C"} <= set(verdicts)
     assert "optimistic" not in verdicts.values()
+    # What all ranges share no innovation shows.
+    assert "cannot_tell" in verdicts.values()
+    assert "pessimistic" not in verdicts.values()
 
 
 @pytest.mark.parametrize(("systems", "scatter_m"), [("C", 0.6), ("G", 1.0), ("E", 0.6)])
