@@ -74,8 +74,8 @@ class Kinematics:
 class Path:
     """Speed (m/s), course and climb angle (rad) over time.
 
-    `bank_ratio` is k, `slip_rad_s2_m` is c and `arm_m` is l (body axes: forward, right, down) of the
-    module's text.
+    `bank_ratio` is k, `slip_rad_s2_m` is c and `arm_m` is l (body axes: forward, right, down) of
+    the module's text.
     """
 
     speed: Profile
