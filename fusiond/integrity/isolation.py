@@ -238,7 +238,7 @@ class Isolation:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
         if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            if record.proof is not None:
+            if record.proof is not None and aid.white:
                 self.hedge.returns(aid.source, record.proof, covariance)
             elif record.means.unlikely or self.hedge.holds(aid.source):
                 self.hedge.look(aid, record, offer or velocity, nav, covariance)
