@@ -70,7 +70,7 @@ def test_a_receiver_that_cannot_have_become_late_is_not(monkeypatch: pytest.Monk
     fitted velocities of 1 s before."""
     asked: list[float] = []
 
-    def unchanged(epochs: Sequence[Epoch], by_s: float) -> bool:
+    def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int) -> bool:
         asked.append(by_s)
         return len(epochs) > 0
 

@@ -50,7 +50,7 @@ from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.course import ways
-from fusiond.navigator.alignment.leaps import Epoch, since_leap, unchanged
+from fusiond.navigator.alignment.leaps import LOOKED_NS, Epoch, since_leap, unchanged
 from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.options import AlignmentOptions
 
@@ -80,6 +80,8 @@ SEEN, AGREED = 3, 4.0
 # A look is 6 fits of 1 ms of a fast computer each, one that searches 50: as often is looked, and so
 # long nothing is searched for again where nothing was found.
 EVERY_NS, SEARCHED_NS = 1_000_000_000, 10_000_000_000
+# Looks of the last minute, and some more, are remembered.
+MOST_LOOKS = 100
 # One fit at a time: no tick waits for many. A tenth of a processor, whatever the rate of ticks.
 FIT_EVERY_NS = 10_000_000
 
@@ -158,6 +160,7 @@ class Lateness:
         self._receivers: dict[str, _Receiver] = {}
         self._due_ns = self._fitted_ns = 0
         self._looking: Generator[None, None, Found | None] | None = None
+        self._looks: deque[int] = deque(maxlen=MOST_LOOKS)
 
     def hear(self, source: str, aids: Sequence[Aid]) -> Sequence[Aid]:
         """A measurement has come, as the aids it stands for; the same at the instants at which it
@@ -218,6 +221,7 @@ class Lateness:
             return None
         if self._looking is None:
             self._looking, self._fitted_ns = self._look(imu), t_ns
+            self._looks.append(t_ns)
         due = (t_ns - self._fitted_ns) // FIT_EVERY_NS
         self._fitted_ns = t_ns
         for _ in range(max(1, due)):
@@ -228,6 +232,10 @@ class Lateness:
                 found: Found | None = end.value
                 return found
         return None
+
+    def _doubted_ns(self, t_ns: int) -> int:
+        """The last instant, before what the looks of now go by, at which something did not fit."""
+        return max((look for look in self._looks if look <= t_ns - LOOKED_NS), default=0)
 
     def _look(self, imu: ImuBuffer) -> Generator[None, None, Found | None]:
         """`look` at all that there is now, a fit at a time."""
@@ -297,7 +305,7 @@ class Lateness:
             least > gate_threshold(FITS, degrees)
             or now - least <= EVIDENCE
             or abs(late.seconds - now_s) <= PRIOR_SIGMAS * prior
-            or unchanged(epochs, abs(late.seconds - now_s))
+            or unchanged(epochs, abs(late.seconds - now_s), self._doubted_ns(t_ns))
         ):
             return
         self._due_ns = t_ns + EVERY_NS

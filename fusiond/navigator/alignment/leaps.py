@@ -58,10 +58,11 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
     return epochs[leaps[-1] + 1 :] if leaps.size else epochs
 
 
-def unchanged(epochs: Sequence[Epoch], by_s: float) -> bool:
+def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool:
     """Whether a receiver cannot have become later by `by_s` within what a look goes by, nor have
     been so before: its positions have followed its velocities all the way, and before that these
-    had changed by as much as shows a lateness."""
+    had changed by as much as shows a lateness. What follows `doubted_ns`, when something did not
+    fit, shows none as long: what is begun anew by late fixes agrees with them for a while."""
     steps = _steps(epochs)
     if steps is None:
         return False
@@ -70,7 +71,7 @@ def unchanged(epochs: Sequence[Epoch], by_s: float) -> bool:
     first = int(unseen[-1]) + 1 if unseen.size else 0
     later = -np.sum(steps.off_m[first:] * steps.v_m_s[first:], axis=1) / speed[first:] ** 2
     times = np.array([e.velocity.t_ns for e in epochs[first:]])
-    before = times <= times[-1] - LOOKED_NS
+    before = (times > doubted_ns + LOOKED_NS) & (times <= times[-1] - LOOKED_NS)
     if not before.any() or np.ptp(np.cumsum(later)) > 0.5 * by_s:
         return False
     v = np.array([e.velocity.v_ned[:2] for e in epochs[first:]])[before]
