@@ -42,6 +42,8 @@ GAP_FORCE_M_S2 = 1.0
 
 # What a propagation does beside the usual, added up.
 HOLD_HEIGHT, RECORD, CARRY, TURN_TILT = 1, 2, 4, 8
+# Cosine of the tilt beyond which no accelerometer is the vertical one.
+UPRIGHT = 0.5
 
 
 def scratch_size(width: int) -> int:
@@ -147,6 +149,38 @@ def turn_tilt(cov: Array, width: int, known: float) -> None:
         cov[width + 1] += grown * north
         cov[1] -= grown * both
         cov[width] = cov[1]
+
+
+@compiled("void(f8[::1], i8, f8[::1], i8[::1], i8[::1], f8, f8)", forceinline=True)
+def turn_down(
+    cov: Array,
+    width: int,
+    step: Array,
+    sensor_slot: Indices,
+    sensor_kind: Indices,
+    grown_north: float,
+    grown_east: float,
+) -> None:
+    """Add to `cov`, flat and of `width` rows, what a tilt that only the gyros' errors have made
+    does to the vertical force: variances (rad^2) that a tilt has `grown` by, times those of the
+    force biases across (fusiond.estimators.tilt_axes)."""
+    upright = step[STEP_DCM + 8]
+    north, east, vertical = 0.0, 0.0, -1
+    for i in range(6, 12):
+        if sensor_kind[i] != PLAIN:
+            continue
+        row = sensor_slot[i] * width
+        if i // 2 == 5:
+            vertical = sensor_slot[i]
+        for k in range(6, 12):
+            if sensor_kind[k] == PLAIN:
+                p = cov[row + sensor_slot[k]]
+                a, b = STEP_DCM + i // 2 - 3, STEP_DCM + k // 2 - 3
+                north += step[a] * step[b] * p
+                east += step[a + 3] * step[b + 3] * p
+    if vertical >= 0 and abs(upright) >= UPRIGHT:
+        more = max(grown_north, 0.0) * east + max(grown_east, 0.0) * north
+        cov[vertical * width + vertical] += more / (upright * upright)
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])")
@@ -266,6 +300,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 for k in range(covs.shape[0]):
                     cov, q = flats[k], 1.0 / shares[k]
                     known = cov[2 * width + 2]
+                    north, east = cov[0], cov[width + 1]
                     propagate_covariance(
                         cov,
                         step,
@@ -289,7 +324,17 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                     if silent:
                         widen_for_gap(cov, width, active, whole, h / shares[k])
                     if turning:
+                        grown_north, grown_east = cov[0] - north, cov[width + 1] - east
                         turn_tilt(cov, width, known)
+                        turn_down(
+                            cov,
+                            width,
+                            step,
+                            sensor_slot,
+                            sensor_kind,
+                            grown_north,
+                            grown_east,
+                        )
                 if phi.shape[0]:
                     propagate_transition(
                         flat_phi,

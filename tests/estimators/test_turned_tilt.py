@@ -133,3 +133,28 @@ def test_an_unknown_turn_turns_the_axes_of_a_tilt(turning: bool) -> None:
     expected = turn * np.array([[east, -both], [-both, north]])
     assert grown[:2, :2] == pytest.approx(expected, rel=0.2)
     assert grown[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_unknown_tilt_turns_what_the_biases_make_downward() -> None:
+    """Var((C b)_D) grows by those of the tilt that gyros pretend, times the biases' across."""
+    model = make_model("ins21", imu_noise(IMU))
+    samples = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -G], (10, 1))
+    across = [model.parameters(FORCE_ERROR + axis)[0] for axis in range(2)]
+    vertical = model.parameters(FORCE_ERROR + 2)[0]
+    found = []
+    for kind in (TiltAxesFilter, KalmanEstimator):
+        imu = ImuBuffer(RATE_HZ, 2.0, np.eye(3), 0.0, 0.5)
+        imu.append(np.arange(1, 11) * round(1e9 / RATE_HZ), samples)
+        p = np.diag(model.initial**2)
+        p[:3, :3] = np.diag([0.01, 0.02, 0.001]) ** 2
+        p[across, across] = 0.3**2, 0.6**2
+        filter_ = kind(model, 0.5)
+        nav = np.array([*runs.ORIGIN, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        filter_.initialise(0, 0, nav, np.zeros(model.size), p)
+        filter_.propagate(imu, round(10e9 / RATE_HZ))
+        found.append(filter_.covariance.copy())
+    tilts, plain = found
+    grown = np.diag(plain)[:2] - np.array([0.01, 0.02]) ** 2
+    more = grown[0] * plain[across[1], across[1]] + grown[1] * plain[across[0], across[0]]
+    assert more > 1e-6
+    assert tilts[vertical, vertical] - plain[vertical, vertical] == pytest.approx(more, rel=0.02)
