@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, State
+from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
@@ -265,9 +265,7 @@ class Timeline:
         if self.estimator.isolates:
             return self.estimator.update(aid)
         if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
-            e = self.estimator
-            state = State(e.nav, e.xi, e.step, e.model, e.covariance)
-            self.isolation.comes(aid, state, e.covariance)
+            self.isolation.comes(aid, self.estimator.state, self.estimator.covariance)
             return self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
         lasting = self.isolation.coarseness(aid)
         return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
