@@ -32,8 +32,12 @@ MOST_FIXES, FIXES_NS = 400, 20_000_000_000
 MOST_POSITIONS = 60
 # A vehicle that drives for long drives faster (m/s).
 SLOWEST_M_S = 3.0
-# Sigmas at which position and velocity of a receiver contradict each other.
+# Sigmas at which position and velocity of a receiver do not confirm each other: of two axes, one
+# time in three thousand by chance, and a start looks up to two hundred times.
 CONTRADICTION_SIGMAS = 4.0
+# Those at which it is no chance (one time in a million): the velocities until then are suspect even
+# when they have come to agree again.
+SUSPECT_SIGMAS = 5.3
 # Of the way by velocity (scale): what the trapezoids between fixes leave out.
 WAY_SCALE = 0.05
 # One sigma (s) of the delay of a receiver's velocity against its position, which smoothing makes.
@@ -106,7 +110,7 @@ class Collected:
         """The last measurements that offered both, velocity and position."""
         self.contradicted_ns: int | None = None
         """The last fix at which positions had moved otherwise than the velocities of their
-        receiver: which of those before it were wrong nobody knows."""
+        receiver, and not by chance: which of those before it were wrong nobody knows."""
         self._at_rest = False
         self._pending: Window | None = None
         self._speed = 0.0
@@ -263,14 +267,13 @@ class Collected:
         size, sd_v = math.hypot(*way), max(latest.velocity.sd[:2])
         sd = math.hypot(max(first.sd[:2]), max(latest.position.sd[:2]), WAY_SCALE * size)
         sd = math.hypot(sd, sd_v * span_s)
-        if math.hypot(*(moved - way)) > CONTRADICTION_SIGMAS * sd:
-            self.contradicted_ns = latest.velocity.t_ns
-            return False
         slope, sd_slope = trend.slope
         lag = LAG_SD_S * math.hypot(*latest.velocity.v_ned[:2]) / max(span_s, 1.0)
         sd_slope = math.hypot(sd_slope, max(sd_v / math.sqrt(count), LEAST_SD_M_S), lag)
-        if slope > CONTRADICTION_SIGMAS * sd_slope:
+        sigmas = max(math.hypot(*(moved - way)) / sd, slope / sd_slope)
+        if sigmas > SUSPECT_SIGMAS:
             self.contradicted_ns = latest.velocity.t_ns
+        if sigmas > CONTRADICTION_SIGMAS:
             return False
         return 2.0 * size > CONTRADICTION_SIGMAS * sd or span_s >= CONFIRMED_S
 

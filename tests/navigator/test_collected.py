@@ -1,0 +1,65 @@
+"""What an alignment is told by positions and velocities of one receiver: do they go together?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.configuration.schema import Config
+from fusiond.configuration.settings import imu_noise
+from fusiond.navigator.alignment.collected import Collected, Fix
+from fusiond.navigator.alignment.options import alignment_options
+
+CONFIG = Config.model_validate({"imu": {"rate_hz": 100.0}})
+SD_M, SD_M_S, SPEED_M_S, EVERY_S, FIXES = 0.8, 0.05, 15.0, 0.1, 40
+METRES = np.array([6_378_137.0, 6_378_137.0])  # a radian at the equator, near enough
+
+
+def _looked_at(
+    rng: np.random.Generator, wrong: NDArray[np.float64], strayed_m: float = 0.0
+) -> tuple[Collected, bool]:
+    """Straight on to the north; the velocity of each fix is `wrong` (n, 2) by so much (m/s), the
+    tenth position off by `strayed_m`. A look at each fix, as an alignment that waits has it; and
+    what it saw at the last."""
+    known = Collected(
+        alignment_options(CONFIG), imu_noise(CONFIG.imu), None, lambda code, text: None
+    )
+    confirmed = False
+    for k in range(FIXES):
+        t_ns = round((k + 1) * EVERY_S * 1e9)
+        place = rng.normal(0.0, SD_M, 2)
+        place[0] += SPEED_M_S * k * EVERY_S
+        place[1] += strayed_m * (k == 10)
+        lat, lon = place / METRES
+        north, east = rng.normal(0.0, SD_M_S, 2) + wrong[k]
+        velocity = VelocityOffer(t_ns, (SPEED_M_S + north, east, 0.0), (SD_M_S, SD_M_S, SD_M_S))
+        sd = (SD_M, SD_M, SD_M)
+        position = PositionOffer(t_ns, float(lat), float(lon), 0.0, sd, (0.0, 0.0, 0.0))
+        known.fixes.append(Fix(velocity, position))
+        confirmed = known.position_confirms(known.fixes[-1])
+    return known, confirmed
+
+
+def test_a_fix_at_the_edge_of_its_noise_makes_no_velocity_suspect() -> None:
+    """4.5 sigma of the way between two fixes: a start waits for a fix or two. It must not be one
+    that has to prove itself for half a minute."""
+    rng, honest = np.random.default_rng(1), np.zeros((FIXES, 2))
+    sigma_m = math.hypot(SD_M, SD_M, 0.05 * SPEED_M_S * 10 * EVERY_S)
+    looked = [_looked_at(rng, honest, 4.5 * sigma_m) for _ in range(50)]
+    suspect = [known.contradicted_ns for known, _ in looked if known.contradicted_ns is not None]
+    assert len(suspect) < 25  # the noise of the two comes on top
+    assert all(confirmed for _, confirmed in looked)
+
+
+def test_velocities_that_run_away_are_suspect_even_when_they_agree_again() -> None:
+    """6 m/s off for the first two seconds of four."""
+    rng, wrong = np.random.default_rng(2), np.zeros((FIXES, 2))
+    for turn in range(50):
+        angle = 2.0 * math.pi * turn / 50
+        wrong[: FIXES // 2] = 6.0 * np.array([math.cos(angle), math.sin(angle)])
+        known, _ = _looked_at(rng, wrong)
+        assert known.contradicted_ns is not None
+        assert known.contradicted_ns > 1_000_000_000
