@@ -73,12 +73,13 @@ class StateKeeper:
         self._kept = state is not None
         return state
 
-    def keep(self, t_ns: int, solution: Solution) -> None:
-        """Renew the file while the vehicle stands; remove it once the vehicle drives."""
+    def keep(self, t_ns: int, solution: Solution, confirmed: bool = True) -> None:
+        """Renew the file while the vehicle stands; remove it once the vehicle drives. `confirmed`:
+        whether anything has shown the heading."""
         if self._path is None or (self._working is not None and not self._working.done()):
             return
         if self._save.due(t_ns):
-            state = self._state(solution)
+            state = self._state(solution, confirmed)
             if state is not None:
                 self._kept = True
                 self._working = asyncio.create_task(asyncio.to_thread(_write, self._path, state))
@@ -86,15 +87,15 @@ class StateKeeper:
             self._kept = False
             self._working = asyncio.create_task(asyncio.to_thread(_remove, self._path))
 
-    async def close(self, solution: Solution | None) -> None:
+    async def close(self, solution: Solution | None, confirmed: bool = True) -> None:
         """Keep the last solution, after what is under way has ended."""
         if self._working is not None:
             await asyncio.wait([self._working])
-        state = None if solution is None else self._state(solution)
+        state = None if solution is None else self._state(solution, confirmed)
         if self._path is not None and state is not None:
             await asyncio.to_thread(_write, self._path, state)
 
-    def _state(self, solution: Solution) -> SavedState | None:
+    def _state(self, solution: Solution, confirmed: bool) -> SavedState | None:
         utc_ns = self._clock.utc_ns(solution.t_ns)
         if utc_ns is None or not _speed_m_s(solution) <= SAVE_MAX_SPEED_M_S:
             return None
@@ -106,6 +107,7 @@ class StateKeeper:
                 math.hypot(s.sd_ned_m[0], s.sd_ned_m[1]),
                 s.rpy_rad[2],
                 s.sd_rpy_rad[2],
+                confirmed,
             )
         except ValidationError as error:  # a heading that no model estimates, a diverged filter
             log.warning("state not saved: %s", error.errors(include_url=False)[0]["msg"])

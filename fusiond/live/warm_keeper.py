@@ -33,7 +33,6 @@ from fusiond.navigator.state_file import (
     write_state,
 )
 from fusiond.navigator.warm_start import (
-    RESTARTED,
     WarmStart,
     WarmState,
     same_run,
@@ -133,10 +132,11 @@ class WarmKeeper:
             state = warm_state(
                 navigator.estimator,
                 navigator.imu,
-                navigator.started.how.partition(RESTARTED)[0],
+                navigator.started.origin,
                 self._config,
                 self._boot_id,
                 _asleep_ns(),
+                not navigator.unconfirmed,
             )
             return KeptState(state, self._clock.known())
         except ValidationError as error:

@@ -310,6 +310,12 @@ class Navigator:
         """Started from the state of the last run, and no position aid has confirmed it yet."""
         return self.warm is not None and self.warm.on_trial
 
+    @property
+    def unconfirmed(self) -> str:
+        """What the heading hangs on and nothing has shown, in words; empty where it does not."""
+        hangs = self._afterwards.unconfirmed if self._afterwards else ""
+        return "no fix has confirmed it yet" if self.on_trial else hangs
+
     def isolated(self, source: str) -> str | None:
         """Why the fault detection leaves a source out; None if it does not."""
         return self._left_out.reason(source)
@@ -354,9 +360,7 @@ class Navigator:
         e, p = self.estimator, self.estimator.covariance.item
         if not 0.0 <= (variance := p(6, 6) + p(7, 7)) <= self.config.estimator.invalid_sd_m**2:
             return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
-        if self.on_trial:
-            return Mode.COASTING, f"heading from {self.started.how}; no fix has confirmed it yet"
-        if self._afterwards is not None and (hangs := self._afterwards.unconfirmed):
+        if hangs := self.unconfirmed:
             return Mode.COASTING, f"heading from {self.started.how}; {hangs}"
         if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
             return Mode.INVALID, why

@@ -50,7 +50,7 @@ from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE, DR, DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, quaternion_from_rpy, rpy_from_dcm
-from fusiond.navigator.alignment.start import SLOPE_SD, Start, as_geodetic
+from fusiond.navigator.alignment.start import RESTARTED, SLOPE_SD, Start, as_geodetic
 from fusiond.navigator.saved_state import STRICT, Height, Latitude, Longitude
 from fusiond.navigator.state_file import DamagedStateError, RefusedStateError
 
@@ -77,8 +77,6 @@ SUSPENDED_NS = 100_000_000
 # Rounding of a covariance on its way through a filter: what its least eigenvalue, scaled to unit
 # diagonal, may lie below zero.
 ROUNDING = 1e-9
-# What a heading that was carried over a gap says after its origin.
-RESTARTED = ", restarted over "
 
 Speed = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Turn = Annotated[float, Field(ge=-3.0, le=3.0)]
@@ -92,8 +90,9 @@ class WarmState:
     """A navigation state: instant, nav (10,), parameters (n,), P (n, n) as its lower triangle.
 
     `t_ns` is CLOCK_MONOTONIC of the boot `boot_id`, `asleep_ns` CLOCK_BOOTTIME minus that clock;
-    `config` the digest of the configuration whose states these are, `how` the heading's origin.
-    `turn_rad_s` is the rate of the heading, `push_m_s2` the acceleration along the way.
+    `config` the digest of the configuration whose states these are, `how` the heading's origin,
+    `confirmed` whether anything has shown that heading. `turn_rad_s` is the rate of the heading,
+    `push_m_s2` the acceleration along the way.
     """
 
     boot_id: Annotated[str, Field(min_length=1, max_length=64)]
@@ -108,6 +107,7 @@ class WarmState:
     push_m_s2: Push
     xi: Annotated[tuple[float, ...], Field(max_length=64)]
     covariance: Annotated[tuple[float, ...], Field(max_length=64 * 65 // 2)]
+    confirmed: bool = True
     version: Literal[1] = 1
 
 
@@ -144,7 +144,13 @@ class WarmStart:
 
 
 def warm_state(
-    estimator: Estimator, imu: ImuBuffer, how: str, config: str, boot_id: str, asleep_ns: int
+    estimator: Estimator,
+    imu: ImuBuffer,
+    how: str,
+    config: str,
+    boot_id: str,
+    asleep_ns: int,
+    confirmed: bool = True,
 ) -> WarmState:
     """What the estimator holds, and what the IMU felt last. Raises pydantic's `ValidationError` if
     no vehicle can have that."""
@@ -165,6 +171,7 @@ def warm_state(
         push_m_s2=push,
         xi=tuple(estimator.xi.tolist()),
         covariance=tuple(estimator.covariance[rows].tolist()),
+        confirmed=confirmed,
     )
 
 
@@ -237,7 +244,8 @@ def _after_gap(state: WarmState, model: Model, p: Array, t_ns: int, gap_s: float
     p[:CORE_SIZE, :CORE_SIZE] += _unseen(v, gap_s)
     xi = np.array(state.xi)
     xi[own] = (phi @ xi)[own]
-    return Start(t_ns, nav, xi, p, f"{state.how}{RESTARTED}{gap_s:.1f} s")
+    how = f"{state.how}{RESTARTED}{gap_s:.1f} s"
+    return Start(t_ns, nav, xi, p, how, confirmed=state.confirmed)
 
 
 def _moved(state: WarmState, gap_s: float) -> tuple[Array, Array, float]:

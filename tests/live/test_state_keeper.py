@@ -86,6 +86,18 @@ async def test_rest_is_kept_and_serves_the_next_start(kept: Kept) -> None:
     assert math.isclose(state.sd_position_m, 5.0)
 
 
+async def test_a_heading_that_nothing_has_shown_is_kept_as_one(kept: Kept) -> None:
+    kept.keeper.keep(kept.t_ns, kept.at(0.0, Mode.COASTING), confirmed=False)
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    state = Kept(kept.path).keeper.load()
+    assert state is not None
+    assert not state.confirmed
+    await kept.keeper.close(kept.at(0.0), confirmed=True)
+    state = Kept(kept.path).keeper.load()
+    assert state is not None
+    assert state.confirmed
+
+
 async def test_the_file_is_renewed_once_a_minute(kept: Kept) -> None:
     await kept.tick(0.0, 0.0)
     kept.path.unlink()

@@ -152,6 +152,15 @@ def test_saved_heading() -> None:
     _assert_started(story, truth, "saved state")
 
 
+def test_a_heading_that_was_saved_unconfirmed_stays_unconfirmed() -> None:
+    """A claim does not become knowledge because the daemon was restarted in between."""
+    truth = _parked(20.0)
+    saved = replace(SAVED, confirmed=False)
+    story = _tell(truth, MEMS, _fixes(truth, 2), saved=saved, heading=("saved",))
+    _assert_started(story, truth, "saved state", confirmed=False)
+    assert story.navigator.unconfirmed
+
+
 def test_saved_position_too_where_no_fix_comes() -> None:
     truth = _parked(8.0)
     story = _tell(truth, MEMS, [], saved=SAVED, heading=("saved",))

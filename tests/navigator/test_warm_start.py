@@ -141,6 +141,27 @@ def test_it_navigates_once_a_fix_agrees_and_finds_back_to_the_filter_that_never_
     assert math.sqrt(navigator.estimator.covariance[2, 2]) < math.radians(3.0)
 
 
+def test_a_heading_that_nothing_has_shown_is_not_shown_by_a_restart() -> None:
+    state = replace(_states()[14.0], how="configured heading", confirmed=False)
+    navigator, row = _restarted(state, 15.0)
+    navigator.add(_fix(navigator), navigator.imu.latest_ns)
+    navigator.advance()
+    mode, reason = navigator.mode(navigator.imu.latest_ns)
+    assert mode is Mode.COASTING
+    assert reason.startswith("heading from configured heading, restarted over ")
+    assert reason.endswith("; no motion has confirmed it yet")
+    waiting = [m for m in drive().measurements if m.t_seen_ns > navigator.imu.latest_ns]
+    d = drive()
+    while row < len(d.times):
+        navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
+        row += 10
+        while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
+            navigator.add(waiting[0], waiting.pop(0).t_seen_ns)
+        navigator.advance()
+    assert not navigator.unconfirmed  # the course has
+    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
+
+
 def test_precise_velocities_do_not_tell_which_way_it_went_in_the_gap() -> None:
     """Two seconds of fixes at 10 Hz, 1 m and 0.05 m/s, after gaps of 3.5 s in bends, braking and
     setting off: where the way is taken to follow from the velocity, a third is beyond 3 sigma."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.witnesses import Witnesses
 from fusiond.navigation.rotation import dcm_elements, wrap_angle
 from fusiond.navigation.strapdown import Q0, VN
-from fusiond.navigator.alignment.headings import CLAIMS, COMPASS, CONFIGURED
+from fusiond.navigator.alignment.headings import CLAIMS
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
 
@@ -31,18 +31,19 @@ class Afterwards:
 
     def __init__(self, options: AlignmentOptions, start: Start) -> None:
         self._options = options
-        self._claim = start.how if start.how in CLAIMS else ""
+        self._claim = start.origin if start.origin in CLAIMS else ""
         self._sd_yaw = math.sqrt(start.covariance[2, 2])
         on_wheels = options.no_slip_m is not None and math.isfinite(options.max_reverse_m_s)
-        self._backward = start.backward and on_wheels
-        self._unproven = start.how in (CONFIGURED, COMPASS)
+        self._backward = start.backward and on_wheels and not start.confirmed
+        self._unproven = bool(self._claim) and not start.confirmed
         self._since_ns: int | None = None
 
     @property
     def unconfirmed(self) -> str:
         """What the heading hangs on and no motion has shown, in words; empty where there is no such
-        thing. A configured heading is a hypothesis until the first motion; one that was saved was
-        measured, before the vehicle was parked. And what looks like driving backward is driving
+        thing. A configured heading is a hypothesis until the first motion, and so is one that
+        was saved without it; another that was saved was measured, before the vehicle was parked.
+        And what looks like driving backward is driving
         forward with an IMU that is mounted the other way, until it goes forward as well."""
         if self._backward:
             return "the vehicle drives backward, or the IMU is mounted backwards"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -88,14 +89,17 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
             by.known.poor_claims[SAVED] = text
             by.known.tell("saved_elsewhere", text)
             return None
-    return _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, SAVED)
+    start = _at_standstill(by, place, by.saved.yaw_rad, by.saved.sd_yaw_rad, SAVED)
+    return start and replace(start, confirmed=by.saved.confirmed)
 
 
 def from_config(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """The configured heading, while the vehicle has not moved."""
-    if by.options.heading_rad is None or by.known.ever_moved:
+    o = by.options
+    if o.heading_rad is None or by.known.ever_moved:
         return None
-    return _at_standstill(by, place, by.options.heading_rad, by.options.heading_sd_rad, CONFIGURED)
+    start = _at_standstill(by, place, o.heading_rad, o.heading_sd_rad, CONFIGURED)
+    return start and replace(start, confirmed=False)
 
 
 def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
@@ -112,7 +116,8 @@ def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     offer = by.known.compass
     if offer is None or imu.latest_ns - offer.t_ns > HEADING_AGE_NS:
         return None
-    return _at_standstill(by, place, offer.yaw_rad, offer.sd_rad, COMPASS, offer)
+    start = _at_standstill(by, place, offer.yaw_rad, offer.sd_rad, COMPASS, offer)
+    return start and replace(start, confirmed=False)
 
 
 def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:

@@ -38,6 +38,8 @@ SLOPE_SD = 0.06
 
 # What `how` ends with where the vehicle was taken to drive backward.
 BACKWARD = ", backward"
+# What the origin of a heading that was carried over a gap ends with.
+RESTARTED = ", restarted over "
 
 Place = tuple[PositionOffer | None, Array, float]
 """The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
@@ -92,7 +94,8 @@ class Start:
     `turns`: the heading is known so poorly that the filter should update in the coordinates of
     `fusiond.estimators.invariant`. `contradicted`: before it, positions have moved otherwise than
     the velocities of the same receiver. `used`: what of its own instant it was made of, which no
-    filter may be told once more.
+    filter may be told once more. `confirmed`: nothing has measured the heading where it is false,
+    nor has the way shown it: one that was configured, of a magnet, backward.
     """
 
     t_ns: int
@@ -103,11 +106,17 @@ class Start:
     turns: bool = False
     contradicted: bool = False
     used: tuple[Offer, ...] = ()
+    confirmed: bool = True
+
+    @property
+    def origin(self) -> str:
+        """Of the heading, before the gap that it was carried over."""
+        return self.how.partition(RESTARTED)[0]
 
     @property
     def backward(self) -> bool:
         """Whether the vehicle was taken to drive backward."""
-        return self.how.endswith(BACKWARD)
+        return self.origin.endswith(BACKWARD)
 
 
 def build_start(
@@ -174,7 +183,8 @@ def build_start(
         _by_velocity(model, by, moves, dcm)
     made_of = fix, moves.offer if moves is not None else None, heading
     used = tuple(offer for offer in made_of if offer is not None)
-    return Start(t_ns, nav, xi, by @ p @ by.T, how, used=used)
+    confirmed = not how.endswith(BACKWARD)
+    return Start(t_ns, nav, xi, by @ p @ by.T, how, used=used, confirmed=confirmed)
 
 
 def _by_heading(model: Model, p: Array, heading: HeadingOffer) -> None:
