@@ -53,7 +53,7 @@ demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 
 # Hardware in the loop waits for real time more than it computes: the others take what it leaves, and
 # are the first to yield.
 test: $(RUNTIME) ## everything that CI checks
-	$(MAKE) --jobs=2 --output-sync=line lint hil unit YIELDING="nice -n 19"
+	$(MAKE) --jobs=2 --output-sync=line lint hil unit systemd YIELDING="nice -n 19"
 
 lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(BIN)/ruff check
@@ -90,7 +90,7 @@ fuzz: $(STAMP) ## every parser with atheris; RUNS=1000000 ARGS=nmea for one of t
 hil: $(STAMP) kernels test-packages ## hardware in the loop; alone, since the daemon keeps real time
 	$(BIN)/pytest tests/hil/test_hil.py
 
-systemd: $(STAMP) test-packages ## the unit as its README installs it, systemd as process 1 of a guest
+systemd: $(STAMP) kernels test-packages ## the unit as its README installs it, systemd as process 1 of a guest
 	$(BIN)/python -m tests.hil.unit_guest
 
 test-packages:

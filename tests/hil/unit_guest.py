@@ -5,6 +5,7 @@ By hand: `.venv/bin/python -m tests.hil.unit_guest`.
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -44,4 +45,7 @@ def run_unit(timeout_s: float, output: TextIO) -> int:
 
 
 if __name__ == "__main__":
+    if platform.machine() != "x86_64":  # Debian has no User Mode Linux for others
+        print("no guest on this machine: the unit is not tried under systemd")
+        sys.exit(0)
     sys.exit(run_unit(3600.0, sys.stdout))
