@@ -60,7 +60,7 @@ WITNESSED_NS = 1_000_000_000
 
 
 def _rate_error(state: State, mean_rate: Array) -> Array:
-    """Mean rate (3,) less the bias's estimate and the Earth's."""
+    """Mean rates (3,) or (k, 3) less the bias's estimate and the Earth's."""
     lat = state.nav[LAT]
     bias = np.array([sum(state.xi[s] for s in state.model.parameters(9 + j)) for j in range(3)])
     earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
@@ -98,32 +98,28 @@ class Rest:
         if square > quantile(rows, VELOCITY_PROBABILITY) or measured.contradicts:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
-        means = (w.mean_rate, 1), (w.run_rate, w.run)
-        if any(self._turns(state, p, *mean, RATE_SIGMAS) for mean in means):
-            sure = known and any(self._turns(state, p, *mean, SURE_SIGMAS) for mean in means)
+        turns = self._turns(state, p)
+        if any(square > RATE_SIGMAS**2 * variance for square, variance in turns):
+            sure = known and any(square > SURE_SIGMAS**2 * variance for square, variance in turns)
             return TURNS_AT_REST if sure else "turning"
         if not known and self.witnesses.smooth_ride(w.end_ns):
             return "quiet_at_speed"
         return None
 
-    def _turns(
-        self,
-        state: State,
-        p: Array,
-        mean_rate: Array,
-        count: int,
-        sigmas: float,
-    ) -> bool:
-        error = _rate_error(state, mean_rate)
-        free = (self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2) / count
+    def _turns(self, state: State, p: Array) -> list[tuple[float, float]]:
+        """Of each axis, the square of what has turned in the window and in the run of windows, and
+        its variance (rad^2/s^2) by bias and noise."""
+        w, free = self.window, self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2
+        errors = _rate_error(state, np.array((w.mean_rate, w.run_rate))).tolist()
+        found = []
         for axis in range(3):
             slots, variance = state.model.parameters(9 + axis), 0.0
             for i in slots:
                 for j in slots:
                     variance += float(p[i, j])
-            if error[axis] ** 2 > sigmas**2 * (variance + free):
-                return True
-        return False
+            for error, count in zip(errors, (1, w.run), strict=True):
+                found.append((error[axis] ** 2, variance + free / count))
+        return found
 
 
 @dataclass(frozen=True, slots=True)
