@@ -38,6 +38,7 @@ from fusiond.aiding.base import (
     NotApplicable,
     State,
     Vector3,
+    immutable,
     rate_columns,
 )
 from fusiond.aiding.witnesses import Witnesses
@@ -122,7 +123,7 @@ class Rest:
         return found
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class ZeroVelocityAid(Aid):
     """Zero velocity with `sd_m_s`."""
 
@@ -142,7 +143,7 @@ class ZeroVelocityAid(Aid):
         return Innovation(state.nav[VN : VN + rows].copy(), h, np.full(rows, self.sd_m_s**2))
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class ZeroRateAid(Aid):
     """Raw mean rate (rad/s, body axes) of a quiet window; `sd_rad_s` of what the vehicle may
     turn."""
