@@ -52,8 +52,7 @@ class CompassAid(HeadingAid):
     lasting_sd_rad: float
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        # super() needs its arguments in a dataclass with slots.
-        found = super().innovation(state)
+        found = HeadingAid.innovation(self, state)  # super() knows no dataclass with slots
         if isinstance(found, NotApplicable):
             return found
         yaw = rpy_from_dcm(state.dcm)[2]

@@ -103,7 +103,7 @@ class SlippingAid(NonHolonomicAid):
     slip: tuple[float, float] = (0.0, 0.0)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        found = super().innovation(state)
+        found = NonHolonomicAid.innovation(self, state)
         if isinstance(found, NotApplicable):
             return found
         return found._replace(z=found.z + np.array(self.slip))
