@@ -30,12 +30,19 @@ Source: Groves, 2nd ed., section 16.1; Euler kinematics, eq. 2.57; paper 001 (st
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, misaligned_axes
+from fusiond.aiding.base import (
+    Aid,
+    Innovation,
+    NotApplicable,
+    State,
+    Vector3,
+    immutable,
+    misaligned_axes,
+)
 from fusiond.aiding.offers import HeadingOffer
 from fusiond.navigation.rotation import (
     dcm_from_rpy,
@@ -51,7 +58,7 @@ UNKNOWN_SD_RAD = math.pi
 STAR_BLOCK = "star_misalignment"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class AttitudeAid(Aid):
     """Roll, pitch, yaw (rad, NED to body) with `sd`; NaN is not measured.
 
@@ -94,7 +101,7 @@ class AttitudeAid(Aid):
         return (HeadingOffer(self.t_ns, self.rpy[2], self.sd[2]),)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class HeadingAid(Aid):
     """True heading (rad) of the body's forward axis with `sd_rad`."""
 

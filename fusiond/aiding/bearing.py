@@ -29,7 +29,6 @@ Source: paper 002, section 2.2 (SAR azimuth and elevation); derived here, checke
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -41,6 +40,7 @@ from fusiond.aiding.base import (
     NotApplicable,
     State,
     Vector3,
+    immutable,
     misaligned_axes,
 )
 from fusiond.gnss.ecef import ned_axes, to_ecef
@@ -60,7 +60,7 @@ def line_of_sight(place: Vector3, point: Vector3) -> Array:
     return np.asarray(ned_axes(place[0], place[1]).T @ apart, dtype=np.float64)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class BearingAid(Aid):
     """Azimuth and elevation (rad) with `sd` of `point` (lat, lon in rad, height in m).
 

@@ -28,13 +28,12 @@ T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and moun
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import SpeedOffer
 from fusiond.models.model import Model
@@ -181,7 +180,7 @@ def _body_velocity(
     return z, h
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class NonHolonomicAid(Aid):
     """No sideways (sigma `sd_m_s`) or vertical velocity (`sd_down_m_s`) at `lever`, above
     `min_speed_m_s`."""
@@ -207,7 +206,7 @@ class NonHolonomicAid(Aid):
         return Innovation(z, h, np.array([sd * sd for sd in sds]))
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class WheelSpeedAid(Aid):
     """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
     `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; what the last says

@@ -17,12 +17,11 @@ Navigator (2019), chapter 8 (coefficients A to E).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Innovation, NotApplicable, State
+from fusiond.aiding.base import Innovation, NotApplicable, State, immutable
 from fusiond.aiding.offers import HeadingOffer
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle
@@ -42,7 +41,7 @@ def disturbance(name: str, sd_rad: float, lasts_s: float) -> Block:
     return Block(name, "rad", ("d",), (-1,), initial=sd_rad, steady=sd_rad, tau_s=lasts_s)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class CompassAid(HeadingAid):
     """A compass's heading with the declination added (rad), `sd_rad` of its white noise;
     `deviation` and `disturbance` name the model's blocks of the rest, of which one sigma in all is
@@ -53,8 +52,7 @@ class CompassAid(HeadingAid):
     lasting_sd_rad: float
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        # super() needs its arguments in a dataclass with slots.
-        found = super(CompassAid, self).innovation(state)
+        found = HeadingAid.innovation(self, state)  # super() knows no dataclass with slots
         if isinstance(found, NotApplicable):
             return found
         yaw = rpy_from_dcm(state.dcm)[2]

@@ -17,17 +17,15 @@ altimeters with respect to geometric altitude, ION GPS 1988); Bernoulli for c.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
 from fusiond.aiding.offers import HeightOffer
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.strapdown import HEIGHT, VE, VN
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class HeightAid(Aid):
     """Ellipsoidal height (m) with `sd_m`. What successive ones share is not estimated: it is of the
     same origin as the error of the blocks `of`, those of the position that came with it."""
@@ -53,7 +51,7 @@ class HeightAid(Aid):
         return (HeightOffer(self.height_m, self.sd_m),)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class BarometerAid(Aid):
     """Height of the standard atmosphere (m) with `sd_m`; `offset`, `scale` and `airflow` name the
     blocks of its errors, which the model has. It is no height to start with: the weather may be

@@ -34,14 +34,14 @@ section 10.3.2 (second-order terms).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.antenna import Matrix, antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
@@ -176,7 +176,7 @@ def _position(
             r[i] += (nav[VN + i] * sd_time) ** 2
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class PositionAid(Aid):
     """Fix (rad, rad, m) of the antenna; `sd` (m) north, east, down; no height where it is None.
 

@@ -33,13 +33,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
@@ -220,7 +220,7 @@ def _by_clock(
             row += 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable(eq=False)
 class PseudorangeAid(Aid):
     """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
 

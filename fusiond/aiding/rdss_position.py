@@ -24,12 +24,11 @@ Source: paper 000, eq. 2 to 4.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Feedback, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Feedback, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
@@ -38,7 +37,7 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, LON, VN
 BIAS_BLOCK = "rdss_bias"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RdssPositionAid(Aid):
     """Fix (rad, rad) with `covariance` (nn, ne, ee) in m^2.
 
@@ -93,7 +92,7 @@ class RdssPositionAid(Aid):
         return (PositionOffer(self.t_ns, *place, (sd_n, sd_e, sd_n), self.lever),)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class FeedBackAid(Aid):
     """The instant at which an estimate that was held is fed back."""
 

@@ -15,14 +15,13 @@ Source: Groves, 2nd ed., eq. 14.109.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.antenna import antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.compiled import compiled
@@ -100,7 +99,7 @@ def _velocity(
             r[2] += (down * sd_time) ** 2
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class VelocityAid(Aid):
     """Velocity (m/s) of the antenna with `sd`; two components (n, e) or three. `time` and
     `rest` as of `PositionAid`."""

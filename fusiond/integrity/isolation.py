@@ -51,7 +51,7 @@ from fusiond.integrity import returns, support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
-from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own, settled
+from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Series, said, velocity_away
@@ -99,6 +99,11 @@ class Memory(NamedTuple):
     doubts: tuple[int, ...]
     tilting: Tilting
     wider: Mapping[str, Array]
+
+
+def _passed(aid: Aid, outcome: Outcome) -> bool:
+    """Whether an innovation has passed its gate, fused or only looked at."""
+    return outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
 
 
 class Isolation:
@@ -201,13 +206,11 @@ class Isolation:
         """
         t_ns = aid.t_ns
         record = self._record(aid)
-        passed = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
         lat, lon, _, v_n, v_e = nav[:VD].tolist()
         offer, velocity, value = said(aid.offers())
         offset, self.shown = None, ()
         if offer is not None:
-            offer = offer if state is None else settled(offer, state)
-            offset = apart(offer, lat, lon, nav)
+            offset = apart(offer, lat, lon, nav) if state is None else residual(offer, state)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
         elif record.moves:
             record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
@@ -216,22 +219,24 @@ class Isolation:
         if record.excluded:
             self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
-            self._look(record, t_ns, passed and not repeats, outcome.whitened, offset, own)
+            passed = _passed(aid, outcome) and not repeats
+            self._look(record, t_ns, passed, outcome.whitened, offset, own)
             return Action.NONE
         if repeats:
             self._exclude(record, t_ns, REPEATS, jumped=True)
+            passed = _passed(aid, outcome)
             return self._doubted(Action.DOUBT_MEASURED if passed else Action.NONE, t_ns)
         if outcome.name != "fused":
             if aid.constraint:
                 self._slides(record, t_ns)
                 return Action.NONE
-            if passed:
+            if _passed(aid, outcome):
                 return Action.NONE
             away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
         begun, comes, self._comes = self._begun, self._comes, returns.NOTHING
         runs = offer is not None and returns.prove(
-            self._records, record, offer, nav, begun, comes, self._pass
+            self._records, record, offer, nav, state, begun, comes, self._pass
         )
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         if runs:

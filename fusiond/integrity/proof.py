@@ -56,6 +56,7 @@ from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VE, VN
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 # A filter's velocity may be off for some seconds after an outage, until its sensor errors have
 # settled: by 0.12 m/s for ten seconds and by 0.2 for five in drive_0708. So long its sigma is not
@@ -248,17 +249,18 @@ def settled(offer: PositionOffer, state: State) -> PositionOffer:
     turns or brakes these move it by v tau and C dl, which is no drift. What the fixes share stays
     in: a drift goes into it. Of the lever arm's own motion, w x l tau, there is a centimetre."""
     time, rest = state.model.slots_of_each((offer.time,), (offer.rest,))
-    if not (time.size or rest.size):
-        return offer
-    nav, xi = state.nav, state.xi
-    late_s = float(xi[time[0]]) if time.size else 0.0
-    x, y, z = xi[rest].tolist() if rest.size else (0.0, 0.0, 0.0)
-    north, east = _apart(nav, 0.0, 0.0, x, y, z)
-    north += float(nav[VN]) * late_s
-    east += float(nav[VE]) * late_s
-    to_north, to_east = metres_a_radian(nav)
-    lat, lon = offer.lat_rad - north / to_north, offer.lon_rad - east / to_east
+    lat, lon = _settled(state.nav, state.xi, time, rest, offer.lat_rad, offer.lon_rad)
     return offer._replace(lat_rad=lat, lon_rad=lon)
+
+
+def residual(offer: PositionOffer, state: State) -> Offset:
+    """From the body's origin, as the `settled` offer has it, to where the filter is, at once: asked
+    of every fix."""
+    time, rest = state.model.slots_of_each((offer.time,), (offer.rest,))
+    place = offer.lat_rad, offer.lon_rad
+    north, east = _residual(state.nav, state.xi, time, rest, *place, *offer.lever)
+    sd_n, sd_e, _ = offer.sd
+    return Offset(north, east, max(sd_n, sd_e))
 
 
 def filters_own(offer: PositionOffer, covariance: Array) -> float:
@@ -282,3 +284,36 @@ def _apart(
         north * (meridian_radius(lat) + height) + c[0] * x + c[1] * y + c[2] * z,
         east * to_east + c[3] * x + c[4] * y + c[5] * z,
     )
+
+
+@compiled("UniTuple(f8, 2)(f8[::1], f8[::1], i8[::1], i8[::1], f8, f8)")
+def _settled(
+    nav: Array, xi: Array, time: Indices, rest: Indices, lat: float, lon: float
+) -> tuple[float, float]:
+    """A place (rad, rad) without v tau and C dl, of which the slots `time` (0 or 1,) and `rest` (0
+    or 3,) of xi (n,) are."""
+    north, east = 0.0, 0.0
+    if rest.size:
+        north, east = _apart(nav, 0.0, 0.0, xi[rest[0]], xi[rest[1]], xi[rest[2]])
+    for slot in time:
+        north += nav[VN] * xi[slot]
+        east += nav[VE] * xi[slot]
+    to_east = (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT])
+    return lat - north / (meridian_radius(nav[LAT]) + nav[HEIGHT]), lon - east / to_east
+
+
+@compiled("UniTuple(f8, 2)(f8[::1], f8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8)")
+def _residual(
+    nav: Array,
+    xi: Array,
+    time: Indices,
+    rest: Indices,
+    lat: float,
+    lon: float,
+    x: float,
+    y: float,
+    z: float,
+) -> tuple[float, float]:
+    """`_apart` of the filter and the `_settled` place."""
+    lat, lon = _settled(nav, xi, time, rest, lat, lon)
+    return _apart(nav, nav[LAT] - lat, nav[LON] - lon, x, y, z)

@@ -27,7 +27,7 @@ from fusiond.aiding.base import Aid, NotApplicable, State
 from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import gate_threshold
 from fusiond.integrity import support
-from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof
+from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof, settled
 from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import NEVER_NS, Series
 from fusiond.integrity.support import FINE_M
@@ -83,13 +83,14 @@ def prove(
     record: Series,
     offer: PositionOffer,
     nav: Array,
+    state: State | None,
     begun: Begun,
     comes: Coming,
     probability: float,
 ) -> bool:
-    """A position was fused into a filter with the state `nav` (10,); whether it runs away, beyond a
-    chi-square of that `probability`, from the motion since an outage, which a velocity of the same
-    device supports. `comes`: what was seen of it before."""
+    """A position was fused into a filter with the state `nav` (10,), the whole `state` where it is
+    known; whether it runs away, beyond a chi-square of that `probability`, from the motion since an
+    outage, which a velocity of the same device supports. `comes`: what was seen of it before."""
     first = record.fused_ns == NEVER_NS and record.sd_m <= FINE_M
     suspect = begun.contradicted and first
     if begun.failed and first:
@@ -101,12 +102,14 @@ def prove(
         v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
         since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
         record.punctual = None if since.told else since
-    if suspect or out:
+    if not (suspect or out or record.proof):
+        return False
+    offer = offer if state is None else settled(offer, state)
+    if suspect or out or record.proof is None:
         record.proof = Proof.begun(offer, nav, record.means.colour, suspect)
-    elif record.proof is not None:
-        sd_m_s = support.velocity_sd(records, record.device)
-        proof = record.proof.with_one(offer, nav, sd_m_s, comes.gain)
-        record.proof = None if proof.proven else proof
-        limit = gate_threshold(probability, 2)
-        return proof.drifts(limit) and support.supported(records, record.device, offer.t_ns)
-    return False
+        return False
+    sd_m_s = support.velocity_sd(records, record.device)
+    proof = record.proof.with_one(offer, nav, sd_m_s, comes.gain)
+    record.proof = None if proof.proven else proof
+    limit = gate_threshold(probability, 2)
+    return proof.drifts(limit) and support.supported(records, record.device, offer.t_ns)

@@ -92,16 +92,16 @@ class CourseTurns:
     def fix(self, t_ns: int, v_ned: tuple[float, ...], turned: Callable[[int, int], float]) -> None:
         """A velocity (m/s) at an instant, in order; `turned(a, b)` (rad) is the gyro's between two
         instants, NaN where it is not known."""
-        if math.hypot(*v_ned[:2]) < COURSE_SPEED_M_S:
+        last = self._last
+        if last is not None and t_ns - last[0] < COURSE_STEP_NS[0]:
+            return
+        if not COURSE_SPEED_M_S <= math.hypot(*v_ned[:2]) < math.inf:
             return
         course = math.atan2(v_ned[1], v_ned[0])
-        if self._last is None:
-            self._last = t_ns, course
-            return
-        last_ns, before = self._last
-        if t_ns - last_ns < COURSE_STEP_NS[0]:
-            return
         self._last = t_ns, course
+        if last is None:
+            return
+        last_ns, before = last
         gyro = turned(last_ns, t_ns)
         if t_ns - last_ns > COURSE_STEP_NS[1] or not math.isfinite(gyro):
             return
@@ -184,8 +184,6 @@ class RateUnits:
                     if isinstance(offer, PositionOffer):
                         way = self._ways.setdefault(aid.source, WayTurns(self._bias_sd))
                         way.fix(offer._replace(t_ns=t_ns))
-            return
-        if not all(math.isfinite(v) for v in m.v_ned_m_s if v is not None):
             return
         turns = self._turns.get(m.source)
         if turns is None:

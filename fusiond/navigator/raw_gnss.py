@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
 from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
 from fusiond.configuration.aiding import RawAiding
@@ -73,7 +73,7 @@ class _Memory:
     counted: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable(eq=False)
 class RawEpochAid(Aid):
     """An epoch whose signals have been chosen, to be corrected where the filter is at its instant.
 

@@ -235,7 +235,8 @@ class Timeline:
             aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
             outcome = self._update(aid) if believed else estimator.look(aid)
-            entry.assumed = isolation.assumes(aid)
+            if not entry.judged:
+                entry.assumed = isolation.assumes(aid)
         except RAISED_BY_NUMBERS as error:
             entry.error = repr(error)
             return Outcome("failed")

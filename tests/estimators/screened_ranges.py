@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State, immutable
 from fusiond.aiding.position import PositionAid
 from fusiond.models.blocks import CLOCK_OFFSET
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Ranges(Aid):
     """A fix's axes, twice, each with the receiver's clock in it (m); `wrong` is added to one."""
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.settings import imu_noise
@@ -53,7 +52,7 @@ def test_linear_aids_as_the_extended_filter_to_rounding(name: str, holding: bool
     compare(extended, unscented, 3e-5, 1e-5)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class _Square(Aid):
     """y = (v_n - v0)^2 + v_e + noise, at the computed v_n = v0: all that EKF sees is v_e."""
 
@@ -186,7 +185,7 @@ def test_rows_judged_one_by_one_stay_apart_with_no_less_noise() -> None:
     assert np.diag(np.linalg.cholesky(noise)) ** 2 == pytest.approx(d)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class _OnlyNorth(Aid):
     """Holds only where the true velocity may be above what is computed."""
 

@@ -20,6 +20,7 @@ from fusiond.integrity.proof import (
     Proof,
     apart,
     metres_a_radian,
+    residual,
     settled,
 )
 from fusiond.models.vehicle import ANTENNA_LEVER, FIX_TIME
@@ -163,6 +164,7 @@ def test_what_is_known_of_a_fix_is_taken_out_of_it() -> None:
     z = innovation_of(aid, state).z[:2]
     known = apart(settled(offer, state), nav[LAT], nav[LON], nav)
     assert np.hypot(known.north - z[0], known.east - z[1]) < 0.1
+    assert residual(offer, state) == known
     plain = apart(offer, nav[LAT], nav[LON], nav)
     assert np.hypot(plain.north - z[0], plain.east - z[1]) > 1.5
     assert settled(replace(aid, time="", rest="").offers()[0], state) == offer._replace(

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from drivers.measurements import Height, MonotonicStamp
-from fusiond.aiding.base import Aid, Innovation, State
+from fusiond.aiding.base import Aid, Innovation, State, immutable
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from tests.navigator.vehicle import CONFIG, drive, feed, outcomes_of, started
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Raising(Aid):
     """An aid of somebody else's."""
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from drivers.measurements import Height, MonotonicStamp, PositionFix, WheelSpeed
 from drivers.rounding import SHARED_SD, rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
@@ -96,14 +96,14 @@ def configuration(**imu: Any) -> Config:
     return Config.model_validate(VEHICLE | {"imu": VEHICLE["imu"] | imu})
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class SlippingAid(NonHolonomicAid):
     """The constraint on a vehicle that slides by `slip` (right, down; m/s), drift and noise."""
 
     slip: tuple[float, float] = (0.0, 0.0)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        found = super(SlippingAid, self).innovation(state)
+        found = NonHolonomicAid.innovation(self, state)
         if isinstance(found, NotApplicable):
             return found
         return found._replace(z=found.z + np.array(self.slip))
