@@ -73,7 +73,8 @@ def _estimate(xi: Array, slot: int) -> float:
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], i8, f8[::1], f8[:, ::1])"
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], i8, f8[::1], f8[:, ::1])",
+    allocates=True,
 )
 def _rows(
     nav: Array,

@@ -64,7 +64,7 @@ Indices = NDArray[np.int64]
 _UNKNOWN = np.zeros((0, 0))
 
 
-@compiled("void(UniTuple(f8, 9), i8[::1], f8[:, :], f8[::1])", forceinline=True)
+@compiled("void(UniTuple(f8, 9), i8[::1], f8[:, :], f8[::1])", forceinline=True, allocates=True)
 def _add_of_turned_lever(c: Matrix, rest: Indices, p: Array, r: Array) -> None:
     """Add to r (m,) the variance of phi x C dl by P (n, n), whose slots `rest` (3,) are dl's."""
     u, x = np.zeros((3, 3)), np.zeros((3, 3))
@@ -83,7 +83,8 @@ def _add_of_turned_lever(c: Matrix, rest: Indices, p: Array, r: Array) -> None:
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8, f8,"
-    "f8, f8, f8, f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])"
+    "f8, f8, f8, f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])",
+    allocates=True,
 )
 def _position(
     nav: Array,

@@ -50,7 +50,7 @@ def antenna_slots(model: Model) -> tuple[Indices, Indices]:
     return model.slots_of_all((levers[0],)), model.slots_of_all((time,))
 
 
-@compiled("void(f8[:, :], f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[::1])")
+@compiled("void(f8[:, :], f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[::1])", allocates=True)
 def keep_antenna(
     m: Array,
     before: Array,

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
+from fusiond.estimators.covariance import in_lines
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
@@ -180,14 +181,14 @@ class ErrorStateFilter:
         self.t_ns = 0
         self.sample = 0
         count, width = len(shares), model.width
-        sizes = (NAV_SIZE, model.size, STEP_SIZE, WIDER, scratch_size(width))
-        self._state: Array = np.zeros(sum(sizes))  # one array for the kernel
+        sizes = (scratch_size(width), NAV_SIZE, model.size, STEP_SIZE, WIDER)
+        self._state: Array = in_lines(sum(sizes))  # one array for the kernel
         parts = np.split(self._state, np.cumsum(sizes)[:-1])
         self.nav: Array
         self.xi: Array
         self.step: Array
-        self.nav, self.xi, self.step, self.wider, self._scratch = parts
-        self._covs: Array = np.zeros((count, width, width))
+        self._scratch, self.nav, self.xi, self.step, self.wider = parts
+        self._covs: Array = in_lines(count * width * width).reshape(count, width, width)
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
         self._view = State(self.nav, self.xi, self.step, model, self._covariance)

@@ -9,7 +9,8 @@ rate d is a state, o <- o + h d):
     after
 
 W the white noise (trapezoid rule), s the steady sigma of Markov states, q a factor on all noise (1,
-or 1 / beta in a federated filter's local filters).
+or 1 / beta in a federated filter's local filters). From interval to interval P12 alone is kept;
+`mirror` makes P21 of it where somebody reads P.
 """
 
 from __future__ import annotations
@@ -23,82 +24,36 @@ from numpy.typing import NDArray
 
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.error_model import (
-    CORE_SIZE,
-    CORE_STRIDE,
-    apply_for,
-    apply_to_core,
-)
+from fusiond.navigation.error_model import CORE_SIZE, CORE_STRIDE, apply_for, apply_to_core
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-# Where the factors of `decays` begin, behind the interval that they are of.
-KEPT = 1
+# Where the factors of `decays` begin: behind the interval that they are of, and 1 if one of them is
+# not 1; two more let them begin a line of the cache.
+KEPT = 4
+LINE = 64
+
+
+def in_lines(size: int) -> Array:
+    """Zeros (size,) that begin a line of the cache: rows as long as some lines are then read and
+    written by whole ones."""
+    memory = np.zeros(size + LINE // 8)
+    first = -memory.ctypes.data % LINE // 8
+    return memory[first : first + size]
 
 
 def work_size(width: int) -> int:
     """Doubles of work space that the kernels of a row width need, zero at first; `decays` at its
     end."""
-    return (6 + 9 + CORE_STRIDE) * width + (6 + 9) * CORE_STRIDE + 12 + KEPT + width
+    return (6 + 9) * width + (9 + 6 + 9) * CORE_STRIDE + 12 + KEPT + 2 * width
 
 
-@cache
-def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
-    """`gather` for rows of `width` doubles: a constant, so that the loops become vector code."""
-    unsigned = np.uint64  # an index that cannot be negative needs no check
-    wide = np.uint64(width)
-
-    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])", variant=width, forceinline=True)
-    def gather(rows: Array, sensor_slot: Indices, weight: Array, sensor: Array) -> None:
-        """sensor (6 rows): the parameters' rows of `rows`, two an axis error, weighted."""
-        for k in range(6):
-            first = unsigned(sensor_slot[2 * k]) * wide
-            second = unsigned(sensor_slot[2 * k + 1]) * wide
-            of_first, of_second = weight[2 * k], weight[2 * k + 1]
-            target = unsigned(k) * wide
-            for i in range(width):
-                j = unsigned(i)
-                sensor[target + j] = of_first * rows[first + j] + of_second * rows[second + j]
-
-    return gather
-
-
-@cache
-def _advance_for(width: int) -> Callable[..., None]:
-    """`advance` for rows of `width` doubles."""
-    gather, apply = _gather_for(width), apply_for(width)
-
-    @compiled(
-        "void(f8[::1], i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[::1])",
-        variant=width,
-        forceinline=True,
-    )
-    def advance(
-        rows: Array,
-        sensor_slot: Indices,
-        weight: Array,
-        c: Array,
-        active: NDArray[np.bool_],
-        sensor: Array,
-        out: Array,
-    ) -> None:
-        """out (9 rows) = transition times `rows`; what is not `active` is zero.
-
-        All flat. `sensor` (6 rows) is work space.
-        """
-        gather(rows, sensor_slot, weight, sensor)
-        apply(rows, sensor, c, out)
-        for i in range(CORE_SIZE):
-            if not active[i]:
-                for j in range(width):
-                    out[i * width + j] = 0.0
-
-    return advance
-
-
-_advance_core = _advance_for(CORE_STRIDE)
+@compiled("f8[::1](f8[::1], i8)", allocates=True)
+def kept_part(work: Array, width: int) -> Array:
+    """The part of `work` (work_size(width),) that `decays` writes."""
+    return work[15 * width + 24 * CORE_STRIDE + 12 :]
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[::1])", forceinline=True)
@@ -112,45 +67,93 @@ def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
             weight[i] = step[3 + i // 2]
 
 
-@compiled("UniTuple(f8[::1], 7)(f8[::1], i8)")
-def work_parts(work: Array, width: int) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    """The parts of `work` (work_size(width),) that the kernels of a row width take: `sensor`,
-    `top`, `turned`, `core_sensor`, `core`, `weight` and, for `decays`, `kept`.
-
-    Made once for many intervals: a slice counts the references to its memory, atomically, and
-    those of an interval took a third of its time.
-    """
-    a = 6 * width
-    b = a + 9 * width
-    c = b + width * CORE_STRIDE
-    d = c + 6 * CORE_STRIDE
-    e = d + 9 * CORE_STRIDE
-    f = e + 12
-    return work[:a], work[a:b], work[b:c], work[c:d], work[d:e], work[e:f], work[f:]
-
-
-@compiled("void(f8, f8[:, ::1], f8[::1])", forceinline=True)
-def decays(h: float, noise: Array, kept: Array) -> None:
-    """Write what each parameter decays by in h seconds, 1 where it does not, to `kept` (1 + n,)
-    from its `KEPT` on; `noise` (3, n) as of the model.
+@compiled("void(f8, f8[:, ::1], i8, f8[::1])", forceinline=True)
+def decays(h: float, noise: Array, width: int, kept: Array) -> None:
+    """Write what each parameter decays by in h seconds, 1 where it does not, to `kept` from its
+    `KEPT` on, and `width` behind it the variance that each state grows by; `noise` (3, n) as of the
+    model.
 
     They are kept from one interval to the next, which is most often as long: an exponential a
     state, and one more for its estimate, cost a tenth of an interval.
     """
     if kept[0] != h:
-        kept[0] = h
+        kept[0], kept[1] = h, 0.0
         for i in range(noise.shape[1]):
-            kept[KEPT + i] = math.exp(-h * noise[0, i]) if noise[0, i] > 0.0 else 1.0
+            decay, variance = 1.0, h * noise[1, i]
+            if noise[0, i] > 0.0:
+                decay, kept[1] = math.exp(-h * noise[0, i]), 1.0
+                variance += noise[2, i] * (1.0 - decay * decay)
+            kept[KEPT + i], kept[KEPT + width + i] = decay, variance
+
+
+@cache
+def _gather_for(width: int) -> Callable[[Array, Indices, Array, Array], None]:
+    """`gather` for rows of `width` doubles.
+
+    The loops along a row end at a length that is read from an array: a short loop of a constant
+    length is unrolled before anybody makes vector code of it. Those down a column are of a constant
+    length for that very reason: vector code scatters, which costs more.
+    """
+    unsigned = np.uint64  # an index that cannot be negative needs no check
+    wide = np.uint64(width)
+
+    @compiled("void(f8[::1], i8[::1], f8[::1], f8[::1])", variant=width, forceinline=True)
+    def gather(rows: Array, sensor_slot: Indices, weight: Array, sensor: Array) -> None:
+        """sensor (6 rows): the parameters' rows of `rows`, two an axis error, weighted."""
+        length = sensor.shape[0] // 6
+        for k in range(6):
+            first = unsigned(sensor_slot[2 * k]) * wide
+            second = unsigned(sensor_slot[2 * k + 1]) * wide
+            of_first, of_second = weight[2 * k], weight[2 * k + 1]
+            target = unsigned(k) * wide
+            for i in range(length):
+                j = unsigned(i)
+                sensor[target + j] = of_first * rows[first + j] + of_second * rows[second + j]
+
+    return gather
+
+
+@cache
+def _columns_for(width: int) -> Callable[[Array, Indices, Array, int, Array], None]:
+    """`columns` for rows of `width` doubles."""
+    unsigned = np.uint64
+    wide = np.uint64(width)
+
+    @compiled("void(f8[::1], i8[::1], f8[::1], i8, f8[::1])", variant=width, forceinline=True)
+    def columns(
+        rows: Array, sensor_slot: Indices, weight: Array, stride: int, sensor: Array
+    ) -> None:
+        """sensor (6 rows of `stride` doubles, the first nine of each): the parameters' columns of
+        the first nine `rows`, two an axis error, weighted."""
+        for k in range(6):
+            first, second = unsigned(sensor_slot[2 * k]), unsigned(sensor_slot[2 * k + 1])
+            of_first, of_second = weight[2 * k], weight[2 * k + 1]
+            target = unsigned(k) * unsigned(stride)
+            for i in range(CORE_SIZE):
+                j = unsigned(i)
+                at = j * wide
+                sensor[target + j] = of_first * rows[at + first] + of_second * rows[at + second]
+
+    return columns
+
+
+@compiled("void(f8[::1], i8, b1[::1])", forceinline=True)
+def _keep_active(rows: Array, width: int, active: NDArray[np.bool_]) -> None:
+    """Of nine rows of `width` doubles those that are not `active` become zero."""
+    for i in range(CORE_SIZE):
+        if not active[i]:
+            for j in range(width):
+                rows[i * width + j] = 0.0
 
 
 @cache
 def covariance_for(width: int) -> Callable[..., None]:
     """`propagate_covariance` for matrices of `width` rows."""
-    advance = _advance_for(width)
+    gather, columns, apply = _gather_for(width), _columns_for(width), apply_for(width)
 
     @compiled(
-        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1],"
-        "f8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
+        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
+        "f8, f8[::1])",
         variant=width,
     )
     def propagate_covariance(
@@ -160,74 +163,89 @@ def covariance_for(width: int) -> Callable[..., None]:
         h: float,
         active: NDArray[np.bool_],
         sensor_terms: Indices,
-        sensor_slot: Indices,
         rate_terms: Indices,
         noise: Array,
         q: float,
-        sensor: Array,
-        top: Array,
-        turned: Array,
-        core_sensor: Array,
-        core: Array,
-        weight: Array,
-        kept: Array,
+        work: Array,
     ) -> None:
         """Advance the covariance (width, width), `flat` (width^2,), in place by h seconds with
-        transition coefficients `c`.
+        transition coefficients `c`; neither read nor written is P21, which `mirror` makes.
 
-        The model's arrays are (n,), `sensor_slot` the first row of its `sensor_terms`; rows and
-        columns from n on are zero and stay so. From `sensor` on what `work_parts` gives.
+        The model's arrays are (n,); rows and columns from n on are zero and stay so. `work` has
+        work_size(width) doubles.
         """
         n = noise.shape[1]
+        sensor_slot = sensor_terms[0]
+        sensor, top = work[: 6 * width], work[6 * width : 15 * width]
+        core_work = work[15 * width : 15 * width + 24 * CORE_STRIDE]
+        turned = core_work[: 9 * CORE_STRIDE]
+        core_sensor = core_work[9 * CORE_STRIDE : 15 * CORE_STRIDE]
+        core = core_work[15 * CORE_STRIDE :]
+        weight = work[15 * width + 24 * CORE_STRIDE : 15 * width + 24 * CORE_STRIDE + 12]
+        kept = work[15 * width + 24 * CORE_STRIDE + 12 :]
         _weights(step, sensor_terms, weight)
-        half = 0.5 * h * q
+        decays(h, noise, width, kept)
+        decay, grown = kept[KEPT : KEPT + width], kept[KEPT + width : KEPT + 2 * width]
+        half = 0.5 * q
         for i in range(CORE_SIZE):
-            flat[i * width + i] += half * noise[1, i]
+            flat[i * width + i] += half * grown[i]
 
-        advance(flat, sensor_slot, weight, c, active, sensor, top)
-        # As rows and as columns at once, and the rest of the columns from what then lies together.
-        for i in range(CORE_SIZE):
-            for j in range(width):
-                value = top[i * width + j]
-                turned[j * CORE_STRIDE + i] = value
-                flat[i * width + j] = value
-        for j in range(CORE_SIZE, width):
-            for i in range(CORE_SIZE):
-                flat[j * width + i] = turned[j * CORE_STRIDE + i]
-        _advance_core(turned, sensor_slot, weight, c, active, core_sensor, core)
+        gather(flat, sensor_slot, weight, sensor)
+        columns(flat, sensor_slot, weight, width, sensor)
+        apply(flat, sensor, c, top)
+        _keep_active(top, width, active)
         for i in range(CORE_SIZE):
             for j in range(CORE_SIZE):
-                lower, upper = core[i * CORE_STRIDE + j], core[j * CORE_STRIDE + i]
-                flat[i * width + j] = 0.5 * (lower + upper)
-            flat[i * width + i] += half * noise[1, i]
+                turned[j * CORE_STRIDE + i] = top[i * width + j]
+        columns(top, sensor_slot, weight, CORE_STRIDE, core_sensor)
+        apply_to_core(turned, core_sensor, c, core)
+        _keep_active(core, CORE_STRIDE, active)
+
         for k in range(rate_terms.shape[1]):
             offset, rate = rate_terms[0, k], rate_terms[1, k]
+            for i in range(CORE_SIZE):
+                top[i * width + offset] += h * top[i * width + rate]
             for j in range(width):
                 flat[offset * width + j] += h * flat[rate * width + j]
-            for j in range(width):
-                flat[j * width + offset] += h * flat[j * width + rate]
-        decays(h, noise, kept)
-        for i in range(CORE_SIZE, n):
-            variance = q * h * noise[1, i]
-            if noise[0, i] > 0.0:
-                decay = kept[KEPT + i]
-                for j in range(width):
-                    flat[i * width + j] *= decay
-                    flat[j * width + i] *= decay
-                variance += q * noise[2, i] * (1.0 - decay * decay)
-            flat[i * width + i] += variance
+            for i in range(CORE_SIZE, width):
+                flat[i * width + offset] += h * flat[i * width + rate]
+        for i in range(CORE_SIZE * width):
+            flat[i] = top[i]
+        if kept[1] != 0.0:
+            for i in range(n):
+                of_row = decay[i]
+                for j in range(decay.shape[0]):
+                    flat[i * width + j] *= of_row * decay[j]
+        for i in range(CORE_SIZE, width):
+            flat[i * width + i] += q * grown[i]
+        for i in range(CORE_SIZE):
+            for j in range(i):
+                mean = 0.5 * (core[i * CORE_STRIDE + j] + core[j * CORE_STRIDE + i])
+                flat[i * width + j] = mean
+                flat[j * width + i] = mean
+            flat[i * width + i] = core[i * CORE_STRIDE + i] + half * grown[i]
 
     return propagate_covariance
+
+
+@compiled("void(f8[::1], i8, i8)")
+def mirror(flat: Array, width: int, n: int) -> None:
+    """Make P21 of a covariance (width, width) of n states, `flat`, of its P12."""
+    unsigned, wide = np.uint64, np.uint64(width)
+    for row in range(CORE_SIZE, n):
+        j = unsigned(row)
+        for column in range(CORE_SIZE):
+            i = unsigned(column)
+            flat[j * wide + i] = flat[i * wide + j]
 
 
 @cache
 def transition_for(width: int) -> Callable[..., None]:
     """`propagate_transition` for matrices of `width` rows."""
-    advance = _advance_for(width)
+    gather, apply = _gather_for(width), apply_for(width)
 
     @compiled(
-        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[::1], i8[:, ::1], f8[:, ::1],"
-        "f8[::1], f8[::1], f8[::1], f8[::1])",
+        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[::1])",
         variant=width,
     )
     def propagate_transition(
@@ -237,30 +255,32 @@ def transition_for(width: int) -> Callable[..., None]:
         h: float,
         active: NDArray[np.bool_],
         sensor_terms: Indices,
-        sensor_slot: Indices,
         rate_terms: Indices,
         noise: Array,
-        sensor: Array,
-        top: Array,
-        weight: Array,
-        kept: Array,
+        work: Array,
     ) -> None:
         """phi (width, width), `flat` (width^2,) <- transition over h seconds times phi; arguments
         as of `propagate_covariance`."""
+        sensor, top = work[: 6 * width], work[6 * width : 15 * width]
+        weight = work[15 * width + 24 * CORE_STRIDE : 15 * width + 24 * CORE_STRIDE + 12]
+        kept = work[15 * width + 24 * CORE_STRIDE + 12 :]
+        decay = kept[KEPT : KEPT + width]
         _weights(step, sensor_terms, weight)
-        advance(flat, sensor_slot, weight, c, active, sensor, top)
+        gather(flat, sensor_terms[0], weight, sensor)
+        apply(flat, sensor, c, top)
+        _keep_active(top, width, active)
         for i in range(CORE_SIZE * width):
             flat[i] = top[i]
         for k in range(rate_terms.shape[1]):
             offset, rate = rate_terms[0, k], rate_terms[1, k]
             for j in range(width):
                 flat[offset * width + j] += h * flat[rate * width + j]
-        decays(h, noise, kept)
-        for i in range(CORE_SIZE, noise.shape[1]):
-            if noise[0, i] > 0.0:
-                decay = kept[KEPT + i]
-                for j in range(width):
-                    flat[i * width + j] *= decay
+        decays(h, noise, width, kept)
+        if kept[1] != 0.0:
+            for i in range(CORE_SIZE, noise.shape[1]):
+                of_row = decay[i]
+                for j in range(decay.shape[0]):
+                    flat[i * width + j] *= of_row
 
     return propagate_transition
 

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.covariance import (
     covariance_for,
+    kept_part,
+    mirror,
     propagate_error,
     propagate_parameters,
     transition_for,
-    work_parts,
     work_size,
 )
-from fusiond.estimators.reading import WIDER, in_fix_time, sigmas, widen
+from fusiond.estimators.reading import in_fix_time, sigmas, widen
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
@@ -183,7 +184,9 @@ def turn_down(
         cov[vertical * width + vertical] += more / (upright * upright)
 
 
-@compiled("void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])")
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])", allocates=True
+)
 def published_ahead(
     nav: Array,
     xi: Array,
@@ -213,6 +216,7 @@ def published_ahead(
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
     propagate_covariance, propagate_transition = covariance_for(width), transition_for(width)
+    worked, scratched = work_size(width), scratch_size(width)
 
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], u1[::1], f8[::1],"
@@ -239,9 +243,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     ) -> tuple[int, int]:
         """Propagate from `now` to `target` (ns); return the next sample's index and the new time.
 
-        A call costs a tenth of a microsecond an array, so what belongs together comes as one:
-        `state` is nav (10,), xi (n,), the last step (27,), the variances (9,) that what is
-        published is wider by, and scratch_size(width) doubles, zero at first; `model` and `imu` are
+        A call costs 25 ns an argument: what belongs together comes as one.
+        `state` is scratch_size(width) doubles, zero at first, nav (10,), xi (n,), the last step
+        (27,) and the variances (9,) that what is published is wider by; `model` and `imu` are
         `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows `times` and `samples` (rate,
         force): sample i holds over (times[i-1], times[i]], with noise of `densities` beyond
         `noise`. Samples first ... end-1 may be used; the last one only as far as `target`, so a
@@ -256,10 +260,10 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         record, carry = (options & RECORD) != 0, (options & CARRY) != 0
         turning = (options & TURN_TILT) != 0
         n, m = dxs.shape[1], imu.shape[0] // ROW_SIZE
-        nav, xi = state[:NAV_SIZE], state[NAV_SIZE : NAV_SIZE + n]
-        step = state[NAV_SIZE + n : NAV_SIZE + n + STEP_SIZE]
-        wider = state[NAV_SIZE + n + STEP_SIZE : NAV_SIZE + n + STEP_SIZE + WIDER]
-        scratch = state[NAV_SIZE + n + STEP_SIZE + WIDER :]
+        work, scratch, rest = state[:worked], state[worked:scratched], state[scratched:]
+        nav, xi = rest[:NAV_SIZE], rest[NAV_SIZE : NAV_SIZE + n]
+        step = rest[NAV_SIZE + n : NAV_SIZE + n + STEP_SIZE]
+        wider = rest[NAV_SIZE + n + STEP_SIZE :]
         noise = model[: 24 * n].view(np.float64).reshape((3, n))
         sensor_terms = model[24 * n : 24 * n + 192].view(np.int64).reshape((2, 12))
         rates = model[24 * n + 192 : model.shape[0] - n].view(np.int64)
@@ -270,9 +274,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         nav_out = imu[13 * m : 23 * m].reshape((m, 10))
         sigma_out = imu[23 * m :].reshape((m, 9))
         sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
-        c, work = scratch[:COEFFICIENTS], scratch[COEFFICIENTS + 24 :]
-        parts = work_parts(work, width)
-        sensor, top, turned, core_sensor, core, weight, kept = parts
+        c = scratch[:COEFFICIENTS]
+        kept = kept_part(work, width)
         flats, first_cov = covs.reshape((covs.shape[0], width * width)), covs[0]
         flat_phi = phi.reshape(phi.size)
         rate, force = (
@@ -308,17 +311,10 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         h,
                         active,
                         sensor_terms,
-                        sensor_slot,
                         rate_terms,
                         noise,
                         q,
-                        sensor,
-                        top,
-                        turned,
-                        core_sensor,
-                        core,
-                        weight,
-                        kept,
+                        work,
                     )
                     shake(cov, width, active, step, densities, i, h / shares[k])
                     if silent:
@@ -343,13 +339,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         h,
                         active,
                         sensor_terms,
-                        sensor_slot,
                         rate_terms,
                         noise,
-                        sensor,
-                        top,
-                        weight,
-                        kept,
+                        work,
                     )
                 if carry:
                     for k in range(dxs.shape[0]):
@@ -375,6 +367,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                     sigmas(first_cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
                     widen(wider, out)
                 i += 1
+        for k in range(covs.shape[0]):
+            mirror(flats[k], width, n)
         return i, now
 
     return propagate

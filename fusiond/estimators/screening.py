@@ -32,7 +32,8 @@ FEWEST_JUMPING = 3
 
 @compiled(
     "f8(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, i8[::1], f8[::1], f8[:, ::1],"
-    "f8[::1])"
+    "f8[::1])",
+    allocates=True,
 )
 def screened_update(
     cov: Array,

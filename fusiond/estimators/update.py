@@ -23,7 +23,7 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 Array = NDArray[np.float64]
 
 
-@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])")
+@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])", allocates=True)
 def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: Array) -> float:
     """nu^T S^-1 nu for z (m,), h (m, n), r (m,) variances; S = H P H^T + diag(r) = L L^T.
 
@@ -69,7 +69,7 @@ def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: A
     return total
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])")
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])", allocates=True)
 def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
     """Fold rows z = h dx + noise (variances r) into `dx` (n,) and `cov` (n, n), in place."""
     n = dx.shape[0]
@@ -130,7 +130,8 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
 
 
 @compiled(
-    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1, f8[::1])"
+    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1, f8[::1])",
+    allocates=True,
 )
 def fuse(
     nav: Array,

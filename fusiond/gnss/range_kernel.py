@@ -63,7 +63,8 @@ NOISE_VALUES = 8
 
 
 @compiled(
-    "void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])"
+    "void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])",
+    allocates=True,
 )
 def range_rows(
     elements: Array,

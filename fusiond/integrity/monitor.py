@@ -52,7 +52,8 @@ def _slide(
     """
     size = figures.shape[1]
     slot = now % size
-    rows[slot] = row
+    for j in range(row.shape[0]):
+        rows[slot, j] = row[j]
     figures[0, slot], figures[1, slot] = nis, energy
     if now < LAGS:
         return 0.0

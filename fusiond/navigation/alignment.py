@@ -70,7 +70,10 @@ def level_in_motion(
     return roll, (-pitch + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@compiled("void(i8[::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])")
+@compiled(
+    "void(i8[::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])",
+    allocates=True,
+)
 def integrate_felt(
     times: NDArray[np.int64],
     samples: Array,

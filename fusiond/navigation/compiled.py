@@ -7,6 +7,9 @@ Where somebody waits for the imports, `gathered` keeps what is to be compiled un
 many there are, and tells how far it is.
 `error_model="numpy"` drops the zero-division checks that would keep loops from being vectorised;
 `fastmath` stays off because it would let results depend on the order that the compiler picks.
+References are counted where a kernel makes arrays and nowhere else (`_nrt`): a count is atomic, a
+slice or a row costs two, an argument one and a small piece of memory, and a caller's arguments live
+longer than the call.
 
 The cache lies in a folder named by a digest of the sources of all rooms that a kernel takes code or
 constants from, since it has them inlined: any edit there or upgrade starts a new one.
@@ -72,12 +75,14 @@ setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48))) 
 
 
 def compiled(
-    signature: str, *, variant: int | None = None, **options: Any
+    signature: str, *, variant: int | None = None, allocates: bool = False, **options: Any
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Compile a function for one signature, ahead of its first call.
 
-    `variant` tells apart the kernels that one piece of source makes. ValueError where a kernel of
-    the same name exists: the cache and the linker know kernels by name.
+    `variant` tells apart the kernels that one piece of source makes. A kernel that makes an array
+    or returns one `allocates`; the others count no references to the memory of their arguments,
+    which their caller holds. ValueError where a kernel of the same name exists: the cache and the
+    linker know kernels by name.
     """
 
     def compile_function(function: Callable[P, R]) -> Callable[P, R]:
@@ -88,7 +93,8 @@ def compiled(
         if name in _names:
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
         place = _names[name] = len(_names)
-        kernel = numba.njit(error_model="numpy", **options)(function)
+        options.update(error_model="numpy", _nrt=allocates)
+        kernel = numba.njit(**options)(function)
         kernel._cache = cache = KernelCache(FOLDER, name, partial(load_kernels, place))
         if cache.file_name(signature, kernel.targetctx) in _in_cache:
             _load_when_called(kernel, signature, place)

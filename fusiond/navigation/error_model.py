@@ -123,29 +123,49 @@ def apply_for(width: int) -> Callable[[Array, Array, Array, Array], None]:
     def apply(rows: Array, sensor: Array, c: Array, out: Array) -> None:
         """out (9 rows) = transition times the nine rows of `rows` and the six of `sensor`.
 
-        All flat, `width` doubles a row. `sensor` holds rate error x y z, force error x y z.
+        All flat, `width` doubles a row. `sensor` holds rate error x y z, force error x y z. In
+        five loops, so that the coefficients of each stay in registers: in one loop most are spilled
+        and read back from where they have hardly arrived.
         """
         for j in range(width):
             p0, p1, p2 = rows[j], rows[width + j], rows[2 * width + j]
-            v0, v1, v2 = rows[3 * width + j], rows[4 * width + j], rows[5 * width + j]
-            r0, r1, r2 = rows[6 * width + j], rows[7 * width + j], rows[8 * width + j]
+            v0, v1 = rows[3 * width + j], rows[4 * width + j]
+            r0, r2 = rows[6 * width + j], rows[8 * width + j]
             e0, e1, e2 = sensor[j], sensor[width + j], sensor[2 * width + j]
-            a0, a1, a2 = sensor[3 * width + j], sensor[4 * width + j], sensor[5 * width + j]
             s0 = p0 + c[0] * p1 + c[1] * p2 + c[2] * v1 + c[3] * r0 + c[4] * r2
             s1 = p1 + c[8] * p0 + c[9] * p2 + c[10] * v0 + c[11] * r2
             s2 = p2 + c[15] * p0 + c[16] * p1 + c[17] * v1 + c[18] * r0 + c[19] * r2
-            s0 += c[5] * e0 + c[6] * e1 + c[7] * e2
-            s1 += c[12] * e0 + c[13] * e1 + c[14] * e2
-            s2 += c[20] * e0 + c[21] * e1 + c[22] * e2
-            q0, q1, q2 = p0 + s0, p1 + s1, p2 + s2
+            out[j] = s0 + (c[5] * e0 + c[6] * e1 + c[7] * e2)
+            out[width + j] = s1 + (c[12] * e0 + c[13] * e1 + c[14] * e2)
+            out[2 * width + j] = s2 + (c[20] * e0 + c[21] * e1 + c[22] * e2)
+        for j in range(width):
+            q1, q2 = rows[width + j] + out[width + j], rows[2 * width + j] + out[2 * width + j]
+            v0, v1, v2 = rows[3 * width + j], rows[4 * width + j], rows[5 * width + j]
+            r0, r2 = rows[6 * width + j], rows[8 * width + j]
+            a0, a1, a2 = sensor[3 * width + j], sensor[4 * width + j], sensor[5 * width + j]
             u0 = v0 + c[23] * q1 + c[24] * q2 + c[25] * v0 + c[26] * v1 + c[27] * v2
-            u1 = v1 + c[33] * q0 + c[34] * q2 + c[35] * v0 + c[36] * v1 + c[37] * v2
-            u2 = v2 + c[43] * q0 + c[44] * q1 + c[45] * v0 + c[46] * v1
             u0 += c[28] * r0 + c[29] * r2 + c[30] * a0 + c[31] * a1 + c[32] * a2
+            out[3 * width + j] = u0
+        for j in range(width):
+            q0, q2 = rows[j] + out[j], rows[2 * width + j] + out[2 * width + j]
+            v0, v1, v2 = rows[3 * width + j], rows[4 * width + j], rows[5 * width + j]
+            r0, r2 = rows[6 * width + j], rows[8 * width + j]
+            a0, a1, a2 = sensor[3 * width + j], sensor[4 * width + j], sensor[5 * width + j]
+            u1 = v1 + c[33] * q0 + c[34] * q2 + c[35] * v0 + c[36] * v1 + c[37] * v2
             u1 += c[38] * r0 + c[39] * r2 + c[40] * a0 + c[41] * a1 + c[42] * a2
+            out[4 * width + j] = u1
+        for j in range(width):
+            q0, q1 = rows[j] + out[j], rows[width + j] + out[width + j]
+            v0, v1, v2 = rows[3 * width + j], rows[4 * width + j], rows[5 * width + j]
+            r0, r2 = rows[6 * width + j], rows[8 * width + j]
+            a0, a1, a2 = sensor[3 * width + j], sensor[4 * width + j], sensor[5 * width + j]
+            u2 = v2 + c[43] * q0 + c[44] * q1 + c[45] * v0 + c[46] * v1
             u2 += c[47] * r0 + c[48] * r2 + c[49] * a0 + c[50] * a1 + c[51] * a2
-            out[j], out[width + j], out[2 * width + j] = s0, s1, s2
-            out[3 * width + j], out[4 * width + j], out[5 * width + j] = u0, u1, u2
+            out[5 * width + j] = u2
+        for j in range(width):
+            v0, v1, v2 = rows[3 * width + j], rows[4 * width + j], rows[5 * width + j]
+            u0, u1, u2 = out[3 * width + j], out[4 * width + j], out[5 * width + j]
+            r0, r1, r2 = rows[6 * width + j], rows[7 * width + j], rows[8 * width + j]
             out[6 * width + j] = r0 + c[52] * (v0 + u0) + c[53] * r0 + c[54] * r2
             out[7 * width + j] = r1 + c[52] * (v1 + u1) + c[55] * r0 + c[56] * r1 + c[57] * r2
             out[8 * width + j] = r2 + c[52] * (v2 + u2)

@@ -85,7 +85,8 @@ def _inverse_strapdown(
 
 @compiled(
     "void(f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8, f8[:, ::1], f8[:, ::1],"
-    "f8[:, ::1], f8[:, ::1])"
+    "f8[:, ::1], f8[:, ::1])",
+    allocates=True,
 )
 def _integrate(
     v: Array,

@@ -263,3 +263,20 @@ def test_snapshot_and_restore_are_exact() -> None:
         assert np.array_equal(np.asarray(a), np.asarray(b))
     assert first.t_ns == 777_000_000
     assert first.sample == 38  # the sample that holds until 780 ms is not finished
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_span_in_one_call_is_to_the_bit_that_span_in_many(name: str) -> None:
+    """What a call keeps to itself, half of P among it, must not show where a span is cut."""
+    rng = np.random.default_rng(3)
+    count = 300
+    samples = rng.standard_normal((count, 6)) * [0.3] + [0.1, 0.0, 0.2, 1.0, 0.5, -9.8]
+    times = STEP_NS * np.arange(1, count + 1)
+    buffer = runs.filled_buffer(IMU, times, samples)
+    _, whole, _ = started(name)
+    _, cut, _ = started(name)
+    whole.propagate(buffer, int(times[-1]))
+    for t in (*times[:-1:7], times[-1]):
+        cut.propagate(buffer, int(t))
+    for a, b in zip(whole.snapshot(), cut.snapshot(), strict=True):
+        assert np.array_equal(np.asarray(a), np.asarray(b))

@@ -51,7 +51,7 @@ def cholesky(a: Array) -> bool:
     return True
 
 
-@compiled("void(f8[:, ::1], f8[:, ::1])")
+@compiled("void(f8[:, ::1], f8[:, ::1])", allocates=True)
 def inverse_of_factor(upper: Array, out: Array) -> None:
     """out (n, n) <- (U^T U)^-1, from the rows of U^-T."""
     n = upper.shape[0]
@@ -100,7 +100,8 @@ def _scaled_information(cov: Array, order: Indices, out: Array, work: Array, sig
 
 @compiled(
     "b1(f8[:, :, ::1], f8[:, ::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1],"
-    "f8[:, ::1], f8[::1], f8[::1])"
+    "f8[:, ::1], f8[::1], f8[::1])",
+    allocates=True,
 )
 def combine(
     covs: Array,
@@ -165,7 +166,9 @@ def combine(
     return True
 
 
-@compiled("f8(f8[:, ::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], i8, i8)")
+@compiled(
+    "f8(f8[:, ::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], i8, i8)", allocates=True
+)
 def difference(
     cov: Array,
     dx: Array,
@@ -216,7 +219,9 @@ def difference(
     return total
 
 
-@compiled("void(f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@compiled(
+    "void(f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])", allocates=True
+)
 def carry(covs: Array, dxs: Array, shares: Array, phi: Array, before: Array, after: Array) -> None:
     """Bring a bank over an interval with transition `phi` (width, width), in place:
 

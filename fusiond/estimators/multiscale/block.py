@@ -106,7 +106,7 @@ def _times_vector(a: Array, x: Array, out: Array) -> None:
         out[i] = total
 
 
-@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])")
+@compiled("void(f8[:, ::1], f8[:, ::1], f8[:, ::1])", allocates=True)
 def _spread(phi: Array, cov: Array, q: Array) -> None:
     """cov <- phi cov phi^T + q, cov symmetric."""
     once, turned = np.empty_like(cov), np.empty_like(cov)
@@ -120,7 +120,7 @@ def _spread(phi: Array, cov: Array, q: Array) -> None:
             cov[i, j] = cov[j, i] = 0.5 * (once[i, j] + once[j, i] + q[i, j] + q[j, i])
 
 
-@compiled("void(f8[:, ::1], f8[:, ::1])")
+@compiled("void(f8[:, ::1], f8[:, ::1])", allocates=True)
 def _transform_rows(w: Array, rows: Array) -> None:
     """rows (M n, k) <- (W kron I) rows."""
     m = len(w)
@@ -137,7 +137,8 @@ def _transform_rows(w: Array, rows: Array) -> None:
 
 
 @compiled(
-    "void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
+    "void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])",
+    allocates=True,
 )
 def begin(
     w: Array, first: Array, first_cov: Array, phi: Array, q: Array, mean: Array, cov: Array
@@ -173,7 +174,8 @@ def begin(
 
 
 @compiled(
-    "void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])"
+    "void(f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1])",
+    allocates=True,
 )
 def predict(
     w: Array, last: Array, last_cov: Array, phi: Array, q: Array, mean: Array, cov: Array
@@ -212,7 +214,7 @@ def predict(
     begin(w, first, here, phi[m:], q[m:], mean, cov)
 
 
-@compiled("f8[:, ::1](f8[:, ::1], i8, f8[:, ::1])")
+@compiled("f8[:, ::1](f8[:, ::1], i8, f8[:, ::1])", allocates=True)
 def rows_on(w: Array, element: int, h: Array) -> Array:
     """Rows h (m, n) on an element (from 0) as rows (m, M n) on the transformed block."""
     n = h.shape[1]
@@ -249,7 +251,7 @@ def fold(
         update(cov, mean, z[a:b], rows_on(w, element + e - first, h[a:b]), r[a:b])
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])")
+@compiled("void(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])", allocates=True)
 def newest(w: Array, mean: Array, cov: Array, last: Array, last_cov: Array) -> None:
     """Write `last` (n,) and `last_cov` (n, n) of the last element, out of the wavelet domain."""
     m, n = len(w), len(last)
@@ -272,7 +274,10 @@ def newest(w: Array, mean: Array, cov: Array, last: Array, last_cov: Array) -> N
             last_cov[i, j] = last_cov[j, i] = 0.5 * (last_cov[i, j] + last_cov[j, i])
 
 
-@compiled("void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1])")
+@compiled(
+    "void(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], i8[::1], f8[:, ::1])",
+    allocates=True,
+)
 def rebase(w: Array, phi: Array, u: Array, z: Array, h: Array, ends: Indices, means: Array) -> None:
     """Take the oldest epoch's `u` off `u`, `z` and the blocks' `means` (M, M n), in place.
 

@@ -121,7 +121,8 @@ def _published(d: Array, nav: Array, tau: float, step: Array, out: Array) -> Non
 
 @compiled(
     "void(f8[:, ::1], f8[:, ::1], i8[::1], i8[:, ::1], i8, f8, f8, f8[::1], f8[:, ::1], f8[:, ::1],"
-    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])"
+    "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])",
+    allocates=True,
 )
 def _back(
     bodies: Array,
@@ -282,7 +283,10 @@ class Smoother:
         return smoothed
 
 
-@compiled("i8(i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])")
+@compiled(
+    "i8(i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1])",
+    allocates=True,
+)
 def correct(
     t_ns: Indices,
     before: Array,

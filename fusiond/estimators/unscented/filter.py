@@ -136,6 +136,6 @@ class UnscentedEstimator(KalmanEstimator):
             imu.nav,
             imu.sigmas,
             self._holding,
-            self._scratch[-work_size(self.model.width) :],
+            self._scratch[: work_size(self.model.width)],
         )
         self.sample = first + imu.start

@@ -30,7 +30,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.covariance import covariance_for, propagate_parameters, work_parts
+from fusiond.estimators.covariance import (
+    covariance_for,
+    kept_part,
+    mirror,
+    propagate_parameters,
+)
 from fusiond.estimators.propagation import (
     compensate,
     sensor_estimates,
@@ -119,7 +124,7 @@ def error_of(nav: Array, true: Array, scale: Array, out: Array) -> None:
     out[8] = true[HEIGHT] - nav[HEIGHT]
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[::1])")
+@compiled("void(f8[:, ::1], f8[::1], f8[::1])", allocates=True)
 def turn_attitude(cov: Array, before: Array, after: Array) -> None:
     """Turn `cov` (width, width) for the feedback that made nav `after` (10,) of `before`."""
     d, scale = np.zeros(CORE_SIZE), np.ones(2)
@@ -154,7 +159,8 @@ def turn_attitude(cov: Array, before: Array, after: Array) -> None:
 @compiled(
     "UniTuple(i8, 2)(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8, b1, b1[::1], i8[:, ::1],"
     "i8[:, ::1], f8[:, ::1], i8, f8, f8, i8[::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, b1,"
-    "f8[:, ::1], f8[:, ::1], b1, f8[::1])"
+    "f8[:, ::1], f8[:, ::1], b1, f8[::1])",
+    allocates=True,
 )
 def propagate_points(
     nav: Array,
@@ -192,8 +198,7 @@ def propagate_points(
     work_size(width) doubles.
     """
     n, width = xi.shape[0], cov.shape[0]
-    flat, parts = cov.reshape(width * width), work_parts(work, width)
-    kept = parts[6]
+    flat, kept = cov.reshape(width * width), kept_part(work, width)
     sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
     root, odd = np.empty((POINTS, width)), np.empty((POINTS, width))
     even = np.empty((POINTS, CORE_SIZE))
@@ -220,15 +225,16 @@ def propagate_points(
             scale[1] = (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT])
 
             coefficients(nav, step, h, c)
-            terms = (active, sensor_terms, sensor_slot, rate_terms, noise, 1.0)
+            terms = (active, sensor_terms, rate_terms, noise, 1.0, work)
             if width == WIDTHS[0]:
-                _covariance_narrow(flat, step, c, h, *terms, *parts)
+                _covariance_narrow(flat, step, c, h, *terms)
             elif width == WIDTHS[1]:
-                _covariance_middle(flat, step, c, h, *terms, *parts)
+                _covariance_middle(flat, step, c, h, *terms)
             elif width == WIDTHS[2]:
-                _covariance_wide(flat, step, c, h, *terms, *parts)
+                _covariance_wide(flat, step, c, h, *terms)
             else:
-                _covariance_widest(flat, step, c, h, *terms, *parts)
+                _covariance_widest(flat, step, c, h, *terms)
+            mirror(flat, width, n)
 
             # Point 0 is the mean, 2 k + 1 and 2 k + 2 are the pair along L_k.
             for point in range(2 * POINTS + 1):

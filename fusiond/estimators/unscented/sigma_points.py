@@ -78,7 +78,8 @@ def factor(cov: Array, slots: Indices, root: Array) -> None:
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], i8[:, ::1], f8[:, ::1], f8, f8[:, ::1],"
-    "f8[:, ::1], f8[:, ::1])"
+    "f8[:, ::1], f8[:, ::1])",
+    allocates=True,
 )
 def spread_states(
     nav: Array,
@@ -123,7 +124,8 @@ def spread_states(
 
 @compiled(
     "void(f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8[::1], f8[:, ::1], f8, b1, f8[::1],"
-    "f8[:, ::1], f8[::1])"
+    "f8[:, ::1], f8[::1])",
+    allocates=True,
 )
 def linear_form(
     points: Array,

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import State
-from fusiond.estimators.covariance import covariance_for, work_parts, work_size
+from fusiond.estimators.covariance import covariance_for, mirror, work_size
 from fusiond.estimators.update import fuse
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
@@ -61,6 +61,7 @@ def _recursions_for(width: int) -> Callable[..., None]:
         "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
         "f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])",
         variant=width,
+        allocates=True,
     )
     def recursions(
         count: int,
@@ -80,11 +81,11 @@ def _recursions_for(width: int) -> Callable[..., None]:
     ) -> None:
         """`count` times: `cov` over h seconds, then `rows` (m, n) with variances `r` (m,)."""
         z, y, dx = np.zeros(r.shape[0]), np.zeros(r.shape[0]), np.zeros(xi.shape[0])
-        parts = work_parts(work, width)
-        flat, sensor_slot = cov.reshape(width * width), sensor_terms[0]
-        terms = (active, sensor_terms, sensor_slot, rate_terms, noise, 1.0)
+        flat = cov.reshape(width * width)
+        terms = (active, sensor_terms, rate_terms, noise, 1.0, work)
         for _ in range(count):
-            propagate_covariance(flat, step, c, h, *terms, *parts)
+            propagate_covariance(flat, step, c, h, *terms)
+            mirror(flat, width, xi.shape[0])
             fuse(nav, xi, cov, dx, z, rows, r, math.inf, False, y)
 
     return recursions
