@@ -228,6 +228,7 @@ class Navigator:
             self._afterwards = Afterwards(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._standing.started(start.t_ns)
+            self._lateness.started(start.t_ns, self._standing.failed)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
         if (what := broken(self.estimator)) is not None:
@@ -237,14 +238,14 @@ class Navigator:
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         e, isolation = self.estimator, self.timeline.isolation
-        failure = self.calibrating.turned or self._standing.failure(e.t_ns, isolation, e.nav)
+        failure = self.calibrating.turned or self._lateness.changed(e)
+        failure = failure or self._standing.failure(e.t_ns, isolation, e.nav)
         if failure is not None:
             self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
-        due = self._lateness.due(e.t_ns)
-        doubtful = due and self._standing.doubtful(e, isolation)
+        doubtful = self._lateness.due(e.t_ns) and self._standing.doubtful(e, isolation)
         if (doubtful or self._lateness.pending) and self._late():
             return
         self._left_out.tell()
