@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from fusiond.models.model import Model
 from fusiond.models.vehicle import TIME_WALK_S_SQRT_S, VELOCITY_TIME, time_offset
-from fusiond.navigator.alignment.offsets import LOOK_NS, OffsetWatch
 from fusiond.navigation.strapdown import VN
+from fusiond.navigator.alignment.offsets import LOOK_NS, OffsetWatch
 
 Array = NDArray[np.float64]
 PRIOR_S, NOISE_S, LATE_S = 0.1, 0.5, 0.8
