@@ -228,7 +228,6 @@ class Navigator:
             self._afterwards = Afterwards(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._standing.started(start.t_ns)
-            self._lateness.started(start.t_ns, self._standing.failed)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
         if (what := broken(self.estimator)) is not None:
@@ -238,7 +237,7 @@ class Navigator:
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         e, isolation = self.estimator, self.timeline.isolation
-        failure = self.calibrating.turned or self._lateness.changed(e)
+        failure = self.calibrating.turned or self._lateness.changed(e, self._standing.failed)
         failure = failure or self._standing.failure(e.t_ns, isolation, e.nav)
         if failure is not None:
             self._standing.given_up(e.t_ns)
@@ -260,9 +259,9 @@ class Navigator:
     def _calibrate(self) -> None:
         """Look at the calibration; one that was taken up and proves wrong is given up."""
         e, watch = self.estimator, self.calibrating
-        if not watch.look(e.t_ns, e.xi, e.covariance) or self.calibration is None:
+        if not (watch.look(e.t_ns, e.xi, e.covariance) or watch.turned) or not self.calibration:
             return
-        wrong = refuted(watch.parameters, self.calibration)
+        wrong = watch.turned or refuted(watch.parameters, self.calibration)
         if wrong is not None:
             self._event("calibration_refused", f"{wrong}: without it, aligning anew")
             self.calibration = None

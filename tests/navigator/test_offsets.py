@@ -83,12 +83,11 @@ def test_a_start_after_a_failure_is_not_vouched_for_before_it_excludes_late_fixe
     vouched = []
     for seed in range(20):
         watch, filtered = OffsetWatch(MODEL), Filtered(seed)
-        watch.restart(1, failed=True)
         filtered.true_s -= late_s
-        watch.look(LOOK_NS + 1, STANDING, *filtered.second())
+        watch.look(LOOK_NS, STANDING, *filtered.second(), failed=True)
         assert not watch.suspects  # what does not move is where its late fixes say
         for k in range(1, 120):
-            watch.look((k + 1) * LOOK_NS + 1, MOVING, *filtered.second())
+            watch.look((k + 1) * LOOK_NS, MOVING, *filtered.second(), failed=True)
             if not watch.suspects:
                 vouched.append(k)
                 break
@@ -102,6 +101,5 @@ def test_a_start_after_a_failure_is_not_vouched_for_before_it_excludes_late_fixe
 def test_a_filter_without_offsets_is_left_alone() -> None:
     model = Model("without", ())
     watch = OffsetWatch(model)
-    watch.restart(1, failed=True)
-    watch.look(2 * LOOK_NS, MOVING, np.zeros(model.size), np.eye(model.size))
+    watch.look(LOOK_NS, MOVING, np.zeros(model.size), np.eye(model.size), failed=True)
     assert not watch.suspects

@@ -203,16 +203,12 @@ class Lateness:
     def stop(self) -> None:
         """A look that has not ended is given up: what was made of the fixes is."""
         self._looking, self._due_ns = None, 0
-        self._offsets.restart(0)
+        self._offsets.restart()
 
-    def started(self, t_ns: int, failed: bool) -> None:
-        """A filter has been started at `t_ns`; `failed`: one before it was given up."""
-        self._offsets.restart(t_ns, failed)
-
-    def changed(self, e: Estimator) -> str | None:
-        """Why a filter that follows late fixes must be given up; to be asked whenever it has
-        run."""
-        self._offsets.look(e.t_ns, e.nav, e.xi, e.covariance)
+    def changed(self, e: Estimator, failed: bool) -> str | None:
+        """Why a filter that follows late fixes must be given up; to be asked whenever it has run.
+        `failed`: one before it was."""
+        self._offsets.look(e.t_ns, e.nav, e.xi, e.covariance, failed)
         return self._offsets.changed
 
     @property

@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 
 from fusiond.integrity.punctual import LATE_S, MOVING_M_S
 from fusiond.integrity.returns import SURPRISE
+from fusiond.integrity.series import NEVER_NS
 from fusiond.models.model import Model
 from fusiond.models.vehicle import FIX_TIME, VELOCITY_TIME
 from fusiond.navigation.strapdown import VE, VN
@@ -65,34 +66,37 @@ class OffsetWatch:
         self._names = [b.name for b in blocks]
         self._prior = np.array([b.initial**2 for b in blocks])
         self._walk = np.array([b.white for b in blocks])
-        self.restart(0)
+        self.restart()
 
-    def restart(self, t_ns: int, failed: bool = False) -> None:
-        """A filter has been started at `t_ns`, with the offsets as configured; `failed`: one before
-        it was given up."""
-        self._looks = deque([(t_ns, np.zeros(len(self._slots)), self._prior)])
-        self._failed, self._looked_ns = failed, t_ns
+    def restart(self) -> None:
+        """The filter that is looked at next is another, with the offsets as configured."""
+        self._looks: deque[tuple[int, Array, Array]] = deque()
+        self._unproven, self._looked_ns = False, NEVER_NS
         self.suspects = ""
         self.changed: str | None = None
 
-    def look(self, t_ns: int, nav: Array, xi: Array, covariance: Array) -> None:
-        """The filter has come to `t_ns` with nav (10,), parameters (k,) and P (n, n)."""
+    def look(
+        self, t_ns: int, nav: Array, xi: Array, covariance: Array, failed: bool = False
+    ) -> None:
+        """The filter has come to `t_ns` with nav (10,), parameters (k,) and P (n, n); `failed`: one
+        before it was given up."""
         if t_ns - self._looked_ns < LOOK_NS or not self._slots.size:
             return
+        if self._looked_ns == NEVER_NS:
+            self._looks.append((t_ns, np.zeros(len(self._slots)), self._prior))
+            self._unproven = failed
         self._looked_ns = t_ns
         x, p = xi[self._slots].copy(), covariance[self._slots, self._slots]
-        while self._looks and t_ns - self._looks[0][0] > COMPARED_NS:
+        self._looks.append((t_ns, x, p))
+        while t_ns - self._looks[0][0] > COMPARED_NS:
             self._looks.popleft()
         self.suspects = self._compare(t_ns, x, p)
-        self._looks.append((t_ns, x, p))
-        self._failed = self._failed and not self._excluded(x, p)
-        if self._failed and not self.suspects and math.hypot(nav[VN], nav[VE]) > MOVING_M_S:
+        self._unproven = self._unproven and not self._excluded(x, p)
+        if self._unproven and not self.suspects and math.hypot(nav[VN], nav[VE]) > MOVING_M_S:
             self.suspects = "began anew after a failure, perhaps from fixes that are late"
 
     def _compare(self, t_ns: int, x: Array, p: Array) -> str:
         """Which offset has changed, in words; `changed` where that is no chance."""
-        if not self._looks:
-            return ""
         since_s = np.array([t_ns - look[0] for look in self._looks])[:, None] * 1e-9
         before = np.array([look[2] for look in self._looks]) + self._walk * since_s
         learned = np.maximum(before - p, 1e-15)
