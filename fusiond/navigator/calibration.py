@@ -71,7 +71,7 @@ STAYS_S = 60.0
 LOOK_NS = 10_000_000_000
 """The watch looks so often (ns of the filter's time)."""
 # A mounting is compared each second with those of five minutes before: what has turned is vouched
-# for meanwhile. On three recorded cars (50 minutes) the yaw moved by 2.0 at most of the sigmas that
+# for meanwhile. On three recorded cars (50 minutes) the yaw moved by 2.2 at most of the sigmas that
 # it may move by.
 TURN_LOOK_NS, TURN_COMPARED_NS = 1_000_000_000, 300_000_000_000
 TURNED_SIGMAS = 5.0

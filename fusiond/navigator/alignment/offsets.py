@@ -108,9 +108,8 @@ class OffsetWatch:
         most = float(sigmas[row, k])
         if most <= SUSPECT_SIGMAS:
             return ""
-        # What is later than its stamp was valid before: the offset falls.
-        by = f"by {-float(change[row, k]):+.1f} s, {most:.1f} sigma of {self._names[k]}"
-        text = f"fixes are later than they were {by}"
+        by = f"{float(change[row, k]):+.1f} s, {most:.1f} sigma"
+        text = f"{self._names[k]} moves as if by {by}: fixes have become late, or the IMU is wrong"
         if most > CHANGED_SIGMAS:
             self.changed = text
         return text
