@@ -29,6 +29,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.integrity.series import NEVER_NS
 from fusiond.models.blocks import Block
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
@@ -73,7 +74,7 @@ LOOK_NS = 10_000_000_000
 # A mounting is compared each second with those of five minutes before: what has turned is vouched
 # for meanwhile. On three recorded cars (50 minutes) the yaw moved by 2.2 at most of the sigmas that
 # it may move by.
-TURN_LOOK_NS, TURN_COMPARED_NS = 1_000_000_000, 300_000_000_000
+TURN_LOOK_NS, TURN_LOOKS = 1_000_000_000, 300
 TURNED_SIGMAS = 5.0
 # What was configured may be wrong by more than it says, which is no turn: looks count from half of
 # its sigma on, where three quarters of it are forgotten.
@@ -182,9 +183,11 @@ class CalibrationWatch:
         """The filter has been started anew."""
         self._cell = self._turn_cell = -1
         self._past: deque[tuple[int, Array]] = deque()
-        self._learned = np.zeros(len(self._slots))
-        self._variance = np.zeros(0)
-        self._looks: deque[tuple[int, Array, Array, NDArray[np.bool_]]] = deque()
+        self._learned, self._variance = np.zeros((2, len(self._yaws)))
+        self._looked_ns = np.full(TURN_LOOKS, NEVER_NS)
+        self._was, self._knew = np.zeros((2, TURN_LOOKS, len(self._yaws)))
+        self._known = np.zeros((TURN_LOOKS, len(self._yaws)), dtype=np.bool_)
+        self._row = 0
         self.turned: str | None = None
         """Set once the IMU has turned in the vehicle: why nothing before counts any more."""
         self.parameters: tuple[Parameter, ...] = ()
@@ -225,22 +228,26 @@ class CalibrationWatch:
 
     def _compare(self, t_ns: int, now: Array, variance: Array) -> None:
         """Whether the mounting's yaw has moved by more than what was learned of it since a look."""
-        if len(self._variance):
-            self._learned = self._learned + np.maximum(self._variance - variance, 0.0)
-        self._variance = variance.copy()
-        for k in self._yaws:
-            for _, before, learned, known in self._looks:
-                if not known[k]:
-                    continue
-                moved = float(now[k] - before[k])
-                may = math.sqrt(self._learned[k] - learned[k] + FIRM_RAD**2)
-                if abs(moved) > TURNED_SIGMAS * may:
-                    by = f"{math.degrees(moved):+.1f} deg, {abs(moved) / may:.0f} sigma"
-                    self.turned = f"the IMU has turned in the vehicle: its yaw has moved by {by}"
-        known = np.sqrt(variance) <= KNOWN_SHARE * self._prior
-        self._looks.append((t_ns, now, self._learned, known))
-        while t_ns - self._looks[0][0] >= TURN_COMPARED_NS:
-            self._looks.popleft()
+        if not self._yaws:
+            return
+        yaws = list(self._yaws)
+        yaw, known = now[yaws], variance[yaws]
+        if self._row:
+            self._learned = self._learned + np.maximum(self._variance - known, 0.0)
+        self._variance = known
+        moved = yaw - self._was
+        may = np.sqrt(np.maximum(self._learned - self._knew, 0.0) + FIRM_RAD**2)
+        sigmas = np.abs(moved) / may
+        recent = t_ns - self._looked_ns <= TURN_LOOKS * TURN_LOOK_NS
+        sigmas[~(self._known & recent[:, None])] = 0.0
+        worst = np.unravel_index(int(np.argmax(sigmas)), sigmas.shape)
+        if sigmas[worst] > TURNED_SIGMAS:
+            by = f"{math.degrees(moved[worst]):+.1f} deg, {sigmas[worst]:.0f} sigma"
+            self.turned = f"the IMU has turned in the vehicle: its yaw has moved by {by}"
+        row = self._row % TURN_LOOKS
+        self._looked_ns[row], self._was[row], self._knew[row] = t_ns, yaw, self._learned
+        self._known[row] = np.sqrt(known) <= KNOWN_SHARE * self._prior[yaws]
+        self._row += 1
 
     def _tell(self) -> None:
         for p in self.parameters:

@@ -32,7 +32,6 @@ sequential estimation and information, section 7.2.
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +53,7 @@ SUSPECT_SIGMAS, CHANGED_SIGMAS = 4.0, 4.9
 FIRM_S = 0.005
 # A look each second, compared with those of the last minute: what is slower is a clock's walk.
 LOOK_NS, COMPARED_NS = 1_000_000_000, 60_000_000_000
+LOOKS = COMPARED_NS // LOOK_NS + 1
 
 
 class OffsetWatch:
@@ -70,7 +70,9 @@ class OffsetWatch:
 
     def restart(self) -> None:
         """The filter that is looked at next is another, with the offsets as configured."""
-        self._looks: deque[tuple[int, Array, Array]] = deque()
+        self._t_ns = np.full(LOOKS, NEVER_NS)
+        self._x, self._p = np.zeros((2, LOOKS, len(self._slots)))
+        self._row = 0
         self._unproven, self._looked_ns = False, NEVER_NS
         self.suspects = ""
         self.changed: str | None = None
@@ -83,27 +85,30 @@ class OffsetWatch:
         if t_ns - self._looked_ns < LOOK_NS or not self._slots.size:
             return
         if self._looked_ns == NEVER_NS:
-            self._looks.append((t_ns, np.zeros(len(self._slots)), self._prior))
+            self._keep(t_ns, np.zeros(len(self._slots)), self._prior)
             self._unproven = failed
         self._looked_ns = t_ns
-        x, p = xi[self._slots].copy(), covariance[self._slots, self._slots]
-        self._looks.append((t_ns, x, p))
-        while t_ns - self._looks[0][0] > COMPARED_NS:
-            self._looks.popleft()
+        x, p = xi[self._slots], covariance[self._slots, self._slots]
         self.suspects = self._compare(t_ns, x, p)
+        self._keep(t_ns, x, p)
         self._unproven = self._unproven and not self._excluded(x, p)
         if self._unproven and not self.suspects and math.hypot(nav[VN], nav[VE]) > MOVING_M_S:
             self.suspects = "began anew after a failure, perhaps from fixes that are late"
 
+    def _keep(self, t_ns: int, x: Array, p: Array) -> None:
+        row = self._row % LOOKS
+        self._t_ns[row], self._x[row], self._p[row] = t_ns, x, p
+        self._row += 1
+
     def _compare(self, t_ns: int, x: Array, p: Array) -> str:
         """Which offset has changed, in words; `changed` where that is no chance."""
-        since_s = np.array([t_ns - look[0] for look in self._looks])[:, None] * 1e-9
-        before = np.array([look[2] for look in self._looks]) + self._walk * since_s
+        since_ns = (t_ns - self._t_ns)[:, None]
+        before = self._p + self._walk * since_ns * 1e-9
         learned = np.maximum(before - p, 1e-15)
-        moved = x - np.array([look[1] for look in self._looks])
+        moved = x - self._x
         change = moved * before / learned
         sigmas = np.abs(moved) / np.sqrt(learned + FIRM_S**2)
-        sigmas[(np.abs(change) < LATE_S) | (before <= p)] = 0.0
+        sigmas[(np.abs(change) < LATE_S) | (before <= p) | (since_ns > COMPARED_NS)] = 0.0
         row, k = np.unravel_index(int(np.argmax(sigmas)), sigmas.shape)
         most = float(sigmas[row, k])
         if most <= SUSPECT_SIGMAS:
