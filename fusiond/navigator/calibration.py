@@ -29,6 +29,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.integrity.series import NEVER_NS
 from fusiond.models.blocks import Block
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
@@ -70,9 +71,10 @@ SETTLED_SHARE = 0.2
 STAYS_S = 60.0
 LOOK_NS = 10_000_000_000
 """The watch looks so often (ns of the filter's time)."""
-# The watch compares a mounting with those of so many looks before: five minutes. On three recorded
-# cars (50 minutes) the yaw moved by 1.9 at most of the sigmas that it may move by.
-TURN_LOOKS = 30
+# A mounting is compared each second with those of five minutes before: what has turned is vouched
+# for meanwhile. On three recorded cars (50 minutes) the yaw moved by 2.2 at most of the sigmas that
+# it may move by.
+TURN_LOOK_NS, TURN_LOOKS = 1_000_000_000, 300
 TURNED_SIGMAS = 5.0
 # What was configured may be wrong by more than it says, which is no turn: looks count from half of
 # its sigma on, where three quarters of it are forgotten.
@@ -179,11 +181,13 @@ class CalibrationWatch:
 
     def restart(self) -> None:
         """The filter has been started anew."""
-        self._cell = -1
+        self._cell = self._turn_cell = -1
         self._past: deque[tuple[int, Array]] = deque()
-        self._learned = np.zeros(len(self._slots))
-        self._variance = np.zeros(0)
-        self._looks: deque[tuple[Array, Array, NDArray[np.bool_]]] = deque(maxlen=TURN_LOOKS)
+        self._learned, self._variance = np.zeros((2, len(self._yaws)))
+        self._looked_ns = np.full(TURN_LOOKS, NEVER_NS)
+        self._was, self._knew = np.zeros((2, TURN_LOOKS, len(self._yaws)))
+        self._known = np.zeros((TURN_LOOKS, len(self._yaws)), dtype=np.bool_)
+        self._row = 0
         self.turned: str | None = None
         """Set once the IMU has turned in the vehicle: why nothing before counts any more."""
         self.parameters: tuple[Parameter, ...] = ()
@@ -199,18 +203,20 @@ class CalibrationWatch:
     def look(self, t_ns: int, xi: Array, covariance: Array) -> bool:
         """The filter has come to `t_ns` with parameters (n,) and P (n, n); whether that was looked
         at, which happens each `LOOK_NS`."""
-        cell = t_ns // LOOK_NS
-        if cell == self._cell or not self._slots:
+        turn_cell, cell = t_ns // TURN_LOOK_NS, t_ns // LOOK_NS
+        if turn_cell == self._turn_cell or not self._slots:
+            return False
+        self._turn_cell = turn_cell
+        now, variance = xi[self._indices].copy(), covariance[self._indices, self._indices]
+        self._compare(t_ns, now, variance)
+        if cell == self._cell:
             return False
         self._cell = cell
-        now = xi[self._indices].copy()
         while len(self._past) > 1 and t_ns - self._past[1][0] >= STAYS_S * 1e9:
             self._past.popleft()
         before = None
         if self._past and t_ns - self._past[0][0] >= STAYS_S * 1e9:
             before = self._past[0][1]
-        variance = covariance[self._indices, self._indices]
-        self._compare(now, variance)
         sd = np.maximum(np.sqrt(variance), self._least_sd)
         self._past.append((t_ns, now))
         self.parameters = tuple(
@@ -220,22 +226,28 @@ class CalibrationWatch:
         self._tell()
         return True
 
-    def _compare(self, now: Array, variance: Array) -> None:
+    def _compare(self, t_ns: int, now: Array, variance: Array) -> None:
         """Whether the mounting's yaw has moved by more than what was learned of it since a look."""
-        if len(self._variance):
-            self._learned = self._learned + np.maximum(self._variance - variance, 0.0)
-        self._variance = variance.copy()
-        for k in self._yaws:
-            for before, learned, known in self._looks:
-                if not known[k]:
-                    continue
-                moved = float(now[k] - before[k])
-                may = math.sqrt(self._learned[k] - learned[k] + FIRM_RAD**2)
-                if abs(moved) > TURNED_SIGMAS * may:
-                    by = f"{math.degrees(moved):+.1f} deg, {abs(moved) / may:.0f} sigma"
-                    self.turned = f"the IMU has turned in the vehicle: its yaw has moved by {by}"
-        known = np.sqrt(variance) <= KNOWN_SHARE * self._prior
-        self._looks.append((now, self._learned, known))
+        if not self._yaws:
+            return
+        yaws = list(self._yaws)
+        yaw, known = now[yaws], variance[yaws]
+        if self._row:
+            self._learned = self._learned + np.maximum(self._variance - known, 0.0)
+        self._variance = known
+        moved = yaw - self._was
+        may = np.sqrt(np.maximum(self._learned - self._knew, 0.0) + FIRM_RAD**2)
+        sigmas = np.abs(moved) / may
+        recent = t_ns - self._looked_ns <= TURN_LOOKS * TURN_LOOK_NS
+        sigmas[~(self._known & recent[:, None])] = 0.0
+        worst = np.unravel_index(int(np.argmax(sigmas)), sigmas.shape)
+        if sigmas[worst] > TURNED_SIGMAS:
+            by = f"{math.degrees(moved[worst]):+.1f} deg, {sigmas[worst]:.0f} sigma"
+            self.turned = f"the IMU has turned in the vehicle: its yaw has moved by {by}"
+        row = self._row % TURN_LOOKS
+        self._looked_ns[row], self._was[row], self._knew[row] = t_ns, yaw, self._learned
+        self._known[row] = np.sqrt(known) <= KNOWN_SHARE * self._prior[yaws]
+        self._row += 1
 
     def _tell(self) -> None:
         for p in self.parameters:

@@ -237,14 +237,14 @@ class Navigator:
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         e, isolation = self.estimator, self.timeline.isolation
-        failure = self.calibrating.turned or self._standing.failure(e.t_ns, isolation, e.nav)
+        failure = self.calibrating.turned or self._lateness.changed(e, self._standing.failed)
+        failure = failure or self._standing.failure(e.t_ns, isolation, e.nav)
         if failure is not None:
             self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
-        due = self._lateness.due(e.t_ns)
-        doubtful = due and self._standing.doubtful(e, isolation)
+        doubtful = self._lateness.due(e.t_ns) and self._standing.doubtful(e, isolation)
         if (doubtful or self._lateness.pending) and self._late():
             return
         self._left_out.tell()
@@ -259,9 +259,9 @@ class Navigator:
     def _calibrate(self) -> None:
         """Look at the calibration; one that was taken up and proves wrong is given up."""
         e, watch = self.estimator, self.calibrating
-        if not watch.look(e.t_ns, e.xi, e.covariance) or self.calibration is None:
+        if not (watch.look(e.t_ns, e.xi, e.covariance) or watch.turned) or not self.calibration:
             return
-        wrong = refuted(watch.parameters, self.calibration)
+        wrong = watch.turned or refuted(watch.parameters, self.calibration)
         if wrong is not None:
             self._event("calibration_refused", f"{wrong}: without it, aligning anew")
             self.calibration = None

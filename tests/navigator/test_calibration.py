@@ -273,6 +273,29 @@ def test_a_unit_that_turns_is_told_and_one_that_is_learned_of_is_not(turned_deg:
     assert all(60 <= k <= 110 for k in told)
 
 
+def test_a_turn_is_told_within_a_second() -> None:
+    """It is vouched for until then."""
+    prior, second_ns = math.radians(5.0), 1_000_000_000
+    model = Model("watched", (mounting(prior),))
+    watch = CalibrationWatch(model, lambda code, text: None)
+    p = np.eye(model.size) * (0.2 * prior) ** 2
+    for k in range(64):
+        moved = math.radians(2.0) * (k >= 63)
+        watch.look(k * second_ns, np.full(model.size, moved), p)
+        assert (watch.turned is not None) == (k >= 63)
+
+
+def test_a_turn_gives_up_a_calibration_of_before() -> None:
+    events: list[str] = []
+    saved = SavedCalibration("", {"mounting_yaw_deg": (YAW_DEG, 0.1)})
+    navigator = run(60.0, saved, lambda code, text: events.append(code), "gnss_course")
+    assert navigator.calibration is not None
+    navigator.calibrating.turned = "the IMU has turned"
+    navigator._calibrate()
+    assert navigator.calibration is None
+    assert "calibration_refused" in events
+
+
 def test_what_was_configured_wrongly_is_no_turn() -> None:
     """Seven of its sigmas: the state says so, and starting anew would not change it."""
     prior, noise, yaw = math.radians(5.0), math.radians(1.0), math.radians(35.0)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import gzip
+
 import numpy as np
 import pytest
 
+from fusiond.configuration.load import load_config
+from fusiond.offline.can_log import read_can_log
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
 from fusiond.studies.faults.tables import TABLES
 from tests.places import DATA, REPOSITORY
 
 DRIVE = DATA / "drive_0708"
+BUS = DATA / "css_164" / "can.log.gz"
+LATE_FROM_S = 1_627_210_367.671
+"""By that log's clock."""
 
 pytestmark = pytest.mark.skipif(
     not DRIVE.is_dir(), reason=f"real drive drive_0708 is absent: {DRIVE} (set FUSIOND_DATA)"
@@ -65,3 +72,30 @@ def test_what_lied_on_it_does_not(place: Place, fault: str, event: str) -> None:
     assert found["verdict"] == "degraded and said so", found
     assert event in {e["code"] for e in found["events"]}
     assert found["longest_lie_s"] <= 2.0
+
+
+@pytest.fixture(scope="module")
+def bus(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    """Three minutes of a car with a consumer unit, a receiver of one fix a second and OBD speed."""
+    if not BUS.is_file():
+        pytest.skip(f"real drive css_164 is absent: {BUS} (set FUSIOND_DATA)")
+    folder = tmp_path_factory.mktemp("bus")
+    part = folder / "part.log.gz"
+    with gzip.open(BUS, "rt") as whole, gzip.open(part, "wt", compresslevel=1) as some:
+        for line in whole:
+            if abs(float(line[1 : line.index(")")]) - LATE_FROM_S + 25.0) < 100.0:
+                some.write(line)
+    found = Place(REPOSITORY / "config" / "css_164.toml", part, folder / "smoothed.csv")
+    smooth(found)
+    return found
+
+
+def test_fixes_that_become_late_are_not_followed(bus: Place) -> None:
+    """The filter's offsets in time followed them, and the vehicle with them: eight sigma off for 35
+    s of this part, and nothing told for the first 52."""
+    log = read_can_log(bus.recording, load_config(bus.config))
+    [row] = recorded_rows(bus, [LATE_FROM_S - log.imu.t_s[0]], "fixes_late_0.8s", "navigating")
+    found = run_recorded(row, bus)
+    assert found["verdict"] == "degraded and said so", found
+    assert found["noticed_s"] < 10.0
+    assert "fixes_late" in {event["code"] for event in found["events"]}

@@ -11,8 +11,9 @@ J(tau* - h)). Neither the filter nor a position is asked: what has followed late
 them. What shows tau is a change of velocity. At constant velocity J is flat, and late positions on
 a straight are the same as ones that have jumped along the track: nobody can tell.
 
-It is looked for where a start is found and where filter and aids do not fit each other. A receiver
-is late by tau* where
+It is looked for where a start is found, where filter and aids do not fit each other, and where the
+filter's own offsets in time move (fusiond.navigator.alignment.offsets). A receiver is late by tau*
+where
 
     J(tau*) <= chi-square of its degrees    the IMU is sound; one that has turned fits at no tau
     J(now) - J(tau*) > EVIDENCE             chi-square of one: 4.5 sigma, one in 130,000
@@ -43,7 +44,7 @@ from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
-from fusiond.estimators.base import gate_threshold
+from fusiond.estimators.base import Estimator, gate_threshold
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
@@ -52,6 +53,7 @@ from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.course import ways
 from fusiond.navigator.alignment.leaps import LOOKED_NS, Epoch, since_leap, unchanged
 from fusiond.navigator.alignment.motion import MOST_FIXES
+from fusiond.navigator.alignment.offsets import OffsetWatch
 from fusiond.navigator.alignment.options import AlignmentOptions
 
 # Fixes that are later (s) are refused as too old or found by the clock, whose envelope is as wide.
@@ -156,6 +158,7 @@ class Lateness:
         on_event: Callable[[str, str], None],
     ) -> None:
         self._options, self._noise, self._model = options, noise, model
+        self._offsets = OffsetWatch(model)
         self._event = on_event
         self._receivers: dict[str, _Receiver] = {}
         self._due_ns = self._fitted_ns = 0
@@ -200,10 +203,18 @@ class Lateness:
     def stop(self) -> None:
         """A look that has not ended is given up: what was made of the fixes is."""
         self._looking, self._due_ns = None, 0
+        self._offsets.restart()
+
+    def changed(self, e: Estimator, failed: bool) -> str | None:
+        """Why a filter that follows late fixes must be given up; to be asked whenever it has run.
+        `failed`: one before it was."""
+        self._offsets.look(e.t_ns, e.nav, e.xi, e.covariance, failed)
+        return self._offsets.changed
 
     @property
     def suspects(self) -> str:
-        """Which receiver is late by as much as is not known yet, in words; empty where none is."""
+        """Which receiver is late by as much as is not known yet, or may be, in words; empty where
+        none is."""
         for source, receiver in self._receivers.items():
             if receiver.suspected is not None:
                 late = receiver.suspected
@@ -211,7 +222,7 @@ class Lateness:
                     f"{source} is about {late.seconds:.1f} s later than its stamps: brake, "
                     "accelerate or take a bend, to tell by how much"
                 )
-        return ""
+        return self._offsets.suspects
 
     def look(self, imu: ImuBuffer) -> Found | None:
         """Begin or go on to look; what is found by the samples and fixes of the last seconds before
