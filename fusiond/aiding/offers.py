@@ -3,7 +3,7 @@
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks
 of errors that all measurements of the device share, as of its aids; `bias_share` is what part of a
-state of `bias` there is in each axis.
+state of `bias` there is in each axis, `wander_m` how many metres of `wander` north and east.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ class PositionOffer(NamedTuple):
     time: str = ""
     rest: str = ""
     bias_share: Vector3 = (1.0, 1.0, 1.0)
+    wander: str = ""
+    wander_m: float = 0.0
 
 
 class VelocityOffer(NamedTuple):

@@ -1,11 +1,13 @@
 r"""Position of an antenna: a GNSS fix, with or without height.
 
     z = [ (phi^ - phi) (R_M + h), (lambda^ - lambda) (R_N + h) cos phi, -(h^ - h) ] + C l^ + s b^
-        + v_a^ tau^ + a^ tau^2 / 2
-      = dr + (C l) x phi + tau^ dv_a - C dl - s db - (v_a + a tau^) dtau + tau^2 / 2 da + noise
+        + w c^ + v_a^ tau^ + a^ tau^2 / 2
+      = dr + (C l) x phi + tau^ dv_a - C dl - s db - w dc - (v_a + a tau^) dtau + tau^2 / 2 da
+        + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
-ionosphere), s what part of it there is in this one, tau how much later than its stamp the fix is
+ionosphere), s what part of it there is in this one, c one that lasts for seconds, north and east,
+of w metres (fusiond.aiding.wander), tau how much later than its stamp the fix is
 valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
 (fusiond.aiding.felt); where the model has states for them they are estimated, true minus estimated
 in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by v s_t, which
@@ -82,8 +84,8 @@ def _add_of_turned_lever(c: Matrix, rest: Indices, p: Array, r: Array) -> None:
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8, f8,"
-    "f8, f8, f8, f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])",
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8,"
+    "f8, f8, f8, f8, f8, f8, f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])",
     allocates=True,
 )
 def _position(
@@ -94,6 +96,7 @@ def _position(
     bias: Indices,
     time: Indices,
     rest: Indices,
+    wander: Indices,
     lat: float,
     lon: float,
     height: float,
@@ -107,6 +110,7 @@ def _position(
     s0: float,
     s1: float,
     s2: float,
+    wander_m: float,
     p: Array,
     z: Array,
     h: Array,
@@ -114,7 +118,7 @@ def _position(
 ) -> None:
     """Write z (m,), H (m, n), zero before, and r (m,) for the first m of north, east, down, with
     what offset in time and lever arm leave out by P (n, n), or (0, 0) where none is known. `bias`
-    (up to 3,), `time` (0 or 1,), `rest` (0 or 3,): slots in `xi`."""
+    (up to 3,), `time` (0 or 1,), `rest` (0 or 3,), `wander` (0 or 2,): slots in `xi`."""
     m, n = h.shape
     share = (s0, s1, s2)
     r[0], r[1] = sd0 * sd0, sd1 * sd1
@@ -143,6 +147,9 @@ def _position(
         if i < bias.size:
             z[i] += share[i] * xi[bias[i]]
             h[i, bias[i]] = -share[i]
+        if i < wander.size:
+            z[i] += wander_m * xi[wander[i]]
+            h[i, wander[i]] = -wander_m
     for slot in time:
         late_s = xi[slot]
         v, of_v = np.empty(m), np.zeros((m, n))
@@ -183,7 +190,8 @@ class PositionAid(Aid):
 
     `bias`: the blocks whose states north, east, down are the error that the fixes share, and
     `bias_share` what part of it there is in each axis; `time` that of their offset in time; `rest`
-    that of what is left of the lever arm. `shares_nothing`: there is no such error.
+    that of what is left of the lever arm; `wander` that of the error that lasts for seconds, of
+    `wander_m`. `shares_nothing`: there is no such error.
     """
 
     locates: ClassVar[bool] = True
@@ -199,6 +207,8 @@ class PositionAid(Aid):
     rest: str = ""
     bias_share: Vector3 = (1.0, 1.0, 1.0)
     shares_nothing: bool = False
+    wander: str = ""
+    wander_m: float = 0.0
 
     @property
     def white(self) -> bool:
@@ -213,10 +223,11 @@ class PositionAid(Aid):
         rows = 2 if self.height_m is None or model.hold_height else 3
         height = 0.0 if self.height_m is None else self.height_m
         z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
-        bias, time, rest = model.slots_of_each(self.bias, (self.time,), (self.rest,))
-        slots = model.column_of, bias, time, rest
+        own = self.bias, (self.time,), (self.rest,), (self.wander,)
+        bias, time, rest, wander = model.slots_of_each(*own)
+        slots = model.column_of, bias, time, rest, wander
         fix = self.lat_rad, self.lon_rad, height
-        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share
+        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
         of_time = _UNKNOWN if p is None else p
         _position(nav, xi, step, *slots, *fix, *where, of_time, z, h, r)
         return Innovation(z, h, r)
@@ -228,4 +239,5 @@ class PositionAid(Aid):
     def offers(self) -> tuple[PositionOffer, ...]:
         place = self.lat_rad, self.lon_rad, self.height_m
         shared = self.bias, self.time, self.rest
-        return (PositionOffer(self.t_ns, *place, self.sd, self.lever, *shared, self.bias_share),)
+        offer = PositionOffer(self.t_ns, *place, self.sd, self.lever, *shared, self.bias_share)
+        return (offer._replace(wander=self.wander, wander_m=self.wander_m),)

@@ -77,8 +77,8 @@ class GnssAiding(Aiding):
     bias_sd_m: NonNegativeFloat = 1.0
     """Error that fixes without carrier phase share for minutes (orbits, ionosphere), one sigma
     north and east: data sheets state 1.5 to 2 m for half of all fixes, noise included. Fixes by
-    carrier phase share half of the variance that they state. 0: none is estimated, and sigma
-    shrinks as if errors were white."""
+    carrier phase share half of the variance that they state. 0: none is estimated, nor one that
+    lasts for seconds, and sigma shrinks as if errors were white."""
     bias_down_sd_m: PositiveFloat = 3.0
     """The same downwards, where most of the ionosphere goes."""
     bias_correlation_s: PositiveFloat = 1800.0

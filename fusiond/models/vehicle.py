@@ -16,6 +16,7 @@ WHEEL_SCALE = "wheel_scale"
 WHEEL_LATENCY = "wheel_latency"
 WHEEL_ROUNDING = "wheel_rounding"
 FIX_TIME = "gnss_time"
+FIX_WANDER = "gnss_wander"
 VELOCITY_TIME = "gnss_velocity_time"
 ANTENNA_LEVER = "antenna_lever"
 BAROMETER_OFFSET = "barometer_offset"
@@ -58,6 +59,12 @@ def wheel_rounding(name: str, sd: float) -> Block:
 def time_offset(name: str, sd_s: float) -> Block:
     """How much later (s) than its stamp a measurement is valid."""
     return Block(name, "s", ("t",), (-1,), initial=sd_s, white=TIME_WALK_S_SQRT_S**2)
+
+
+def fix_wander(name: str, lasts_s: float) -> Block:
+    """An error north and east that fixes share for a while, of sigma one: an aid says how many
+    metres it counts (fusiond.aiding.wander)."""
+    return Block(name, "1", ("n", "e"), (-1, -1), initial=1.0, steady=1.0, tau_s=lasts_s)
 
 
 def antenna_lever(name: str, sd_m: float) -> Block:

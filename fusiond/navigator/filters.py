@@ -21,7 +21,7 @@ from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
-from fusiond.models.vehicle import ANTENNA_LEVER
+from fusiond.models.vehicle import ANTENNA_LEVER, FIX_WANDER
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 
 def model_of(config: Config, *extra: Block) -> Model:
-    """The error-state model of a configuration, with the blocks that its aids need; without that of
-    a lever arm that nobody asked for, where there is no room for it.
+    """The error-state model of a configuration, with the blocks that its aids need; without those
+    that nobody asked for, where there is no room for them.
 
     Raises `ConfigError` where those are more states than the kernels hold.
     """
@@ -40,14 +40,20 @@ def model_of(config: Config, *extra: Block) -> Model:
     try:
         return make_model(name, noise, *extra)
     except TooManyStatesError as error:
-        asked = [block for block in extra if not _unasked(config, block)]
-        if len(asked) < len(extra):
-            return model_of(config, *asked)
+        for unasked in (_wanders, _unasked):
+            asked = [block for block in extra if not unasked(config, block)]
+            if len(asked) < len(extra):
+                return model_of(config, *asked)
         names = ", ".join(block.name for block in extra)
         raise ConfigError(
             f"estimator.model: {error}; the aids add {names}: choose a smaller model, such as"
             " 'ins15', or fewer aids"
         ) from error
+
+
+def _wanders(_: Config, block: Block) -> bool:
+    """Whether a block is that of an error which fixes share for seconds."""
+    return block.name.startswith(FIX_WANDER)
 
 
 def _unasked(config: Config, block: Block) -> bool:

@@ -28,6 +28,7 @@ from fusiond.models.vehicle import (
     antenna_lever,
     axle_lever,
     drift,
+    fix_wander,
     mounting,
     time_offset,
     wheel_rounding,
@@ -42,6 +43,7 @@ Array = NDArray[np.float64]
 SOURCE = ("aid", 0, 0.99)
 LEVER = (1.3, -0.4, -2.1)
 FIX_BIAS = ("gnss_bias", "gnss_bias_down")
+FIX_WANDER = "gnss_wander"
 RATE_SENSED = np.array([0.05, -0.03, 0.4])
 VELOCITY = (12.0, -7.0, 0.8)
 RPY = (0.08, -0.12, 2.3)
@@ -52,6 +54,7 @@ def aid_model(name: str) -> Model:
         position_bias(BIAS_BLOCK, 30.0, 600.0),
         position_bias(FIX_BIAS[0], 1.5, 1800.0),
         position_bias(FIX_BIAS[1], 5.0, 1800.0, "d"),
+        fix_wander(FIX_WANDER, 30.0),
     )
     return make_model(name, imu_noise(Imu()), *biases)
 

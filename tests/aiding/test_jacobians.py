@@ -37,6 +37,7 @@ from tests.aiding.aid_bench import (
     AIR,
     ESTIMATED,
     FIX_BIAS,
+    FIX_WANDER,
     KM_H,
     LEVER,
     RPY,
@@ -106,6 +107,9 @@ AIDS: dict[str, Callable[[Array], Linearised]] = {
     "horizontal, shared error": lambda nav: replace(position_aid(nav, False), bias=FIX_BIAS),
     "position with a part of it": lambda nav: replace(
         position_aid(nav), bias=FIX_BIAS, bias_share=(0.3, 0.7, 0.2)
+    ),
+    "position that wanders": lambda nav: replace(
+        position_aid(nav), bias=FIX_BIAS, wander=FIX_WANDER, wander_m=2.3
     ),
     "rdss": rdss_aid,
     "rdss, moved by the delay": lambda nav: rdss_aid(nav, 1.5),

@@ -114,7 +114,10 @@ def test_fixes_share_an_error_of_which_those_by_phase_have_a_part() -> None:
     level, down = blocks["gnss_bias"], blocks["gnss_bias_down"]
     assert (level.states, level.steady, level.tau_s) == (("n", "e"), 1.5, 900.0)
     assert (down.states, down.steady, down.tau_s) == (("d",), 4.0, 900.0)
-    assert set(blocks) == {*(f"gnss_bias{n}" for n in ("", "_down", "_front", "_front_down"))}
+    assert set(blocks) == {
+        *(f"gnss_bias{n}" for n in ("", "_down", "_front", "_front_down")),
+        *(f"gnss_wander{n}" for n in ("", "_front")),
+    }
     fix = PositionFix("gnss", 0, MonotonicStamp(7), 0.5, 1.9, 10.0, sd_ned_m=(1.0, 1.0, 2.0))
     for source, quality, names in (
         ("gnss", 1, ("gnss_bias", "gnss_bias_down")),

@@ -8,7 +8,7 @@ import pytest
 
 from fusiond.configuration.aiding import UNKNOWN_LEVER_SD_M
 from fusiond.configuration.schema import Config
-from fusiond.models.vehicle import ANTENNA_LEVER
+from fusiond.models.vehicle import ANTENNA_LEVER, FIX_WANDER
 from fusiond.navigator.navigator import Navigator
 
 
@@ -16,6 +16,11 @@ def _levers(**settings: Any) -> dict[str, float]:
     """The blocks of lever arms, with their priors (m)."""
     model = Navigator(Config.model_validate(settings)).model
     return {b.name: b.initial for b in model.blocks if b.name.startswith(ANTENNA_LEVER)}
+
+
+def _wanders(**settings: Any) -> bool:
+    """Whether the error that fixes share for seconds is a state."""
+    return Navigator(Config.model_validate(settings)).model.slots_of(FIX_WANDER) != []
 
 
 @pytest.mark.parametrize(
@@ -55,3 +60,6 @@ def test_without_room_nothing_is_estimated_that_nobody_asked_for() -> None:
     assert _levers(**full) == {}
     del full["aiding"]["rear"]
     assert _levers(**full) == {ANTENNA_LEVER: UNKNOWN_LEVER_SD_M}
+    assert not _wanders(**full)
+    del full["aiding"]["barometer"]
+    assert _wanders(**full)

@@ -204,13 +204,15 @@ def _by_heading(model: Model, p: Array, heading: HeadingOffer) -> None:
 def _by_fix(model: Model, by: Array, fix: PositionOffer, dcm: Array, velocity: Array) -> None:
     """Rows of the position in `by` (n, n): an innovation of 0 (fusiond.aiding.position) says
 
-        dr = e + s db + v dtau + C dl - [C l x] phi,   e the fix's noise
+        dr = e + s db + w dc + v dtau + C dl - [C l x] phi,   e the fix's noise
 
-    and a start without it would take the next fixes for proof that b, tau and dl are 0.
+    and a start without it would take the next fixes for proof that b, c, tau and dl are 0.
     """
     by[DR : DR + 3, PHI : PHI + 3] = -skew(dcm @ np.array(fix.lever))
     for row, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
         by[DR + row, slot] = fix.bias_share[row]
+    for row, slot in enumerate(model.slots_of(fix.wander)):
+        by[DR + row, slot] = fix.wander_m
     for slot in model.slots_of(fix.time):
         by[DR : DR + 3, slot] = velocity
     for axis, slot in enumerate(model.slots_of(fix.rest)):

@@ -9,13 +9,16 @@ from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import Aid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import SUFFIX, VelocityAid
+from fusiond.aiding.wander import LASTS_S, Fix, Wander
 from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     FIX_TIME,
+    FIX_WANDER,
     VELOCITY_TIME,
     antenna_lever,
+    fix_wander,
     time_offset,
 )
 from fusiond.navigator.intake.kind import Instants, Kind, Sections
@@ -73,6 +76,8 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     )
     time, velocity_time, rest = sections.each_own(_SHARED, m.source, o)
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
+    by_phase = _by_phase(m, sections)
+    wander = "" if by_phase else _wander(m.source, o, sections)
     position = PositionAid(
         m.source,
         when.t_ns,
@@ -86,8 +91,10 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         _fix_bias(m.source, o, sections),
         time,
         rest,
-        _phase_share(sd, o) if _by_phase(m, sections) else (1.0, 1.0, 1.0),
+        _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0),
         o.bias_sd_m == 0.0,
+        wander,
+        _wandering(m, when, o, sections, sd) if wander else 0.0,
     )
     if m.v_ned_m_s is None or not o.use_velocity:
         return [position]
@@ -168,6 +175,26 @@ def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str
     return level, f"{level}_down"
 
 
+def _wander(source: str, section: GnssAiding, sections: Sections) -> str:
+    """The block of the error that fixes share for seconds; "" where none is estimated."""
+    return sections.own(FIX_WANDER, source, section) if section.bias_sd_m else ""
+
+
+def _wandering(
+    m: PositionFix, when: Instants, o: GnssAiding, sections: Sections, sd: Vector3
+) -> float:
+    """How many metres of that there are, as this receiver's fixes and velocities have shown."""
+    known = sections.wander.get(m.source)
+    if known is None:
+        offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
+        known = sections.wander[m.source] = Wander(offset_sd_s)
+    if m.v_ned_m_s is not None:
+        (north, east, *_), sds = _velocity(m, m.v_ned_m_s, o)
+        sd_v = math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
+        known.take(Fix(when.t_ns, m.lat_rad, m.lon_rad, (north, east), sd_v))
+    return known.sd_m(math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)))
+
+
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
     """What a receiver's fixes share: their offset in time, that of its velocities, what is left of
     the lever arm, an error north and east, and one down."""
@@ -187,6 +214,7 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
         lasts_s = section.bias_correlation_s
         found.append(position_bias(level, section.bias_sd_m, lasts_s))
         found.append(position_bias(down, section.bias_down_sd_m, lasts_s, "d"))
+        found.append(fix_wander(_wander(source, section, sections), LASTS_S))
     return found
 
 

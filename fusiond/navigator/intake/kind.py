@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from drivers.measurements import DelayedFix, PositionFix, UtcStamp
 from fusiond.aiding.base import Aid
+from fusiond.aiding.wander import Wander
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
 from fusiond.navigator.raw_gnss import RawGnss
@@ -38,6 +39,8 @@ class Sections:
         """Latitude and longitude (rad) of the last fix."""
         self.by_code: set[tuple[str, int]] = set()
         """Receivers and the qualities under which they have stated a sigma of code."""
+        self.wander: dict[str, Wander] = {}
+        """Of each receiver whose fixes share an error."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
