@@ -339,11 +339,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, passed, log, tuple(whitened.tolist()))
 
     def _own_snapshot(self) -> object:
-        return self.turns, self._doubted
+        return self.turns, self._doubted, self.undoubted
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self._doubted = extra
+        self.turns, self._doubted, self.undoubted = extra
 
 
 def _way(a: Array, b: Array) -> Array:

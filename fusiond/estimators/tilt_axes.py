@@ -59,6 +59,7 @@ from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT, UPRIGHT
+from fusiond.estimators.turn_rate import gyro_slots, keep_turn
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
@@ -133,8 +134,9 @@ def carry_over(p: Array, before: Array, after: Array, biases: Indices) -> float:
 
 
 class TiltAxesFilter(KalmanEstimator):
-    """The centralised filter, in whose P the axes of a tilt turn with the heading, and the place of
-    an antenna stays where a lever arm is estimated (fusiond.estimators.antenna_place)."""
+    """The centralised filter, in whose P the axes of a tilt turn with the heading, what is known of
+    the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
+    of an antenna where a lever arm is estimated (fusiond.estimators.antenna_place)."""
 
     def __init__(self, model: Model, gap_s: float) -> None:
         super().__init__(model, gap_s)
@@ -145,10 +147,25 @@ class TiltAxesFilter(KalmanEstimator):
         known = found if found and found[0][1] == 2 else []
         self._biases = np.array(known, dtype=np.int64).reshape(-1, 2).T.copy()
         self._slots = self._biases[0]
+        self._gyros = gyro_slots(model) if known else self._slots
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
+        self.undoubted = True
+        """Whether what gyros are wrong by is what they were wrong by when the filter started."""
         if known:
             self._options |= TURN_TILT
+
+    def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
+        """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
+        super().initialise(t_ns, sample, nav, xi, covariance)
+        self.undoubted = True
+
+    def doubt(
+        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
+    ) -> None:
+        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
+        super().doubt(aid, measured, motion, apart)
+        self.undoubted &= not motion
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
@@ -173,18 +190,23 @@ class TiltAxesFilter(KalmanEstimator):
         return super().update(aid)
 
     def _estimate(self) -> Array:
-        """Nav (10,), and what is left of the lever arm (0 or 3,)."""
-        return np.concatenate([self.nav, self.xi[self._lever]]) if self._astray else self.nav.copy()
+        """Nav (10,), the gyros' biases (0 or 3,), what is left of the lever arm (0 or 3,)."""
+        return np.concatenate([self.nav, self.xi[self._gyros], self.xi[self._lever]])
 
     def _carry_over(self, before: Array) -> None:
-        """P after an update of the estimate `before` (10 or 13,)."""
+        """P after an update of an `_estimate` `before`."""
         p = self._covariance
         self.turned = carry_over(p, before[Q0:NAV_SIZE], self.nav[Q0:], self._biases)
-        if self._astray:
-            for rows in (p, p.T):
-                self._keep_antenna(rows, before)
+        for rows in (p, p.T):
+            self._keep(rows, before)
 
-    def _keep_antenna(self, rows: Array, before: Array) -> None:
-        """M (n, k) <- T M."""
-        arms = before[NAV_SIZE:], self.xi[self._lever]
-        keep_antenna(rows, before[:NAV_SIZE], self.nav, *arms, self._lever, self._late)
+    def _keep(self, rows: Array, before: Array) -> None:
+        """M (n, k) <- T M: what is known of the gyros, and of the antenna's place."""
+        end = NAV_SIZE + self._gyros.size
+        if self._gyros.size and self.undoubted:
+            told = self.xi[self._gyros] - before[NAV_SIZE:end]
+            turned = before[Q0:NAV_SIZE], self.nav[Q0:], self.turned
+            keep_turn(rows, *turned, told, self._gyros)
+        if self._astray:
+            arms = before[end:], self.xi[self._lever]
+            keep_antenna(rows, before[:NAV_SIZE], self.nav, *arms, self._lever, self._late)

@@ -25,9 +25,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.turn_rate import gyro_slots
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR
+from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, PHI
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
 
 Array = NDArray[np.float64]
@@ -54,12 +55,17 @@ class Nodes(NamedTuple):
 
 def links(model: Model) -> Indices:
     """(2, k): rows and columns of what Phi has beside the navigation errors' rows and its diagonal:
-    offsets by their rates, and a vertical accelerometer's bias by those of the others, where the
-    axes of a tilt were turned (fusiond.estimators.tilt_axes)."""
+    offsets by their rates, and where the axes of a tilt were turned (fusiond.estimators.tilt_axes)
+    a vertical accelerometer's bias by those of the others, and each gyro's by the tilt and by
+    those of the others (fusiond.estimators.turn_rate)."""
     down, *others = [model.parameters(FORCE_ERROR + axis) for axis in (2, 0, 1)]
-    slots = [*down[1:], *itertools.chain(*others)] if down else []
-    pairs = np.array([[down[0]] * len(slots), slots] if down else [[], []], dtype=np.int64)
-    return np.ascontiguousarray(np.hstack([model.rate_terms, pairs]))
+    if not down:
+        return np.ascontiguousarray(model.rate_terms)
+    pairs = [(down[0], slot) for slot in (*down[1:], *itertools.chain(*others))]
+    gyros = gyro_slots(model).tolist()
+    pairs += [(to, of) for to in gyros for of in (PHI, PHI + 1, *gyros) if of != to]
+    told = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return np.ascontiguousarray(np.hstack([model.rate_terms, told.T]))
 
 
 def body_size(size: int, linked: int) -> int:

@@ -51,6 +51,7 @@ class _Kept(NamedTuple):
     fed_back: Array
     phi: Array
     closed_ns: int
+    undoubted: bool
 
 
 class TapedKalman(TiltAxesFilter):
@@ -151,12 +152,11 @@ class TapedKalman(TiltAxesFilter):
         return outcome
 
     def _carry_over(self, before: Array) -> None:
-        """P after an update of the estimate `before` (10 or 13,)."""
+        """P after an update of an `_estimate` `before`."""
         self._close()  # with P as it was: T begins the transition to the next node
         super()._carry_over(before)
         turn_rows(self._phi, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
-        if self._astray:
-            self._keep_antenna(self._phi, before)
+        self._keep(self._phi, before)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
@@ -194,13 +194,19 @@ class TapedKalman(TiltAxesFilter):
 
     def _own_snapshot(self) -> object:
         return _Kept(
-            self.newest, tuple(self._ops), self._fed_back.copy(), self._phi.copy(), self._closed_ns
+            self.newest,
+            tuple(self._ops),
+            self._fed_back.copy(),
+            self._phi.copy(),
+            self._closed_ns,
+            self.undoubted,
         )
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, _Kept)
         self.newest, self._ops, self._closed_ns = extra.newest, list(extra.ops), extra.closed_ns
         self._fed_back[:], self._phi[:] = extra.fed_back, extra.phi
+        self.undoubted = extra.undoubted
 
     def restore(self, s: Snapshot) -> None:
         """Back to a snapshot, bit for bit."""
