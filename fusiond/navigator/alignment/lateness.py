@@ -207,8 +207,10 @@ class Lateness:
 
     def changed(self, e: Estimator, failed: bool) -> str | None:
         """Why a filter that follows late fixes must be given up; to be asked whenever it has run.
-        `failed`: one before it was."""
-        self._offsets.look(e.t_ns, e.nav, e.xi, e.covariance, failed)
+        `failed`: one before it was. A filter that isolates forgets what a source has told, and
+        then its estimates are no martingale."""
+        if not e.isolates:
+            self._offsets.look(e.t_ns, e.nav, e.xi, e.covariance, failed)
         return self._offsets.changed
 
     @property
