@@ -210,7 +210,8 @@ async def test_why_there_are_none_is_said_and_it_is_tried_again(
     caster = Caster(b"HTTP/1.1 401 Unauthorized\r\n\r\n")
     vehicle = Vehicle(device, caster.options(user="vehicle"))
     async with caster.up(), at_work(vehicle.driver.run()):
-        await until(lambda: bool(vehicle.events))
+        # What is sent before the port is open is lost.
+        await until(lambda: bool(vehicle.events) and vehicle.counters["opened"] == 1)
         device.send(gga(29) + rmc(29))
         await until(lambda: vehicle.driver.status.state == "running")
         where = f"no corrections of localhost:{caster.port}/VRS3"
