@@ -20,9 +20,9 @@ whatever it is, falls out of the difference
 
 averaged over both axes and the last minutes. Nothing of it depends on the filter, which follows its
 fixes and so hides what they do. delta is a least squares slope, with what the offsets in time may
-be for a prior; w begins as half of the variance
-that the fix states, with the weight of one lag, and is no more than that sigma. How
-long the errors last is not asked: errors of other lengths get the w that is right over a lag.
+be for a prior; w begins as half of the variance that the fix states, with the weight of one lag,
+and is no more than that sigma. How long the errors last is not asked: errors of other lengths get
+the w that is right over a lag.
 
 Source: Allan, Statistics of atomic frequency standards, Proc. IEEE 54 (1966); Gelb, Applied
 Optimal Estimation (1974), section 4.5 (Markov processes of a shaping filter).
