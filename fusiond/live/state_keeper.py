@@ -73,7 +73,7 @@ class StateKeeper:
         self._kept = state is not None
         return state
 
-    def keep(self, t_ns: int, solution: Solution, confirmed: bool = True) -> None:
+    def keep(self, t_ns: int, solution: Solution, *, confirmed: bool) -> None:
         """Renew the file while the vehicle stands; remove it once the vehicle drives. `confirmed`:
         whether anything has shown the heading."""
         if self._path is None or (self._working is not None and not self._working.done()):
@@ -87,7 +87,7 @@ class StateKeeper:
             self._kept = False
             self._working = asyncio.create_task(asyncio.to_thread(_remove, self._path))
 
-    async def close(self, solution: Solution | None, confirmed: bool = True) -> None:
+    async def close(self, solution: Solution | None, *, confirmed: bool) -> None:
         """Keep the last solution, after what is under way has ended."""
         if self._working is not None:
             await asyncio.wait([self._working])

@@ -136,7 +136,7 @@ class WarmKeeper:
                 self._config,
                 self._boot_id,
                 _asleep_ns(),
-                not navigator.unconfirmed,
+                confirmed=not navigator.unconfirmed,
             )
             return KeptState(state, self._clock.known())
         except ValidationError as error:

@@ -125,8 +125,7 @@ class Navigator:
         for run in self._door.admit(times, samples, self.imu, self.started is not None):
             if run.ends:
                 self._begin_anew(run.ends)
-            appended = self.imu.append(run.times, run.samples)
-            if appended:
+            if appended := self.imu.append(run.times, run.samples):
                 self._feel(appended)
             taken += appended
         if self._door.restarts(self.imu):
@@ -261,8 +260,7 @@ class Navigator:
         e, watch = self.estimator, self.calibrating
         if not (watch.look(e.t_ns, e.xi, e.covariance) or watch.turned) or not self.calibration:
             return
-        wrong = watch.turned or refuted(watch.parameters, self.calibration)
-        if wrong is not None:
+        if wrong := watch.turned or refuted(watch.parameters, self.calibration):
             self._event("calibration_refused", f"{wrong}: without it, aligning anew")
             self.calibration = None
             self.reset(f"the saved calibration is wrong: {wrong}")
@@ -324,10 +322,9 @@ class Navigator:
         """The solution at `t_ns`, of all that has been run by `advance`.
 
         Later than the newest sample it is carried ahead by holding that sample's rates, at most for
-        `gap_s`: beyond it the mode says that the IMU is silent. Earlier it is the filter's state at
-        that very instant, with the aids valid until then and no later ones; before the history that
-        is kept (`buffer_s`, and the start) nothing is known. The mode is always that of what is
-        known now.
+        `gap_s`: beyond it the mode says that the IMU is silent. Earlier it is the filter's state of
+        that very instant, by the aids valid until then; before what is kept of it (`buffer_s`, and
+        the start) nothing is known. The mode is always that of now.
         """
         if self.started is None or t_ns >= self.estimator.t_ns:
             return self._present(t_ns)

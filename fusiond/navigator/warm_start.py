@@ -150,7 +150,8 @@ def warm_state(
     config: str,
     boot_id: str,
     asleep_ns: int,
-    confirmed: bool = True,
+    *,
+    confirmed: bool,
 ) -> WarmState:
     """What the estimator holds, and what the IMU felt last. Raises pydantic's `ValidationError` if
     no vehicle can have that."""

@@ -67,7 +67,7 @@ class Kept:
     async def tick(self, after_s: float, speed_m_s: float, mode: Mode = Mode.NAVIGATING) -> None:
         """A tick some time later, and what it started in the background."""
         self.t_ns += round(after_s * S)
-        self.keeper.keep(self.t_ns, self.at(speed_m_s, mode))
+        self.keeper.keep(self.t_ns, self.at(speed_m_s, mode), confirmed=True)
         await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
 
 
@@ -135,7 +135,7 @@ async def test_a_state_of_the_last_run_is_forgotten_too(kept: Kept) -> None:
 async def test_the_end_keeps_a_solution_at_rest(
     kept: Kept, speed_m_s: float, mode: Mode, written: bool
 ) -> None:
-    await kept.keeper.close(kept.at(speed_m_s, mode))
+    await kept.keeper.close(kept.at(speed_m_s, mode), confirmed=True)
     assert kept.path.exists() is written
 
 
@@ -145,7 +145,7 @@ async def test_a_disk_that_fails_is_told_and_costs_nothing(
     caplog.set_level(logging.WARNING, logger="fusiond")
     kept = Kept(tmp_path / "absent" / "state.json")
     await kept.tick(0.0, 0.0)
-    await kept.keeper.close(kept.at(0.0))
+    await kept.keeper.close(kept.at(0.0), confirmed=True)
     assert [r.getMessage().partition(":")[0] for r in caplog.records] == ["state not saved"] * 2
 
 
@@ -157,11 +157,13 @@ async def test_systemd_names_the_folder(tmp_path: Path) -> None:
     config = Config(vehicle="truck")
     clock = Clock(config.clock)
     now = replace(NAVIGATING, t_ns=clock.now_ns())
-    await StateKeeper(config, clock, never, {"STATE_DIRECTORY": f"{tmp_path}:/other"}).close(now)
+    await StateKeeper(config, clock, never, {"STATE_DIRECTORY": f"{tmp_path}:/other"}).close(
+        now, confirmed=True
+    )
     assert os.listdir(tmp_path) == ["truck.json"]
     silent = StateKeeper(config, clock, never, {})
     assert silent.load() is None
-    await silent.close(now)
+    await silent.close(now, confirmed=True)
 
 
 def _deep(path: Path) -> None:

@@ -146,19 +146,12 @@ def _assert_started(
 SAVED = SavedState(0.0, tuple(runs.ORIGIN), 2.0, (YAW_DEG + 1.5) * DEG, 2.0 * DEG)  # type: ignore[arg-type]
 
 
-def test_saved_heading() -> None:
-    truth = _parked(20.0)
-    story = _tell(truth, MEMS, _fixes(truth, 2), saved=SAVED, heading=("saved",))
-    _assert_started(story, truth, "saved state")
-
-
-def test_a_heading_that_was_saved_unconfirmed_stays_unconfirmed() -> None:
-    """A claim does not become knowledge because the daemon was restarted in between."""
-    truth = _parked(20.0)
-    saved = replace(SAVED, confirmed=False)
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_saved_heading(*, confirmed: bool) -> None:
+    """A claim does not become knowledge because the daemon was restarted."""
+    truth, saved = _parked(20.0), replace(SAVED, confirmed=confirmed)
     story = _tell(truth, MEMS, _fixes(truth, 2), saved=saved, heading=("saved",))
-    _assert_started(story, truth, "saved state", confirmed=False)
-    assert story.navigator.unconfirmed
+    _assert_started(story, truth, "saved state", confirmed=confirmed)
 
 
 def test_saved_position_too_where_no_fix_comes() -> None:

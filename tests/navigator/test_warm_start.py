@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -42,7 +43,9 @@ COLD: dict[str, Any] = {**CONFIG, "alignment": {"heading": ["gnss_course"]}}
 
 
 def _kept(navigator: Navigator) -> WarmState:
-    return warm_state(navigator.estimator, navigator.imu, "gnss course", "digest", "boot", 0)
+    return warm_state(
+        navigator.estimator, navigator.imu, "gnss course", "digest", "boot", 0, confirmed=True
+    )
 
 
 @lru_cache(maxsize=1)
@@ -72,6 +75,19 @@ def _restarted(state: WarmState, at_s: float, **callbacks: Any) -> tuple[Navigat
     navigator.add_imu(d.times[row : row + 1], d.samples[row : row + 1])
     navigator.advance()
     return navigator, row + 1
+
+
+def _driven_on(navigator: Navigator, row: int) -> Iterator[None]:
+    """From a row to the end of the drive, with what is measured; a step each time."""
+    waiting = [m for m in drive().measurements if m.t_seen_ns > navigator.imu.latest_ns]
+    d = drive()
+    while row < len(d.times):
+        navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
+        row += 10
+        while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
+            navigator.add(waiting[0], waiting.pop(0).t_seen_ns)
+        navigator.advance()
+        yield
 
 
 def _ratios(navigator: Navigator) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -128,14 +144,7 @@ def test_it_navigates_once_a_fix_agrees_and_finds_back_to_the_filter_that_never_
     navigator.advance()
     assert not navigator.on_trial
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
-    waiting = [m for m in drive().measurements if m.t_seen_ns > navigator.imu.latest_ns]
-    d = drive()
-    while row < len(d.times):
-        navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
-        row += 10
-        while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
-            navigator.add(waiting[0], waiting.pop(0).t_seen_ns)
-        navigator.advance()
+    for _ in _driven_on(navigator, row):
         assert np.abs(_ratios(navigator)).max() < 4.0
     assert told == ["aligned"]
     assert math.sqrt(navigator.estimator.covariance[2, 2]) < math.radians(3.0)
@@ -150,14 +159,8 @@ def test_a_heading_that_nothing_has_shown_is_not_shown_by_a_restart() -> None:
     assert mode is Mode.COASTING
     assert reason.startswith("heading from configured heading, restarted over ")
     assert reason.endswith("; no motion has confirmed it yet")
-    waiting = [m for m in drive().measurements if m.t_seen_ns > navigator.imu.latest_ns]
-    d = drive()
-    while row < len(d.times):
-        navigator.add_imu(d.times[row : row + 10], d.samples[row : row + 10])
-        row += 10
-        while waiting and waiting[0].t_seen_ns <= navigator.imu.latest_ns:
-            navigator.add(waiting[0], waiting.pop(0).t_seen_ns)
-        navigator.advance()
+    for _ in _driven_on(navigator, row):
+        pass
     assert not navigator.unconfirmed  # the course has
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
