@@ -147,9 +147,10 @@ def slots(systems: Sequence[System] = ("C", "G")) -> tuple[Slot, ...]:
     return tuple(slot for system in systems for slot in makers[system]())
 
 
-def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
+def ephemeris(slot: Slot, week: int, tow_s: float, epoch_s: float = EPOCH_S) -> Ephemeris:
     """What the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest one.
 
+    At `epoch_s` (GPS time, s) the satellites stand where they do at `EPOCH_S` unless told.
     Unquantised: `fusiond.simulation.gnss.nav_fields.quantised` rounds to what a message can carry.
     """
     system = slot.system
@@ -160,7 +161,7 @@ def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
     if toe >= WEEK_S:
         own_week, toe = own_week + 1, toe - WEEK_S
     gps_week, start_s = gps_time(system, own_week, 0.0)
-    week_start = gps_week * WEEK_S + start_s - EPOCH_S
+    week_start = gps_week * WEEK_S + start_s - epoch_s
     tau = week_start + toe
     e = _ECCENTRICITY[slot.kind]
     n = math.sqrt(mu / slot.semi_major_m**3)
@@ -213,10 +214,13 @@ def ephemeris(slot: Slot, week: int, tow_s: float) -> Ephemeris:
 
 
 def constellation(
-    week: int, tow_s: float, systems: Sequence[System] = ("C", "G")
+    week: int,
+    tow_s: float,
+    systems: Sequence[System] = ("C", "G"),
+    epoch_s: float = EPOCH_S,
 ) -> tuple[Ephemeris, ...]:
     """All that is broadcast at GPS time `week`, `tow_s`, one ephemeris for each satellite."""
-    return tuple(ephemeris(slot, week, tow_s) for slot in slots(systems))
+    return tuple(ephemeris(slot, week, tow_s, epoch_s) for slot in slots(systems))
 
 
 def system_time(system: System, week: int, tow_s: float) -> tuple[int, float]:

@@ -35,7 +35,7 @@ from fusiond.simulation.can.aids import CanAid, can_aids
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.files import write_truth
 from fusiond.simulation.gnss.masks import parse_mask
-from fusiond.simulation.gnss.raw import GnssRaw
+from fusiond.simulation.gnss.raw import START, GnssRaw
 from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import States
@@ -98,13 +98,15 @@ class SimulatedVehicle:
         self._next_raw = 0
 
     def _start_clock(self) -> None:
-        """Start at the next full tenth of a UTC second, where receivers have their epochs."""
+        """Start at the next full tenth of a UTC second, where receivers have their epochs.
+
+        The sky is that of `fusiond simulate`: a seed meets the same satellites at every hour."""
         utc_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
         wait_ns = -utc_ns % 100_000_000
         self.start_ns = monotonic_ns + wait_ns
         self.utc_start_ns = self.terminal.utc_start_ns = utc_ns + wait_ns
         if self.raw is not None:
-            self.raw.receiver.begin(*utc_ns_to_gps(self.utc_start_ns))
+            self.raw.receiver.begin(*utc_ns_to_gps(self.utc_start_ns), sky=START)
 
     # ------------------------------------------------------------------ truth
 

@@ -45,13 +45,15 @@ def test_hardware_in_the_loop(
     with capfd.disabled(), ThreadPoolExecutor() as guests:  # the guests' reports, as they are made
         print()
         files = [[str(INSIDE / name) for name in group] for group in GROUPS]
+        failures = [tmp_path / f"failures-{k + 1}" for k in range(len(GROUPS))]
         runs = [
-            guests.submit(run_group, f"{k + 1}| ", tests, tmp_path / f"failures-{k + 1}")
+            guests.submit(run_group, f"{k + 1}| ", tests, failures[k])
             for k, tests in enumerate(files)
         ]
         results = [run.result() for run in runs]
-    for result in results:
-        assert result.status == 0, f"failures in the report above (ran on: {result.where})"
+    for result, notes in zip(results, failures, strict=True):
+        told = notes.read_text().split("\n") if notes.exists() else []
+        assert result.status == 0, f"on {result.where}, the report is above: {told}"
     check(logs)
 
 

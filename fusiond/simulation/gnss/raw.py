@@ -50,7 +50,7 @@ from fusiond.gnss.atmosphere import (
     mapping_coefficients,
     zenith_delays,
 )
-from fusiond.gnss.constellation import constellation, ephemeris, slots
+from fusiond.gnss.constellation import EPOCH_S, constellation, ephemeris, slots
 from fusiond.gnss.ecef import ned_axes, to_ecef
 from fusiond.gnss.group_delay import group_delay
 from fusiond.gnss.orbit import CONSTANTS, WEEK_S, Orbits
@@ -183,11 +183,14 @@ class GnssRaw:
         self.clock_drift_m_s = drift
         self._reset = np.diff(whole, prepend=whole[:1]) != 0.0
 
-    def begin(self, week: int, tow_s: float) -> None:
-        """Set GPS time at the trajectory's 0."""
+    def begin(self, week: int, tow_s: float, sky: tuple[int, float] | None = None) -> None:
+        """Set GPS time at the trajectory's 0, and where the satellites stand then: as at GPS time
+        `sky`, if that is not the same."""
         o = self.options
         self.start = week, tow_s
-        self._true = constellation(week, tow_s, o.systems)
+        sky_week, sky_tow_s = sky or self.start
+        self._epoch_s = EPOCH_S + (week - sky_week) * WEEK_S + (tow_s - sky_tow_s)
+        self._true = constellation(week, tow_s, o.systems, self._epoch_s)
         self._orbits = Orbits.of(self._true)
         self._earth_rate = np.array([CONSTANTS[e.system].earth_rate for e in self._true])
         self._view = View(o.elevation_deg, o.masks)
@@ -201,7 +204,7 @@ class GnssRaw:
         """What satellites (system, PRN) send at `t_s`, as their messages carry it."""
         week, tow_s = self.gps_time(t_s)
         return [
-            quantised(ephemeris(slot, week, tow_s))
+            quantised(ephemeris(slot, week, tow_s, self._epoch_s))
             for slot in self._slots
             if (slot.system, slot.prn) in satellites
         ]

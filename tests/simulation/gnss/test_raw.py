@@ -144,6 +144,23 @@ def test_same_seed_same_epochs(moving: Truth) -> None:
 # --------------------------------------------------------------------------- masks
 
 
+def test_a_sky_may_be_that_of_another_time(moving: Truth) -> None:
+    """To the millimetre that a toe on another grid, and the rounding of an angle, leave."""
+    early, late = (GnssRaw(moving, QUIET, np.random.default_rng(6)) for _ in range(2))
+    late.begin(2437, 423_196.3, sky=early.start)
+    assert late.gps_time(10.0) == (2437, 423_206.3)
+    for k in (0, 100):
+        for there, here in zip(early.sky(k)[:4], late.sky(k)[:4], strict=True):
+            np.testing.assert_allclose(here, there, rtol=1e-9, atol=1e-4)
+    satellites = {(slot.system, slot.prn) for slot in slots(("C", "G"))}
+    told = late.broadcast(0.0, satellites)
+    assert all(abs(e.toe_s - 423_196.3) <= 3614.0 for e in told)
+    fix = single_point(model_of(late), late.epoch(0))
+    assert isinstance(fix, SinglePoint)
+    true, _ = antenna(moving, float(late.t_s[0]))
+    assert float(np.linalg.norm(fix.position - true)) < 10.0
+
+
 def counts(truth: Truth, *masks: Mask) -> np.ndarray:
     options = replace(QUIET, masks=masks)
     receiver = GnssRaw(truth, options, np.random.default_rng(1), NOON)
