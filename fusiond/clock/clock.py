@@ -85,7 +85,8 @@ that it can be (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 class Clock:
     """Turns stamps into instants. `counters` names everything it refused, guessed or learnt.
 
-    `on_event(code, text)` hears of `utc_jumped`, `system_clock_stepped` and `host_resumed`;
+    `on_event(code, text)` hears of `utc_jumped`, `utc_implausible`, `system_clock_stepped` and
+    `host_resumed`;
     `on_time` has every report by which the system clock may be set.
     """
 
@@ -151,6 +152,12 @@ class Clock:
         if self.on_event is not None:
             self.on_event(code, text)
 
+    def _envelope(self, of: dict[str, UtcEnvelope], source: str) -> UtcEnvelope:
+        """The one of `source`; the first time, one that has heard nothing."""
+        if source not in of:
+            of[source] = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
+        return of[source]
+
     # ------------------------------------------------------------------ stamps
 
     def resolve(self, stamp: Stamp, source: str, t_seen_ns: int) -> Instant:
@@ -214,10 +221,7 @@ class Clock:
 
     def _from_others_utc(self, utc_ns: int, source: str, t_seen_ns: int) -> Instant:
         """By the reference's UTC or the system's; by the source's own stamps if that cannot be."""
-        own = self._stamped.get(source)
-        if own is None:
-            own = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
-            self._stamped[source] = own
+        own = self._envelope(self._stamped, source)
         own.update(utc_ns, t_seen_ns)
         offset_ns, sd_s, how = self._mapping(source)
         t_ns = utc_ns + offset_ns
@@ -272,10 +276,10 @@ class Clock:
         plausible = dates.plausible(utc_ns)
         self.counters["utc_report_implausible"] += not plausible
         self.counters["gps_week_rollover"] += utc_ns != report.utc_ns
-        envelope = self._utc.get(report.source)
-        if envelope is None:
-            envelope = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
-            self._utc[report.source] = envelope
+        envelope = self._envelope(self._utc, report.source)
+        if envelope.plausible and not plausible:
+            told = f"{report.source} tells the year {dates.year(utc_ns)}: not believed"
+            self._event("utc_implausible", told)
         jumped_ns = -envelope.update(utc_ns, report.t_seen_ns, plausible=plausible)
         if jumped_ns and report.source == self._reference:
             self._jumped(jumped_ns, f"{report.source} has said so for minutes")
@@ -311,9 +315,8 @@ class Clock:
                 continue
             if not dates.plausible(each.utc_ns):
                 continue
-            envelope = UtcEnvelope(self._options.max_clock_drift_ppm, self.counters)
+            envelope = self._envelope(self._utc, each.source)
             envelope.resume(each)
-            self._utc[each.source] = envelope
             self.counters["utc_resumed"] += 1
             self._choose_reference(each.source, envelope)
 

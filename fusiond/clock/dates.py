@@ -6,6 +6,8 @@ Dates from before the last rollover of the ten-bit GPS week are moved by 1024 we
 
 from __future__ import annotations
 
+import numpy as np
+
 from fusiond.clock.host import SECOND_NS
 
 WEEKS_1024_NS = 1024 * 7 * 86400 * SECOND_NS
@@ -19,6 +21,11 @@ a rollover moved once too often, nor one beyond the service life of this code.""
 def plausible(utc_ns: int) -> bool:
     """Whether a date can be today's."""
     return EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS
+
+
+def year(utc_ns: int) -> int:
+    """The Gregorian year of a date, of any at all."""
+    return int(np.datetime64(utc_ns // SECOND_NS, "s").astype("datetime64[Y]").astype(int)) + 1970
 
 
 def rolled_over(utc_ns: int) -> int:

@@ -29,6 +29,7 @@ WARNINGS = (
     "refused",
     "jumped",
     "stepped",
+    "implausible",
     "resumed",
     "saturated",
     "repeated",

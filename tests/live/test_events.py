@@ -29,6 +29,7 @@ from tests.clock.host_time import Host, S
         ("rdss_suppressed", "warning"),
         ("isolated", "warning"),
         ("utc_jumped", "warning"),
+        ("utc_implausible", "warning"),
         ("system_clock_stepped", "warning"),
         ("host_resumed", "warning"),
         ("driver_fault", "error"),
