@@ -58,7 +58,7 @@ NO_CLOCK = -1
 
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1],"
-    "i8[::1], i8, f8, f8, f8, f8[::1], f8[:, ::1])"
+    "i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])"
 )
 def _rows(
     nav: Array,
@@ -70,15 +70,21 @@ def _rows(
     velocity: Array,
     ranges: Array,
     rates: Array,
-    offset_slot: Indices,
-    drift_slot: int,
+    clock: Indices,
+    offsets: Indices,
+    drifts: Indices,
+    displacement: Indices,
     l0: float,
     l1: float,
     l2: float,
     z: Array,
     h: Array,
 ) -> None:
-    """Write z (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates."""
+    """Write z (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates.
+
+    Slots of the clocks' offsets, of their drift and of the displacement; none where the model has
+    no such state.
+    """
     c00, c01, c02, c10, c11, c12, c20, c21, c22 = dcm_elements(nav[Q0:])
     a0 = c00 * l0 + c01 * l1 + c02 * l2
     a1 = c10 * l0 + c11 * l1 + c12 * l2
@@ -115,9 +121,10 @@ def _rows(
                 z[row] = distance - ranges[i]
                 g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
                 g[6], g[7], g[8] = -u0, -u1, -u2
-                if offset_slot[i] >= 0:
-                    z[row] += xi[offset_slot[i]]
-                    g[offset_slot[i]] = -1.0
+                if clock[i] >= 0:
+                    slot = offsets[clock[i]]
+                    z[row] += xi[slot]
+                    g[slot] = -1.0
             else:
                 e0, e1, e2 = velocity[i, 0], velocity[i, 1], velocity[i, 2]
                 q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
@@ -149,12 +156,16 @@ def _rows(
                         g[slot] = n2 * l0 - n0 * l2
                     elif axis == 2:
                         g[slot] = n0 * l1 - n1 * l0
-                if drift_slot >= 0:
-                    z[row] += xi[drift_slot]
-                    g[drift_slot] = -1.0
+                if clock[i] >= 0:
+                    z[row] += xi[drifts[0]]
+                    g[drifts[0]] = -1.0
             for j in range(CORE_SIZE):
                 if not active[j]:
                     g[j] = 0.0
+            if kind == 0:
+                for axis in range(displacement.shape[0]):
+                    g[displacement[axis]] = -g[6 + axis]
+                    z[row] += g[6 + axis] * xi[displacement[axis]]
             row += 1
 
 
@@ -166,7 +177,7 @@ _WRONG = {
 }
 
 
-@compiled("UniTuple(i8, 3)(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])")
+@compiled("UniTuple(i8, 4)(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])")
 def _measured(
     ranges: Array,
     rates: Array,
@@ -174,13 +185,14 @@ def _measured(
     rate_variance: Array,
     clock: Indices,
     r: Array,
-) -> tuple[int, int, int]:
+) -> tuple[int, int, int, int]:
     """Write the variances of the finite ranges and then of the finite rates to r (2 n,); how many
-    ranges and rates those are, and what is wrong with them."""
+    ranges and rates those are, how many clocks they have, and what is wrong with them."""
     n = ranges.shape[0]
-    row = finite = timed = 0
+    row = finite = timed = clocks = 0
     wrong = _SOUND
     for i in range(n):
+        clocks = max(clocks, clock[i] + 1)
         if math.isfinite(ranges[i]):
             r[row] = range_variance[i]
             row += 1
@@ -195,29 +207,49 @@ def _measured(
     for a in range(row):
         if not 0.0 < r[a] < math.inf:
             wrong = _VARIANCES
-    return finite, row - finite, wrong
+    return finite, row - finite, clocks, wrong
 
 
-@compiled("void(i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[:, :, ::1])")
+@compiled("void(i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1])")
 def _by_clock(
     clock: Indices,
     ranges: Array,
     rates: Array,
     kept: NDArray[np.bool_],
     whitened: Array,
-    sums: Array,
+    means: Array,
+    counts: Array,
+    first: Indices,
 ) -> None:
-    """Add up in `sums` (2, 2, k), zero before, what is `whitened` and `kept` (m,) of the ranges and
-    of the rates that have each of k clocks, and how many those are."""
+    """Add up in `means` (k, 2), zero before, what is `whitened` and `kept` (m,) of the ranges and
+    of the rates that have each of k clocks, over the root of how many those are (`counts` (k, 2),
+    zero before). `first` (k,) satellite of each clock; NO_CLOCK where it has no range or no rate.
+    """
     row = 0
     for kind in range(2):
         for i in range(ranges.shape[0]):
             if not math.isfinite(ranges[i] if kind == 0 else rates[i]):
                 continue
             if kept[row] and clock[i] >= 0:
-                sums[kind, 0, clock[i]] += whitened[row]
-                sums[kind, 1, clock[i]] += 1.0
+                means[clock[i], kind] += whitened[row]
+                counts[clock[i], kind] += 1.0
             row += 1
+    first[:] = NO_CLOCK
+    for i in range(ranges.shape[0] - 1, -1, -1):
+        k = clock[i]
+        if k >= 0 and counts[k, 0] > 0.0 and counts[k, 1] > 0.0:
+            first[k] = i
+    for k in range(first.shape[0]):
+        for kind in range(2):
+            means[k, kind] /= math.sqrt(max(counts[k, kind], 1.0))
+
+
+_ARRAYS = (
+    *((name, np.float64, (3,)) for name in ("position", "velocity")),
+    *((name, np.float64, ()) for name in ("ranges", "rates", "range_variance", "rate_variance")),
+    ("clock", np.int64, ()),
+)
+"""Of an epoch of n satellites: kind and shape, (n, ...)."""
 
 
 @immutable(eq=False)
@@ -249,21 +281,22 @@ class PseudorangeAid(Aid):
     lever: Vector3 = (0.0, 0.0, 0.0)
     clock_reset: bool = False
     _r: Array = field(init=False, repr=False)
-    _ranges: int = field(init=False, repr=False)
+    _clocks: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         n = len(self.satellites)
-        for name, shape in (("position", (n, 3)), ("velocity", (n, 3)), ("ranges", (n,))):
-            _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), shape)
-        for name in ("rates", "range_variance", "rate_variance"):
-            _keep(self, name, np.ascontiguousarray(getattr(self, name), dtype=float), (n,))
-        _keep(self, "clock", np.ascontiguousarray(self.clock, dtype=np.int64), (n,))
+        for name, kind, shape in _ARRAYS:
+            value = np.ascontiguousarray(getattr(self, name), dtype=kind)
+            if value.shape != (n, *shape):
+                raise ValueError(f"{name} has shape {value.shape}, not {(n, *shape)}")
+            object.__setattr__(self, name, value)
         r, variances = np.empty(2 * n), (self.range_variance, self.rate_variance)
-        ranges, rates, wrong = _measured(self.ranges, self.rates, *variances, self.clock, r)
+        found = _measured(self.ranges, self.rates, *variances, self.clock, r)
+        ranges, rates, clocks, wrong = found
         if wrong != _SOUND:
             raise ValueError(_WRONG[wrong])
         object.__setattr__(self, "_r", r[: ranges + rates])
-        object.__setattr__(self, "_ranges", ranges)
+        object.__setattr__(self, "_clocks", clocks)
 
     @property
     def labels(self) -> list[tuple[str, str]]:
@@ -301,25 +334,21 @@ class PseudorangeAid(Aid):
         White innovations give N(0, 1) whatever the number of satellites, so that epochs of any sky
         form one series. A system without a range or without a rate in the epoch has none.
         """
-        clocks = self.clock.tolist()
-        count = max(clocks, default=NO_CLOCK) + 1
-        sums = np.zeros((2, 2, count))
-        used = np.asarray(kept, dtype=bool)
-        _by_clock(self.clock, self.ranges, self.rates, used, np.array(whitened, float), sums)
-        first = sorted((clocks.index(k), k) for k in range(count) if sums[:, 1, k].all())
-        return {self.satellites[at][0]: sums[:, 0, k] / np.sqrt(sums[:, 1, k]) for at, k in first}
+        means, counts = np.zeros((2, self._clocks, 2))
+        first = np.empty(self._clocks, dtype=np.int64)
+        used, values = np.asarray(kept, dtype=bool), np.array(whitened, float)
+        _by_clock(self.clock, self.ranges, self.rates, used, values, means, counts, first)
+        order = sorted((at, k) for k, at in enumerate(first.tolist()) if at != NO_CLOCK)
+        return {self.satellites[at][0]: means[k] for at, k in order}
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model = state.model
         if not self._r.size:
             return NotApplicable("no_satellites")
-        offsets = model.slots_of(CLOCK_OFFSET) or [NO_CLOCK]
-        drifts = model.slots_of(CLOCK_DRIFT)
-        greatest = max(self.clock.tolist())
-        if greatest >= len(offsets) or (greatest >= 0 and not drifts):
+        clocks, blocks = self._clocks, ((CLOCK_OFFSET,), (CLOCK_DRIFT,), RANGE_BIAS)
+        offsets, drifts, displacement = model.slots_of_each(*blocks)
+        if clocks > offsets.size or (clocks and not drifts.size):
             return NotApplicable("no_clock_state")
-        # NO_CLOCK, which is -1, is the place of the last, too.
-        slots = np.array([*offsets, NO_CLOCK], dtype=np.int64)[self.clock]
         rows = self._r.size
         z, h = np.empty(rows), np.zeros((rows, model.size))
         _rows(
@@ -332,29 +361,12 @@ class PseudorangeAid(Aid):
             self.velocity,
             self.ranges,
             self.rates,
-            slots,
-            drifts[0] if greatest >= 0 else NO_CLOCK,
+            self.clock,
+            offsets,
+            drifts,
+            displacement,
             *self.lever,
             z,
             h,
         )
-        self._shared(state, z, h)
         return Innovation(z, h, self._r)
-
-    def _shared(self, state: State, z: Array, h: Array) -> None:
-        """The displacement that the ranges share, where the model has states for it."""
-        model = state.model
-        slots, count = model.slots_of_all(RANGE_BIAS), self._ranges
-        if len(slots) != 3:
-            return
-        toward = -h[:count, 6:9]
-        h[:count, slots] = toward
-        z[:count] -= toward @ state.xi[slots]
-
-
-def _keep(
-    aid: PseudorangeAid, name: str, value: NDArray[np.generic], shape: tuple[int, ...]
-) -> None:
-    if value.shape != shape:
-        raise ValueError(f"{name} has shape {value.shape}, not {shape}")
-    object.__setattr__(aid, name, value)

@@ -299,10 +299,10 @@ class ErrorStateFilter:
                 cov[offsets] = 0.0
                 cov[:, offsets] = 0.0
                 cov[offsets, offsets] = self.model.initial[offsets] ** 2
-            codes, y = np.zeros(z.shape[0], dtype=np.int64), np.zeros(z.shape[0])
+            codes, y = np.zeros(z.shape[0], dtype=np.int64), np.empty(z.shape[0])
             cov_out, dx_out = np.empty_like(cov), np.empty_like(dx)
             nis = screened_update(cov, dx, z, h, r, threshold, codes, y, cov_out, dx_out)
-            if renew or not offsets or not jumped(codes, h[:, offsets]):
+            if renew or not offsets or not jumped(codes, h, offsets):
                 return Screened(codes, y, nis, cov_out, dx_out)
             renew = True
 

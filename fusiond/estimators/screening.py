@@ -13,6 +13,9 @@ does not matter.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,32 +52,33 @@ def screened_update(
 ) -> float:
     """Fold the rows z = h dx + noise (variances r) that pass into `cov_out` and `dx_out`.
 
-    cov and cov_out (w, w), dx and dx_out (n,), z, r, y (m,), h (m, n). `codes` (m,) says what
-    became of each row; rows not KEPT at the call are left out from the start. y[a] is left as the
-    whitened innovation of a kept row, 0 otherwise. Returns the sum of their squares, nu^T S^-1 nu.
+    cov and cov_out (w, w) symmetric, dx and dx_out (n,), z, r, y (m,), h (m, n). `codes` (m,) says
+    what became of each row; rows not KEPT at the call are left out from the start. y[a] is left as
+    the whitened innovation of a kept row, 0 otherwise. Returns the sum of their squares,
+    nu^T S^-1 nu.
     """
     m, n = h.shape
-    columns = np.empty((m, n), dtype=np.int64)
+    width = cov.shape[0]
+    columns, values = np.empty((m, n), dtype=np.int64), np.empty((m, n))
     counts = np.zeros(m, dtype=np.int64)
     for a in range(m):
         for i in range(n):
             if h[a, i] != 0.0:
                 columns[a, counts[a]] = i
+                values[a, counts[a]] = h[a, i]
                 counts[a] += 1
-    u, k = np.empty(n), np.empty(n)
     for a in range(m):
         innovation, s = z[a], r[a]
-        u[:] = 0.0
         for p in range(counts[a]):
-            i = columns[a, p]
-            c = h[a, i]
+            i, c = columns[a, p], values[a, p]
             innovation -= c * dx[i]
-            for j in range(n):
-                u[j] += c * cov[i, j]
-        for p in range(counts[a]):
-            s += h[a, columns[a, p]] * u[columns[a, p]]
+            half = 0.5 * c * cov[i, i]
+            for q in range(p):
+                half += values[a, q] * cov[i, columns[a, q]]
+            s += 2.0 * c * half
         if codes[a] == KEPT and not innovation * innovation <= threshold * s:
             codes[a] = GATED
+    u = np.empty(width)
     while True:
         cov_out[:] = cov
         dx_out[:] = dx
@@ -86,44 +90,40 @@ def screened_update(
             u[:] = 0.0
             innovation = z[a]
             for p in range(counts[a]):
-                i = columns[a, p]
-                c = h[a, i]
+                i, c = columns[a, p], values[a, p]
                 innovation -= c * dx_out[i]
-                for j in range(n):
+                for j in range(width):
                     u[j] += c * cov_out[i, j]
-            s = r[a]
+            s, hk = r[a], 0.0
             for p in range(counts[a]):
-                s += h[a, columns[a, p]] * u[columns[a, p]]
-            y[a] = innovation / np.sqrt(s)
+                s += values[a, p] * u[columns[a, p]]
+            for p in range(counts[a]):
+                hk += values[a, p] * (u[columns[a, p]] / s)
+            y[a] = innovation / math.sqrt(s)
             nis += y[a] * y[a]
-            # k = u / s; u is then u / sqrt(s), so that k k^T s = u u^T.
-            hk, root = 0.0, np.sqrt(s)
+            gain = innovation / s
             for i in range(n):
-                k[i] = u[i] / s
-                u[i] /= root
-                dx_out[i] += k[i] * innovation
-            for p in range(counts[a]):
-                hk += h[a, columns[a, p]] * k[columns[a, p]]
-            # Joseph form of one row, as in fusiond.estimators.update; each product is the same to
-            # the bit with i and j exchanged.
-            c = (r[a] - (1.0 - hk) * s) / s - 1.0
+                dx_out[i] += u[i] * gain
+            # Joseph form of one row, as in fusiond.estimators.update, with the gain u / s: what it
+            # takes away is (1 + ((1 - h k) s - r) / s) u u^T / s, a square of its root.
+            root = math.sqrt((1.0 + ((1.0 - hk) * s - r[a]) / s) / s)
+            for i in range(width):
+                u[i] *= root
             for i in range(n):
-                for j in range(n):
-                    cov_out[i, j] += c * (u[i] * u[j])
+                for j in range(width):
+                    cov_out[i, j] -= u[i] * u[j]
         worst, greatest = -1, threshold
         for a in range(m):
             if codes[a] != KEPT:
                 continue
             residual, variance = z[a], r[a]
-            u[:] = 0.0
             for p in range(counts[a]):
-                i = columns[a, p]
-                c = h[a, i]
+                i, c = columns[a, p], values[a, p]
                 residual -= c * dx_out[i]
-                for j in range(n):
-                    u[j] += c * cov_out[i, j]
-            for p in range(counts[a]):
-                variance -= h[a, columns[a, p]] * u[columns[a, p]]
+                half = 0.5 * c * cov_out[i, i]
+                for q in range(p):
+                    half += values[a, q] * cov_out[i, columns[a, q]]
+                variance -= 2.0 * c * half
             if variance > _DETERMINED * r[a] and residual * residual > greatest * variance:
                 worst, greatest = a, residual * residual / variance
         if worst < 0:
@@ -131,12 +131,12 @@ def screened_update(
         codes[worst] = RESIDUAL
 
 
-def jumped(codes: Codes, of_clock: Array) -> bool:
-    """Whether the better half of the ranges fails; of the rows, `codes` (m,) and what they have of
-    the clock's offsets (m, k)."""
-    if np.count_nonzero(codes != KEPT) < FEWEST_JUMPING:
+def jumped(codes: Codes, h: Array, offsets: Sequence[int]) -> bool:
+    """Whether the better half of the ranges fails; of the rows, `codes` (m,) and `h` (m, n), with
+    the slots of the clock's offsets."""
+    if np.count_nonzero(codes) < FEWEST_JUMPING:  # KEPT is 0
         return False
     # One in a range, nothing in a rate: nothing up to the rounding of sigma points.
-    ranges = (np.abs(of_clock) > 0.5).any(axis=1)
-    lost = np.count_nonzero(codes[ranges] != KEPT)
+    ranges = (np.abs(h[:, offsets]) > 0.5).any(axis=1)
+    lost = np.count_nonzero(codes[ranges])
     return bool(lost >= FEWEST_JUMPING and 2 * lost > np.count_nonzero(ranges))

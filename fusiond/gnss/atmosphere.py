@@ -152,13 +152,14 @@ def klobuchar_beidou(
 ) -> float:
     """Delay in m at B1I; `q` (8,) alpha, beta; BeiDou second of week; receiver's position."""
     e = max(elevation_rad, 0.0)
-    sine = BEIDOU_RADIUS_M / (BEIDOU_RADIUS_M + LAYER_M) * math.cos(e)
-    arc = 0.5 * math.pi - e - math.asin(sine)
-    lat = math.asin(
-        math.sin(lat_rad) * math.cos(arc)
-        + math.cos(lat_rad) * math.sin(arc) * math.cos(azimuth_rad)
-    )
-    lon = lon_rad + math.asin(math.sin(arc) * math.sin(azimuth_rad) / math.cos(lat))
+    se, ce = math.sin(e), math.cos(e)
+    # The angle at the layer; the arc to its point is pi/2 less this and the elevation.
+    sine = BEIDOU_RADIUS_M / (BEIDOU_RADIUS_M + LAYER_M) * ce
+    cosine = math.sqrt(1.0 - sine * sine)
+    sin_arc, cos_arc = ce * cosine - se * sine, se * cosine + ce * sine
+    north = math.sin(lat_rad) * cos_arc + math.cos(lat_rad) * sin_arc * math.cos(azimuth_rad)
+    lat = math.asin(north)
+    lon = lon_rad + math.asin(sin_arc * math.sin(azimuth_rad) / math.sqrt(1.0 - north * north))
     local = (tow_s + 43200.0 * lon / math.pi) % DAY_S
     s = abs(lat) / math.pi
     amplitude = max(q[0] + s * (q[1] + s * (q[2] + s * q[3])), 0.0)
@@ -166,7 +167,7 @@ def klobuchar_beidou(
     day = 0.0
     if abs(local - 50400.0) < 0.25 * period:
         day = amplitude * math.cos(2.0 * math.pi * (local - 50400.0) / period)
-    return SPEED_OF_LIGHT_M_S * (5e-9 + day) / math.sqrt(1.0 - sine * sine)
+    return SPEED_OF_LIGHT_M_S * (5e-9 + day) / cosine
 
 
 @compiled("f8(f8)")

@@ -32,7 +32,7 @@ from fusiond.gnss.atmosphere import (
     zenith_delays,
 )
 from fusiond.gnss.ecef import to_geodetic
-from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states
+from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states, turned
 from fusiond.navigation.compiled import compiled
 
 Array = npt.NDArray[np.float64]
@@ -40,6 +40,9 @@ Array = npt.NDArray[np.float64]
 EARTH_RATE_RAD_S = 7.2921151467e-5
 LOWEST_RADIUS_M = 6.3e6
 """A receiver nearer to the earth's centre is a starting value: no elevation, no atmosphere."""
+
+_NEPERS = 0.1 * math.log(10.0)
+"""A decibel of power as an exponent of e."""
 
 # What the plan says of each row.
 SIGNAL_COLUMNS = 4
@@ -49,10 +52,10 @@ NO_MODEL, GPS_MODEL, BEIDOU_MODEL = 0.0, 1.0, 2.0
 MEASURED_COLUMNS = 5
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = range(MEASURED_COLUMNS)
 # Results.
-ROW_COLUMNS = 19
+ROW_COLUMNS = 20
 (
     X, Y, Z, VX, VY, VZ, LX, LY, LZ, RANGE, ELEVATION, AZIMUTH, CORRECTED, CORRECTED_RATE,
-    VARIANCE, RATE_VARIANCE, TROPOSPHERE, IONOSPHERE, COMMON,
+    VARIANCE, RATE_VARIANCE, TROPOSPHERE, IONOSPHERE, COMMON, TOTAL_VARIANCE,
 ) = range(ROW_COLUMNS)  # fmt: skip
 # Noise.
 NOISE_VALUES = 8
@@ -63,7 +66,8 @@ NOISE_VALUES = 8
 
 
 @compiled(
-    "void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8[:, ::1])",
+    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8[::1], f8[::1], f8, f8,"
+    "f8[:, ::1])",
     allocates=True,
 )
 def range_rows(
@@ -75,14 +79,18 @@ def range_rows(
     tow: float,
     receiver: Array,
     noise: Array,
+    least_elevation: float,
+    least_cno: float,
     out: Array,
-) -> None:
-    """Write (n, 19) rows for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock.
+) -> int:
+    """Write (20, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
+    many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 29), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
+    `elements` (n, 31), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
     BeiDou's coefficients; `noise` (8,).
     """
     n = elements.shape[0]
+    refused = 0
     sent = np.empty(n)
     for k in range(n):
         sent[k] = tow - measured[k, PSEUDORANGE] / SPEED_OF_LIGHT_M_S
@@ -106,8 +114,7 @@ def range_rows(
         for _ in range(2):  # unturned 27 m off, then 0.2 mm, then less than a nanometre
             dx, dy, dz = x - rx, y - ry, z - rz
             distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-            angle = EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S
-            c, s = math.cos(angle), math.sin(angle)
+            s, c = turned(0.0, 1.0, EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S)
             x, y = c * xt + s * yt, c * yt - s * xt
         dx, dy, dz = x - rx, y - ry, z - rz
         distance = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -136,27 +143,28 @@ def range_rows(
             iono_sigma = noise[IONO_SHARE] * iono
             if model == NO_MODEL:
                 iono_sigma = noise[IONO_UNMODELLED] * slant(elevation) * signals[k, IONO_SCALE]
-        out[k, X], out[k, Y], out[k, Z] = x, y, z
-        out[k, VX], out[k, VY], out[k, VZ] = vx, vy, vz
-        out[k, LX], out[k, LY], out[k, LZ] = lx, ly, lz
-        out[k, RANGE] = distance
-        out[k, ELEVATION], out[k, AZIMUTH] = elevation, azimuth
-        out[k, TROPOSPHERE], out[k, IONOSPHERE], out[k, COMMON] = tropo, iono, iono_sigma
+        out[X, k], out[Y, k], out[Z, k] = x, y, z
+        out[VX, k], out[VY, k], out[VZ, k] = vx, vy, vz
+        out[LX, k], out[LY, k], out[LZ, k] = lx, ly, lz
+        out[RANGE, k] = distance
+        out[ELEVATION, k], out[AZIMUTH, k] = elevation, azimuth
+        out[TROPOSPHERE, k], out[IONOSPHERE, k], out[COMMON, k] = tropo, iono, iono_sigma
         clock = SPEED_OF_LIGHT_M_S * states[k, 6] - signals[k, GROUP_DELAY_M]
-        out[k, CORRECTED] = measured[k, PSEUDORANGE] + clock - tropo - iono
+        out[CORRECTED, k] = measured[k, PSEUDORANGE] + clock - tropo - iono
         inertial = (
             lx * (vx - EARTH_RATE_RAD_S * y) + ly * (vy + EARTH_RATE_RAD_S * x) + lz * vz
         ) / SPEED_OF_LIGHT_M_S
         drift = SPEED_OF_LIGHT_M_S * states[k, 7]
-        out[k, CORRECTED_RATE] = measured[k, RATE] * (1.0 + inertial) + drift
+        out[CORRECTED_RATE, k] = measured[k, RATE] * (1.0 + inertial) + drift
         thin = slant(elevation)
         code = noise[CODE_ZENITH] * thin
         cno = measured[k, CNO]
-        weak = 0.0 if math.isnan(cno) else 10.0 ** (0.1 * (noise[CNO_REFERENCE] - cno))
+        refused += elevation < least_elevation or cno < least_cno
+        weak = 0.0 if math.isnan(cno) else math.exp(_NEPERS * (noise[CNO_REFERENCE] - cno))
         stated = measured[k, SD_PSEUDORANGE]
         if math.isnan(stated):
             stated = 0.0
-        out[k, VARIANCE] = (
+        out[VARIANCE, k] = (
             code * code
             + noise[CODE_CNO] * noise[CODE_CNO] * weak
             + stated * stated
@@ -164,9 +172,11 @@ def range_rows(
             + (noise[IONO_LOCAL] * iono_sigma) ** 2
             + signals[k, FIXED_VARIANCE]
         )
+        out[TOTAL_VARIANCE, k] = out[VARIANCE, k] + iono_sigma * iono_sigma
         stated = measured[k, SD_RATE]
         if math.isnan(stated):
             stated = 0.0
-        out[k, RATE_VARIANCE] = (
+        out[RATE_VARIANCE, k] = (
             noise[RATE_ZENITH] * noise[RATE_ZENITH] * thin * thin + stated * stated
         )
+    return refused

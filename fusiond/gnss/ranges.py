@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from itertools import chain
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -122,8 +123,8 @@ class Rows(NamedTuple):
     satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
     that was assumed; `system` (n,) indices into `SYSTEMS`; `measured_at` (n,) into the epoch's
     signals; `variance` and `rate_variance` (n,) of what is independent, `ionosphere_sigma_m` (n,)
-    of what is common; `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs of
-    satellite and reason.
+    of what is common, `total_variance` (n,) of both; `troposphere_m` and `ionosphere_m` (n,) were
+    taken out; `refused` pairs of satellite and reason.
     """
 
     satellites: tuple[str, ...]
@@ -143,6 +144,7 @@ class Rows(NamedTuple):
     troposphere_m: Array
     ionosphere_m: Array
     ionosphere_sigma_m: Array
+    total_variance: Array
     refused: tuple[tuple[str, str], ...]
 
     def without(self, satellites: Collection[str]) -> Rows:
@@ -160,6 +162,7 @@ class _Plan(NamedTuple):
     keys: list[tuple[System, int, str]]
     version: int
     gps_s: float
+    serving: list[int]
     measured_at: npt.NDArray[np.intp]
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
@@ -214,16 +217,16 @@ class RangeModel:
             or plan.keys != keys
         ):
             self._plan = plan = self._make_plan(epoch, keys, now)
-        signals = epoch.signals
-        values = [_MEASURED(signals[k]) for k in plan.measured_at.tolist()]
-        measured = np.array(values, float).reshape(len(values), rk.MEASURED_COLUMNS)
+        serving = map(epoch.signals.__getitem__, plan.serving)
+        values = np.array(list(chain.from_iterable(map(_MEASURED, serving))), float)
+        measured = values.reshape(len(plan.serving), rk.MEASURED_COLUMNS)
         return Picked(plan, epoch.week, epoch.tow_s, measured)
 
     def evaluate(self, picked: Picked, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
-        plan = picked.plan
-        out = np.empty((len(plan.measured_at), rk.ROW_COLUMNS))
-        rk.range_rows(
+        plan, options = picked.plan, self.options
+        out = np.empty((rk.ROW_COLUMNS, len(plan.satellites)))
+        lost = rk.range_rows(
             plan.orbits.elements,
             plan.fixed,
             picked.measured,
@@ -232,18 +235,20 @@ class RangeModel:
             picked.tow_s,
             np.ascontiguousarray(receiver, float),
             self._noise,
+            options.elevation_mask_rad,
+            options.cno_mask_db_hz,
             out,
         )
-        satellites, signals, system, index = (
+        satellites, signals, system, index, refused = (
             plan.satellites,
             plan.signals,
             plan.system,
             plan.measured_at,
+            plan.refused,
         )
-        refused = plan.refused
-        weak = picked.measured[:, rk.CNO] < self.options.cno_mask_db_hz
-        low = out[:, rk.ELEVATION] < self.options.elevation_mask_rad
-        if (drop := weak | low).any():
+        if lost:
+            weak = picked.measured[:, rk.CNO] < options.cno_mask_db_hz
+            drop = weak | (out[rk.ELEVATION] < options.elevation_mask_rad)
             refused += tuple(
                 (satellites[k], "weak_signal" if weak[k] else "low_elevation")
                 for k in np.flatnonzero(drop)
@@ -251,25 +256,26 @@ class RangeModel:
             keep = np.flatnonzero(~drop)
             satellites = tuple(satellites[k] for k in keep)
             signals = tuple(signals[k] for k in keep)
-            system, index, out = system[keep], index[keep], out[keep]
+            system, index, out = system[keep], index[keep], out[:, keep]
         return Rows(
             satellites,
             signals,
             system,
             index,
-            out[:, rk.CORRECTED],
-            out[:, rk.CORRECTED_RATE],
-            out[:, rk.X : rk.VX],
-            out[:, rk.VX : rk.LX],
-            out[:, rk.LX : rk.RANGE],
-            out[:, rk.RANGE],
-            out[:, rk.ELEVATION],
-            out[:, rk.AZIMUTH],
-            out[:, rk.VARIANCE],
-            out[:, rk.RATE_VARIANCE],
-            out[:, rk.TROPOSPHERE],
-            out[:, rk.IONOSPHERE],
-            out[:, rk.COMMON],
+            out[rk.CORRECTED],
+            out[rk.CORRECTED_RATE],
+            out[rk.X : rk.VX].T,
+            out[rk.VX : rk.LX].T,
+            out[rk.LX : rk.RANGE].T,
+            out[rk.RANGE],
+            out[rk.ELEVATION],
+            out[rk.AZIMUTH],
+            out[rk.VARIANCE],
+            out[rk.RATE_VARIANCE],
+            out[rk.TROPOSPHERE],
+            out[rk.IONOSPHERE],
+            out[rk.COMMON],
+            out[rk.TOTAL_VARIANCE],
             refused,
         )
 
@@ -291,11 +297,13 @@ class RangeModel:
             index, ephemeris, row = served
             chosen.append((index, epoch.signals[index], ephemeris))
             fixed.append(row)
+        serving = [k for k, _, _ in chosen]
         return _Plan(
             keys,
             self.store.version,
             now,
-            np.array([k for k, _, _ in chosen], np.intp),
+            serving,
+            np.array(serving, np.intp),
             tuple(s.satellite for _, s, _ in chosen),
             tuple(s.signal for _, s, _ in chosen),
             np.array([SYSTEMS.index(s.system) for _, s, _ in chosen], np.intp),

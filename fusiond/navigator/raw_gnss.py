@@ -179,7 +179,7 @@ class RawGnss:
             rows.velocity,
             rows.pseudorange_m,
             rows.rate_m_s,
-            (rows.variance + rows.ionosphere_sigma_m**2) * scale,
+            rows.total_variance * scale,
             rows.rate_variance * scale,
             self._clock[rows.system],
             self._section.lever_arm_m,
