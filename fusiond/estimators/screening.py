@@ -8,7 +8,7 @@ Each row is judged twice, both times against a chi-square quantile with one degr
 The residual's variance follows from v = (I - H K) nu; its square over that variance is the
 statistic of leaving the row out (Teunissen, Testing Theory, 2006, section 4.4: the w-test). While
 the largest fails, that row goes and the update is made anew from the rest. The order of the rows
-does not matter.
+does not matter. A judgement looks at no more of P than the states of its row: seven of some thirty.
 """
 
 from __future__ import annotations
@@ -28,6 +28,22 @@ KEPT, GATED, RESIDUAL = 0, 1, 2
 _DETERMINED = 1e-6
 # Ranges that must fail together before the receiver's clock is to blame, not as many satellites.
 FEWEST_JUMPING = 3
+
+
+@compiled("UniTuple(f8, 2)(f8[:, ::1], f8[::1], f8, f8[:, ::1], i8, i8[:, ::1], i8)")
+def _seen(
+    cov: Array, dx: Array, z: float, h: Array, a: int, columns: Codes, count: int
+) -> tuple[float, float]:
+    """z - h dx and h P h^T of row `a` of h (m, n), whose `columns` (m, n) are the first `count`."""
+    variance = 0.0
+    for p in range(count):
+        i = columns[a, p]
+        c, along = h[a, i], 0.0
+        for q in range(count):
+            along += h[a, columns[a, q]] * cov[i, columns[a, q]]
+        z -= c * dx[i]
+        variance += c * along
+    return z, variance
 
 
 @compiled(
@@ -54,6 +70,7 @@ def screened_update(
     whitened innovation of a kept row, 0 otherwise. Returns the sum of their squares, nu^T S^-1 nu.
     """
     m, n = h.shape
+    width = cov.shape[1]
     columns = np.empty((m, n), dtype=np.int64)
     counts = np.zeros(m, dtype=np.int64)
     for a in range(m):
@@ -61,20 +78,11 @@ def screened_update(
             if h[a, i] != 0.0:
                 columns[a, counts[a]] = i
                 counts[a] += 1
-    u, k = np.empty(n), np.empty(n)
     for a in range(m):
-        innovation, s = z[a], r[a]
-        u[:] = 0.0
-        for p in range(counts[a]):
-            i = columns[a, p]
-            c = h[a, i]
-            innovation -= c * dx[i]
-            for j in range(n):
-                u[j] += c * cov[i, j]
-        for p in range(counts[a]):
-            s += h[a, columns[a, p]] * u[columns[a, p]]
-        if codes[a] == KEPT and not innovation * innovation <= threshold * s:
+        innovation, s = _seen(cov, dx, z[a], h, a, columns, counts[a])
+        if codes[a] == KEPT and not innovation * innovation <= threshold * (s + r[a]):
             codes[a] = GATED
+    g = np.empty(width)
     while True:
         cov_out[:] = cov
         dx_out[:] = dx
@@ -83,47 +91,33 @@ def screened_update(
             y[a] = 0.0
             if codes[a] != KEPT:
                 continue
-            u[:] = 0.0
-            innovation = z[a]
+            g[:] = 0.0
+            innovation, s = z[a], r[a]
             for p in range(counts[a]):
                 i = columns[a, p]
                 c = h[a, i]
                 innovation -= c * dx_out[i]
-                for j in range(n):
-                    u[j] += c * cov_out[i, j]
-            s = r[a]
+                for j in range(width):
+                    g[j] += c * cov_out[i, j]
             for p in range(counts[a]):
-                s += h[a, columns[a, p]] * u[columns[a, p]]
-            y[a] = innovation / np.sqrt(s)
+                s += h[a, columns[a, p]] * g[columns[a, p]]
+            # As in fusiond.estimators.update, row after row.
+            root = np.sqrt(s)
+            y[a] = innovation / root
             nis += y[a] * y[a]
-            # k = u / s; u is then u / sqrt(s), so that k k^T s = u u^T.
-            hk, root = 0.0, np.sqrt(s)
+            for j in range(width):
+                g[j] /= root
             for i in range(n):
-                k[i] = u[i] / s
-                u[i] /= root
-                dx_out[i] += k[i] * innovation
-            for p in range(counts[a]):
-                hk += h[a, columns[a, p]] * k[columns[a, p]]
-            # Joseph form of one row, as in fusiond.estimators.update; each product is the same to
-            # the bit with i and j exchanged.
-            c = (r[a] - (1.0 - hk) * s) / s - 1.0
-            for i in range(n):
-                for j in range(n):
-                    cov_out[i, j] += c * (u[i] * u[j])
+                c = g[i]
+                dx_out[i] += c * y[a]
+                for j in range(width):
+                    cov_out[i, j] -= c * g[j]
         worst, greatest = -1, threshold
         for a in range(m):
             if codes[a] != KEPT:
                 continue
-            residual, variance = z[a], r[a]
-            u[:] = 0.0
-            for p in range(counts[a]):
-                i = columns[a, p]
-                c = h[a, i]
-                residual -= c * dx_out[i]
-                for j in range(n):
-                    u[j] += c * cov_out[i, j]
-            for p in range(counts[a]):
-                variance -= h[a, columns[a, p]] * u[columns[a, p]]
+            residual, s = _seen(cov_out, dx_out, z[a], h, a, columns, counts[a])
+            variance = r[a] - s
             if variance > _DETERMINED * r[a] and residual * residual > greatest * variance:
                 worst, greatest = a, residual * residual / variance
         if worst < 0:
