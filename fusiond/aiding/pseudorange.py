@@ -198,26 +198,32 @@ def _measured(
     return finite, row - finite, wrong
 
 
-@compiled("void(i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[:, :, ::1])")
+@compiled("void(i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[:, ::1], f8[:, ::1])")
 def _by_clock(
     clock: Indices,
     ranges: Array,
     rates: Array,
     kept: NDArray[np.bool_],
     whitened: Array,
+    numbers: Array,
     sums: Array,
 ) -> None:
-    """Add up in `sums` (2, 2, k), zero before, what is `whitened` and `kept` (m,) of the ranges and
-    of the rates that have each of k clocks, and how many those are."""
+    """Write to `sums` (k, 2), zero before, what is `whitened` and `kept` (m,) of the ranges and of
+    the rates that have each of k clocks, added up over the root of their `numbers` (k, 2), zero
+    before."""
     row = 0
     for kind in range(2):
         for i in range(ranges.shape[0]):
             if not math.isfinite(ranges[i] if kind == 0 else rates[i]):
                 continue
             if kept[row] and clock[i] >= 0:
-                sums[kind, 0, clock[i]] += whitened[row]
-                sums[kind, 1, clock[i]] += 1.0
+                sums[clock[i], kind] += whitened[row]
+                numbers[clock[i], kind] += 1.0
             row += 1
+    for k in range(sums.shape[0]):
+        for kind in range(2):
+            if numbers[k, kind] > 0.0:
+                sums[k, kind] /= math.sqrt(numbers[k, kind])
 
 
 @immutable(eq=False)
@@ -303,11 +309,12 @@ class PseudorangeAid(Aid):
         """
         clocks = self.clock.tolist()
         count = max(clocks, default=NO_CLOCK) + 1
-        sums = np.zeros((2, 2, count))
-        used = np.asarray(kept, dtype=bool)
-        _by_clock(self.clock, self.ranges, self.rates, used, np.array(whitened, float), sums)
-        first = sorted((clocks.index(k), k) for k in range(count) if sums[:, 1, k].all())
-        return {self.satellites[at][0]: sums[:, 0, k] / np.sqrt(sums[:, 1, k]) for at, k in first}
+        numbers, sums = np.zeros((count, 2)), np.zeros((count, 2))
+        used, white = np.asarray(kept, dtype=bool), np.array(whitened, float)
+        _by_clock(self.clock, self.ranges, self.rates, used, white, numbers, sums)
+        both = (k for k, (ranges, rates) in enumerate(numbers.tolist()) if ranges and rates)
+        first = sorted((clocks.index(k), k) for k in both)
+        return {self.satellites[at][0]: sums[k] for at, k in first}
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model = state.model

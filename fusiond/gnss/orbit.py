@@ -111,10 +111,10 @@ def satellite_states(
         n = math.sqrt(q[_GM] / axis) / axis + q[_DN]
         mean = q[_M0] + n * tk
         anomaly = mean + ecc * math.sin(mean)
-        for _ in range(12):  # Newton, quadratic: two or three steps at e = 0.02
+        for _ in range(12):  # Newton: two steps at e = 0.02; one more is the last one squared
             change = (anomaly - ecc * math.sin(anomaly) - mean) / (1.0 - ecc * math.cos(anomaly))
             anomaly -= change
-            if abs(change) < 1e-14:
+            if abs(change) < 1e-8:
                 break
         sin_e, cos_e = math.sin(anomaly), math.cos(anomaly)
         nearness = 1.0 - ecc * cos_e
