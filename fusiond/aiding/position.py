@@ -152,7 +152,7 @@ def _position(
             h[i, wander[i]] = -wander_m
     for slot in time:
         late_s = xi[slot]
-        v, of_v = np.empty(m), np.zeros((m, n))
+        v, of_v, columns = np.empty(m), np.zeros((m, n)), np.empty(n, dtype=np.int64)
         antenna_velocity(nav, step, column_of, rest, c, l0, l1, l2, STEP_SMOOTH_RATE_B, v, of_v)
         f0, f1, f2 = step[STEP_SMOOTH_N], step[STEP_SMOOTH_N + 1], step[STEP_SMOOTH_N + 2]
         a = (f0, f1, f2 + gravity(nav[LAT], nav[HEIGHT]))
@@ -168,12 +168,15 @@ def _position(
             add_of_force(step, column_of, c, x0, x1, x2, h[i])
             h[i, slot] = -(v[i] + a[i] * late_s)
             if p.size:
-                variance, across = 0.0, 0.0
+                variance, across, count = 0.0, 0.0, 0
                 for j in range(n):
                     if of_v[i, j] != 0.0:
-                        across += of_v[i, j] * p[j, slot]
-                        for k in range(n):
-                            variance += of_v[i, j] * p[j, k] * of_v[i, k]
+                        columns[count] = j
+                        count += 1
+                for j in columns[:count]:
+                    across += of_v[i, j] * p[j, slot]
+                    for k in columns[:count]:
+                        variance += of_v[i, j] * p[j, k] * of_v[i, k]
                 square = a[i] * p[slot, slot]
                 left = variance * p[slot, slot] + across * across
                 r[i] += max(left - 2.0 * square * across + 0.5 * square * square, 0.0)
@@ -237,7 +240,6 @@ class PositionAid(Aid):
         return replace(self, sd=(factor * north, factor * east, factor * down))
 
     def offers(self) -> tuple[PositionOffer, ...]:
-        place = self.lat_rad, self.lon_rad, self.height_m
-        shared = self.bias, self.time, self.rest
-        offer = PositionOffer(self.t_ns, *place, self.sd, self.lever, *shared, self.bias_share)
-        return (offer._replace(wander=self.wander, wander_m=self.wander_m),)
+        measured = self.t_ns, self.lat_rad, self.lon_rad, self.height_m, self.sd, self.lever
+        shared = self.bias, self.time, self.rest, self.bias_share, self.wander, self.wander_m
+        return (PositionOffer(*measured, *shared),)

@@ -31,10 +31,15 @@ Optimal Estimation (1974), section 4.5 (Markov processes of a shaping filter).
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import meridian_radius, transverse_radius
+
+Array = NDArray[np.float64]
 
 LASTS_S = 30.0
 """Correlation time of the state. Fixes were simulated with 10 to 20 s; it is what their lag shows
@@ -49,14 +54,19 @@ GAP_S = 2.5
 FORGETS_S = 600.0
 """Streets change."""
 
-
-class _Point(NamedTuple):
-    """At `t_s`: u and v north and east, and the variance that the velocities' noise has walked."""
-
-    t_s: float
-    u: tuple[float, float]
-    v: tuple[float, float]
-    walked: float
+# Of the array that the kernels read: the last fix (ns, an integer; rad, rad; m/s; its sigma), u
+# north and east and the variance that the velocities' noise has walked. Sums over both axes: of d^2
+# over a lag less what was walked, d dv and dv^2, and their number; of d^2 from fix to fix less what
+# was walked, exp(-h / LASTS_S), their number. How many points there are, and those: of each t (s),
+# u and v north and east, what was walked.
+(
+    _AT, _LAT, _LON, _VN, _VE, _SD_V, _UN, _UE, _WALKED, _FAR, _ACROSS, _SPEEDS, _COUNT, _NEAR,
+    _ALIKE, _STEPS, _KEPT, _POINTS,
+) = range(18)  # fmt: skip
+_POINT = 6
+# Points within a lag, the one before them, the one that comes, and one for rounding.
+_MOST = round(LAG_S / STEP_S) + 3
+_SIZE = _POINTS + _POINT * _MOST
 
 
 class Fix(NamedTuple):
@@ -69,96 +79,110 @@ class Fix(NamedTuple):
     sd_v: float
 
 
+@compiled("void(f8[::1], f8, f8, f8)")
+def _keep(packed: Array, t_s: float, v_n: float, v_e: float) -> None:
+    """One point more; those go that a whole lag lies before it, but for the last of them."""
+    number = int(packed[_KEPT])
+    points = packed[_POINTS:]
+    gone = 0
+    while gone + 1 < number and t_s - points[_POINT * (gone + 1)] >= LAG_S:
+        gone += 1
+    number -= gone
+    for k in range(_POINT * number):
+        points[k] = points[k + _POINT * gone]
+    last = points[_POINT * number :]
+    last[0], last[1], last[2], last[3], last[4] = t_s, packed[_UN], packed[_UE], v_n, v_e
+    last[5] = packed[_WALKED]
+    packed[_KEPT] = number + 1.0
+
+
+@compiled("void(f8[::1])")
+def _compare(packed: Array) -> None:
+    """The last point with the first, where a lag lies between them."""
+    before = packed[_POINTS : _POINTS + _POINT]
+    at = _POINTS + _POINT * (int(packed[_KEPT]) - 1)
+    now = packed[at : at + _POINT]
+    if now[0] - before[0] < LAG_S:
+        return
+    kept = math.exp(-STEP_S / FORGETS_S)
+    packed[_FAR] *= kept
+    packed[_COUNT] = kept * packed[_COUNT] + 2.0
+    packed[_ACROSS] *= kept
+    packed[_SPEEDS] *= kept
+    for axis in range(2):
+        d = now[1 + axis] - before[1 + axis]
+        faster = now[3 + axis] - before[3 + axis]
+        packed[_FAR] += d * d - (now[5] - before[5])
+        packed[_ACROSS] += d * faster
+        packed[_SPEEDS] += faster * faster
+
+
+@compiled("void(f8[::1], i8, f8, f8, f8, f8, f8)")
+def _take(
+    packed: Array, t_ns: int, lat: float, lon: float, v_n: float, v_e: float, sd_v: float
+) -> None:
+    """The next fix: its instant (ns), place (rad, rad), velocity (m/s) and that one's sigma."""
+    at = packed[:1].view(np.int64)
+    begins, step_s = packed[_KEPT] == 0.0, (t_ns - at[0]) * 1e-9
+    if begins or not 0.0 < step_s <= GAP_S:
+        packed[_UN] = packed[_UE] = packed[_WALKED] = packed[_KEPT] = 0.0
+        _keep(packed, t_ns * 1e-9, v_n, v_e)
+    else:
+        east = lon - packed[_LON]
+        east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
+        north = (lat - packed[_LAT]) * meridian_radius(lat)
+        north -= 0.5 * (v_n + packed[_VN]) * step_s
+        east = east * transverse_radius(lat) * math.cos(lat) - 0.5 * (v_e + packed[_VE]) * step_s
+        walked = 0.5 * (sd_v * sd_v + packed[_SD_V] * packed[_SD_V]) * step_s * step_s
+        packed[_UN] += north
+        packed[_UE] += east
+        packed[_WALKED] += walked
+        kept = math.exp(-step_s / FORGETS_S)
+        packed[_NEAR] = kept * packed[_NEAR] + north * north + east * east - 2.0 * walked
+        packed[_ALIKE] = kept * packed[_ALIKE] + 2.0 * math.exp(-step_s / LASTS_S)
+        packed[_STEPS] = kept * packed[_STEPS] + 2.0
+        if t_ns * 1e-9 - packed[_POINTS + _POINT * (int(packed[_KEPT]) - 1)] >= STEP_S:
+            _keep(packed, t_ns * 1e-9, v_n, v_e)
+            _compare(packed)
+    at[0], packed[_LAT], packed[_LON] = t_ns, lat, lon
+    packed[_VN], packed[_VE], packed[_SD_V] = v_n, v_e, sd_v
+
+
+@compiled("f8(f8[::1], f8, f8)")
+def _sd_m(packed: Array, offset_sd_s: float, stated_m: float) -> float:
+    """w (m), no more than `stated_m`; `offset_sd_s` is one sigma of delta."""
+    if packed[_KEPT] == 0.0:
+        return 0.0
+    assumed, count = ASSUMED * stated_m * stated_m, packed[_COUNT]
+    if count == 0.0:
+        return math.sqrt(assumed)
+    # As many comparisons as a lag has share its errors, and are one.
+    alike = 2.0 * LAG_S / STEP_S
+    far = packed[_FAR]
+    if offset_sd_s > 0.0 and packed[_SPEEDS] > 0.0:
+        noise = max(far, 0.0) / count * alike / 2.0
+        delta = packed[_ACROSS] / (packed[_SPEEDS] + noise / (offset_sd_s * offset_sd_s))
+        far -= delta * (2.0 * packed[_ACROSS] - delta * packed[_SPEEDS])
+    near, held = packed[_NEAR] / packed[_STEPS], packed[_ALIKE] / packed[_STEPS]
+    square = far / count - near
+    square /= 2.0 * (held - math.exp(-LAG_S / LASTS_S))
+    square += (assumed - square) * alike / (count + alike)
+    return min(math.sqrt(max(square, 0.0)), stated_m)
+
+
 class Wander:
     """Of one receiver; `offset_sd_s` is one sigma of delta."""
 
-    __slots__ = (
-        "_across",
-        "_count",
-        "_far",
-        "_last",
-        "_near",
-        "_offset_sd_s",
-        "_points",
-        "_speeds",
-        "_steps",
-        "_u",
-        "_walked",
-    )
+    __slots__ = ("_offset_sd_s", "_packed")
 
     def __init__(self, offset_sd_s: float) -> None:
         self._offset_sd_s = offset_sd_s
-        self._last: Fix | None = None
-        self._u, self._walked = (0.0, 0.0), 0.0
-        self._points: deque[_Point] = deque()
-        # Sums over both axes: of d^2 over a lag less what was walked, d dv and dv^2, and their
-        # number; of d^2 from fix to fix less what was walked, exp(-h / LASTS_S), their number.
-        self._far = self._across = self._speeds = self._count = 0.0
-        self._near, self._steps = [0.0, 0.0], 0.0
+        self._packed = np.zeros(_SIZE)
 
     def take(self, fix: Fix) -> None:
         """The receiver's next fix, with its velocity."""
-        last, self._last = self._last, fix
-        step_s = math.inf if last is None else (fix.t_ns - last.t_ns) * 1e-9
-        if last is None or not 0.0 < step_s <= GAP_S:
-            self._u, self._walked = (0.0, 0.0), 0.0
-            self._points.clear()
-            self._points.append(_Point(fix.t_ns * 1e-9, self._u, fix.v, 0.0))
-            return
-        east = fix.lon_rad - last.lon_rad
-        east -= 2.0 * math.pi * round(east / (2.0 * math.pi))
-        lat = fix.lat_rad
-        moved = (
-            (lat - last.lat_rad) * meridian_radius(lat) - 0.5 * (fix.v[0] + last.v[0]) * step_s,
-            east * transverse_radius(lat) * math.cos(lat) - 0.5 * (fix.v[1] + last.v[1]) * step_s,
-        )
-        walked = 0.5 * (fix.sd_v**2 + last.sd_v**2) * step_s * step_s
-        self._u = self._u[0] + moved[0], self._u[1] + moved[1]
-        self._walked += walked
-        kept = math.exp(-step_s / FORGETS_S)
-        near, alike = self._near
-        self._near = [
-            kept * near + moved[0] ** 2 + moved[1] ** 2 - 2.0 * walked,
-            kept * alike + 2.0 * math.exp(-step_s / LASTS_S),
-        ]
-        self._steps = kept * self._steps + 2.0
-        if fix.t_ns * 1e-9 - self._points[-1].t_s >= STEP_S:
-            self._compare(_Point(fix.t_ns * 1e-9, self._u, fix.v, self._walked))
-
-    def _compare(self, now: _Point) -> None:
-        points = self._points
-        points.append(now)
-        while now.t_s - points[1].t_s >= LAG_S:
-            points.popleft()
-        before = points[0]
-        if now.t_s - before.t_s < LAG_S:
-            return
-        kept = math.exp(-STEP_S / FORGETS_S)
-        self._far, self._count = kept * self._far, kept * self._count + 2.0
-        self._across, self._speeds = kept * self._across, kept * self._speeds
-        for axis in range(2):
-            d = now.u[axis] - before.u[axis]
-            faster = now.v[axis] - before.v[axis]
-            self._far += d * d - (now.walked - before.walked)
-            self._across += d * faster
-            self._speeds += faster * faster
+        _take(self._packed, fix.t_ns, fix.lat_rad, fix.lon_rad, *fix.v, fix.sd_v)
 
     def sd_m(self, stated_m: float) -> float:
         """w (m), no more than `stated_m`; 0 of a receiver that has shown no velocity."""
-        if self._last is None:
-            return 0.0
-        assumed = ASSUMED * stated_m * stated_m
-        if not self._count:
-            return math.sqrt(assumed)
-        # As many comparisons as a lag has share its errors, and are one.
-        alike = 2.0 * LAG_S / STEP_S
-        far = self._far
-        if self._offset_sd_s and self._speeds:
-            noise = max(far, 0.0) / self._count * alike / 2.0
-            delta = self._across / (self._speeds + noise / self._offset_sd_s**2)
-            far -= delta * (2.0 * self._across - delta * self._speeds)
-        near, held = (each / self._steps for each in self._near)
-        square = far / self._count - near
-        square /= 2.0 * (held - math.exp(-LAG_S / LASTS_S))
-        square += (assumed - square) * alike / (self._count + alike)
-        return min(math.sqrt(max(square, 0.0)), stated_m)
+        return _sd_m(self._packed, self._offset_sd_s, stated_m)

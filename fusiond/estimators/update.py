@@ -1,8 +1,11 @@
 r"""Compiled kernels: gate, measurement update, feedback.
 
-An update takes one scalar row after another (rows must be uncorrelated), Joseph form:
+Rows must be uncorrelated. With S = H P H^T + R = L L^T and z the innovation
 
-    u = P h^T,  s = h u + r,  k = u / s,  P <- (I - k h) P (I - k h)^T + k r k^T
+    y = L^-1 z,   G = L^-1 H P,   nu^T S^-1 nu = y^T y,   dx <- dx + G^T y,   P <- P - G^T G
+
+which is one scalar row after another, of which the factor is kept: all of them are taken off P in
+one pass over it, and the same to the bit above the diagonal as below it.
 
 Source: Bierman, Factorization Methods (1977), section V.2; Groves, 2nd ed., eq. 3.58.
 """
@@ -23,92 +26,81 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 Array = NDArray[np.float64]
 
 
-@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])", allocates=True)
-def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: Array) -> float:
-    """nu^T S^-1 nu for z (m,), h (m, n), r (m,) variances; S = H P H^T + diag(r) = L L^T.
+@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
+def whiten(cov: Array, z: Array, h: Array, r: Array, y: Array, g: Array) -> float:
+    """nu^T S^-1 nu for z (m,), h (m, n), r (m,) variances; infinite where S is not positive.
 
-    `y` (m,) is left as the whitened innovation L^-1 z.
-
-    By Cholesky and forward substitution, without forming S^-1.
+    `y` (m,) is left as the whitened innovation L^-1 z, `g` (m, w) as L^-1 H P for P (w, w).
     """
-    m = z.shape[0]
-    n = h.shape[1]
-    u = np.zeros((m, n))
-    s = np.zeros((m, m))
+    m, n = h.shape
+    width = g.shape[1]
+    total = 0.0
     for a in range(m):
+        for j in range(width):
+            g[a, j] = 0.0
         for i in range(n):
             c = h[a, i]
             if c != 0.0:
-                for j in range(n):
-                    u[a, j] += c * cov[i, j]
-    for a in range(m):
-        for b in range(a + 1):
-            total = 0.0
-            for j in range(n):
-                total += u[a, j] * h[b, j]
-            s[a, b] = total
-        s[a, a] += r[a]
-    # Cholesky s = L L^T and forward substitution L y = z, y^T y is the answer.
-    total = 0.0
-    for a in range(m):
-        for b in range(a + 1):
-            value = s[a, b]
-            for k in range(b):
-                value -= s[a, k] * s[b, k]
-            if a == b:
-                if value <= 0.0:
-                    return np.inf
-                s[a, a] = math.sqrt(value)
-            else:
-                s[a, b] = value / s[b, b]
-        value = z[a]
-        for k in range(a):
-            value -= s[a, k] * y[k]
-        y[a] = value / s[a, a]
+                for j in range(width):
+                    g[a, j] += c * cov[i, j]
+        innovation, s = z[a], r[a]
+        for b in range(a):
+            common = 0.0
+            for i in range(n):
+                if h[a, i] != 0.0:
+                    common += h[a, i] * g[b, i]
+            innovation -= common * y[b]
+            for j in range(width):
+                g[a, j] -= common * g[b, j]
+        for i in range(n):
+            if h[a, i] != 0.0:
+                s += h[a, i] * g[a, i]
+        if s <= 0.0:
+            return np.inf
+        root = math.sqrt(s)
+        y[a] = innovation / root
         total += y[a] * y[a]
+        for j in range(width):
+            g[a, j] /= root
     return total
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
+def fold_in(cov: Array, dx: Array, y: Array, g: Array) -> None:
+    """Update `dx` (n,) and `cov` (w, w), in place, by what `whiten` left."""
+    m, width = g.shape
+    for i in range(dx.shape[0]):
+        for a in range(m):
+            c = g[a, i]
+            dx[i] += c * y[a]
+            for j in range(width):
+                cov[i, j] -= c * g[a, j]
+
+
+@compiled("void(f8[::1], f8[:, ::1], f8[::1], f8[::1])", forceinline=True)
+def take_off(z: Array, h: Array, dx: Array, out: Array) -> None:
+    """Write z - H dx to `out` (m,)."""
+    for a in range(z.shape[0]):
+        out[a] = z[a]
+        for i in range(dx.shape[0]):
+            out[a] -= h[a, i] * dx[i]
+
+
+@compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])", allocates=True)
+def normalised_innovation_squared(cov: Array, z: Array, h: Array, r: Array, y: Array) -> float:
+    """nu^T S^-1 nu for z (m,), h (m, n), r (m,); `y` (m,) is left as the whitened innovation."""
+    return whiten(cov, z, h, r, y, np.empty((z.shape[0], cov.shape[1])))
 
 
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1])", allocates=True)
 def update(cov: Array, dx: Array, z: Array, h: Array, r: Array) -> None:
-    """Fold rows z = h dx + noise (variances r) into `dx` (n,) and `cov` (n, n), in place."""
-    n = dx.shape[0]
-    u, k = np.empty(n), np.empty(n)
-    for a in range(z.shape[0]):
-        u[:] = 0.0
-        innovation, noise = z[a], r[a]
-        for i in range(n):
-            c = h[a, i]
-            if c != 0.0:
-                innovation -= c * dx[i]
-                for j in range(n):
-                    u[j] += c * cov[i, j]
-        s = noise
-        for i in range(n):
-            s += h[a, i] * u[i]
-        hk = 0.0
-        for i in range(n):
-            k[i] = u[i] / s
-            hk += h[a, i] * k[i]
-            dx[i] += k[i] * innovation
-        # T = (I - k h) P = P - k u^T;  T h^T = u (1 - h k);  P = T - T h^T k^T + k r k^T.
-        # By rows, which is vector code, and above the diagonal by the products of what is below it:
-        # the same bits. What is above it at first differs by what others have rounded.
-        if a == 0:
-            for i in range(n):
-                for j in range(i):
-                    cov[j, i] = cov[i, j]
-        c = (1.0 - hk) * s
-        for i in range(n):
-            k_i, u_i = k[i], u[i]
-            c_i, r_i = c * k_i, noise * k_i
-            for j in range(n):
-                k_j = k[j]
-                below = j <= i
-                t = k_i * u[j] if below else k_j * u_i
-                turned = c_i * k_j if below else c * k_j * k_i
-                of_noise = r_i * k_j if below else noise * k_j * k_i
-                cov[i, j] = cov[i, j] - t - turned + of_noise
+    """Fold rows z = h dx + noise (variances r) into `dx` (n,) and `cov` (w, w), in place; nothing
+    changes where S is not positive."""
+    m = z.shape[0]
+    innovation, y, g = np.empty(m), np.empty(m), np.empty((m, cov.shape[1]))
+    take_off(z, h, dx, innovation)
+    if whiten(cov, innovation, h, r, y, g) < np.inf:
+        fold_in(cov, dx, y, g)
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1])")
@@ -151,18 +143,15 @@ def fuse(
     is kept and added to instead of fed back; `z` is then the innovation before `dx` is taken off.
     `y` (m,) is left as the whitened innovation.
     """
-    n = dx.shape[0]
-    innovation = z
+    innovation, g = z, np.empty((z.shape[0], cov.shape[1]))
     if holding:
-        innovation = z.copy()
-        for a in range(z.shape[0]):
-            for i in range(n):
-                innovation[a] -= h[a, i] * dx[i]
-    nis = normalised_innovation_squared(cov, innovation, h, r, y)
+        innovation = np.empty_like(z)
+        take_off(z, h, dx, innovation)
+    nis = whiten(cov, innovation, h, r, y, g)
     if nis <= threshold:
         if not holding:
             dx[:] = 0.0
-        update(cov, dx, z, h, r)
+        fold_in(cov, dx, y, g)
         if not holding:
             feed_back(nav, xi, dx)
             dx[:] = 0.0

@@ -88,8 +88,10 @@ _LONG_AGO_NS = -(2**62)
 
 @compiled("void(f8[::1], f8[::1])")
 def _add(packed: Array, y: Array) -> None:
-    """Take in an innovation (d,)."""
+    """Take in an innovation (d,); the first begins the means."""
     d = y.shape[0]
+    if packed[_COUNT] == 0.0:
+        packed[_HEAD:] = 0.0
     for i in range(d):
         fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
         packed[_HEAD + i] = fast + FAST * (y[i] - fast)
@@ -259,8 +261,6 @@ class Means:
         if packed.shape[0] != width:
             packed = self._packed = np.concatenate((packed[:_HEAD], np.zeros(width - _HEAD)))
             packed[_COUNT] = 0.0
-        elif packed[_COUNT] == 0.0:
-            packed[_HEAD:] = 0.0
         return packed
 
     @property

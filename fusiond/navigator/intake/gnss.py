@@ -53,6 +53,8 @@ VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
 # An operator who errs by six sigma is wrong.
 OPERATOR_GATE = 1.0 - 1e-9
 _SHARED = FIX_TIME, VELOCITY_TIME, ANTENNA_LEVER
+Motion = tuple[tuple[float, ...], tuple[float, ...]]
+"""Velocity (m/s) north, east, and down where it is measured, and one sigma of each."""
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -77,6 +79,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     time, velocity_time, rest = sections.each_own(_SHARED, m.source, o)
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
     by_phase = _by_phase(m, sections)
+    motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
     wander = "" if by_phase else _wander(m.source, o, sections)
     position = PositionAid(
         m.source,
@@ -94,11 +97,11 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0),
         o.bias_sd_m == 0.0,
         wander,
-        _wandering(m, when, o, sections, sd) if wander else 0.0,
+        _wandering(m, when, motion, o, sections, sd) if wander else 0.0,
     )
-    if m.v_ned_m_s is None or not o.use_velocity:
+    if motion is None or not o.use_velocity:
         return [position]
-    v, sd_v = _velocity(m, m.v_ned_m_s, o)
+    v, sd_v = motion
     velocity = VelocityAid(
         f"{m.source}{SUFFIX}",
         when.t_ns - round(o.velocity_delay_s * 1e9),
@@ -136,9 +139,7 @@ def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:
     return horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP)
 
 
-def _velocity(
-    m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssAiding
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _velocity(m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssAiding) -> Motion:
     """North, east, and down where it is measured, and one sigma of each."""
     north, east, down = v_ned
     sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
@@ -181,15 +182,20 @@ def _wander(source: str, section: GnssAiding, sections: Sections) -> str:
 
 
 def _wandering(
-    m: PositionFix, when: Instants, o: GnssAiding, sections: Sections, sd: Vector3
+    m: PositionFix,
+    when: Instants,
+    motion: Motion | None,
+    o: GnssAiding,
+    sections: Sections,
+    sd: Vector3,
 ) -> float:
     """How many metres of that there are, as this receiver's fixes and velocities have shown."""
     known = sections.wander.get(m.source)
     if known is None:
         offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
         known = sections.wander[m.source] = Wander(offset_sd_s)
-    if m.v_ned_m_s is not None:
-        (north, east, *_), sds = _velocity(m, m.v_ned_m_s, o)
+    if motion is not None:
+        (north, east, *_), sds = motion
         sd_v = math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
         known.take(Fix(when.t_ns, m.lat_rad, m.lon_rad, (north, east), sd_v))
     return known.sd_m(math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)))
