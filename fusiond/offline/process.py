@@ -130,7 +130,7 @@ def _read(
         for name, rejected in log.rejected.items():
             rows = [row for row in arrivals if row.measurement.source == name]
             if rows or rejected:
-                files[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
+                files[name] = FileRead(_span_s(rows), len(rows), rejected)
     else:
         assert imu_path is not None
         imu = read_imu(imu_path)
@@ -138,7 +138,7 @@ def _read(
     for kind, path in aids:
         rows, rejected = READERS[kind](path, imu, source_of(kind, config))
         name = kind if kind not in files else f"{kind}:{path.name}"
-        files[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
+        files[name] = FileRead(_span_s(rows), len(rows), rejected)
         arrivals += rows
     held = Counter[str]()
     if outages:
@@ -157,7 +157,7 @@ def _read(
 
 def _imu_read(imu: ImuTable) -> FileRead:
     span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
-    return FileRead(span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)
+    return FileRead(span_s, len(imu.t_s), imu.rejected)
 
 
 def _process(
