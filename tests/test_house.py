@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -63,6 +64,20 @@ def test_floors_are_those_of_the_contract(tmp_path: Path) -> None:
         '[[tool.importlinter.contracts]]\nid = "floors"\nlayers = ["a", "b | (c)", "(d)"]\n'
     )
     assert floors(pyproject) == [["a"], ["b", "c"], ["d"]]
+
+
+def test_no_room_of_the_daemon_is_left_out_of_its_contract() -> None:
+    """`recording` was: a simulated vehicle could be imported there, and nobody told."""
+    levels = floors(REPOSITORY / "pyproject.toml")
+    above = [room for level in levels[: levels.index(["simulation"])] for room in level]
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    (held,) = (
+        contract["source_modules"]
+        for contract in project["tool"]["importlinter"]["contracts"]
+        if contract["id"] == "daemon"
+    )
+    free = {"__main__", "batch", "bench", "commands", "demo", "studies"}
+    assert {f"fusiond.{room}" for room in above if room not in free} == set(held)
 
 
 def test_the_house_is_that_of_the_sources() -> None:
