@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import subprocess
+import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -61,6 +64,20 @@ def test_floors_are_those_of_the_contract(tmp_path: Path) -> None:
         '[[tool.importlinter.contracts]]\nid = "floors"\nlayers = ["a", "b | (c)", "(d)"]\n'
     )
     assert floors(pyproject) == [["a"], ["b", "c"], ["d"]]
+
+
+def test_no_room_of_the_daemon_is_left_out_of_its_contract() -> None:
+    """`recording` was: a simulated vehicle could be imported there, and nobody told."""
+    levels = floors(REPOSITORY / "pyproject.toml")
+    above = [room for level in levels[: levels.index(["simulation"])] for room in level]
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    (held,) = (
+        contract["source_modules"]
+        for contract in project["tool"]["importlinter"]["contracts"]
+        if contract["id"] == "daemon"
+    )
+    free = {"__main__", "batch", "bench", "commands", "demo", "studies"}
+    assert {f"fusiond.{room}" for room in above if room not in free} == set(held)
 
 
 def test_the_house_is_that_of_the_sources() -> None:
@@ -125,3 +142,96 @@ def test_every_room_says_what_it_must_not_do() -> None:
     }
     packages = {path.parent.name for path in REPOSITORY.glob("fusiond/*/__init__.py")}
     assert packages | {"drivers"} <= rows
+
+
+def test_every_room_has_its_tests() -> None:
+    rooms = {path.parent.name for path in REPOSITORY.glob("fusiond/*/__init__.py")} | {"drivers"}
+    tested = {
+        path.relative_to(REPOSITORY).parts[1] for path in REPOSITORY.glob("tests/**/test_*.py")
+    }
+    assert rooms - tested == set()
+
+
+def test_files_that_are_named_exist() -> None:
+    """In sources, configurations and pages: those that have moved keep no old name."""
+    kept = subprocess.run(
+        ("git", "ls-files"), cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    named = re.compile(
+        r"(?<![\w/.])(?:fusiond|drivers|tests|tools|docs|config|benchmarks|systemd)/[\w/.-]*"
+        r"\.(?:py|md|toml|dbc|sh|service|rules|network|json|csv|svg|png)\b"
+    )
+    ours = [name for name in kept.stdout.split() if name.endswith((".py", ".md", ".toml", ".yml"))]
+    missing = {
+        f"{name}: {path}"
+        for name in ours
+        for path in named.findall((REPOSITORY / name).read_text())
+        if not (REPOSITORY / path).exists()
+    }
+    # In a wheel `drivers/config` is the folder `config`.
+    assert {text for text in missing if ": drivers/config/" not in text} == set()
+
+
+NOT_IN_THE_PROGRAM = {
+    "fusiond.files.fixed_decimal.MAX_DECIMALS": "the domain of what it is a bound of",
+    "fusiond.navigation.error_model.dense_transition": "what the kernels never form",
+    "fusiond.simulation.can.aids.SIM_BAROMETER": "a device for who simulates one",
+    "fusiond.studies.observability.gramian_stable": "an equation of paper 002",
+}
+"""Module-level names that tests alone use, and why they are there."""
+
+
+def test_what_stands_at_module_level_is_used() -> None:
+    """By the program, an entry point or a decorator: what tests alone use is named above."""
+    sources = {
+        ".".join(path.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__init__"): (
+            ast.parse(path.read_text())
+        )
+        for room in ("fusiond", "drivers")
+        for path in (REPOSITORY / room).rglob("*.py")
+    }
+    used = set(re.findall(r'= "([\w.]+:\w+)"', (REPOSITORY / "pyproject.toml").read_text()))
+    used = {name.replace(":", ".") for name in used}
+    for module, tree in sources.items():
+        used |= _used(module, tree)
+    unused = {
+        name
+        for module, tree in sources.items()
+        for name in _defined(module, tree)
+        if not {name, name.rpartition(".")[2]} & used
+    }
+    assert unused == set(NOT_IN_THE_PROGRAM)
+
+
+def _defined(module: str, tree: ast.Module) -> list[str]:
+    """Functions and classes without decorators, and constants."""
+    found = []
+    for node in tree.body:
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                found += [] if node.decorator_list else [node.name]
+            case ast.Assign():
+                found += [target.id for target in node.targets if isinstance(target, ast.Name)]
+            case ast.AnnAssign(target=ast.Name(id=name)):
+                found.append(name)
+    return [f"{module}.{name}" for name in found if not name.startswith("__")]
+
+
+def _used(module: str, tree: ast.Module) -> set[str]:
+    """What a module takes of others and of itself, beside the definition."""
+    used: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            used |= {f"{node.module}.{alias.name}" for alias in node.names}
+    for top in tree.body:
+        own = {getattr(top, "name", "")}
+        if isinstance(top, ast.Assign | ast.AnnAssign):
+            targets = top.targets if isinstance(top, ast.Assign) else [top.target]
+            own = {target.id for target in targets if isinstance(target, ast.Name)}
+        for node in ast.walk(top):
+            match node:
+                case ast.Name(id=name) if name not in own:
+                    used.add(f"{module}.{name}")
+                case ast.Attribute(attr=attribute):
+                    used.add(attribute)  # of a module, maybe: `study.run`
+    return used

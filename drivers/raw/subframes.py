@@ -7,13 +7,12 @@ what it completes. What it refuses it names by raising `RefusedError`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.raw.bits import Bits, KlobucharTable
 from drivers.raw.messages import Ephemeris, Klobuchar, System
-from drivers.raw.weeks import HALF_WEEK_S, WeekReference
+from drivers.raw.weeks import HALF_WEEK_S
 
 MAX_ECCENTRICITY = 0.5
 """What the 32 bits of IS-GPS-200 table 20-III are said to hold at most (0.03); GPS and Galileo
@@ -59,7 +58,6 @@ class Parts:
 
 
 Decoded = list[Ephemeris | Klobuchar]
-Decode = Callable[[Subframe, WeekReference], Decoded]
 
 
 def ephemeris(subframe: Subframe, message: str, numbers: dict[str, Any], **rest: Any) -> Ephemeris:

@@ -33,8 +33,7 @@ from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 
 GEOSTATIONARY_RADIUS_M = 42_164_170.0
 LONGITUDES_DEG = (80.0, 140.0)
-"""Working satellites; the spare stands at `SPARE_LONGITUDE_DEG`."""
-SPARE_LONGITUDE_DEG = 110.5
+"""Working satellites; the spare stands at 110.5 deg."""
 
 ELEVATION_MASK_RAD = math.radians(5.0)
 """Customary mask: below it the troposphere is crossed over more than ten zenith thicknesses

@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
@@ -51,8 +50,6 @@ from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
 from fusiond.studies.reduced_order import cost as reduced_cost
-
-Array = NDArray[np.float64]
 
 REPETITIONS = 15
 PROCESS_S = 1560.0

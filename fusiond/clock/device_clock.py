@@ -22,8 +22,6 @@ _JITTER_NS = 50 * MILLISECOND_NS
 """Beyond the jitter of a serial line (1 to 16 ms for USB); 5000 ppm of drift over the window."""
 _LATE_FOR_NS = 120 * SECOND_NS
 """A busy host is late for seconds; what lasts for two minutes is the device's clock."""
-_RESTART_NS = SECOND_NS
-"""A device clock that moves by more than this against the host has been restarted."""
 _CONFIRM_SAMPLES = 3
 
 

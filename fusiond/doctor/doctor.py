@@ -15,7 +15,6 @@ from typing import Any, TextIO
 
 import aiomqtt
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.base import Driver, Emitted
 from drivers.measurements import DeviceEvent, ImuSample, TimeReport
@@ -28,8 +27,6 @@ from fusiond.doctor.devices import device_name, open_findings
 from fusiond.doctor.values import KEPT, Values
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.outputs import broker_access
-
-Array = NDArray[np.float64]
 
 BURST_S = 0.1
 """What comes within one read of a line, such as all ephemerides, has no rate."""

@@ -11,14 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse
-
-Array = NDArray[np.float64]
 
 
 class KalmanEstimator(ErrorStateFilter):

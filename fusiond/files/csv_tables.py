@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO, TextIOWrapper
 from math import inf, isfinite, nan
@@ -45,14 +45,17 @@ class MissingPackageError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A row that is not used: line in the file (the header is 1), reason's name, what was seen."""
+    """A row that is not used: line in the file (the header is 1; 0: it has none), reason's name,
+    what was seen, and how often."""
 
     line: int
     reason: str
     detail: str
+    times: int = 1
 
     def __str__(self) -> str:
-        return f"line {self.line}: {self.reason}: {self.detail}"
+        where = f"line {self.line}: " if self.line else ""
+        return f"{where}{self.reason}: {self.detail}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +94,17 @@ class RawTable:
     rejected: list[Rejection]
 
 
+def counted(refused: Mapping[str, int]) -> list[Rejection]:
+    """Rejections of what has no lines, frames and sentences, from their number by reason."""
+    return [Rejection(0, name, f"{n} times", n) for name, n in refused.items() if n]
+
+
 def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
     """How many rows were rejected for each reason."""
-    return dict(Counter(r.reason for r in rejected))
+    found = Counter[str]()
+    for each in rejected:
+        found[each.reason] += each.times
+    return dict(found)
 
 
 def file_report(rows: int, rejected: Sequence[Rejection], first: int = 5) -> dict[str, Any]:

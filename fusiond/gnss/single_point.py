@@ -58,21 +58,19 @@ class Dops(NamedTuple):
 
 class SinglePoint(NamedTuple):
     """`position` (3,) ECEF m with `covariance` (3, 3) m^2; `clock_m` by system letter;
-    `ionosphere_sigmas` n; `velocity` (3,) ECEF m/s with `velocity_covariance` (3, 3) (m/s)^2 and
-    `drift_m_s`, None without enough rates;
-    `rows` those used with `residual_m` (n,); `refused` pairs of satellite and reason;
+    `velocity` (3,) ECEF m/s with `velocity_covariance` (3, 3) (m/s)^2 and `drift_m_s`, None without
+    enough rates;
+    `rows` those used; `refused` pairs of satellite and reason;
     `statistic` of the residual test against `bound` with `redundancy` degrees of freedom."""
 
     position: Array
     covariance: Array
     clock_m: dict[str, float]
-    ionosphere_sigmas: float
     velocity: Array | None
     velocity_covariance: Array | None
     drift_m_s: float | None
     dops: Dops
     rows: Rows
-    residual_m: Array
     refused: tuple[tuple[str, str], ...]
     statistic: float
     bound: float
@@ -147,13 +145,11 @@ def single_point(
         position,
         fit.covariance[:3, :3],
         {SYSTEMS[s]: float(c) for s, c in zip(fit.systems, fit.clocks, strict=True)},
-        fit.ionosphere,
         velocity,
         velocity_covariance,
         drift,
         quality,
         rows,
-        fit.residual,
         rows.refused + tuple((s, "residual") for s in out),
         statistic,
         bound,

@@ -32,7 +32,8 @@ SAVE_EVERY_S = 300
 class CalibrationKeeper:
     """Keeps one vehicle's calibration beside its saved state, where that is kept.
 
-    `on_event(code, text)` hears `calibration_damaged` and `calibration_refused`.
+    What is taken up is told in the log. `on_event(code, text)` hears `calibration_damaged` and
+    `calibration_refused`.
     """
 
     def __init__(
@@ -58,6 +59,9 @@ class CalibrationKeeper:
             self._event("calibration_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
         except RefusedStateError as error:
             self._event("calibration_refused", f"{self._path}: {error}")
+        else:
+            found = navigator.calibration.values if navigator.calibration else ()
+            log.info("%s: %s", self._path, ", ".join(found) or "no saved calibration")
 
     def keep(self, t_ns: int, navigator: Navigator) -> None:
         """Renew the file, if it is due and something has been observed."""

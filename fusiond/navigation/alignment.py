@@ -52,24 +52,6 @@ def levelling_jacobian(dcm: Array, lat: float, height: float) -> Array:
     return np.vstack([dcm[1] / g, -dcm[0] / g, np.zeros(3)])
 
 
-def level_in_motion(
-    mean_force: Array, acceleration: Array, yaw: float, g: float
-) -> tuple[float, float]:
-    """Roll and pitch (rad) from mean force (3,) and known acceleration (3,) NED at a known yaw.
-
-    Solves R_x(roll) f = R_y(pitch)^T R_z(yaw)^T (a - g e_D).
-    """
-    n, e, d = acceleration[0], acceleration[1], acceleration[2] - g
-    x, y = math.cos(yaw) * n + math.sin(yaw) * e, -math.sin(yaw) * n + math.cos(yaw) * e
-    f_x, f_y, f_z = (float(v) for v in mean_force)
-    size = math.hypot(f_y, f_z)
-    # cos(roll) f_y - sin(roll) f_z = y, on the branch where gravity still points down.
-    roll = math.asin(max(-1.0, min(1.0, y / size))) + math.atan2(-f_y, -f_z)
-    down = math.sin(roll) * f_y + math.cos(roll) * f_z
-    pitch = math.atan2(d, x) - math.atan2(down, f_x)
-    return roll, (-pitch + math.pi) % (2.0 * math.pi) - math.pi
-
-
 @compiled(
     "void(i8[::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])",
     allocates=True,

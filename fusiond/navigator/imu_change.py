@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG
@@ -13,8 +12,6 @@ from fusiond.estimators.base import Estimator
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.error_model import COLUMN_END, PHI, RATE_ERROR
 from fusiond.navigator.timeline import Timeline
-
-Array = NDArray[np.float64]
 
 
 def publish_by_axes(estimator: Estimator, imu: Imu, spare: bool = False) -> None:

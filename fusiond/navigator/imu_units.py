@@ -20,7 +20,6 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.measurements import PositionFix
 from fusiond.aiding.base import Aid
@@ -30,8 +29,6 @@ from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer, squares
 from fusiond.navigator.imu_way import PROOF, WayTurns
-
-Array = NDArray[np.float64]
 
 # In a loop of 2 g for half of the time nobody flies, and half of gravity for as long nobody falls.
 FORCE_RANGE = (0.5, 2.0)

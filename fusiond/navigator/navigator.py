@@ -44,6 +44,7 @@ from fusiond.navigator.standing import Standing
 from fusiond.navigator.state_file import RefusedStateError
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
 from fusiond.navigator.warm_start import WarmStart
+from fusiond.navigator.worth import Begun, Worth
 
 Array = NDArray[np.float64]
 
@@ -102,6 +103,10 @@ class Navigator:
         """What an earlier drive has shown, taken up by each alignment until it is refuted."""
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
         self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
+        self._worth = Worth(
+            *(config, self.estimator, self.imu, self.timeline),
+            *(self._door, self._units, self._standing, self._lateness),
+        )
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -343,31 +348,10 @@ class Navigator:
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
         """What the solution is worth at `t_ns`, and why."""
-        if not self.imu.end:
-            return Mode.WAITING, self._door.silence(None)
-        if self._units.wrong is not None:
-            return Mode.INVALID, self._units.wrong
-        silent = (t_ns - self.imu.latest_ns) * 1e-9
-        if self.started is None:
-            if silent > self.config.imu.gap_s:
-                return Mode.WAITING, self._door.silence(silent)
-            return Mode.ALIGNING, self._aligner.reason
-        if silent > self.config.imu.gap_s:
-            return Mode.INVALID, self._door.silence(silent)
-        e, p = self.estimator, self.estimator.covariance.item
-        if not 0.0 <= (variance := p(6, 6) + p(7, 7)) <= self.config.estimator.invalid_sd_m**2:
-            return Mode.INVALID, f"horizontal sigma {np.sqrt(variance):.0f} m"
-        if hangs := self.unconfirmed:
-            return Mode.COASTING, f"heading from {self.started.how}; {hangs}"
-        if (why := self._standing.unproven(self.estimator.t_ns)) is not None:
-            return Mode.INVALID, why
-        shaken = self._standing.shaken(e, self.timeline.isolation) or self._lateness.suspects
-        if (why := shaken or self._units.unproven(e)) is not None:
-            return Mode.COASTING, why
-        unaided = (t_ns - self._last_position_ns) * 1e-9
-        if unaided > self.config.estimator.coast_after_s:
-            return Mode.COASTING, f"no position fused for {unaided:.0f} s"
-        return Mode.NAVIGATING, f"heading from {self.started.how}"
+        begun = None
+        if self.started is not None:
+            begun = Begun(self.started.how, self.unconfirmed, self._last_position_ns)
+        return self._worth.of(t_ns, begun, self._aligner.reason)
 
     # ------------------------------------------------------------------ inside
 

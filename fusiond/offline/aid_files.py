@@ -28,7 +28,7 @@ from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
 from fusiond.configuration.aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import Rejection, TableError
+from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.tables import (
     ImuTable,
     read_attitude,
@@ -239,7 +239,7 @@ def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
         rows.append(Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
     if found and not rows:
         raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
-    refused = [Rejection(0, name, f"{count} times") for name, count in decoder.counters.items()]
+    refused = counted(decoder.counters)
     return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
 
 
@@ -267,11 +267,7 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
         epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
     if not epochs:
         raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
-    refused = [
-        Rejection(0, name, f"{count} times")
-        for name, count in decoder.counters.items()
-        if count and name.endswith(_REFUSALS)
-    ]
+    refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
     return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused
 

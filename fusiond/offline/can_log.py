@@ -13,7 +13,7 @@ import importlib.util
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -24,6 +24,7 @@ import numpy as np
 from drivers.base import Emitted
 from drivers.can.bus import CanFrame
 from drivers.can.driver import CanDriver
+from drivers.can.imu import CanImuDriver
 from drivers.can.python_can import can, with_mf4
 from drivers.measurements import (
     DeviceEvent,
@@ -35,7 +36,7 @@ from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
+from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
 from fusiond.files.tables import ImuTable
 from fusiond.offline.aid_files import Arrival
 
@@ -62,8 +63,8 @@ REFUSALS = {
 
 
 class CanLog(NamedTuple):
-    """What a log holds: IMU samples, aids with their arrivals, refusals by source and number of
-    measurements by source; `events` (code, text) of devices and clock."""
+    """What a log holds: IMU samples with what was refused of them, aids with their arrivals,
+    refusals of frames (`can`) and by source of an aid; `events` (code, text)."""
 
     imu: ImuTable
     arrivals: list[Arrival]
@@ -139,11 +140,14 @@ class _Replay:
             for driver in buses[message.channel]:
                 driver.feed(frame)
         cut = [Rejection(0, "cut", f"the log ends in damage: {text}") for text in damage]
-        rejected = {"can": [*_rejections(frames), *cut]}
+        rejected, imu = {"can": [*counted(frames), *cut]}, self._imu_table()
         for name, driver in self._drivers.items():
-            refused = {n: c for n, c in driver.counters.items() if n in REFUSALS}
-            rejected[name] = _rejections(refused)
-        return CanLog(self._imu_table(), self._arrivals, rejected, self._events)
+            refused = counted({n: c for n, c in driver.counters.items() if n in REFUSALS})
+            if isinstance(driver, CanImuDriver):
+                imu.rejected.extend(refused)
+            else:
+                rejected[name] = refused
+        return CanLog(imu, self._arrivals, rejected, self._events)
 
     def _buses(self) -> dict[Any, list[CanDriver[Any]]]:
         """Whose frames those of each channel of the log are.
@@ -192,7 +196,8 @@ class _Replay:
         kept = [(t_ns, m) for t_ns, m in self._imu if m.source == first]
         rejected = []
         if len(kept) < len(self._imu):
-            rejected.append(Rejection(0, "second_imu", f"{len(self._imu) - len(kept)} samples"))
+            others = len(self._imu) - len(kept)
+            rejected.append(Rejection(0, "second_imu", f"{others} samples", others))
         times = np.array([t_ns for t_ns, _ in kept], dtype=np.int64)
         gyro = np.array([m.gyro_rad_s for _, m in kept], dtype=np.float64).reshape(-1, 3)
         accel = np.array([m.accel_m_s2 for _, m in kept], dtype=np.float64).reshape(-1, 3)
@@ -276,7 +281,3 @@ def _not_data(message: can.Message) -> str | None:
     if message.is_error_frame:
         return "error_frames"
     return "remote_frames" if message.is_remote_frame else None
-
-
-def _rejections(counted: Mapping[str, int]) -> list[Rejection]:
-    return [Rejection(0, name, f"{count} times") for name, count in counted.items() if count]

@@ -11,30 +11,27 @@ import gc
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurements import (
-    Measurement,
-    MonotonicStamp,
-)
-from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
-from fusiond.configuration.aiding import GnssAiding, RawAiding, WheelAiding
+from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch, System
+from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
-from fusiond.files.csv_tables import TableError, counts
+from fusiond.files.csv_tables import counts
 from fusiond.files.solution_csv import STATUS
-from fusiond.files.tables import ImuTable, read_imu
+from fusiond.files.tables import ImuTable
 from fusiond.models.model import Model
 from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.navigator import Navigator
-from fusiond.offline.aid_files import READERS, Arrival, source_of
-from fusiond.offline.outages import Outage, named, withheld
+from fusiond.offline.aid_files import Arrival
+from fusiond.offline.outages import Outage
 from fusiond.offline.reasons import FileRead, apart, nothing_navigated, wrong_units
+from fusiond.offline.recorded import Recorded, read_recorded, valid_ns
 from fusiond.offline.rows import Rows, RowsWriter
 
 if TYPE_CHECKING:
@@ -75,7 +72,7 @@ def process(
     whose package is not installed.
     """
     with _imports_left_alone():
-        read = _read(config, imu_path, aids, outages or (), systems, can_log)
+        read = read_recorded(config, imu_path, aids, outages or (), systems, can_log)
         return _process(read, out, watch, smooth, progress)
 
 
@@ -94,74 +91,8 @@ def _imports_left_alone() -> Iterator[None]:
         gc.unfreeze()
 
 
-@dataclass(slots=True)
-class _Read:
-    """What has been read, and of which files; `withheld` measurements by source."""
-
-    config: Config
-    imu: ImuTable
-    arrivals: list[Arrival]
-    files: dict[str, FileRead]
-    events: list[dict[str, str]]
-    withheld: Counter[str]
-
-
-def _read(
-    config: Config,
-    imu_path: Path | None,
-    aids: list[tuple[str, Path]],
-    outages: Sequence[Outage],
-    systems: tuple[System, ...] | None,
-    can_log: Path | None,
-) -> _Read:
-    if any(kind == "raw" for kind, _ in aids):
-        config = _with_raw(config, systems)
-    events: list[dict[str, str]] = []
-    arrivals: list[Arrival] = []
-    files: dict[str, FileRead] = {}
-    if can_log is not None:
-        # python-can and the DBC files' reader come only where there is a bus to be read.
-        from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
-
-        log = read_can_log(can_log, config)
-        imu, arrivals = log.imu, log.arrivals
-        events += [{"code": code, "text": text} for code, text in log.events]
-        files["imu"] = _imu_read(imu)
-        for name, rejected in log.rejected.items():
-            rows = [row for row in arrivals if row.measurement.source == name]
-            if rows or rejected:
-                files[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
-    else:
-        assert imu_path is not None
-        imu = read_imu(imu_path)
-        files["imu"] = _imu_read(imu)
-    for kind, path in aids:
-        rows, rejected = READERS[kind](path, imu, source_of(kind, config))
-        name = kind if kind not in files else f"{kind}:{path.name}"
-        files[name] = FileRead(_span_s(rows), len(rows) + len(rejected), rejected)
-        arrivals += rows
-    held = Counter[str]()
-    if outages:
-        there = {row.measurement.source for row in arrivals}
-        unknown = sorted(named(outages) - there - set(config.sources))
-        if unknown:
-            known = ", ".join(sorted(there))
-            raise TableError(f"outage of {unknown[0]}: no aid comes from it; there are {known}")
-        kept = [row for row in arrivals if not _withheld(row.measurement, outages)]
-        held += Counter(row.measurement.source for row in arrivals)
-        held -= Counter(row.measurement.source for row in kept)
-        arrivals = kept
-    arrivals.sort(key=lambda a: a.t_arrival_ns)
-    return _Read(config, imu, arrivals, files, events, held)
-
-
-def _imu_read(imu: ImuTable) -> FileRead:
-    span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
-    return FileRead(span_s, len(imu.t_s) + len(imu.rejected), imu.rejected)
-
-
 def _process(
-    read: _Read,
+    read: Recorded,
     out: Path | None,
     watch: Callable[[Navigator], None],
     smooth: bool,
@@ -232,45 +163,12 @@ def outcomes_of(navigator: Navigator, withheld: Mapping[str, int]) -> dict[str, 
     return sources
 
 
-def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
-    """The configuration with a section for the raw data of a file, and the systems asked for."""
-    name = source_of("raw", config)
-    section = config.aiding.get(name)
-    raw = section if isinstance(section, RawAiding) else RawAiding()
-    if systems is not None:
-        raw = raw.model_copy(update={"systems": systems})
-    return config.model_copy(update={"aiding": {**config.aiding, name: raw}})
-
-
 def _account(file: FileRead) -> dict[str, Any]:
     return {
         "rows": file.rows,
         "rejected": counts(file.rejected),
         "first_rejected": [str(r) for r in file.rejected[:_SHOWN]],
     }
-
-
-def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
-    """Of the measurements' instants; what a satellite broadcasts has none."""
-    valid_ns = [
-        _valid_ns(row.measurement)
-        for row in rows
-        if not isinstance(row.measurement, Ephemeris | Klobuchar)
-    ]
-    return (min(valid_ns) * 1e-9, max(valid_ns) * 1e-9) if valid_ns else None
-
-
-def _withheld(m: Measurement | RawEvent, outages: Sequence[Outage]) -> bool:
-    if isinstance(m, Ephemeris | Klobuchar):
-        return False
-    return withheld(m.source, _valid_ns(m) * 1e-9, outages)
-
-
-def _valid_ns(m: Measurement | RawGnssEpoch) -> int:
-    """The instant of the IMU's clock that a recorded measurement is valid at."""
-    stamp = getattr(m, "stamp", None)
-    assert isinstance(stamp, MonotonicStamp)
-    return stamp.t_ns
 
 
 def _run(
@@ -322,7 +220,7 @@ def _give(navigator: Navigator, arrival: Arrival) -> None:
     if isinstance(m, Ephemeris | Klobuchar):
         navigator.learn(m)
         return
-    navigator.add(m, _valid_ns(m), arrival.sd_time_s)
+    navigator.add(m, valid_ns(m), arrival.sd_time_s)
 
 
 def _is_late(arrival: Arrival, config: Config) -> bool:
@@ -335,7 +233,7 @@ def _is_late(arrival: Arrival, config: Config) -> bool:
     section = config.aiding.get(m.source)
     delayed = isinstance(section, GnssAiding) and section.velocity_delay_s > 0.0
     delayed |= isinstance(section, WheelAiding) and section.latency_s > 0.0
-    return delayed or config.imu.time_offset_s > 0.0 or _valid_ns(m) < arrival.t_arrival_ns
+    return delayed or config.imu.time_offset_s > 0.0 or valid_ns(m) < arrival.t_arrival_ns
 
 
 def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:

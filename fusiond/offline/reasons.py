@@ -22,11 +22,21 @@ _TIMES = {"time_backwards", "time_ahead"}
 @dataclass(frozen=True, slots=True)
 class FileRead:
     """A file's rows as they were read: s of its own time from the first to the last that is used
-    (None: none is), how many, and those that are not."""
+    (None: none is), how many are, and those that are not."""
 
     span_s: tuple[float, float] | None
-    rows: int
+    used: int
     rejected: Sequence[Rejection]
+
+    @property
+    def refused(self) -> int:
+        """Rows that are not used."""
+        return sum(counts(self.rejected).values())
+
+    @property
+    def rows(self) -> int:
+        """All of them."""
+        return self.used + self.refused
 
 
 def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
@@ -73,7 +83,7 @@ def nothing_navigated(
     alignment's.
     """
     for name, file in files.items():
-        if len(file.rejected) > file.rows / 2:
+        if file.refused > file.used:
             return _refused_rows(name, file)
     (imu_name, imu), *aids = files.items()
     if not aids:
@@ -101,10 +111,11 @@ def apart(files: Mapping[str, FileRead]) -> list[str]:
 def _refused_rows(name: str, file: FileRead) -> str:
     by_reason = Counter(counts(file.rejected))
     times = sum(by_reason[reason] for reason in _TIMES)
-    if times > len(file.rejected) / 2:
+    if times > file.refused / 2:
         return f"{name}: its times run backwards in {times} of {file.rows} rows"
     most, number = by_reason.most_common(1)[0]
-    return f"{name}: {number} of {file.rows} rows are refused as {most}: {file.rejected[0]}"
+    said = f"{name}: {number} of {file.rows} rows are refused as {most}"
+    return f"{said}: {file.rejected[0]}" if file.rejected[0].line else said
 
 
 def _overlap(a: FileRead, b: FileRead) -> bool:

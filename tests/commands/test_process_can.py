@@ -78,6 +78,29 @@ def test_a_bus_from_its_raw_frames(part: Path, tmp_path: Path) -> None:
 
 
 @needs_drive
+def test_frames_that_cannot_be_read_are_refused_rows(part: Path, tmp_path: Path) -> None:
+    """Of the IMU and of the receiver, each as often as it came: one of the IMU's ended `process`
+    with a division by zero."""
+    whole, _ = run(part, tmp_path)
+    left = {" 009#": 1, " 003#": 3}
+    damaged = tmp_path / "damaged.log.gz"
+    with gzip.open(part, "rt") as sound, gzip.open(damaged, "wt", compresslevel=1) as lines:
+        for k, line in enumerate(sound):
+            hit = next((frame for frame, n in left.items() if n and k > 3000 and frame in line), "")
+            left.update({hit: left[hit] - 1} if hit else {})
+            lines.write(f"{line.partition('#')[0]}#00\n" if hit else line)
+    report, _ = run(damaged, tmp_path)
+    for source, times in {"imu": 1, "gnss": 3}.items():
+        now, before = report["files"][source], whole["files"][source]
+        assert now["rejected"]["wrong_length"] == times
+        assert f"wrong_length: {times} times" in now["first_rejected"]
+        used = [file["rows"] - sum(file["rejected"].values()) for file in (before, now)]
+        assert used[0] - used[1] == times
+    assert report["solution_rows"] == pytest.approx(whole["solution_rows"], abs=1)
+    assert " of 6" in process(CONFIG, "--can", damaged)[1]  # samples
+
+
+@needs_drive
 def test_an_outage_of_the_receiver_leaves_the_wheels(part: Path, tmp_path: Path) -> None:
     whole, _ = run(part, tmp_path)
     report, out = run(part, tmp_path, "--outage", f"{OUTAGE_S}:60:gnss")

@@ -42,6 +42,18 @@ def test_what_was_kept_is_taken_up(tmp_path: Path) -> None:
     assert offered(config) == (saved, [])
 
 
+def test_what_is_taken_up_stands_in_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config, path = vehicle(tmp_path), tmp_path / "truck.calibration.json"
+    with caplog.at_level("INFO", "fusiond"):
+        offered(config)
+        assert caplog.messages == [f"{path}: no saved calibration"]
+        save_calibration(path, SavedCalibration(mounting_digest(config), VALUES))
+        offered(config)
+    assert caplog.messages[1:] == [f"{path}: mounting_yaw_deg"]
+
+
 def test_another_mounting_voids_it(tmp_path: Path) -> None:
     saved = SavedCalibration(mounting_digest(vehicle(tmp_path)), VALUES)
     save_calibration(tmp_path / "truck.calibration.json", saved)

@@ -1,6 +1,6 @@
 """`fusiond process` over the real walk: the raw stream alone, tight, against the RTK track.
 
-The track's base has an unstated datum (see `test_gnss_walk`): all solutions are off it by one
+The track's base has an unstated datum (`tests/gnss/test_walk.py`): all solutions are off it by one
 constant vector, so that they are judged about their mean, against a least-squares solution of the
 same corrected ranges, and against each other.
 """

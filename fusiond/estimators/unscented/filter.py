@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome
@@ -30,8 +29,6 @@ from fusiond.estimators.unscented.sigma_points import factor, linear_form, sprea
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
-
-Array = NDArray[np.float64]
 
 SPREAD = math.sqrt(3.0)
 """Sigmas from the mean to a point: the fourth moment of a Gaussian (Julier, Uhlmann, eq. 20)."""

@@ -88,7 +88,7 @@ class Felt(NamedTuple):
 
 
 def span_since(imu: ImuBuffer, t_ns: int) -> Span:
-    """A copy of the samples from an instant on, and of what `rate_at` it looks at."""
+    """A copy of the samples from an instant on, and of what `samples_at` it looks at."""
     first = max(0, imu.index_after(t_ns - AROUND_NS) - 1)
     return Span(imu.times[first : imu.end].copy(), imu.samples[first : imu.end].copy())
 
@@ -116,11 +116,6 @@ def rate_before_motion(past: Past, m: Measured) -> Array:
         return np.zeros(3)
     mean: Array = past.samples[first:end, :3].mean(axis=0)
     return mean
-
-
-def rate_at(past: Past, t_ns: int) -> Array:
-    """Mean rate (3,) around an instant."""
-    return samples_at(past, t_ns)[:3]
 
 
 def samples_at(past: Past, t_ns: int) -> Array:

@@ -36,7 +36,6 @@ SD_HEIGHT_M = 10.0
 """Paper 000, section 3: after differential correction, one sigma."""
 SD_RANGE_M = math.hypot(SATELLITE_M, RANGING_M)
 PAPER_FIX_M = 30.0
-CLASSES_M = (20.0, 100.0)
 
 LATITUDES_DEG = tuple(range(5, 56))
 LONGITUDES_GRID_DEG = tuple(70.0 + 2.5 * i for i in range(29))

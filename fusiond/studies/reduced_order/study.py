@@ -36,8 +36,6 @@ from fusiond.studies.reduced_order.report import (
 )
 from fusiond.studies.reduced_order.runs import Flown, combinations, monte_carlo, nees
 
-Array = NDArray[np.float64]
-
 DEFAULT_RUNS = 40
 CONFIDENCE = 0.99
 SERIES_EVERY_S = 20

@@ -1,0 +1,118 @@
+"""What a run was given: samples and aids of files or of a recorded bus, in order of arrival."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.measurements import Measurement, MonotonicStamp
+from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
+from fusiond.configuration.aiding import RawAiding
+from fusiond.configuration.schema import Config
+from fusiond.files.csv_tables import TableError
+from fusiond.files.tables import ImuTable, read_imu
+from fusiond.offline.aid_files import READERS, Arrival, source_of
+from fusiond.offline.outages import Outage, named, withheld
+from fusiond.offline.reasons import FileRead
+
+
+@dataclass(slots=True)
+class Recorded:
+    """What has been read, and of which files; `withheld` measurements by source."""
+
+    config: Config
+    imu: ImuTable
+    arrivals: list[Arrival]
+    files: dict[str, FileRead]
+    events: list[dict[str, str]]
+    withheld: Counter[str]
+
+
+def read_recorded(
+    config: Config,
+    imu_path: Path | None,
+    aids: list[tuple[str, Path]],
+    outages: Sequence[Outage],
+    systems: tuple[System, ...] | None,
+    can_log: Path | None,
+) -> Recorded:
+    """Read it, less what the outages withhold. Raises as `fusiond.offline.process.process` does."""
+    if any(kind == "raw" for kind, _ in aids):
+        config = _with_raw(config, systems)
+    events: list[dict[str, str]] = []
+    arrivals: list[Arrival] = []
+    files: dict[str, FileRead] = {}
+    if can_log is not None:
+        # python-can and the DBC files' reader come only where there is a bus to be read.
+        from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
+
+        log = read_can_log(can_log, config)
+        imu, arrivals = log.imu, log.arrivals
+        events += [{"code": code, "text": text} for code, text in log.events]
+        files["imu"] = _imu_read(imu)
+        for name, rejected in log.rejected.items():
+            rows = [row for row in arrivals if row.measurement.source == name]
+            if rows or rejected:
+                files[name] = FileRead(_span_s(rows), len(rows), rejected)
+    else:
+        assert imu_path is not None
+        imu = read_imu(imu_path)
+        files["imu"] = _imu_read(imu)
+    for kind, path in aids:
+        rows, rejected = READERS[kind](path, imu, source_of(kind, config))
+        name = kind if kind not in files else f"{kind}:{path.name}"
+        files[name] = FileRead(_span_s(rows), len(rows), rejected)
+        arrivals += rows
+    held = Counter[str]()
+    if outages:
+        there = {row.measurement.source for row in arrivals}
+        unknown = sorted(named(outages) - there - set(config.sources))
+        if unknown:
+            known = ", ".join(sorted(there))
+            raise TableError(f"outage of {unknown[0]}: no aid comes from it; there are {known}")
+        kept = [row for row in arrivals if not _withheld(row.measurement, outages)]
+        held += Counter(row.measurement.source for row in arrivals)
+        held -= Counter(row.measurement.source for row in kept)
+        arrivals = kept
+    arrivals.sort(key=lambda a: a.t_arrival_ns)
+    return Recorded(config, imu, arrivals, files, events, held)
+
+
+def valid_ns(m: Measurement | RawGnssEpoch) -> int:
+    """The instant of the IMU's clock that a recorded measurement is valid at."""
+    stamp = getattr(m, "stamp", None)
+    assert isinstance(stamp, MonotonicStamp)
+    return stamp.t_ns
+
+
+def _imu_read(imu: ImuTable) -> FileRead:
+    span_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if len(imu.t_s) else None
+    return FileRead(span_s, len(imu.t_s), imu.rejected)
+
+
+def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
+    """The configuration with a section for the raw data of a file, and the systems asked for."""
+    name = source_of("raw", config)
+    section = config.aiding.get(name)
+    raw = section if isinstance(section, RawAiding) else RawAiding()
+    if systems is not None:
+        raw = raw.model_copy(update={"systems": systems})
+    return config.model_copy(update={"aiding": {**config.aiding, name: raw}})
+
+
+def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
+    """Of the measurements' instants; what a satellite broadcasts has none."""
+    instants = [
+        valid_ns(row.measurement)
+        for row in rows
+        if not isinstance(row.measurement, Ephemeris | Klobuchar)
+    ]
+    return (min(instants) * 1e-9, max(instants) * 1e-9) if instants else None
+
+
+def _withheld(m: Measurement | RawEvent, outages: Sequence[Outage]) -> bool:
+    if isinstance(m, Ephemeris | Klobuchar):
+        return False
+    return withheld(m.source, valid_ns(m) * 1e-9, outages)
