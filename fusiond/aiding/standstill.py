@@ -8,7 +8,8 @@ Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a 
 all that is known may refute (`Rest.doubt`):
 
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
-    the mean of measured speeds is not zero               `moving`    (fusiond.aiding.witnesses)
+    the mean of measured speeds is not zero, in the run
+    of windows or in this one                             `moving`    (fusiond.aiding.witnesses)
     |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
     the same by seven sigma, and the speed is known to be zero        `turns_at_rest`
     the ride is smooth, and neither sqrt(P_vv) nor the
@@ -111,7 +112,10 @@ class Rest:
         square = _normalised(v.tolist(), p_v.tolist(), least)
         begin_ns = w.end_ns - w.run * WITNESSED_NS
         measured = self.witnesses.measured(begin_ns, w.end_ns)
-        if square > quantile(rows, VELOCITY_PROBABILITY) or measured.contradicts:
+        # A vehicle that turns back has a mean of nothing; the last window alone has not.
+        lately = self.witnesses.measured(w.end_ns - WITNESSED_NS, w.end_ns)
+        contradicted = measured.contradicts or lately.contradicts
+        if square > quantile(rows, VELOCITY_PROBABILITY) or contradicted:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
         turns = self._turns(state, p)
