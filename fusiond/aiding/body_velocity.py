@@ -198,6 +198,16 @@ class NonHolonomicAid(Aid):
     def across_sd_m_s(self) -> float:
         return self.sd_m_s
 
+    def across(self, state: State) -> tuple[float, float]:
+        slots = _slots(state.model, SIDE_DRIFT)
+        z, _ = _body_velocity(state, self.lever, RIGHT, 1, slots)
+        # Backward, a heading that has turned goes across to the other side.
+        way = math.copysign(1.0, float(state.dcm[:, 0] @ state.nav[VN : VN + 3]))
+        drift = slots[DRIFT]
+        if drift < 0:
+            return way * float(z[0]), 0.0
+        return way * float(z[0] + state.xi[drift]), float(state.model.initial[drift])
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")

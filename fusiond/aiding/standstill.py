@@ -8,7 +8,8 @@ Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a 
 all that is known may refute (`Rest.doubt`):
 
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
-    the mean of measured speeds is not zero               `moving`    (fusiond.aiding.witnesses)
+    the mean of measured speeds is not zero, in the run
+    of windows or in this one                             `moving`    (fusiond.aiding.witnesses)
     |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
     the same by seven sigma, and the speed is known to be zero        `turns_at_rest`
     the ride is smooth, and neither sqrt(P_vv) nor the
@@ -41,7 +42,7 @@ from fusiond.aiding.base import (
     immutable,
     rate_columns,
 )
-from fusiond.aiding.witnesses import Witnesses
+from fusiond.aiding.witnesses import Measured, Witnesses
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.standstill import Window
@@ -55,7 +56,7 @@ VELOCITY_PROBABILITY = 1e-4
 RATE_SIGMAS = 3.0
 # The same, where it is no chance: on wheels nothing turns on the spot.
 SURE_SIGMAS = 7.0
-TURNS_AT_REST = "turns_at_rest"
+TURNING, TURNS_AT_REST = "turning", "turns_at_rest"
 # How far back measured speeds are averaged: as many windows as a run has.
 WITNESSED_NS = 1_000_000_000
 
@@ -94,6 +95,7 @@ class Rest:
     velocity_sd_m_s: float
     rate_sd_rad_s: float
     noise_sd_rad_s: float
+    window_s: float = 1.0
 
     def doubt(self, state: State) -> str | None:
         """The name of what refutes rest; None if nothing does."""
@@ -109,18 +111,35 @@ class Rest:
         # A tenth of the sigma that the aid claims, beside P: a filter that is surer is not.
         least = (0.1 * self.velocity_sd_m_s) ** 2
         square = _normalised(v.tolist(), p_v.tolist(), least)
-        begin_ns = w.end_ns - w.run * WITNESSED_NS
-        measured = self.witnesses.measured(begin_ns, w.end_ns)
-        if square > quantile(rows, VELOCITY_PROBABILITY) or measured.contradicts:
+        measured = self._measured()
+        # A vehicle that turns back has a mean of nothing; the last window alone has not.
+        lately = self.witnesses.measured(w.end_ns - WITNESSED_NS, w.end_ns)
+        contradicted = measured.contradicts or lately.contradicts
+        if square > quantile(rows, VELOCITY_PROBABILITY) or contradicted:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
         turns = self._turns(state, p)
         if any(square > RATE_SIGMAS**2 * variance for square, variance in turns):
             sure = known and any(square > SURE_SIGMAS**2 * variance for square, variance in turns)
-            return TURNS_AT_REST if sure else "turning"
+            return TURNS_AT_REST if sure else TURNING
         if not known and self.witnesses.smooth_ride(w.end_ns):
             return "quiet_at_speed"
         return None
+
+    def _measured(self) -> Measured:
+        w = self.window
+        return self.witnesses.measured(w.end_ns - w.run * WITNESSED_NS, w.end_ns)
+
+    def felt_turn(self, state: State) -> float:
+        """Of a window in which it was `TURNING`: the angle (rad) about down that the gyros have
+        felt in it, where the speed is known to be zero; else 0."""
+        p = state.covariance
+        if p is None:
+            return 0.0
+        sd = math.sqrt(max(p[3, 3], p[4, 4]))
+        if min(sd, self._measured().sd) > self.velocity_sd_m_s:
+            return 0.0
+        return abs(float(state.dcm[2] @ _rate_error(state, self.window.mean_rate))) * self.window_s
 
     def _turns(self, state: State, p: Array) -> list[tuple[float, float]]:
         """Of each axis, the square of what has turned in the window and in the run of windows, and
@@ -178,3 +197,6 @@ class ZeroRateAid(Aid):
         rate_columns(h, slice(None), model, np.eye(3))
         z = _rate_error(state, np.array(self.mean_rate))
         return Innovation(z, h, np.full(3, self.sd_rad_s**2))
+
+    def felt_turn(self, state: State) -> float:
+        return self.rest.felt_turn(state)

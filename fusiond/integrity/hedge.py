@@ -27,6 +27,13 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
+Where the filter has a state for a slip that lasts, the innovations say less of it than that state
+does (fusiond.integrity.slip): what is beyond the slips that the vehicle has shown is open as well.
+
+While such a vehicle stands it does not turn. What its gyros feel then, beyond their bias, is the
+gyros' error or the ground's turn, and the heading is open by its sum until it has been driven along
+for as long as the slow mean looks back.
+
 What is published is the attitude of the axes that were configured, and the vehicle's as far as the
 unit sits on it so. A mounting that is found off by more than chance has it in one vehicle of a
 thousand is not the one that was configured: pitch and yaw are open by what it has beyond that,
@@ -55,7 +62,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.means import SLOW
 from fusiond.integrity.proof import Proof
@@ -74,7 +81,8 @@ Said = PositionOffer | VelocityOffer | None
 SELDOM = 10.83
 # What is left open of a tilt fades by this with each innovation, as the slow mean's square; below a
 # hundredth of P's variance, half a percent of sigma, it is nothing. It is kept under its own name.
-FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
+FADES, LEAST, TILT, ACROSS = (1.0 - SLOW) ** 2, 0.01, " tilt", " across"
+AT_REST = "turns at rest"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -133,6 +141,29 @@ class Hedge:
             rest = {other: each for other, each in self.wider.items() if other != name}
             self.wider = rest or NOTHING
 
+    def goes_across(self, aid: Aid, record: Series, state: State) -> None:
+        """An aid that does not slip was fused; the `state` after it."""
+        across, variance = aid.across(state), aid.across_sd_m_s**2
+        record.slip = record.slip.with_one(aid.t_ns, across, state.speed, variance)
+        self._heading(aid.source + ACROSS, record.slip.opened)
+        if AT_REST in self.wider:
+            kept, p = FADES * float(self.wider[AT_REST][8]), state.covariance
+            own = 0.0 if p is None else float(p[PHI + 2, PHI + 2])
+            self._heading(AT_REST, kept if kept > LEAST * own else 0.0)
+
+    def turns_at_rest(self, angle: float) -> None:
+        """The gyros have felt a turn by so much (rad) of a vehicle that stands and cannot turn."""
+        before = self.wider.get(AT_REST)
+        angle += 0.0 if before is None else math.sqrt(before[8])
+        self._heading(AT_REST, angle * angle)
+
+    def _heading(self, name: str, variance: float) -> None:
+        wider = None
+        if variance > 0.0:
+            wider = np.zeros(9)
+            wider[8] = variance
+        self._put(name, wider)
+
     def returns(self, source: str, proof: Proof, covariance: Array | None) -> None:
         """A position that is back, and whether it drifts, is not known yet; P (n, n) of the
         filter."""
@@ -175,6 +206,7 @@ class Hedge:
         """Nothing of a series is beyond chance, or P holds it."""
         self._put(source, None)
         self._put(source + TILT, None)
+        self._put(source + ACROSS, None)
 
 
 def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:

@@ -242,6 +242,8 @@ class Isolation:
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
+        if aid.across_sd_m_s > 0.0 and state is not None:
+            self.hedge.goes_across(aid, record, state)
         if not record.means.tested(outcome.whitened, t_ns, self._pass):
             if record.proof is not None and aid.white:
                 self.hedge.returns(aid.source, record.proof, covariance)
@@ -257,6 +259,12 @@ class Isolation:
         """A position that is not yet seen to go with the motion is about to be fused into a filter
         with that state and P (n, n)."""
         self._comes = returns.coming(aid, state, covariance)
+
+    def turns_at_rest(self, angle: float) -> None:
+        """The gyros have felt a turn by so much (rad) of a vehicle that stands. One that does not
+        slip cannot turn on the spot."""
+        if any(record.no_slip for record in self._records.values()):
+            self.hedge.turns_at_rest(angle)
 
     def correcting(self, nav: Array, covariance: Array) -> None:
         """A position or velocity is about to be fused into a filter with the state `nav` (10,) and
@@ -326,7 +334,7 @@ class Isolation:
     @staticmethod
     def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
         record.excluded, record.refused_ns, record.jumped = reason, since_ns, jumped
-        record.passes, record.ran = 0, False
+        record.passes, record.ran, record.slip = 0, False, record.slip.without_lately()
         record.means.restart()
 
     def _look(

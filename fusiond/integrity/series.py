@@ -21,6 +21,7 @@ from fusiond.integrity.proof import (
     Trend,
 )
 from fusiond.integrity.punctual import Punctual
+from fusiond.integrity.slip import Slip
 
 DRIFTS, REPEATS = "drifts", "repeats itself"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
@@ -29,6 +30,7 @@ REPEATED = 2
 # Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
 # repeats the one before, as this series has shown it (average of so many).
 CHANCE, REPEATS_KEPT = 1e-9, 100.0
+NO_SLIP = Slip()
 # Before any instant that a clock can say.
 NEVER_NS = -(2**62)
 
@@ -76,6 +78,8 @@ class Series:
     """Of one that came back behind the filter: until it would have shown that it is late."""
     every_ns: int = 0
     """From the one before to the last that was heard."""
+    slip: Slip = NO_SLIP
+    """Of what is said not to slip."""
 
     def copied(self) -> Series:
         """A copy for a checkpoint."""

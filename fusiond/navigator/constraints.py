@@ -74,6 +74,7 @@ class ConstraintMaker:
             z.velocity_sd_m_s,
             z.rate_sd_deg_s * DEG,
             self._rate_noise / math.sqrt(z.window_s),
+            z.window_s,
         )
         rate = (float(w.mean_rate[0]), float(w.mean_rate[1]), float(w.mean_rate[2]))
         return [

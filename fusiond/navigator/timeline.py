@@ -19,6 +19,7 @@ import numpy as np
 
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import Offer
+from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
@@ -31,6 +32,7 @@ Key = tuple[int, str, int]
 
 # Outcomes that say something of a source.
 JUDGED = frozenset({"fused", "gated", "isolated"})
+TURNS = frozenset({TURNING, TURNS_AT_REST})
 # Aids that may wait for the start or for the IMU: more than a minute of all that a well-equipped
 # vehicle sends. Beyond it the oldest are given up.
 MOST_WAITING = 4096
@@ -240,6 +242,9 @@ class Timeline:
         except RAISED_BY_NUMBERS as error:
             entry.error = repr(error)
             return Outcome("failed")
+        if outcome.name in TURNS:
+            isolation.turns_at_rest(aid.felt_turn(estimator.state))
+            self._hedge()
         if outcome.name in JUDGED and not estimator.isolates:
             known = estimator.nav, estimator.covariance, estimator.state
             action = isolation.judge(aid, outcome, *known)

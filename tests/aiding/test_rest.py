@@ -72,6 +72,20 @@ def test_a_fix_before_the_quiet_windows_says_nothing() -> None:
     assert runs.rest(witnesses=witnesses, run=2).doubt(_state(0.0, 0.02)) == "moving"
 
 
+def test_a_vehicle_that_turns_back_is_not_at_rest() -> None:
+    """Three quiet windows of a vehicle that rolls to a stop and on the other way: the mean of what
+    was measured in them is nothing, that of the last is not. The filter's own velocity, a second
+    after the last fix, says as little."""
+    witnesses, sd = Witnesses(), (0.05, 0.05, 0.05)
+    for ago_s, north in ((2.9, -0.35), (1.9, -0.05), (0.9, 0.25)):
+        t_ns = round((END_S - ago_s) * 1e9)
+        v = (north, 0.0, 0.0)
+        witnesses.hear([VelocityAid("gnss_velocity", t_ns, 0.999, v, sd, (0.0, 0.0, 0.0))])
+    span = round((END_S - 3.0) * 1e9), round(END_S * 1e9)
+    assert not witnesses.measured(*span).contradicts
+    assert runs.rest(witnesses=witnesses, run=3).doubt(_state(0.4, 0.15)) == "moving"
+
+
 def test_a_wheel_that_turns_is_no_rest() -> None:
     witnesses = Witnesses()
     t_ns = round((END_S - 0.5) * 1e9)
