@@ -59,7 +59,7 @@ from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.means import SLOW
 from fusiond.integrity.proof import Proof
-from fusiond.integrity.punctual import MOVING_M_S
+from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import Series
 from fusiond.integrity.support import COARSER, FINE_M, FORGET_NS
 from fusiond.models.vehicle import MOUNTING
@@ -75,6 +75,8 @@ SELDOM = 10.83
 # What is left open of a tilt fades by this with each innovation, as the slow mean's square; below a
 # hundredth of P's variance, half a percent of sigma, it is nothing. It is kept under its own name.
 FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
+# What may be a lateness is kept under its own name, too.
+LATE = " late"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -148,12 +150,23 @@ class Hedge:
             wider[3:6] += variance * (covariance[DV : DV + 3, axis] / own) ** 2
         return self._put(source, wider)
 
+    def late(self, source: str, punctual: Punctual | None, covariance: Array | None) -> None:
+        """A position that is back, and whether it is on time has not shown yet; P (n, n) of the
+        filter."""
+        wider = None
+        if punctual is not None and not punctual.started and covariance is not None:
+            own = covariance.diagonal()
+            known = np.concatenate((own[DR : DR + 3], own[DV : DV + 3]))
+            opened = np.maximum(punctual.leaves_open - known, 0.0)
+            wider = np.concatenate((opened, np.zeros(3))) if opened.any() else None
+        self._put(source + LATE, wider)
+
     def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
         """A series is fused, and what others left open that are silent may be its to tell now."""
         if not self.wider or not record.means.degrees:
             return
         for name in self.wider:
-            other = records.get(source := name.removesuffix(TILT))
+            other = records.get(source := name.removesuffix(TILT).removesuffix(LATE))
             if other is None or other is record or t_ns - other.heard_ns <= FORGET_NS:
                 continue
             fine = 0.0 < record.sd_m <= max(FINE_M, COARSER * other.sd_m)
@@ -173,8 +186,8 @@ class Hedge:
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""
-        self._put(source, None)
-        self._put(source + TILT, None)
+        for name in (source, source + TILT, source + LATE):
+            self._put(name, None)
 
 
 def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:

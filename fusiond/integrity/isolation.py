@@ -247,6 +247,8 @@ class Isolation:
                 self.hedge.returns(aid.source, record.proof, covariance)
             elif record.means.unlikely or self.hedge.holds(aid.source):
                 self.hedge.look(aid, record, offer or velocity, nav, covariance)
+            if offer is not None and not aid.wanders:
+                self.hedge.late(aid.source, record.punctual, covariance)
             self.hedge.answered(self._records, record, t_ns)
             return Action.NONE
         self.shown = differ(record, offer or velocity, covariance)
