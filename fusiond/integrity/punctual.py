@@ -81,8 +81,8 @@ class Punctual(NamedTuple):
     begin_ns: int
     started: bool = False
     """The filter was started from them: only the speed counts."""
-    behind: bool = False
-    """The first of them lay behind the filter by more than is likely."""
+    expected: bool = False
+    """The first of them lay no farther behind the filter than is likely: it is vouched for."""
     before: Before = Before()
     n: int = 0
     t_ns: int = 0
@@ -101,10 +101,10 @@ class Punctual(NamedTuple):
 
     @property
     def matters(self) -> bool:
-        """Whether it is not vouched for: there is a reason to fear a lateness, it would not have
-        shown yet, and would be worse than a fix. Of a start it would not where it moves it by less
-        than what one fix is good to; of what came back, where the vehicle stands."""
-        if self.told or not (self.behind or self.started):
+        """Whether it is not vouched for: a lateness would not have shown yet, and would be worse
+        than a fix. Of a start it would not where it moves it by less than what one fix is good to;
+        of what came back, where the vehicle stands."""
+        if self.told or self.expected:
             return False
         least_m_s = self.sd / LATE_S if self.started else MOVING_M_S
         return self.speed > least_m_s

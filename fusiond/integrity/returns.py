@@ -103,7 +103,7 @@ def prove(
         record.punctual = Punctual(offer.t_ns, started=True)
     out = support.outage(records, offer.t_ns)
     if out and not (record.punctual and record.punctual.started):
-        came = Punctual(offer.t_ns, behind=comes.behind, before=comes.before)
+        came = Punctual(offer.t_ns, expected=not comes.behind, before=comes.before)
         record.punctual = came if record.sd_m <= FINE_M else None
     if record.punctual is not None:
         v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
