@@ -33,7 +33,12 @@ thousand is not the one that was configured: pitch and yaw are open by what it h
 
     sigma^2 + max(0, m^2 - 10.83 sigma_m^2)          sigma_m as configured
 
-A position that is back after an outage has no means yet: it leaves open what its slope has beyond
+A position that is back after an outage may be late, and lie within the outage's sigma all the same:
+until that would have shown position and velocity are no surer than a lateness leaves them
+(fusiond.integrity.punctual), along the track and the acceleration. Fixes by code have errors that
+last for seconds (`gnss_wander`): P is never below those.
+
+Such a position has no means yet: it leaves open what its slope has beyond
 chance (fusiond.integrity.proof), where its errors are configured to be white. Where fixes share one
 that is a state P never falls below it, and a minute's drift is within it: on css_164, 90 s after
 each tunnel, sigma would be 4 m of a receiver that states 1 to 2 m and is off by less. What a source

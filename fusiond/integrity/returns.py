@@ -1,9 +1,9 @@
 r"""What a position is asked once it is back after an outage, or a filter was started from it anew.
 
-That it goes with the motion (fusiond.integrity.proof), always; and that it is on time
-(fusiond.integrity.punctual), where its first fix lies behind the filter by more than is likely, or
-the start was one after a failure: nothing else is known of it then, and an outage more does not
-tell either.
+That it goes with the motion (fusiond.integrity.proof) and is on time (fusiond.integrity.punctual).
+Until then what is published is the wider for it (fusiond.integrity.hedge); and where its first fix
+lies behind the filter by more than is likely, or the start was one after a failure, the mode says
+so, too: nothing else is known of it then, and an outage more does not tell either.
 
 A fix that is late by tau lies behind by tau v, along the track and nowhere else. So with the
 innovation z = estimate - fix, S its covariance and u the direction of the velocity, it is
