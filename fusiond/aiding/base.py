@@ -141,6 +141,12 @@ class Aid:
         return False
 
     @property
+    def wanders(self) -> bool:
+        """Whether its errors are known to last for seconds: a position's own sigma is then that of
+        metres that no motion tells from a lateness."""
+        return False
+
+    @property
     def shares(self) -> tuple[str, ...]:
         """Blocks of the model whose states are an error that successive ones share."""
         return ()

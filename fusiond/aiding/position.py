@@ -218,6 +218,10 @@ class PositionAid(Aid):
         return self.shares_nothing
 
     @property
+    def wanders(self) -> bool:
+        return bool(self.wander)
+
+    @property
     def shares(self) -> tuple[str, ...]:
         return self.bias
 

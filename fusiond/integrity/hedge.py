@@ -40,7 +40,12 @@ thousand is not the one that was configured: pitch and yaw are open by what it h
 
     sigma^2 + max(0, m^2 - 10.83 sigma_m^2)          sigma_m as configured
 
-A position that is back after an outage has no means yet: it leaves open what its slope has beyond
+A position that is back after an outage may be late, and lie within the outage's sigma all the same:
+until that would have shown position and velocity are no surer than a lateness leaves them
+(fusiond.integrity.punctual), along the track and the acceleration. Fixes by code have errors that
+last for seconds (`gnss_wander`): P is never below those.
+
+Such a position has no means yet: it leaves open what its slope has beyond
 chance (fusiond.integrity.proof), where its errors are configured to be white. Where fixes share one
 that is a state P never falls below it, and a minute's drift is within it: on css_164, 90 s after
 each tunnel, sigma would be 4 m of a receiver that states 1 to 2 m and is off by less. What a source
@@ -66,7 +71,7 @@ from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.means import SLOW
 from fusiond.integrity.proof import Proof
-from fusiond.integrity.punctual import MOVING_M_S
+from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import Series
 from fusiond.integrity.support import COARSER, FINE_M, FORGET_NS
 from fusiond.models.vehicle import MOUNTING
@@ -81,8 +86,9 @@ Said = PositionOffer | VelocityOffer | None
 SELDOM = 10.83
 # What is left open of a tilt fades by this with each innovation, as the slow mean's square; below a
 # hundredth of P's variance, half a percent of sigma, it is nothing. It is kept under its own name.
-FADES, LEAST, TILT, ACROSS = (1.0 - SLOW) ** 2, 0.01, " tilt", " across"
-AT_REST = "turns at rest"
+FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
+# What may be a lateness or a heading that has turned is kept under names of their own, too.
+LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -179,12 +185,23 @@ class Hedge:
             wider[3:6] += variance * (covariance[DV : DV + 3, axis] / own) ** 2
         return self._put(source, wider)
 
+    def late(self, source: str, punctual: Punctual | None, covariance: Array | None) -> None:
+        """A position that is back, and whether it is on time has not shown yet; P (n, n) of the
+        filter."""
+        wider = None
+        if punctual is not None and not punctual.started and covariance is not None:
+            own = covariance.diagonal()
+            known = np.concatenate((own[DR : DR + 3], own[DV : DV + 3]))
+            opened = np.maximum(punctual.leaves_open - known, 0.0)
+            wider = np.concatenate((opened, np.zeros(3))) if opened.any() else None
+        self._put(source + LATE, wider)
+
     def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
         """A series is fused, and what others left open that are silent may be its to tell now."""
         if not self.wider or not record.means.degrees:
             return
         for name in self.wider:
-            other = records.get(source := name.removesuffix(TILT))
+            other = records.get(source := name.removesuffix(TILT).removesuffix(LATE))
             if other is None or other is record or t_ns - other.heard_ns <= FORGET_NS:
                 continue
             fine = 0.0 < record.sd_m <= max(FINE_M, COARSER * other.sd_m)
@@ -204,9 +221,8 @@ class Hedge:
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""
-        self._put(source, None)
-        self._put(source + TILT, None)
-        self._put(source + ACROSS, None)
+        for name in (source, source + TILT, source + LATE, source + ACROSS):
+            self._put(name, None)
 
 
 def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:

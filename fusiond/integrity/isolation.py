@@ -27,7 +27,8 @@ does not. The filter's error, P / (P + R) of a position's variance, is the same 
 c no less: a filter that has gone astray by one of its sigmas could never be corrected else. After
 an outage of all positions the first that comes back is taken at once, but counts less until it is
 seen to go with the motion (fusiond.integrity.proof), and, where it lies behind the filter by more
-than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.returns).
+than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.returns);
+what is published is no surer than that meanwhile (fusiond.integrity.punctual).
 
 With all series of position refused, how it began tells who is wrong (fusiond.integrity.jumps).
 
@@ -249,6 +250,8 @@ class Isolation:
                 self.hedge.returns(aid.source, record.proof, covariance)
             elif record.means.unlikely or self.hedge.holds(aid.source):
                 self.hedge.look(aid, record, offer or velocity, nav, covariance)
+            if offer is not None and not aid.wanders:
+                self.hedge.late(aid.source, record.punctual, covariance)
             self.hedge.answered(self._records, record, t_ns)
             return Action.NONE
         self.shown = differ(record, offer or velocity, covariance)

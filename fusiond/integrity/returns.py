@@ -1,9 +1,9 @@
 r"""What a position is asked once it is back after an outage, or a filter was started from it anew.
 
-That it goes with the motion (fusiond.integrity.proof), always; and that it is on time
-(fusiond.integrity.punctual), where its first fix lies behind the filter by more than is likely, or
-the start was one after a failure: nothing else is known of it then, and an outage more does not
-tell either.
+That it goes with the motion (fusiond.integrity.proof) and is on time (fusiond.integrity.punctual).
+Until then what is published is the wider for it (fusiond.integrity.hedge); and where its first fix
+lies behind the filter by more than is likely, or the start was one after a failure, the mode says
+so, too: nothing else is known of it then, and an outage more does not tell either.
 
 A fix that is late by tau lies behind by tau v, along the track and nowhere else. So with the
 innovation z = estimate - fix, S its covariance and u the direction of the velocity, it is
@@ -28,10 +28,11 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof, settled
-from fusiond.integrity.punctual import MOVING_M_S, Punctual
+from fusiond.integrity.punctual import MOVING_M_S, Before, Punctual
 from fusiond.integrity.series import NEVER_NS, Series
 from fusiond.integrity.support import FINE_M
-from fusiond.navigation.error_model import DR
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.error_model import DR, PHI
 from fusiond.navigation.strapdown import VE, VN
 
 Array = NDArray[np.float64]
@@ -49,11 +50,13 @@ class Begun(NamedTuple):
 
 
 class Coming(NamedTuple):
-    """Of a position that is about to be fused: whether it lies `behind` by more than is likely, and
-    the `gain` that the filter follows it with, the horizontal axes' mean."""
+    """Of a position that is about to be fused: whether it lies `behind` by more than is likely,
+    the `gain` that the filter follows it with, the horizontal axes' mean, and what is known
+    `before` it."""
 
     behind: bool = False
     gain: float = 0.0
+    before: Before = Before()
 
 
 NOTHING = Coming()
@@ -69,13 +72,16 @@ def coming(aid: Aid, state: State, covariance: Array) -> Coming:
     own, r = with_all @ rows.h[:2].T, np.diag(rows.r[:2])
     gain = np.linalg.solve(own + UNPROVEN_SIGMAS**2 * r, with_all[:, DR : DR + 2])
     followed = max(0.0, 0.5 * float(np.trace(gain)))
+    tilt, yaw = max(np.diag(covariance)[PHI : PHI + 2]), covariance[PHI + 2, PHI + 2]
+    before = Before(math.inf, STANDARD_GRAVITY_M_S2 * math.sqrt(tilt), math.sqrt(yaw))
     v_n, v_e = float(state.nav[VN]), float(state.nav[VE])
     speed = math.hypot(v_n, v_e)
     if speed <= MOVING_M_S:
-        return Coming(gain=followed)
+        return Coming(gain=followed, before=before)
     along = np.array([v_n, v_e]) / speed
-    variance = float(along @ (own + r) @ along)
-    return Coming(float(along @ rows.z[:2]) > SURPRISE * math.sqrt(variance), followed)
+    sd = math.sqrt(float(along @ (own + r) @ along))
+    behind = float(along @ rows.z[:2]) > SURPRISE * sd
+    return Coming(behind, followed, before._replace(late_s=sd / speed))
 
 
 def prove(
@@ -97,11 +103,12 @@ def prove(
         record.punctual = Punctual(offer.t_ns, started=True)
     out = support.outage(records, offer.t_ns)
     if out and not (record.punctual and record.punctual.started):
-        record.punctual = Punctual(offer.t_ns) if comes.behind and record.sd_m <= FINE_M else None
+        came = Punctual(offer.t_ns, expected=not comes.behind, before=comes.before)
+        record.punctual = came if record.sd_m <= FINE_M else None
     if record.punctual is not None:
         v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
         since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)
-        record.punctual = None if since.told else since
+        record.punctual = None if since.over else since
     if not (suspect or out or record.proof):
         return False
     offer = offer if state is None else settled(offer, state)

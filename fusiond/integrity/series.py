@@ -75,7 +75,8 @@ class Series:
     proof: Proof | None = None
     """Of a position that came back after an outage: what is seen of it until it is proven."""
     punctual: Punctual | None = None
-    """Of one that came back behind the filter: until it would have shown that it is late."""
+    """Of one that came back, or that a filter was started from: until it would have shown that it
+    is late."""
     every_ns: int = 0
     """From the one before to the last that was heard."""
     slip: Slip = NO_SLIP

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.integrity.punctual import LATE_S, TOLD, Punctual
+from fusiond.integrity.punctual import LATE_S, MOST_LATE_S, MOST_SIGMAS, TOLD, Before, Punctual
 
 Array = NDArray[np.float64]
 RATE_HZ, SD_M, S = 5.0, 0.6, 1_000_000_000
@@ -98,3 +98,56 @@ def test_of_a_start_only_the_speed_tells() -> None:
 def test_nothing_is_told_before_the_second_fix() -> None:
     assert not Punctual(0).told
     assert not Punctual(0).with_one(0, 20.0, 0.0, SD_M).told
+
+
+def test_tilt_and_heading_take_their_part() -> None:
+    """Of motions whose acceleration and heading are off by what an outage leaves, the estimate of a
+    lateness by all that is known has the sigma that is claimed; as if both were known it would be
+    less than half."""
+    n, before = 75, Before(acceleration=0.08, yaw=math.radians(1.5))
+    t = np.arange(n) / RATE_HZ
+    v = np.array([_bend(s) for s in t.tolist()])
+    way = np.vstack((np.zeros(2), np.cumsum(0.5 / RATE_HZ * (v[1:] + v[:-1]), axis=0)))
+    one, zero = np.ones(n), np.zeros(n)
+    rows = np.stack(
+        [
+            np.column_stack((one, zero, t, zero, 0.5 * t**2, zero, -way[:, 1], -v[:, 0])),
+            np.column_stack((zero, one, zero, t, zero, 0.5 * t**2, way[:, 0], -v[:, 1])),
+        ]
+    ).reshape(2 * n, 8)
+    sd = np.array([before.acceleration] * 2 + [before.yaw])
+    normal = rows.T @ rows / SD_M**2 + np.diag([0.0] * 4 + (sd**-2.0).tolist() + [0.0])
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(400):
+        x = np.concatenate(([3.0, -2.0, 0.4, 0.3], sd * rng.standard_normal(3), [LATE_S]))
+        z = rows @ x + SD_M * rng.standard_normal(2 * n)
+        found.append(float(np.linalg.solve(normal, rows.T @ z / SD_M**2)[-1]))
+    seconds = n / RATE_HZ
+    punctual, known = (
+        _after(seconds, _bend, Punctual(100 * S, before=before)),
+        _after(seconds, _bend),
+    )
+    claimed = SD_M / math.sqrt(punctual.left)
+    assert np.mean(found) == pytest.approx(LATE_S, abs=4.0 * claimed / 20.0)
+    assert np.std(found) == pytest.approx(claimed, rel=0.15)
+    assert punctual.left < known.left / 2.0**2
+
+
+def test_a_lateness_is_open_until_it_has_shown() -> None:
+    """On a straight as far as all that come; less than an outage's own sigma allows; and of a
+    vehicle that has braked by no more than a fix."""
+    most = MOST_LATE_S / MOST_SIGMAS
+    straight = _after(30.0, _straight)
+    assert straight.sd_s == pytest.approx(most)
+    assert straight.leaves_open == pytest.approx(
+        [(20.0 * most) ** 2, (12.0 * most) ** 2, 0.0, 0.0, 0.0, 0.0], abs=1e-6
+    )
+    assert not straight.over
+    surer = _after(30.0, _straight, Punctual(100 * S, before=Before(late_s=0.1)))
+    assert surer.sd_s == pytest.approx(0.1)
+    braking = _after(3.0, _braking)
+    assert np.sqrt(braking.leaves_open[3:5]) == pytest.approx([0.6 * most, 0.36 * most], rel=0.01)
+    shown = _after(20.0, _ends_braking)
+    assert shown.over
+    assert math.sqrt(shown.leaves_open[0]) < SD_M

@@ -4,9 +4,11 @@ along and to be on time, and what is published until then."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fusiond.aiding.base import State
 from fusiond.aiding.position import PositionAid
@@ -19,6 +21,7 @@ from fusiond.integrity.proof import (
     UNPROVEN_SIGMAS,
     metres_a_radian,
 )
+from fusiond.integrity.punctual import MOST_LATE_S, MOST_SIGMAS
 from fusiond.integrity.returns import coming
 from fusiond.models.blocks import position_bias
 from fusiond.models.catalogue import make_model
@@ -41,6 +44,7 @@ from tests.integrity.journey import (
     state_at,
 )
 
+Array = NDArray[np.float64]
 OUTAGE_S = (40.0, 80.0)
 SECONDS = 120.0
 
@@ -109,6 +113,44 @@ def test_a_filter_that_knows_its_place_hardly_follows() -> None:
     p[:, bias] = 0.0
     p[6:9, 6:9] = 100.0 * np.eye(3)
     assert coming(aid, state, p).gain == pytest.approx(100.0 / (100.0 + r))
+
+
+def _back(wander: str, seconds: float) -> list[tuple[Array, Array]]:
+    """Of a receiver that is back, for so long, after 40 s without, on a straight and then braking
+    and turning: what is open, and the velocity."""
+    isolation, p = Isolation(), 0.2**2 * np.eye(MODEL.size)
+    found: list[tuple[Array, Array]] = []
+    for k in [*range(50), *range(250, 250 + round(seconds * RATE_HZ))]:
+        t_s = k / RATE_HZ
+        nav, turned = START.copy(), 0.2 * max(0.0, t_s - 60.0)
+        nav[VN : VE + 1] = 8.0 * math.cos(turned), 8.0 * math.sin(turned)
+        nav[LAT] += 8.0 * t_s / metres_a_radian(START)[0]
+        place = float(nav[LAT]), float(nav[LON]), 40.0
+        aid = PositionAid("gnss", round(t_s * S), 0.9999, *place, (0.02,) * 3, (0.0,) * 3)
+        if isolation.unproven("gnss", aid.t_ns):
+            before = p.copy()
+            before[6:8, 6:8] = 30.0**2 * np.eye(2)
+            isolation.comes(aid, state_at(nav), before if k == 250 else p)
+        aid = replace(aid, wander=wander)
+        isolation.judge(aid, Outcome("fused", 1.0, 3, ()), nav, p)
+        if k >= 250:
+            wider = isolation.hedge.wider.get("gnss late", np.zeros(9))
+            found.append((wider, nav[VN : VE + 1]))
+    return found
+
+
+def test_what_is_back_is_no_surer_than_that_it_is_on_time() -> None:
+    """Along the track, and until the vehicle has turned; of the filter's own sigma as much less."""
+    found = _back("", 30.0)
+    straight, _ = found[40]
+    most = (8.0 * MOST_LATE_S / MOST_SIGMAS) ** 2
+    assert straight == pytest.approx([most - 0.2**2, *[0.0] * 8], abs=1e-6)
+    assert not found[-1][0].any()
+
+
+def test_of_errors_that_last_a_lateness_leaves_nothing_open() -> None:
+    """P is never below them."""
+    assert not any(wider.any() for wider, _ in _back("gnss_wander", 5.0))
 
 
 def test_positions_count_less_after_an_outage_until_they_are_proven() -> None:

@@ -45,6 +45,7 @@ from typing import NamedTuple
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.estimators.base import Estimator, gate_threshold
+from fusiond.integrity.punctual import MOST_LATE_S
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
@@ -56,8 +57,6 @@ from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.offsets import OffsetWatch
 from fusiond.navigator.alignment.options import AlignmentOptions
 
-# Fixes that are later (s) are refused as too old or found by the clock, whose envelope is as wide.
-MOST_LATE_S = 3.0
 # What is searched (s): a change of course at 10 deg/s is still one valley at twice the step.
 SEARCHED_S = tuple(0.2 * k for k in range(16))
 # Half a step (s) of the two parabolas that follow it.
