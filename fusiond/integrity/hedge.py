@@ -45,12 +45,12 @@ until that would have shown position and velocity are no surer than a lateness l
 (fusiond.integrity.punctual), along the track and the acceleration. Fixes by code have errors that
 last for seconds (`gnss_wander`): P is never below those.
 
-Such a position has no means yet: it leaves open what its slope has beyond
-chance (fusiond.integrity.proof), where its errors are configured to be white. Where fixes share one
-that is a state P never falls below it, and a minute's drift is within it: on css_164, 90 s after
-each tunnel, sigma would be 4 m of a receiver that states 1 to 2 m and is off by less. What a source
-left open that has fallen silent stays, for silence answers nothing, until another that measures the
-same, about as finely, has a mean of its own.
+Such a position has no means yet: it leaves open what its slope has beyond chance
+(fusiond.integrity.proof), and where its errors are configured to be white is no surer than that
+slope. Where fixes share one that is a state P never falls below it: as wide as the slope is known,
+css_164's sigma would be 4 m, 90 s after each tunnel, of a receiver that states 1 to 2 m and is off
+by less. What a source left open that has fallen silent stays, for silence answers nothing, until
+another that measures the same, about as finely, has a mean of its own.
 
 Once the series is left out, P is: by S m^2, which is what the filter and the series were apart for
 as long as the mean looks back. The last innovation alone is mostly noise.
@@ -170,20 +170,23 @@ class Hedge:
             wider[8] = variance
         self._put(name, wider)
 
-    def returns(self, source: str, proof: Proof, covariance: Array | None) -> None:
+    def returns(self, source: str, proof: Proof, covariance: Array | None, white: bool) -> bool:
         """A position that is back, and whether it drifts, is not known yet; P (n, n) of the
-        filter."""
+        filter, `white` where its fixes share no error. Whether that leaves anything open."""
         if covariance is None:
-            return self.drop(source)
+            self.drop(source)
+            return False
         owns: list[float] = covariance.diagonal()[DR : DR + 2].tolist()
-        opened = proof.leaves_open(owns)
+        opened = proof.leaves_open(owns, white=white)
         if not any(opened):
-            return self.drop(source)
+            self.drop(source)
+            return False
         wider = np.zeros(9)
         for axis, variance, own in zip((DR, DR + 1), opened, owns, strict=True):
             wider[:3] += variance * (covariance[DR : DR + 3, axis] / own) ** 2
             wider[3:6] += variance * (covariance[DV : DV + 3, axis] / own) ** 2
-        return self._put(source, wider)
+        self._put(source, wider)
+        return True
 
     def late(self, source: str, punctual: Punctual | None, covariance: Array | None) -> None:
         """A position that is back, and whether it is on time has not shown yet; P (n, n) of the

@@ -246,9 +246,10 @@ class Isolation:
         if aid.across_sd_m_s > 0.0 and state is not None:
             self.hedge.goes_across(aid, record, state)
         if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            if record.proof is not None and aid.white:
-                self.hedge.returns(aid.source, record.proof, covariance)
-            elif record.means.unlikely or self.hedge.holds(aid.source):
+            proof, asked = record.proof, False
+            if proof is not None and (aid.white or aid.wanders):
+                asked = self.hedge.returns(aid.source, proof, covariance, aid.white) or aid.white
+            if not asked and (record.means.unlikely or self.hedge.holds(aid.source)):
                 self.hedge.look(aid, record, offer or velocity, nav, covariance)
             if offer is not None and not aid.wanders:
                 self.hedge.late(aid.source, record.punctual, covariance)
