@@ -45,12 +45,20 @@ until that would have shown position and velocity are no surer than a lateness l
 (fusiond.integrity.punctual), along the track and the acceleration. Fixes by code have errors that
 last for seconds (`gnss_wander`): P is never below those.
 
-Such a position has no means yet: it leaves open what its slope has beyond
-chance (fusiond.integrity.proof), where its errors are configured to be white. Where fixes share one
-that is a state P never falls below it, and a minute's drift is within it: on css_164, 90 s after
-each tunnel, sigma would be 4 m of a receiver that states 1 to 2 m and is off by less. What a source
-left open that has fallen silent stays, for silence answers nothing, until another that measures the
-same, about as finely, has a mean of its own.
+Such a position has no means yet: it leaves open what its slope has beyond chance
+(fusiond.integrity.proof), and where its errors are configured to be white is no surer than that
+slope. Where fixes share one that is a state P never falls below it: as wide as the slope is known,
+css_164's sigma would be 4 m, 90 s after each tunnel, of a receiver that states 1 to 2 m and is off
+by less. What a source left open that has fallen silent stays, for silence answers nothing, until
+another that measures the same, about as finely, has a mean of its own.
+
+A filter that has a state b for an error that fixes share, of variance one (fusiond.aiding.wander),
+takes a drift for it as long as it can, and for its own motion what is beyond. But whatever was
+measured, the estimate of such a state has the variance 1 - P_bb, and one beyond what chance does
+once in a thousand is of another error. Without its prior b would be estimated by b / (1 - P_bb),
+and all that P says goes with it, P_ib / P_bb of the difference, is open by as much:
+
+    sigma_i^2 + P_ib^2 max(0, b^2 - 10.83 (1 - P_bb)) / (1 - P_bb)^2
 
 Once the series is left out, P is: by S m^2, which is what the filter and the series were apart for
 as long as the mean looks back. The last innovation alone is mostly noise.
@@ -89,6 +97,8 @@ SELDOM = 10.83
 FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
 # What may be a lateness or a heading that has turned is kept under names of their own, too.
 LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
+# So is what fixes share beyond chance.
+STRAYS = " strays"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -170,20 +180,24 @@ class Hedge:
             wider[8] = variance
         self._put(name, wider)
 
-    def returns(self, source: str, proof: Proof, covariance: Array | None) -> None:
+    def returns(self, source: str, proof: Proof, covariance: Array | None, white: bool) -> bool:
         """A position that is back, and whether it drifts, is not known yet; P (n, n) of the
-        filter."""
+        filter, `white` where its fixes share no error. Whether its means have nothing to add: they
+        have where such an error keeps P, and the slope is not beyond chance."""
         if covariance is None:
-            return self.drop(source)
+            self.drop(source)
+            return white
         owns: list[float] = covariance.diagonal()[DR : DR + 2].tolist()
-        opened = proof.leaves_open(owns)
+        opened = proof.leaves_open(owns, white=white)
         if not any(opened):
-            return self.drop(source)
+            self.drop(source)
+            return white
         wider = np.zeros(9)
         for axis, variance, own in zip((DR, DR + 1), opened, owns, strict=True):
             wider[:3] += variance * (covariance[DR : DR + 3, axis] / own) ** 2
             wider[3:6] += variance * (covariance[DV : DV + 3, axis] / own) ** 2
-        return self._put(source, wider)
+        self._put(source, wider)
+        return True
 
     def late(self, source: str, punctual: Punctual | None, covariance: Array | None) -> None:
         """A position that is back, and whether it is on time has not shown yet; P (n, n) of the
@@ -196,12 +210,19 @@ class Hedge:
             wider = np.concatenate((opened, np.zeros(3))) if opened.any() else None
         self._put(source + LATE, wider)
 
+    def strays(self, source: str, wander: str, state: State | None) -> None:
+        """A position was fused whose error has the block `wander`; the `state` after it."""
+        wider = None
+        if state is not None and state.covariance is not None:
+            wider = _beyond_prior(state.xi, state.covariance, state.model.slots_of(wander))
+        self._put(source + STRAYS, wider)
+
     def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
         """A series is fused, and what others left open that are silent may be its to tell now."""
         if not self.wider or not record.means.degrees:
             return
         for name in self.wider:
-            other = records.get(source := name.removesuffix(TILT).removesuffix(LATE))
+            other = records.get(source := _series_of(name))
             if other is None or other is record or t_ns - other.heard_ns <= FORGET_NS:
                 continue
             fine = 0.0 < record.sd_m <= max(FINE_M, COARSER * other.sd_m)
@@ -221,8 +242,31 @@ class Hedge:
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""
-        for name in (source, source + TILT, source + LATE, source + ACROSS):
+        for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
             self._put(name, None)
+
+
+def _series_of(name: str) -> str:
+    """Whose answer is awaited of what is kept under a name."""
+    for what in (TILT, LATE, STRAYS):
+        name = name.removesuffix(what)
+    return name
+
+
+def _beyond_prior(xi: Array, covariance: Array, slots: Sequence[int]) -> Array | None:
+    """What estimates of variance one that are beyond chance leave open (9,); None where none is:
+    the `slots` in xi (n,) and P (n, n)."""
+    wider = None
+    for slot in slots:
+        shown = 1.0 - float(covariance[slot, slot])
+        excess = float(xi[slot]) ** 2 - SELDOM * shown
+        if shown <= 0.0 or excess <= 0.0:
+            continue
+        opened = excess * (covariance[:, slot] / shown) ** 2
+        tilt = opened[PHI] + opened[PHI + 1]  # of whichever axis roll and pitch are about
+        own = (*opened[DR : DR + 3], *opened[DV : DV + 3], tilt, tilt, opened[PHI + 2])
+        wider = np.array(own) if wider is None else wider + own
+    return wider
 
 
 def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:

@@ -246,11 +246,13 @@ class Isolation:
         if aid.across_sd_m_s > 0.0 and state is not None:
             self.hedge.goes_across(aid, record, state)
         if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            if record.proof is not None and aid.white:
-                self.hedge.returns(aid.source, record.proof, covariance)
-            elif record.means.unlikely or self.hedge.holds(aid.source):
+            proof, white = record.proof if aid.white or aid.wanders else None, aid.white
+            told = proof is not None and self.hedge.returns(aid.source, proof, covariance, white)
+            if not told and (record.means.unlikely or self.hedge.holds(aid.source)):
                 self.hedge.look(aid, record, offer or velocity, nav, covariance)
-            if offer is not None and not aid.wanders:
+            if offer is not None and aid.wanders:
+                self.hedge.strays(aid.source, offer.wander, state)
+            elif offer is not None:
                 self.hedge.late(aid.source, record.punctual, covariance)
             self.hedge.answered(self._records, record, t_ns)
             return Action.NONE

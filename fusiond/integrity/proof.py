@@ -28,7 +28,9 @@ that admits a drift; and it is open by what the slope has beyond what chance doe
 
     max(P, (2^2 / 3) sigma_b^2 g^2) + max(0, b^2 - 3.84 sigma_b^2) g^2
 
-The first is P of white errors and a way without any: sigma_b T / 2 = sqrt(3) s / sqrt(n).
+The first is P of white errors and a way without any: sigma_b T / 2 = sqrt(3) s / sqrt(n). Where
+fixes share an error that is a state P never falls below it, and it is the second alone: a slope
+beyond chance is no such error's.
 
 Errors that last make means and slopes less certain than white ones would: by the `colour` that the
 series has shown before. The way has errors of its own: of velocities of sigma s_v, of which a slope
@@ -196,13 +198,13 @@ class Proof(NamedTuple):
         walked = WALKED * self.sd_m_s / math.sqrt(max(self.trend.n, 1))
         return math.hypot(self.trend.slope[1] * self.colour, walked)
 
-    def leaves_open(self, own: Sequence[float]) -> tuple[float, ...]:
+    def leaves_open(self, own: Sequence[float], *, white: bool = True) -> tuple[float, ...]:
         """What of a position, north and east (m^2), is open beside the variances that the filter
-        has of its `own`, until it is known whether it drifts."""
+        has of its `own`, until it is known whether it drifts; `white`: its fixes share no error."""
         variance = self.sigma**2
         if not math.isfinite(variance):
             return 0.0, 0.0
-        least = UNPROVEN_SIGMAS**2 / 3.0 * variance * self.follows**2
+        least = UNPROVEN_SIGMAS**2 / 3.0 * variance * self.follows**2 if white else 0.0
         open_by = (max(0.0, b * b - LIKELY * variance) * self.follows**2 for b in self.trend.line)
         return tuple(max(0.0, least - p) + more for p, more in zip(own, open_by, strict=False))
 

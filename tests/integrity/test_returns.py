@@ -285,3 +285,39 @@ def test_a_start_after_a_failure_waits_until_an_even_braking_ends(failed: bool) 
         told.append("began anew" in (isolation.contested(aid.t_ns) or ""))
     assert told[:76] == [failed] * 76
     assert not told[-1]
+
+
+def _drifting(drift_m_s: float, wander: str) -> list[tuple[float, float]]:
+    """Of a receiver that was sound for ten minutes, is back after 40 s without, and drifts: by how
+    much the filter, which follows it, is off to the north, and the variance that is open beside its
+    own of 1 m^2."""
+    isolation, p, k = Isolation(), np.eye(MODEL.size), 1.0 / (1.0 + UNPROVEN_SIGMAS**2)
+    to_m, error_m, rng = metres_a_radian(START)[0], 0.0, np.random.default_rng(7)
+    found: list[tuple[float, float]] = []
+    for t_s in [*range(600), *range(640, 665)]:
+        drifted = drift_m_s * max(0.0, t_s - 640.0)
+        error_m += k * (drifted - error_m)
+        nav = START.copy()
+        nav[VN : VE + 1] = 8.0, 0.0
+        nav[LAT] += (8.0 * t_s + error_m) / to_m
+        place = START[LAT] + (8.0 * t_s + drifted) / to_m, START[LON], 40.0
+        aid = PositionAid("gnss", t_s * S, 0.9999, *place, (1.0,) * 3, (0.0,) * 3)
+        moving = VelocityAid("gnss_velocity", t_s * S, 0.9999, (8.0, 0.0), (0.2,) * 2, (0.0,) * 3)
+        isolation.judge(moving, Outcome("fused", 0.0, 2, (0.0, 0.0)), nav, p)
+        if isolation.unproven("gnss", aid.t_ns):
+            isolation.comes(aid, state_at(nav), p)
+        aid = replace(aid, wander=wander)
+        noise = rng.standard_normal(3) if t_s < 600 else np.zeros(3)
+        isolation.judge(aid, Outcome("fused", 1.0, 3, tuple(noise.tolist())), nav, p)
+        if t_s >= 640 and isolation.believes("gnss"):
+            wider = isolation.hedge.wider.get("gnss", np.zeros(9))
+            found.append((error_m, float(wider[0])))
+    return found
+
+
+def test_a_slope_beyond_chance_is_no_error_that_fixes_share() -> None:
+    """A state for such an error keeps P above it; a drift that is not told yet goes beyond that."""
+    found = _drifting(0.5, "gnss_wander")
+    assert max(error for error, _ in found) > 5.0
+    assert all(error < 3.0 * math.sqrt(1.0 + opened) for error, opened in found[8:])
+    assert not any(opened for _, opened in _drifting(0.0, "gnss_wander"))
