@@ -85,8 +85,7 @@ that it can be (a drive at 15 m/s with 0.15 s: 8 sigma)."""
 class Clock:
     """Turns stamps into instants. `counters` names everything it refused, guessed or learnt.
 
-    `on_event(code, text)` hears of `utc_jumped`, `utc_implausible`, `system_clock_stepped` and
-    `host_resumed`;
+    `on_event(code, text)` hears what happens to UTC, to the system clock and to the host;
     `on_time` has every report by which the system clock may be set.
     """
 
