@@ -77,21 +77,12 @@ def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
 
 
 # Columns of the elements' array.
-_COLUMNS = 31
+_COLUMNS = 29
 (
-    _WEEK, _TOE, _TOC, _GM, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _SIN_I0, _COS_I0, _NODE,
-    _SIN_PERIGEE, _COS_PERIGEE, _M0, _DN, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC, _CIS,
-    _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK,
+    _WEEK, _TOE, _TOC, _GM, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _I0, _NODE, _PERIGEE, _M0,
+    _DN, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC, _CIS, _A0, _A1, _A2,
+    _COS_TILT, _SIN_TILT, _TOC_WEEK,
 ) = range(_COLUMNS)  # fmt: skip
-
-
-@compiled("UniTuple(f8, 2)(f8, f8, f8)")
-def turned(sine: float, cosine: float, angle: float) -> tuple[float, float]:
-    """Sine and cosine of what is `angle` further: to the rounding where that is
-    below 2e-4 rad."""
-    half = 0.5 * angle * angle
-    c, s = 1.0 - half, angle * (1.0 - half / 3.0)
-    return sine * c + cosine * s, cosine * c - sine * s
 
 
 @compiled("void(f8[:, ::1], f8, f8[::1], b1, f8[:, ::1])")
@@ -100,7 +91,7 @@ def satellite_states(
 ) -> None:
     """Write (n, 8): position m, velocity m/s, clock offset s and drift s/s.
 
-    `elements` (n, 31) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
+    `elements` (n, 29) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
     satellite's own clock has it if `by_satellite_clock`.
     """
     for k in range(elements.shape[0]):
@@ -120,34 +111,30 @@ def satellite_states(
         n = math.sqrt(q[_GM] / axis) / axis + q[_DN]
         mean = q[_M0] + n * tk
         anomaly = mean + ecc * math.sin(mean)
-        sin_e, cos_e = 0.0, 1.0
-        for _ in range(12):  # Newton, quadratic: a step of 1e-8 leaves 1e-16
-            sin_e, cos_e = math.sin(anomaly), math.cos(anomaly)
-            change = (anomaly - ecc * sin_e - mean) / (1.0 - ecc * cos_e)
+        for _ in range(12):  # Newton: two steps at e = 0.02; one more is the last one squared
+            change = (anomaly - ecc * math.sin(anomaly) - mean) / (1.0 - ecc * math.cos(anomaly))
             anomaly -= change
             if abs(change) < 1e-8:
                 break
-        sin_e, cos_e = turned(sin_e, cos_e, -change)
+        sin_e, cos_e = math.sin(anomaly), math.cos(anomaly)
         nearness = 1.0 - ecc * cos_e
         anomaly_rate = n / nearness
         root = math.sqrt(1.0 - ecc * ecc)
-        # The true anomaly's sine and cosine, then those of phi = true anomaly + perigee.
-        sv, cv = root * sin_e / nearness, (cos_e - ecc) / nearness
-        sw, cw = q[_SIN_PERIGEE], q[_COS_PERIGEE]
-        sp, cp = sv * cw + cv * sw, cv * cw - sv * sw
+        phi = math.atan2(root * sin_e, cos_e - ecc) + q[_PERIGEE]
         phi_rate = root * anomaly_rate / nearness
-        s2, c2 = 2.0 * sp * cp, cp * cp - sp * sp
-        su, cu = turned(sp, cp, q[_CUS] * s2 + q[_CUC] * c2)
+        s2, c2 = math.sin(2.0 * phi), math.cos(2.0 * phi)
+        u = phi + q[_CUS] * s2 + q[_CUC] * c2
         u_rate = phi_rate * (1.0 + 2.0 * (q[_CUS] * c2 - q[_CUC] * s2))
         r = axis * nearness + q[_CRS] * s2 + q[_CRC] * c2
         r_rate = axis * ecc * sin_e * anomaly_rate + 2.0 * phi_rate * (q[_CRS] * c2 - q[_CRC] * s2)
-        change = q[_I_RATE] * tk + q[_CIS] * s2 + q[_CIC] * c2
-        si, ci = turned(q[_SIN_I0], q[_COS_I0], change)
+        inc = q[_I0] + q[_I_RATE] * tk + q[_CIS] * s2 + q[_CIC] * c2
         inc_rate = q[_I_RATE] + 2.0 * phi_rate * (q[_CIS] * c2 - q[_CIC] * s2)
         we = q[_RATE]
         geo = q[_GEO] > 0.0
         node_rate = q[_NODE_RATE] if geo else q[_NODE_RATE] - we
         node = q[_NODE] + node_rate * tk - we * q[_OWN_TOE]
+        su, cu = math.sin(u), math.cos(u)
+        si, ci = math.sin(inc), math.cos(inc)
         so, co = math.sin(node), math.cos(node)
         px, py = r * cu, r * su
         px_rate = r_rate * cu - py * u_rate
@@ -175,7 +162,7 @@ def satellite_states(
 
 
 def elements_row(ephemeris: Ephemeris) -> Array:
-    """One ephemeris as the row (31,) that `satellite_states` takes."""
+    """One ephemeris as the row (29,) that `satellite_states` takes."""
     e = ephemeris
     constants = CONSTANTS[e.system]
     week, toe = gps_time(e.system, e.week, e.toe_s)
@@ -184,10 +171,9 @@ def elements_row(ephemeris: Ephemeris) -> Array:
     toc_week = week + round((toe - toc) / WEEK_S)
     values = (
         week, toe, toc, *constants, is_beidou_geo(e.system, e.prn), e.toe_s, e.sqrt_a,
-        e.eccentricity, math.sin(e.inclination), math.cos(e.inclination), e.ascending_node,
-        math.sin(e.perigee), math.cos(e.perigee), e.mean_anomaly, e.mean_motion_correction,
-        e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc, e.crs, e.cic, e.cis,
-        e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
+        e.eccentricity, e.inclination, e.ascending_node, e.perigee, e.mean_anomaly,
+        e.mean_motion_correction, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
+        e.crs, e.cic, e.cis, e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
         math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week,
     )  # fmt: skip
     return np.array(values, float)
@@ -204,7 +190,7 @@ class SatelliteStates(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Orbits:
-    """Ephemerides of n satellites, stacked once: `elements` (n, 31)."""
+    """Ephemerides of n satellites, stacked once: `elements` (n, 29)."""
 
     elements: Array
 

@@ -32,7 +32,7 @@ from fusiond.gnss.atmosphere import (
     zenith_delays,
 )
 from fusiond.gnss.ecef import to_geodetic
-from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states, turned
+from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states
 from fusiond.navigation.compiled import compiled
 
 Array = npt.NDArray[np.float64]
@@ -86,7 +86,7 @@ def range_rows(
     """Write (20, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 31), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
+    `elements` (n, 29), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
     BeiDou's coefficients; `noise` (8,).
     """
     n = elements.shape[0]
@@ -114,7 +114,8 @@ def range_rows(
         for _ in range(2):  # unturned 27 m off, then 0.2 mm, then less than a nanometre
             dx, dy, dz = x - rx, y - ry, z - rz
             distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-            s, c = turned(0.0, 1.0, EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S)
+            angle = EARTH_RATE_RAD_S * distance / SPEED_OF_LIGHT_M_S
+            c, s = 1.0 - 0.5 * angle * angle, angle  # 1e-5 rad: off by its cube over six, 1e-16
             x, y = c * xt + s * yt, c * yt - s * xt
         dx, dy, dz = x - rx, y - ry, z - rz
         distance = math.sqrt(dx * dx + dy * dy + dz * dz)
