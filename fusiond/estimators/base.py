@@ -176,18 +176,19 @@ class ErrorStateFilter:
 
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         self.model = model
-        self.published = Published(model.time_slot)
         self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
         count, width = len(shares), model.width
-        sizes = (scratch_size(width), NAV_SIZE, model.size, STEP_SIZE, WIDER)
+        self.published = Published(model.time_slot)
+        sizes = (scratch_size(width), NAV_SIZE, model.size, STEP_SIZE, WIDER, len(self.published))
         self._state: Array = in_lines(sum(sizes))  # one array for the kernel
         parts = np.split(self._state, np.cumsum(sizes)[:-1])
         self.nav: Array
         self.xi: Array
         self.step: Array
-        self._scratch, self.nav, self.xi, self.step, self.wider = parts
+        self._scratch, self.nav, self.xi, self.step, self.wider, self._by = parts
+        self._by[:] = self.published
         self._covs: Array = in_lines(count * width * width).reshape(count, width, width)
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
@@ -200,7 +201,7 @@ class ErrorStateFilter:
         self._carrying = False
         self.turned = 0.0
         self._options = HOLD_HEIGHT if model.hold_height else 0
-        self._kernel = propagate_for(width)
+        self._kernel, self._model = propagate_for(width), model.packed
 
     @property
     def covariance(self) -> Array:
@@ -220,6 +221,7 @@ class ErrorStateFilter:
     def publish_by(self, published: Published) -> None:
         """From the next start on."""
         self.published = published
+        self._by[:] = published
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -236,7 +238,7 @@ class ErrorStateFilter:
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
-        model, start, options = self.model, imu.start, self._options
+        start, hold_ns, options = imu.start, imu.hold_ns, self._options
         if record:
             options |= RECORD
         if self._holding or self._carrying:
@@ -247,14 +249,13 @@ class ErrorStateFilter:
             self._dxs,
             self._shares,
             self._phi,
-            model.packed,
+            self._model,
             imu.packed,
-            *self.published,
             self.sample - start,
             imu.end,
             self.t_ns,
             target_ns,
-            min(self.gap_ns, imu.hold_ns),
+            min(self.gap_ns, hold_ns),
             options,
         )
         self.sample = first + start

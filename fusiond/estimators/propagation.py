@@ -22,7 +22,7 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
-from fusiond.estimators.reading import in_fix_time, sigmas, widen
+from fusiond.estimators.reading import WIDER, in_fix_time, sigmas, widen
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
@@ -220,7 +220,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
 
     @compiled(
         "UniTuple(i8, 2)(f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], u1[::1], f8[::1],"
-        "i8, f8, f8, i8, i8, i8, i8, i8, i8)",
+        "i8, i8, i8, i8, i8, i8)",
         variant=width,
     )
     def propagate(
@@ -231,9 +231,6 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         phi: Array,
         model: NDArray[np.uint8],
         imu: Array,
-        time_slot: int,
-        clock_sd_s: float,
-        axes_sd_rad: float,
         first: int,
         end: int,
         now: int,
@@ -245,9 +242,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
 
         A call costs 25 ns an argument: what belongs together comes as one.
         `state` is scratch_size(width) doubles, zero at first, nav (10,), xi (n,), the last step
-        (27,) and the variances (9,) that what is published is wider by; `model` and `imu` are
-        `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows `times` and `samples` (rate,
-        force): sample i holds over (times[i-1], times[i]], with noise of `densities` beyond
+        (27,), the variances (9,) that what is published is wider by, and `Published`; `model` and
+        `imu` are `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows `times` and `samples`
+        (rate, force): sample i holds over (times[i-1], times[i]], with noise of `densities` beyond
         `noise`. Samples first ... end-1 may be used; the last one only as far as `target`, so a
         target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD, with which the
         solution and the sigmas of covariance 0 at the end of each whole sample go into the IMU's
@@ -263,7 +260,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         work, scratch, rest = state[:worked], state[worked:scratched], state[scratched:]
         nav, xi = rest[:NAV_SIZE], rest[NAV_SIZE : NAV_SIZE + n]
         step = rest[NAV_SIZE + n : NAV_SIZE + n + STEP_SIZE]
-        wider = rest[NAV_SIZE + n + STEP_SIZE :]
+        wider = rest[NAV_SIZE + n + STEP_SIZE : NAV_SIZE + n + STEP_SIZE + WIDER]
+        by = NAV_SIZE + n + STEP_SIZE + WIDER
+        time_slot, clock_sd_s, axes_sd_rad = int(rest[by]), rest[by + 1], rest[by + 2]
         noise = model[: 24 * n].view(np.float64).reshape((3, n))
         sensor_terms = model[24 * n : 24 * n + 192].view(np.int64).reshape((2, 12))
         rates = model[24 * n + 192 : model.shape[0] - n].view(np.int64)
