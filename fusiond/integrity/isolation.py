@@ -249,7 +249,8 @@ class Isolation:
             proof, white = record.proof if aid.white or aid.wanders else None, aid.white
             told = proof is not None and self.hedge.returns(aid.source, proof, covariance, white)
             if not told and (record.means.unlikely or self.hedge.holds(aid.source)):
-                self.hedge.look(aid, record, offer or velocity, nav, covariance)
+                left = self._tilting.left(covariance)
+                self.hedge.look(aid, record, offer or velocity, nav, covariance, left)
             if offer is not None and aid.wanders:
                 self.hedge.strays(aid.source, offer.wander, state)
             elif offer is not None:
