@@ -145,9 +145,11 @@ def rest(
     witnesses: Witnesses | None = None,
     end_s: float = 10.0,
     run: int = 1,
+    scatter: Array | None = None,
 ) -> Rest:
     """The hypothesis of rest in a window of one second, with the default sigmas and no noise."""
     rate = np.array(mean_rate)
-    window = Window(round(end_s * 1e9), 100, rate, np.array([0.0, 0.0, -9.8]), True, run, rate)
+    force, scatters = np.array([0.0, 0.0, -9.8]), np.zeros(3) if scatter is None else scatter
+    window = Window(round(end_s * 1e9), 100, rate, force, True, run, rate, scatters)
     sd_rate = math.radians(0.1)
     return Rest(window, witnesses or Witnesses(), max_speed_m_s, 0.05, sd_rate, 0.0)

@@ -21,6 +21,17 @@ in a row (one, and up to ten). The bias's P is at the start that of the data she
 it cannot be told from a bias. The last test asks for evidence as good as what the aid
 will claim, once quiet windows at speed have shown that quiet is none.
 
+What has stood the tests may creep still, at a speed of sigma s_v, and around a bend: it turns about
+its down axis with the sigma s_v / R at the most, R the least radius of a car. A creep is not even:
+as a rate of first order that lasts for T it scatters over k windows of a second by
+
+    E S^2 = sigma^2 (1 - c),   c = 2 / (k (k - 1)) sum_d (k - d) exp(-d / T)
+
+so that a run that scatters by S turns with no more than sigma^2 = S^2 / (1 - c) (k - 1) / q, with q
+the twentieth part of chi-square of k - 1. The lesser of the two adds to the variance of the zero
+rate: of a first window it is nearly all of it where the speed is not known, after five seconds at
+rest nothing.
+
 Source: Groves, 2nd ed., section 15.3.
 """
 
@@ -28,6 +39,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -59,6 +71,11 @@ SURE_SIGMAS = 7.0
 TURNING, TURNS_AT_REST = "turning", "turns_at_rest"
 # How far back measured speeds are averaged: as many windows as a run has.
 WITNESSED_NS = 1_000_000_000
+# The least turning radius of a car (m), and how long (s) a rate of turn lasts in a car that creeps.
+LEAST_RADIUS_M = 5.0
+CREEP_LASTS_S = 3.0
+# A run scatters by less than its turn would make it once in twenty.
+SCATTERS = 0.95
 
 
 def _rate_error(state: State, mean_rate: Array) -> Array:
@@ -83,6 +100,15 @@ def _normalised(v: list[float], p: list[list[float]], least: float) -> float:
             for j in range(k + 1, len(p)):
                 p[i][j] -= share * row[j]
     return square
+
+
+@lru_cache(maxsize=64)
+def _evenly(windows: int, window_s: float) -> float:
+    """Over the variance by which so many of a creep scatter, that of its turn, at the most."""
+    lags = range(1, windows)
+    alike = sum((windows - d) * math.exp(-d * window_s / CREEP_LASTS_S) for d in lags)
+    alike *= 2.0 / (windows * (windows - 1))
+    return (windows - 1) / quantile(windows - 1, SCATTERS) / (1.0 - alike)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +155,19 @@ class Rest:
     def _measured(self) -> Measured:
         w = self.window
         return self.witnesses.measured(w.end_ns - w.run * WITNESSED_NS, w.end_ns)
+
+    def creeps(self, state: State) -> Array:
+        """Variances (3,), rad^2/s^2, of what may have turned though nothing has refuted rest."""
+        p, w = state.covariance, self.window
+        if p is None:
+            return np.zeros(3)
+        sd = min(math.sqrt(max(p[3, 3], p[4, 4])), self._measured().sd)
+        turns = (sd / LEAST_RADIUS_M) ** 2
+        down = np.square(state.dcm[2])
+        if w.run > 1:
+            turns = min(turns, float(w.scatter @ down) * _evenly(w.run, self.window_s))
+        creeps: Array = turns * down
+        return creeps
 
     def felt_turn(self, state: State) -> float:
         """Of a window in which it was `TURNING`: the angle (rad) about down that the gyros have
@@ -196,7 +235,7 @@ class ZeroRateAid(Aid):
         h = np.zeros((3, model.size))
         rate_columns(h, slice(None), model, np.eye(3))
         z = _rate_error(state, np.array(self.mean_rate))
-        return Innovation(z, h, np.full(3, self.sd_rad_s**2))
+        return Innovation(z, h, self.sd_rad_s**2 + self.rest.creeps(state))
 
     def felt_turn(self, state: State) -> float:
         return self.rest.felt_turn(state)

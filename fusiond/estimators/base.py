@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.covariance import in_lines
+from fusiond.estimators.doubt import open_by, unsettle
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
@@ -41,13 +42,6 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
 
 Array = NDArray[np.float64]
-
-# One sigma added when the motion is in doubt: to the attitude (rad) what an alignment on the move
-# can be wrong by, to the sensor errors what a damaged or loose unit shows, a hundred times the bias
-# of a data sheet.
-DOUBTED_ATTITUDE_RAD = math.radians(3.0)
-DOUBTED_RATE_RAD_S = math.radians(1.0)
-DOUBTED_FORCE_M_S2 = 0.5
 
 
 @lru_cache(maxsize=1024)
@@ -151,6 +145,9 @@ class Estimator(Protocol):
     ) -> None:
         """Widen P: by an aid's innovation, or what its series is `apart` (m,) from the filter, what
         it measures, or attitude and sensor errors."""
+
+    def unsettle(self, share: float) -> None:
+        """Add that share of what a doubt of the motion adds to the sensor errors' variances."""
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""
@@ -349,24 +346,13 @@ class ErrorStateFilter:
 
     def _doubt(self, rows: Innovation, motion: bool) -> None:
         """Widen what is kept between updates by an innovation."""
-        self._widen(self._covs[0], rows.z - rows.h @ self._dxs[0], rows.h, motion)
+        z = rows.z - rows.h @ self._dxs[0]
+        open_by(self._covs[0], self.model, z, rows.h, motion)
 
-    def _widen(self, cov: Array, z: Array, h: Array, motion: bool) -> None:
-        """Add the innovation's own square to the states that it measures directly. With `motion`,
-        doubt attitude and sensor errors beyond what any data sheet says."""
-        if motion:
-            doubted = DOUBTED_ATTITUDE_RAD, DOUBTED_RATE_RAD_S, DOUBTED_FORCE_M_S2
-            for first, sd in zip((0, 9, 12), doubted, strict=True):
-                for axis in range(first, first + 3):
-                    slots = [axis] if first == 0 else self.model.parameters(axis)
-                    for slot in slots[:1]:  # a model may know no such error
-                        cov[slot, slot] += sd**2 * self.model.active[slot]
-        for row, value in zip(h, z, strict=True):
-            # Position or velocity before the attitude that turns a lever arm.
-            group = next(g for g in (slice(3, 9), slice(0, 3), slice(0, len(row))) if row[g].any())
-            slot = group.start + int(np.argmax(np.abs(row[group])))
-            if self.model.active[slot]:
-                cov[slot, slot] += value * value
+    def unsettle(self, share: float) -> None:
+        """Add that share of what a doubt of the motion adds to the sensor errors' variances."""
+        for cov in self._covs:
+            unsettle(cov, self.model, share)
 
     def snapshot(self) -> Snapshot:
         """A copy of everything."""

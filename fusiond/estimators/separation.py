@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.doubt import open_by
 from fusiond.estimators.federated.options import local_of
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
@@ -96,7 +97,7 @@ class SeparatedEstimator(KalmanEstimator):
         for k in range(len(self.devices)):
             used = len(rows.z) if measured and k != own else 0
             z, h = rows.z[:used], rows.h[:used]
-            self._widen(self._covs[k + 1], z - h @ self._dxs[k + 1], h, motion)
+            open_by(self._covs[k + 1], self.model, z - h @ self._dxs[k + 1], h, motion)
 
     def release(self) -> None:
         """Feed back what was carried."""

@@ -21,7 +21,8 @@ by as much again, is accelerated by that over T, which gravity makes of a tilt:
 
 A tilt is known better than some seconds of velocities tell it, so that this counts beyond what
 chance does once in a thousand. The tilt is a sum of rates: it stays wrong when the mean passes
-through zero on its way back, and what was left open of it fades as the slow mean forgets. And a
+through zero on its way back, and beside a force that is wrong as long as the two look alike. An
+update takes of an error what it takes of P, so that what was left open fades by (P+ / P-)^2. And a
 vehicle that does not slip faces its velocity, which is measured: of what goes across at a speed v
 a slip is one cause, a heading the other, for a mounting does not change,
 
@@ -92,8 +93,9 @@ Said = PositionOffer | VelocityOffer | None
 
 # Of a chi-square of one, by chance once in a thousand.
 SELDOM = 10.83
-# What is left open of a tilt fades by this with each innovation, as the slow mean's square; below a
-# hundredth of P's variance, half a percent of sigma, it is nothing. It is kept under its own name.
+# What a turn at rest has left open fades by this with each innovation, as the slow mean's square;
+# below a hundredth of P's variance, half a percent of sigma, it is nothing, and so is what is left
+# open of a tilt, which is kept under its own name.
 FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
 # What may be a lateness or a heading that has turned is kept under names of their own, too.
 LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
@@ -117,10 +119,17 @@ class Hedge:
         return source in self.wider or source + TILT in self.wider
 
     def look(
-        self, aid: Aid, record: Series, said: Said, nav: Array, covariance: Array | None
+        self,
+        aid: Aid,
+        record: Series,
+        said: Said,
+        nav: Array,
+        covariance: Array | None,
+        left: float,
     ) -> None:
         """A mean of a series that is fused is beyond what is likely, or was; the state `nav` (10,)
-        and P (n, n) of the filter. A coarse position cannot say that a fine one is wrong."""
+        and P (n, n) of the filter, and what the update has `left` of the tilt's (1). A coarse
+        position cannot say that a fine one is wrong."""
         source, unlikely = aid.source, record.means.unlikely
         if covariance is None or record.sd_m > FINE_M:
             if not unlikely:
@@ -131,16 +140,21 @@ class Hedge:
             wider = record.means.leaves_open(covariance, first, said.sd) if unlikely else None
             self._put(source, wider)
             if record.moves and not record.locates:
-                self._put(source + TILT, self._tilts(source + TILT, record, said, covariance))
+                self._put(source + TILT, self._tilts(source + TILT, record, said, covariance, left))
         elif aid.across_sd_m_s > 0.0:
             self._put(source, _turns(aid, record, nav, covariance) if unlikely else None)
 
     def _tilts(
-        self, name: str, record: Series, said: PositionOffer | VelocityOffer, covariance: Array
+        self,
+        name: str,
+        record: Series,
+        said: PositionOffer | VelocityOffer,
+        covariance: Array,
+        left: float,
     ) -> Array | None:
         """What a velocity leaves open of roll and pitch; None where it is nothing."""
         before = self.wider.get(name)
-        kept = 0.0 if before is None else FADES * float(before[6])
+        kept = 0.0 if before is None else left * left * float(before[6])
         told = record.means.unlikely and record.every_ns > 0
         now = _tilt(record, said, covariance) if told else 0.0
         tilt = max(kept, now)

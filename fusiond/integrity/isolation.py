@@ -249,7 +249,8 @@ class Isolation:
             proof, white = record.proof if aid.white or aid.wanders else None, aid.white
             told = proof is not None and self.hedge.returns(aid.source, proof, covariance, white)
             if not told and (record.means.unlikely or self.hedge.holds(aid.source)):
-                self.hedge.look(aid, record, offer or velocity, nav, covariance)
+                left = self._tilting.left(covariance)
+                self.hedge.look(aid, record, offer or velocity, nav, covariance, left)
             if offer is not None and aid.wanders:
                 self.hedge.strays(aid.source, offer.wander, state)
             elif offer is not None:
@@ -270,6 +271,11 @@ class Isolation:
         slip cannot turn on the spot."""
         if any(record.no_slip for record in self._records.values()):
             self.hedge.turns_at_rest(angle)
+
+    def unsettled(self, t_ns: int) -> float:
+        """Of a doubt's variances, the share by which the sensors' errors may have changed anew
+        since the position or velocity before the one that comes."""
+        return support.unsettled(self._records, self._doubts, t_ns)
 
     def correcting(self, nav: Array, covariance: Array) -> None:
         """A position or velocity is about to be fused into a filter with the state `nav` (10,) and
@@ -324,7 +330,8 @@ class Isolation:
         record.refused += 1
         if record.refused == 1:
             record.refused_ns = t_ns
-            record.jumped = jumps(record, t_ns, nis, away, self._supported(record.device, t_ns))
+            agrees = support.supported(self._records, record.device, t_ns)
+            record.jumped = jumps(record, t_ns, nis, away, agrees)
         if record.refused < REFUSED_IN_A_ROW:
             return Action.NONE
         reason = "jumped" if record.jumped else "disagrees"
@@ -365,26 +372,16 @@ class Isolation:
         if offset is not None:
             record.trend = record.trend.with_one(offset, (t_ns - record.passing_ns) * 1e-9)
             record.ran = record.ran or record.trend.runs_away
+        means, degrees = record.means, record.means.degrees
         if (
             record.passes >= READMIT_COUNT
             and t_ns - record.passing_ns >= READMIT_NS
             and (offset is None or record.steady)
-            and not self._biased(record, t_ns, own)
+            and not (degrees and means.biased(t_ns, gate_threshold(self._pass, degrees), own))
         ):
             record.excluded, record.fused_ns, record.back_ns = "", t_ns, t_ns
             record.refused, record.jumped, record.proof = 0, False, None
             record.means.restart()
-
-    def _supported(self, device: str, t_ns: int) -> bool:
-        """Whether a velocity of the device agrees with the filter still."""
-        return support.supported(self._records, device, t_ns)
-
-    # ------------------------------------------------------------------ the mean test
-
-    def _biased(self, record: Series, t_ns: int, own: float = 0.0) -> bool:
-        means = record.means
-        degrees = means.degrees
-        return degrees > 0 and means.biased(t_ns, gate_threshold(self._pass, degrees), own)
 
     def _blame(self, record: Series, aid: Aid) -> Action:
         """A bias inside the gate: the series', where something else supports the filter."""

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
@@ -23,6 +23,11 @@ FINE_M = 3.0
 COARSER = 3.0
 # While the velocity of the same device was fused this lately, the filter's motion is supported.
 SUPPORT_NS = 2_000_000_000
+# How long (ns) a sensor that has changed is wrong has no scale: what has lasted for t may be over
+# within another. That counts from when a doubt is over for the operator; what has lasted for ten
+# times as long is how the sensor is. Between two aids it counts no longer than `SUPPORT_NS`: what
+# an outage hides it would have hidden before.
+UNSETTLED_NS, SETTLED_NS = 10_000_000_000, 100_000_000_000
 # Two velocities in a row that the gate of 0.9999 refuses are no chance: an IMU that has turned is
 # wrong by the full acceleration from the first on, and of a receiver of 1 Hz the third comes late.
 REFUSED_TWICE = 2
@@ -105,6 +110,17 @@ def contested(records: Records, t_ns: int) -> str | None:
             came = "began anew after a failure" if r.punctual.started else "is back"
             return f"{name} {came}, and no change of velocity has shown yet that it is on time"
     return None
+
+
+def unsettled(records: Records, doubts: Sequence[int], t_ns: int) -> float:
+    """Of a doubt's variances, the share by which the sensors' errors may have changed anew since
+    the position or velocity before the one that comes."""
+    since_ns = t_ns - doubts[-1] if doubts else 0
+    if not 0 < since_ns <= SETTLED_NS:
+        return 0.0
+    before_ns = max(r.heard_ns for r in records.values() if r.moves or r.locates)
+    step_ns = min(t_ns - before_ns, since_ns, SUPPORT_NS)
+    return max(step_ns, 0) / max(since_ns, UNSETTLED_NS)
 
 
 def repeats(records: Records, record: Series, value: tuple[float, ...], moving: bool) -> bool:

@@ -100,7 +100,7 @@ class Tilting:
 
     def __init__(self, sums: Array | None = None) -> None:
         self._sums = np.zeros(_SIZE) if sums is None else sums
-        self._before = np.empty(7)
+        self._before = np.zeros(7)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Tilting) and self._sums.tobytes() == other._sums.tobytes()
@@ -114,6 +114,14 @@ class Tilting:
     def before(self, nav: Array, covariance: Array) -> None:
         """What a filter holds before an update: the state `nav` (10,) and P (n, n)."""
         _remember(nav, covariance, self._before)
+
+    def left(self, covariance: Array | None) -> float:
+        """What that update has left of the tilt's variance (1), after which a filter holds P
+        (n, n); 1 where that is not known."""
+        before = float(self._before[4] + self._before[6])
+        if covariance is None or before <= 0.0:
+            return 1.0
+        return min(float(covariance[0, 0] + covariance[1, 1]) / before, 1.0)
 
     def after(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> bool:
         """Add that update, after which it holds these, P in axes that have `turned` (rad); whether

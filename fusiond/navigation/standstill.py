@@ -47,7 +47,8 @@ class QuietLimits:
 class Window:
     """A finished window: its end, means (3,) and whether the sensor was quiet in all of it.
 
-    `run_rate` (3,) is the mean rate of the last `run` quiet windows in a row, this one with them.
+    `run_rate` (3,) is the mean rate of the last `run` quiet windows in a row, this one with them;
+    `scatter` (3,) the variance of one of them, as they differ (nothing where there is one).
     """
 
     end_ns: int
@@ -57,6 +58,7 @@ class Window:
     quiet: bool
     run: int
     run_rate: Array
+    scatter: Array
 
 
 @compiled("void(f8[:, ::1], i8, i8, f8[::1], f8[::1])")
@@ -99,7 +101,7 @@ def judge(
         and max(abs(mx), abs(my), abs(mz)) < limits.mean_rate
     )
     rate = mean[:3]
-    return Window(int(times[end - 1]), end - first, rate, mean[3:], quiet, 1, rate)
+    return Window(int(times[end - 1]), end - first, rate, mean[3:], quiet, 1, rate, np.zeros(3))
 
 
 class StandstillDetector:
@@ -147,4 +149,5 @@ class StandstillDetector:
         if len(self._run) == 1:
             return w
         rate: Array = np.add.reduce(self._run) / len(self._run)
-        return replace(w, run=len(self._run), run_rate=rate)
+        scatter: Array = np.add.reduce(np.square(self._run - rate)) / (len(self._run) - 1)
+        return replace(w, run=len(self._run), run_rate=rate, scatter=scatter)

@@ -232,6 +232,8 @@ class Timeline:
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
         tilts = (aid.locates or aid.moves) and estimator.model.sensor_errors
         if tilts:
+            if (share := isolation.unsettled(aid.t_ns)) and not estimator.isolates:
+                estimator.unsettle(share)
             isolation.correcting(estimator.nav, estimator.covariance)
         try:
             aid = aid.at(estimator.nav)

@@ -121,6 +121,33 @@ def test_a_slow_turn_on_the_spot_is_told_by_a_run_of_windows() -> None:
     assert runs.rest(mean_rate=mean_rate, run=10).doubt(_state(0.0, 0.5)) == "turning"
 
 
+def test_what_a_creep_may_turn_is_bounded_by_what_is_known_of_the_speed() -> None:
+    """About down alone, by the better of filter and measurements: 5 m are a car's least radius."""
+    turns = (0.2 / 5.0) ** 2
+    assert runs.rest().creeps(_state(0.0, 0.2)) == pytest.approx([0.0, 0.0, turns], rel=1e-3)
+    measured = runs.rest(witnesses=_fixes(0.0, 4)).creeps(_state(0.0, 0.2))
+    assert measured == pytest.approx([0.0, 0.0, (0.05 / 5.0) ** 2], rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 10])
+def test_a_creep_turns_by_no_more_than_its_windows_scatter(count: int) -> None:
+    """Rates of first order that last for three seconds: the last one is beyond two sigma of what
+    the run says as seldom as of a sigma that is known. What stands scatters by a gyro's noise."""
+    rng, rho = np.random.default_rng(5), math.exp(-1.0 / 3.0)
+    state, beyond, draws = _state(0.0, 5.0), 0, 2000
+    for _ in range(draws):
+        rates = np.zeros((count, 3))
+        rates[0, 2] = rng.standard_normal()
+        for k in range(1, count):
+            rates[k, 2] = rho * rates[k - 1, 2] + math.sqrt(1.0 - rho**2) * rng.standard_normal()
+        rates *= 0.3 * DEG
+        rest = runs.rest(run=count, scatter=rates.var(axis=0, ddof=1))
+        beyond += rates[-1, 2] ** 2 > 4.0 * rest.creeps(state)[2]
+    assert beyond < 0.0455 * draws
+    still = runs.rest(run=count, scatter=np.full(3, (0.01 * DEG) ** 2))
+    assert math.sqrt(still.creeps(state)[2]) < 0.3 * DEG / (count - 1)
+
+
 def test_quiet_proves_nothing_on_a_smooth_ride() -> None:
     """Once quiet windows at speed have been seen, rest takes evidence as good as its claim."""
     witnesses = Witnesses()

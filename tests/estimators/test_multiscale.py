@@ -14,6 +14,7 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.doubt import DOUBTED_FORCE_M_S2, DOUBTED_RATE_RAD_S
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.models.catalogue import make_model
@@ -171,6 +172,24 @@ def test_a_filter_in_doubt_widens_and_begins_anew() -> None:
         run(either, buffer, aids[:20])
         either.doubt(far, measured=True, motion=True)
         assert either.update(far).name == "fused"
+    np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(one.covariance, ordinary.covariance, rtol=1e-7, atol=1e-15)
+
+
+def test_sensors_that_may_change_again_are_known_as_much_less_in_both() -> None:
+    model, buffer, aids, start, sd = drive()
+    one, ordinary = MultiscaleEstimator(model, IMU.gap_s, 1), KalmanEstimator(model, IMU.gap_s)
+    for estimator in (one, ordinary):
+        begun(estimator, start, sd)
+        run(estimator, buffer, aids[:20])
+        before = estimator.covariance.copy()
+        estimator.unsettle(0.25)
+        added = np.diag(estimator.covariance - before)
+        expected = np.zeros(model.size)
+        expected[9:12] = 0.25 * DOUBTED_RATE_RAD_S**2
+        expected[12:15] = 0.25 * DOUBTED_FORCE_M_S2**2
+        np.testing.assert_allclose(added, expected, rtol=1e-9, atol=1e-12)
+        run(estimator, buffer, aids[20:30])
     np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(one.covariance, ordinary.covariance, rtol=1e-7, atol=1e-15)
 

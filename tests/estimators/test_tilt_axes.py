@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.attitude import AttitudeAid, HeadingAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.base import DOUBTED_FORCE_M_S2
+from fusiond.estimators.doubt import DOUBTED_FORCE_M_S2
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.tilt_axes import heading_turn
 from fusiond.models.catalogue import make_model

@@ -20,6 +20,8 @@ S = 1_000_000_000
 NAV = np.array([0.53, 1.99, 40.0, 8.0, 3.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 LEVER = (0.0, 0.0, 0.0)
 SD_M = 1.0
+# P before an update over P after it.
+TOLD = 1.04
 
 
 class Bench:
@@ -83,6 +85,8 @@ class Bench:
         if not fused and self.isolation.believes(aid.source):
             name = "gated"
         seen = Outcome(name, nis, 3, tuple(y.tolist()))
+        if self.covariance is not None:
+            self.isolation.correcting(NAV, TOLD * self.covariance)
         return self.isolation.judge(aid, seen, NAV, self.covariance)
 
     def both(self, seconds: range, north_m: float = 0.0) -> set[Action]:

@@ -308,7 +308,7 @@ def test_what_goes_across_is_a_heading_for_a_vehicle_that_does_not_slip() -> Non
 
 
 def test_a_velocity_that_is_corrected_again_and_again_leaves_a_tilt_open() -> None:
-    """As much as gravity makes of it in the 0.5 s between two; it fades as the slow mean does."""
+    """As much as gravity makes of it in the 0.5 s between two; it fades as P hears of the tilt."""
     made = bench()
     assert made.covariance is not None
     for k in range(200):

@@ -112,3 +112,21 @@ def test_a_wheel_that_hangs_is_told_by_what_it_has_shown() -> None:
         coarse.wheel(60.0 + 0.1 * k, 8.0)
     assert lively.isolation.excluded == {"wheel": "repeats itself"}
     assert not coarse.isolation.excluded
+
+
+def test_sensors_that_have_changed_may_change_again_for_as_long() -> None:
+    """By the tenth of a doubt each second at first, then as the time since; an outage adds no more
+    than the two seconds in which a velocity still supports the filter."""
+    bench = Bench()
+    bench.both(range(60))
+    assert bench.isolation.unsettled(60 * S) == 0.0
+    for t in range(60, 63):
+        bench.velocity(t, bias=12.0, east_m_s=3.6)
+    assert bench.isolation.doubts == (62 * S,)
+    assert bench.isolation.unsettled(63 * S) == pytest.approx(0.1)
+    bench.fix(63.0)
+    assert bench.isolation.unsettled(63 * S) == 0.0
+    assert bench.isolation.unsettled(82 * S) == pytest.approx(2.0 / 20.0)
+    bench.fix(102.0)
+    assert bench.isolation.unsettled(103 * S) == pytest.approx(1.0 / 41.0)
+    assert bench.isolation.unsettled(163 * S) == 0.0

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.doubt import open_by
 from fusiond.estimators.federated.bank import combine
 from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection
 from fusiond.estimators.federated.options import FederatedOptions, local_of
@@ -247,7 +248,7 @@ class FederatedFilter(ErrorStateFilter):
 
     def _widen_by(self, cov: Array, dx: Array, i: Innovation, motion: bool) -> None:
         """Open a filter for an innovation that is in doubt."""
-        self._widen(cov, i.z - i.h @ dx, i.h, motion)
+        open_by(cov, self.model, i.z - i.h @ dx, i.h, motion)
 
     @staticmethod
     def _fuse_into(cov: Array, dx: Array, i: Innovation, share: float = 1.0) -> None:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.doubt import open_by
 from fusiond.estimators.multiscale.block import (
     Block,
     Window,
@@ -197,7 +198,7 @@ class MultiscaleEstimator(ErrorStateFilter):
     def _doubt(self, rows: Innovation, motion: bool) -> None:
         """Blocks that were wrong are given up, and the start comes again from a wider P."""
         wide = self.covariance
-        self._widen(wide, rows.z - rows.h @ self._dxs[0], rows.h, motion)
+        open_by(wide, self.model, rows.z - rows.h @ self._dxs[0], rows.h, motion)
         self._begin_anew(wide)
 
     def _open(self) -> _Open:

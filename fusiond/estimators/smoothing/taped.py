@@ -186,6 +186,12 @@ class TapedKalman(TiltAxesFilter):
         super().doubt(aid, measured, motion, apart)
         self._close()
 
+    def unsettle(self, share: float) -> None:
+        """Add that share of what a doubt of the motion adds to the sensor errors' variances."""
+        self._close()
+        super().unsettle(share)
+        self._close()
+
     def release(self) -> None:
         """Feed back what was carried."""
         self._fed_back += self._dxs[0]
