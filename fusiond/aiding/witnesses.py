@@ -30,6 +30,9 @@ CONTRADICTION = (10.83, 13.82)
 KEEP_NS = 700_000_000_000
 # Spans of which sums are kept: that of the standstill so far, and those of windows in it.
 MOST_SUMS = 8
+# Spans of which it is kept what they say, two a window: those of two minutes. A rewind asks for
+# those within the history again.
+MOST_TOLD = 256
 # A ride is smooth if this many windows of this time were quiet at a speed that is no rest: chance
 # makes one or two where driving shakes the vehicle.
 SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
@@ -79,7 +82,10 @@ class Witnesses:
         self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
         self._told: dict[tuple[int, int], Measured] = {}
-        """What `measured` has said of spans since the last speed: it is asked at every tick."""
+        """What `measured` has said of spans, asked for at every tick and again by each rewind: of
+        those that no speed has come into since."""
+        self._told_ns = 0
+        """The latest end of them."""
         self._sums: dict[tuple[str, int], _Sum] = {}
         """By source and begin of a span: a standstill is asked about at each speed of minutes."""
 
@@ -100,7 +106,9 @@ class Witnesses:
     def _keep(
         self, source: str, t_ns: int, v: tuple[float, ...], sd: float, rounding: float = 0.0
     ) -> None:
-        self._told.clear()
+        if t_ns <= self._told_ns:
+            self._told.clear()
+            self._told_ns = 0
         speeds = self._speeds[source]
         speed = _Speed(t_ns, v, sd, rounding)
         if speeds and speed < speeds[-1]:
@@ -110,14 +118,19 @@ class Witnesses:
             speeds.append(speed)
         if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
             self._sums.clear()
+            self._told.clear()
             del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
         """What was measured from `begin_ns` to `end_ns`, both included."""
         span = begin_ns, end_ns
-        if span not in self._told:
-            self._told[span] = self._measured(begin_ns, end_ns)
-        return self._told[span]
+        found = self._told.get(span)
+        if found is None:
+            if len(self._told) >= MOST_TOLD:
+                self._told.clear()
+            found = self._told[span] = self._measured(begin_ns, end_ns)
+            self._told_ns = max(self._told_ns, end_ns)
+        return found
 
     def _measured(self, begin_ns: int, end_ns: int) -> Measured:
         contradicts, best = False, math.inf

@@ -42,3 +42,23 @@ def test_sums_that_grow_have_the_bits_of_those_made_at_once() -> None:
     assert contradicted  # and not for nothing
     witnesses.hear([_aid("a", t_ns + 3 * KEEP_NS, 0.0, 0.1)])
     assert witnesses.measured(0, t_ns + 4 * KEEP_NS).sd < 0.1
+
+
+def test_what_was_said_of_spans_holds_until_a_speed_comes_into_one() -> None:
+    """A rewind asks for the spans of all windows again; one late speed is in some of them."""
+    rng = random.Random(2)
+    witnesses, heard = Witnesses(), []
+    windows = [(k * SECOND_NS, (k + 1) * SECOND_NS) for k in range(20)]
+    for begin_ns, _ in windows:
+        for t_ns in (begin_ns + SECOND_NS // 4, begin_ns + 3 * SECOND_NS // 4):
+            heard.append(_aid("a", t_ns, rng.gauss(0.0, 0.1), 0.1))
+            witnesses.hear(heard[-1:])
+        for span in windows:
+            assert witnesses.measured(*span) == _at_once(heard, *span)
+    late = _aid("b", windows[3][0], 5.0, 0.1)
+    before = [witnesses.measured(*span) for span in windows]
+    witnesses.hear([late])
+    after = [witnesses.measured(*span) for span in windows]
+    assert after == [_at_once([*heard, late], *span) for span in windows]
+    changed = [k for k in range(len(windows)) if after[k] != before[k]]
+    assert changed == [2, 3]
