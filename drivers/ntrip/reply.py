@@ -81,37 +81,33 @@ class CasterReply:
         return True
 
     def _chunks(self) -> bytes:
-        found = bytearray()
-        while self._buffer and self.over is None:
+        found, buffer, at = bytearray(), self._buffer, 0
+        while at < len(buffer) and self.over is None:
             if self._left:
-                taken = self._buffer[: self._left]
-                del self._buffer[: len(taken)]
-                payload = max(0, self._left - 2)
-                found += taken[:payload]
-                self._left -= len(taken)
+                taken = min(self._left, len(buffer) - at)
+                payload = min(taken, max(0, self._left - 2))
+                found += buffer[at : at + payload]
+                self._left -= taken
+                at += taken
                 continue
-            line, ends, rest = bytes(self._buffer).partition(b"\r\n")
-            if not ends:
-                if len(line) <= _SIZE_LINE_BYTES:
-                    break
-                size = None
-            else:
-                size = _size(line)
+            ends = buffer.find(b"\r\n", at, at + _SIZE_LINE_BYTES + 2)
+            if ends < 0 and len(buffer) - at < _SIZE_LINE_BYTES + 2:
+                break
+            size = None if ends < 0 else _size(bytes(buffer[at:ends]))
             if not size:
                 no_size = CasterRefusedError("a chunk of the answer has no size")
                 self.over = no_size if size is None else EOFError()
                 break
             self._left = size + 2
-            self._buffer = bytearray(rest)
+            at = ends + 2
+        del buffer[:at]
         return bytes(found)
 
 
 def _size(line: bytes) -> int | None:
     """What a chunk's first line says; None where that is no size."""
     digits = line.partition(b";")[0].strip()
-    if len(line) > _SIZE_LINE_BYTES or not _HEXADECIMAL.fullmatch(digits):
-        return None
-    return int(digits, 16)
+    return int(digits, 16) if _HEXADECIMAL.fullmatch(digits) else None
 
 
 def _judge(first: str, head: bytes) -> None:
