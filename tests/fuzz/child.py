@@ -8,6 +8,7 @@ and a decoder's corpus need not tell one split of the line from another.
 from __future__ import annotations
 
 import gc
+import importlib
 import sys
 from pathlib import Path
 
@@ -24,8 +25,16 @@ def main() -> None:
     # atheris takes whole packages; compiled functions cannot be traced at all.
     others = [module for package in packages for module in _modules(package)]
     others = [module for module in others if module not in traced]
+    plain = {module: importlib.import_module(module) for module in traced}
+    for module in traced:
+        package, _, own = module.rpartition(".")
+        del sys.modules[module]
+        delattr(sys.modules[package], own)
     with atheris.instrument_imports(include=list(traced), exclude=others):
-        from tests.fuzz.targets import TARGETS  # noqa: PLC0415
+        from tests.fuzz.targets import TARGETS, UNTRACED  # noqa: PLC0415
+    for module, twin in plain.items():
+        probed = vars(sys.modules[module]).items()
+        UNTRACED.update({v: vars(twin)[k] for k, v in probed if isinstance(v, type)})
     # What is loaded stays: thousands of collections a minute need not look through it.
     gc.freeze()
     # libFuzzer starts itself anew where it merges.

@@ -13,22 +13,21 @@ class Parser(NamedTuple):
     length: int
 
 
-_RDSS = ("drivers.rdss.framing", "drivers.rdss.messages")
 _NMEA = ("decoder", "epochs", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
 _WORDS = ("beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes", "weeks")
 
 PARSERS = {
-    "splitter": Parser(("drivers.nmea.framing",), 300),
-    "nmea": Parser(tuple(f"drivers.nmea.{m}" for m in _NMEA), 320),
-    "raw": Parser(tuple(f"drivers.raw.{m}" for m in _RAW), 320),
-    "words": Parser(tuple(f"drivers.raw.{m}" for m in _WORDS), 320),
-    "rdss_binary": Parser((*_RDSS, "drivers.rdss.binary_4_0"), 128),
-    "rdss_text": Parser((*_RDSS, "drivers.rdss.text_2_1"), 160),
-    "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 256),
+    "splitter": Parser(("drivers.nmea.framing",), 128),
+    "nmea": Parser(tuple(f"drivers.nmea.{m}" for m in _NMEA), 256),
+    "raw": Parser(tuple(f"drivers.raw.{m}" for m in _RAW), 192),
+    "words": Parser(tuple(f"drivers.raw.{m}" for m in _WORDS), 128),
+    "rdss_binary": Parser(("drivers.rdss.framing", "drivers.rdss.binary_4_0"), 128),
+    "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
+    "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 162),
     "ntrip": Parser(("drivers.ntrip.reply",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),
     "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
-    "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 200),
+    "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
 }
 """By target."""

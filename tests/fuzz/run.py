@@ -128,6 +128,9 @@ def main() -> int:
     for name in options.targets:
         if name not in PARSERS:
             parser.error(f"no target {name!r}: {', '.join(PARSERS)}")
+    # A service manager or a shell's background job interrupts by another signal than a terminal.
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, signal.default_int_handler)
     every = [Fuzzing(name, options.runs) for name in options.targets or PARSERS]
     with ThreadPoolExecutor(options.jobs) as pool:
         running = [pool.submit(one.run) for one in every]
@@ -135,9 +138,9 @@ def main() -> int:
             for each in running:
                 each.result()
         except KeyboardInterrupt:
-            for one, each in zip(every, running, strict=True):
+            for fuzzing, each in zip(every, running, strict=True):
                 if not each.cancel():
-                    one.stop()
+                    fuzzing.stop()
     print(_table([_HEADINGS, *(one.row for one in every)]))
     failed = any(one.crashes or not one.done for one in every)
     return 1 if failed else 0

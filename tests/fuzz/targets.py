@@ -7,12 +7,14 @@ first, so that a fuzzer reaches what stands behind them. What is no stream is in
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
+from typing import Any, TypeVar
 
 from drivers.can.bus import CanFrame
 from drivers.can.dbc import MessagePlan
@@ -25,8 +27,9 @@ from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawGnssEpoch
+from drivers.raw.rtcm import load_pyrtcm
 from drivers.rdss import binary_4_0, text_2_1
-from drivers.rdss.framing import checksum
+from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
 from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, ubx
 from tests.fuzz.documents import commands, csv, input_of, state
@@ -35,10 +38,10 @@ EARLIEST = date(2014, 1, 1)
 
 
 _EVERYWHERE = 15
-_PIECES = 16
+_PIECES = 8
 
 
-def _pieces(choice: int, stream: bytes) -> Iterator[bytes]:
+def _pieces(choice: int, stream: bytes) -> list[bytes]:
     """Of a size by the low bits of `choice`, everywhere or where its high ones say: a few pieces
     between two long ones find what many do, at each place in turn, for a tenth of the work."""
     size, place = (1, 2, 3, 7, 16, 61, 255, 5000)[choice & 7], choice >> 4
@@ -47,7 +50,24 @@ def _pieces(choice: int, stream: bytes) -> Iterator[bytes]:
         begin = end * place // _EVERYWHERE
         end = min(end, begin + _PIECES * size)
     cuts = (0, *range(begin, end, size), end, len(stream))
-    return (stream[a:b] for a, b in itertools.pairwise(cuts) if a < b)
+    return [stream[a:b] for a, b in itertools.pairwise(cuts) if a < b]
+
+
+Reader = TypeVar("Reader")
+UNTRACED: dict[type, type] = {}
+"""Of a fuzzed reader, the same without the fuzzer's probes. A stream is read twice, to see that its
+split does not matter: where the pieces have shown which branches there are, the whole need not."""
+
+
+def untraced(reader: type[Reader]) -> type[Reader]:
+    """The reader itself where nothing is traced."""
+    return UNTRACED.get(reader, reader)
+
+
+def _whole_and_cut(
+    reader: type[Reader], choice: int, stream: bytes
+) -> tuple[tuple[type[Reader], list[bytes]], ...]:
+    return (untraced(reader), [stream]), (reader, _pieces(choice, stream))
 
 
 # --------------------------------------------------------------------------- NMEA, UBX, RTCM 3
@@ -70,8 +90,10 @@ def _mended(stream: bytes) -> bytes:
     return b"".join(mended)
 
 
-def _split(pieces: Iterator[bytes]) -> tuple[list[bytes], Counter[str], int]:
-    splitter = StreamSplitter()
+def _split(
+    kind: type[StreamSplitter], pieces: list[bytes]
+) -> tuple[list[bytes], Counter[str], int]:
+    splitter = kind()
     items = [item for piece in pieces for item in splitter.feed(piece)] + splitter.finish()
     assert splitter.waiting == 0
     return [item.raw for item in items], splitter.counters, splitter.summed
@@ -85,8 +107,10 @@ def splitter(data: bytes) -> None:
     """Sentences and frames out of a stream: the same for any split, every byte accounted for."""
     choice, stream = input_of(data)
     stream = _mended(stream) if choice & 8 else stream
-    items, counters, summed = _split(iter((stream,)))
-    assert (items, counters) == _split(_pieces(choice, stream))[:2]
+    (items, counters, summed), cut = (
+        _split(kind, pieces) for kind, pieces in _whole_and_cut(StreamSplitter, choice, stream)
+    )
+    assert (items, counters) == cut[:2]
     used = b"".join(items)
     garbage = len(stream) - _ends(stream) - (len(used) - _ends(used))
     assert counters["garbage_bytes"] == garbage
@@ -95,13 +119,16 @@ def splitter(data: bytes) -> None:
     assert summed <= 3 * len(stream)  # Fletcher's sums twice, the CRC once
 
 
+_DECODING = NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True)
+
+
 def nmea(data: bytes) -> None:
     """Measurements out of NMEA: the same for any split, finite and plausible."""
     choice, stream = input_of(data)
     stream = _mended(stream) if choice & 8 else stream
     found = []
-    for pieces in (iter((stream,)), _pieces(choice, stream)):
-        decoder = NmeaDecoder("fuzz", NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True))
+    for kind, pieces in _whole_and_cut(NmeaDecoder, choice, stream):
+        decoder = kind("fuzz", _DECODING)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
         found.append((events + decoder.flush(), decoder.counters))
         assert not decoder.epoch_open
@@ -133,13 +160,18 @@ def _check_raw(events: Sequence[object]) -> None:
             assert math.isfinite(event.sqrt_a + event.mean_anomaly + event.clock_bias_s)
 
 
+# Most frames of an input are those of the one before, and pyrtcm takes longer than all else.
+_parse_rtcm = functools.lru_cache(4096)(load_pyrtcm())
+
+
 def raw(data: bytes) -> None:
     """UBX and RTCM 3 payloads: the same for any split, finite and plausible."""
     choice, stream = input_of(data)
     stream = _mended(stream) if choice & 8 else stream
     found = []
-    for pieces in (iter((stream,)), _pieces(choice, stream)):
-        decoder = RawDecoder("fuzz", earliest=EARLIEST)
+    for kind, pieces in _whole_and_cut(RawDecoder, choice, stream):
+        decoder = kind("fuzz", earliest=EARLIEST)
+        decoder._rtcm._parse = _parse_rtcm  # type: ignore[union-attr]
         decoder.note_utc(1_500_000_000_000_000_000)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
         found.append((events + decoder.flush(), decoder.counters))
@@ -191,7 +223,7 @@ def words(data: bytes) -> None:
 # --------------------------------------------------------------------------- NTRIP
 
 
-def _answer(pieces: Iterator[bytes]) -> tuple[bytes, type[Exception] | None]:
+def _answer(pieces: list[bytes]) -> tuple[bytes, type[Exception] | None]:
     reply, found = CasterReply(), bytearray()
     try:
         for piece in pieces:
@@ -204,7 +236,7 @@ def _answer(pieces: Iterator[bytes]) -> tuple[bytes, type[Exception] | None]:
 def ntrip(data: bytes) -> None:
     """A caster's answer: the same corrections and the same end for any split."""
     choice, stream = input_of(data)
-    whole = _answer(iter((stream,)))
+    whole = _answer([stream])
     assert whole == _answer(_pieces(choice, stream))
     assert len(whole[0]) <= len(stream)
 
@@ -212,39 +244,34 @@ def ntrip(data: bytes) -> None:
 # --------------------------------------------------------------------------- RDSS
 
 
-class _Watch:
-    """Of a decoder: the frames that it took, how often it looked at one's head, bytes it read."""
+@functools.cache
+def _watched(family: type[FrameDecoder]) -> Callable[[], Any]:
+    """A decoder that keeps the frames it took, how often it looked at a head, what it read."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.taken: list[bytes] = []
-        self.heads = self.read = 0
+    class Watched(family):  # type: ignore[misc, valid-type]
+        def __init__(self) -> None:
+            super().__init__()
+            self.taken: list[bytes] = []
+            self.heads = self.read = 0
 
-    def _extent(self, buffer: bytearray, at: int) -> tuple[int, str]:
-        self.heads += 1
-        found: tuple[int, str] = super()._extent(buffer, at)  # type: ignore[misc]
-        return found
+        def _extent(self, buffer: bytearray, at: int) -> Any:
+            self.heads += 1
+            return super()._extent(buffer, at)
 
-    def _read(self, whole: bytes) -> Message | None:
-        self.read += len(whole)
-        message: Message | None = super()._read(whole)  # type: ignore[misc]
-        if message is not None:
-            self.taken.append(whole)
-        return message
+        def _read(self, whole: bytes) -> Message | None:
+            self.read += len(whole)
+            message = super()._read(whole)
+            if message is not None:
+                self.taken.append(whole)
+            return message
 
-
-class _Binary(_Watch, binary_4_0.Decoder):
-    pass
-
-
-class _Text(_Watch, text_2_1.Decoder):
-    pass
+    return Watched
 
 
-def _rdss(family: type[_Binary] | type[_Text], between: bytes, stream: bytes, choice: int) -> None:
+def _rdss(family: type[FrameDecoder], between: bytes, stream: bytes, choice: int) -> None:
     found = []
-    for pieces in ((stream,), tuple(_pieces(choice, stream))):
-        decoder = family()
+    for kind, pieces in _whole_and_cut(family, choice, stream):
+        decoder = _watched(kind)()
         messages = [message for piece in pieces for message in decoder.feed(piece)]
         while decoder.awaited_bytes:
             messages += decoder.expire()
@@ -269,13 +296,13 @@ def rdss_binary(data: bytes) -> None:
     if choice & 8 and len(stream) > 6 and stream[:1] == b"$":
         head = stream[:5] + (len(stream) + 1 & 0xFFFF).to_bytes(2, "big") + stream[7:]
         stream = head + bytes((checksum(head),))
-    _rdss(_Binary, b"", stream, choice)
+    _rdss(binary_4_0.Decoder, b"", stream, choice)
 
 
 def rdss_text(data: bytes) -> None:
     """RDSS family 2.1: the same for any split, every byte accounted for."""
     choice, stream = input_of(data)
-    _rdss(_Text, b"\r\n", _mended(stream) if choice & 8 else stream, choice)
+    _rdss(text_2_1.Decoder, b"\r\n", _mended(stream) if choice & 8 else stream, choice)
 
 
 # --------------------------------------------------------------------------- CAN
