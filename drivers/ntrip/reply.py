@@ -48,6 +48,8 @@ class CasterReply:
         """Why no more corrections follow on those that came: the caster ended them, or its chunks
         make no sense."""
         self._buffer = bytearray()
+        self._sought = 0
+        """Where the end of the head may begin: not before."""
         self._chunked = False
         self._left = 0
         """Bytes of the chunk that have not come, its closing CR LF included."""
@@ -66,18 +68,20 @@ class CasterReply:
     def _head(self) -> bool:
         """Take the head off the buffer; whether it is whole."""
         ends = b"\r\n" if self._buffer.startswith(b"ICY ") else b"\r\n\r\n"
-        head, found, rest = bytes(self._buffer).partition(ends)
-        if len(head) > HEADER_BYTES + (0 if found else len(ends) - 1):
+        end = self._buffer.find(ends, self._sought)
+        found = end >= 0
+        if (end if found else len(self._buffer) - len(ends) + 1) > HEADER_BYTES:
             raise CasterRefusedError("no answer of a caster: its head does not end")
-        first = head.partition(b"\r\n")[0].decode("latin-1")
-        if first.startswith("SOURCETABLE"):
+        if self._buffer.startswith(b"SOURCETABLE"):
             raise CasterRefusedError("no such mountpoint: the caster answers with its table")
         if not found:
+            self._sought = max(0, len(self._buffer) - 3)
             return False
-        _judge(first, head)
+        head, rest = bytes(self._buffer[:end]), self._buffer[end + len(ends) :]
+        _judge(head.partition(b"\r\n")[0].decode("latin-1"), head)
         self._chunked = b"transfer-encoding: chunked" in head.lower()
         self.accepted = True
-        self._buffer = bytearray(rest)
+        self._buffer = rest
         return True
 
     def _chunks(self) -> bytes:

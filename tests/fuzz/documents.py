@@ -25,7 +25,7 @@ from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
 
 _MEMORY = Path("/dev/shm")
 _SCRATCH = tempfile.TemporaryDirectory(prefix="fuzz-", dir=_MEMORY if _MEMORY.is_dir() else None)
-_FILE = Path(_SCRATCH.name, "fuzzed")
+INPUT_FILE = Path(_SCRATCH.name, "fuzzed")
 
 
 def input_of(data: bytes) -> tuple[int, bytes]:
@@ -50,7 +50,7 @@ def commands(data: bytes) -> None:
     assert request_id is None or len(request_id) <= 64
 
 
-_STATES: tuple[TypeAdapter[Any], ...] = (
+STATES: tuple[TypeAdapter[Any], ...] = (
     TypeAdapter(SavedState),
     TypeAdapter(SavedCalibration),
     KEPT_STATE,
@@ -70,21 +70,21 @@ def state(data: bytes) -> None:
     """A file of state is one of finite numbers and is read again as it was written, or
     DamagedStateError says why not. The high bit: with a good check in front."""
     choice, text = input_of(data)
-    kind = _STATES[choice % len(_STATES)]
+    kind = STATES[choice % len(STATES)]
     if choice & 0x80 and text:
-        write_state(_FILE, text, durable=False)
+        write_state(INPUT_FILE, text, durable=False)
     else:
-        _FILE.write_bytes(text)
+        INPUT_FILE.write_bytes(text)
     try:
-        found = read_state(_FILE, kind)
+        found = read_state(INPUT_FILE, kind)
     except DamagedStateError:
         return
     assert all(map(math.isfinite, _numbers(kind.dump_python(found))))
-    write_state(_FILE, kind.dump_json(found), durable=False)
-    assert read_state(_FILE, kind) == found
+    write_state(INPUT_FILE, kind.dump_json(found), durable=False)
+    assert read_state(INPUT_FILE, kind) == found
 
 
-_READERS: tuple[Callable[[Path], Any], ...] = (
+TABLES: tuple[Callable[[Path], Any], ...] = (
     tables.read_imu,
     tables.read_gnss,
     tables.read_rdss,
@@ -99,9 +99,9 @@ _READERS: tuple[Callable[[Path], Any], ...] = (
 def csv(data: bytes) -> None:
     """A table is read with what is wrong named by line, or TableError says why not."""
     choice, text = input_of(data)
-    _FILE.write_bytes(text)
+    INPUT_FILE.write_bytes(text)
     try:
-        table = _READERS[choice % len(_READERS)](_FILE)
+        table = TABLES[choice % len(TABLES)](INPUT_FILE)
     except TableError:
         return
     t_s = table.t_s.tolist()

@@ -119,7 +119,7 @@ def splitter(data: bytes) -> None:
     assert summed <= 3 * len(stream)  # Fletcher's sums twice, the CRC once
 
 
-_DECODING = NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True)
+DECODING = NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True)
 
 
 def nmea(data: bytes) -> None:
@@ -128,7 +128,7 @@ def nmea(data: bytes) -> None:
     stream = _mended(stream) if choice & 8 else stream
     found = []
     for kind, pieces in _whole_and_cut(NmeaDecoder, choice, stream):
-        decoder = kind("fuzz", _DECODING)
+        decoder = kind("fuzz", DECODING)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
         found.append((events + decoder.flush(), decoder.counters))
         assert not decoder.epoch_open
@@ -318,22 +318,22 @@ _RACELOGIC = CanImuOptions(
     gyro=("IMU_602.ROLL_RATE", "IMU_602.PITCH_RATE", "IMU_600.YAW_RATE"),
     accel=("IMU_600.ACCEL_X", "IMU_601.ACCEL_Y", "IMU_603.ACCEL_Z"),
 )
-_DEVICES = (_RACELOGIC, _SBG)
+DEVICES = (_RACELOGIC, _SBG)
 # Reading a DBC and planning take a hundred times as long as the frames of one input, and a plan
 # does not change.
-_PLANS = [CanImuDecoder("imu", options)._plan() for options in _DEVICES]
+_PLANS = [CanImuDecoder("imu", options)._plan() for options in DEVICES]
 _REFUSED = ("other_frames", "wrong_length", "undecodable", "not_finite", "out_of_range")
 
 
-class _Planned(CanImuDecoder):
+class Planned(CanImuDecoder):
     def _plan(self) -> tuple[list[MessagePlan], list[float]]:
-        return _PLANS[_DEVICES.index(self._options)]
+        return _PLANS[DEVICES.index(self._options)]
 
 
 def can(data: bytes) -> None:
     """Frames of an IMU, ten bytes each: identifier, time and data; every frame accounted for."""
     choice, data = input_of(data)
-    decoder = _Planned("imu", _DEVICES[choice & 1])
+    decoder = Planned("imu", DEVICES[choice & 1])
     ids = [plan.message.frame_id for plan in decoder.plans]
     t_ns, frames, samples = 1_000_000_000, 0, 0
     last: dict[str, int] = {}
