@@ -41,11 +41,11 @@ class Fuzzing:
         self.done, self.done_long, self.seconds = 0, 0, 0.0
         self.kept = 0
         self._found, self._corpus = FOUND / name, CORPUS / name
+        self._found.mkdir(parents=True, exist_ok=True)
         self._child: subprocess.Popen[str] | None = None
         self._stopped = False
 
     def run(self) -> None:
-        self._found.mkdir(parents=True, exist_ok=True)
         began = time.monotonic()
         self.done = self._fuzz(self._runs, [f"-max_len={PARSERS[self.name].length}"])
         if not (self._stopped or self.crashes):
