@@ -83,7 +83,7 @@ unit: $(STAMP) kernels test-packages $(if $(YIELDING),collected) ## unit and pro
 	OPENBLAS_NUM_THREADS=1 $(YIELDING) $(BIN)/pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder \
 		--ignore tests/hil/test_hil.py $(ARGS)
 
-fuzz: $(STAMP) ## every parser with atheris; RUNS=1000000 ARGS=nmea for one of them
+fuzz: $(STAMP) ## every parser with atheris, side by side; RUNS=10000000 ARGS=nmea for one of them
 	@$(BIN)/python -c 'import atheris' 2>/dev/null || $(PIP) install --quiet 'atheris>=3'
 	$(BIN)/python -m tests.fuzz.run --runs $(RUNS) $(ARGS)
 

@@ -136,8 +136,9 @@ class StreamSplitter:
                 self._garbage(buffer[at:])
                 at = len(buffer)
                 break
-            self._garbage(buffer[at : start.start()])
-            at = start.start()
+            if start.start() > at:
+                self._garbage(buffer[at : start.start()])
+                at = start.start()
             if buffer[at] == 0x24:
                 used = self._sentence(at, items)
             elif buffer[at] == 0xB5:
@@ -152,9 +153,10 @@ class StreamSplitter:
                 if buffer[at] != 0x24:
                     self.counters["frame_cut"] += 1
             at += used
-        del buffer[:at]
-        for along in (self._whole, self._fletcher, self._crc):
-            along.drop(at)
+        if at:
+            del buffer[:at]
+            for along in (self._whole, self._fletcher, self._crc):
+                along.drop(at)
 
     def _garbage(self, skipped: bytearray) -> None:
         self.counters["garbage_bytes"] += len(skipped) - skipped.count(0x0D) - skipped.count(0x0A)
@@ -251,7 +253,8 @@ class _WholeSentences:
     def drop(self, count: int) -> None:
         """The first `count` bytes leave the buffer."""
         self._searched = max(0, self._searched - count)
-        self._found = deque((a - count, b - count) for a, b in self._found if a >= count)
+        if self._found:
+            self._found = deque((a - count, b - count) for a, b in self._found if a >= count)
 
 
 class NmeaSplitter:

@@ -48,6 +48,8 @@ class CasterReply:
         """Why no more corrections follow on those that came: the caster ended them, or its chunks
         make no sense."""
         self._buffer = bytearray()
+        self._sought = 0
+        """Where the end of the head may begin: not before."""
         self._chunked = False
         self._left = 0
         """Bytes of the chunk that have not come, its closing CR LF included."""
@@ -66,52 +68,50 @@ class CasterReply:
     def _head(self) -> bool:
         """Take the head off the buffer; whether it is whole."""
         ends = b"\r\n" if self._buffer.startswith(b"ICY ") else b"\r\n\r\n"
-        head, found, rest = bytes(self._buffer).partition(ends)
-        if len(head) > HEADER_BYTES + (0 if found else len(ends) - 1):
+        end = self._buffer.find(ends, self._sought)
+        found = end >= 0
+        if (end if found else len(self._buffer) - len(ends) + 1) > HEADER_BYTES:
             raise CasterRefusedError("no answer of a caster: its head does not end")
-        first = head.partition(b"\r\n")[0].decode("latin-1")
-        if first.startswith("SOURCETABLE"):
+        if self._buffer.startswith(b"SOURCETABLE"):
             raise CasterRefusedError("no such mountpoint: the caster answers with its table")
         if not found:
+            self._sought = max(0, len(self._buffer) - 3)
             return False
-        _judge(first, head)
+        head, rest = bytes(self._buffer[:end]), self._buffer[end + len(ends) :]
+        _judge(head.partition(b"\r\n")[0].decode("latin-1"), head)
         self._chunked = b"transfer-encoding: chunked" in head.lower()
         self.accepted = True
-        self._buffer = bytearray(rest)
+        self._buffer = rest
         return True
 
     def _chunks(self) -> bytes:
-        found = bytearray()
-        while self._buffer and self.over is None:
+        found, buffer, at = bytearray(), self._buffer, 0
+        while at < len(buffer) and self.over is None:
             if self._left:
-                taken = self._buffer[: self._left]
-                del self._buffer[: len(taken)]
-                payload = max(0, self._left - 2)
-                found += taken[:payload]
-                self._left -= len(taken)
+                taken = min(self._left, len(buffer) - at)
+                payload = min(taken, max(0, self._left - 2))
+                found += buffer[at : at + payload]
+                self._left -= taken
+                at += taken
                 continue
-            line, ends, rest = bytes(self._buffer).partition(b"\r\n")
-            if not ends:
-                if len(line) <= _SIZE_LINE_BYTES:
-                    break
-                size = None
-            else:
-                size = _size(line)
+            ends = buffer.find(b"\r\n", at, at + _SIZE_LINE_BYTES + 2)
+            if ends < 0 and len(buffer) - at < _SIZE_LINE_BYTES + 2:
+                break
+            size = None if ends < 0 else _size(bytes(buffer[at:ends]))
             if not size:
                 no_size = CasterRefusedError("a chunk of the answer has no size")
                 self.over = no_size if size is None else EOFError()
                 break
             self._left = size + 2
-            self._buffer = bytearray(rest)
+            at = ends + 2
+        del buffer[:at]
         return bytes(found)
 
 
 def _size(line: bytes) -> int | None:
     """What a chunk's first line says; None where that is no size."""
     digits = line.partition(b";")[0].strip()
-    if len(line) > _SIZE_LINE_BYTES or not _HEXADECIMAL.fullmatch(digits):
-        return None
-    return int(digits, 16)
+    return int(digits, 16) if _HEXADECIMAL.fullmatch(digits) else None
 
 
 def _judge(first: str, head: bytes) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import importlib
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from drivers.base import PermanentDriverError
@@ -99,15 +100,15 @@ Parse = Callable[[bytes], Any]
 
 
 def load_pyrtcm() -> Parse:
-    """The parser of a frame. PermanentDriverError when pyrtcm is not installed."""
+    """The parser of a verified frame: it does not look at the CRC again, which takes it longer than
+    all else. PermanentDriverError when pyrtcm is not installed."""
     try:
         pyrtcm = importlib.import_module("pyrtcm")
     except ImportError as error:
         raise PermanentDriverError(
             "RTCM 3 needs the package pyrtcm: install fusiond[raw], or set rtcm = false"
         ) from error
-    parse: Parse = pyrtcm.RTCMReader.parse
-    return parse
+    return partial(pyrtcm.RTCMReader.parse, validate=pyrtcm.VALNONE)
 
 
 class RtcmDecoder:

@@ -70,8 +70,9 @@ class FrameDecoder(ABC):
             start = buffer.find(b"$", at)
             if start < 0:
                 start = len(buffer)
-            counters["garbage_bytes"] += len(buffer[at:start].translate(None, self.BETWEEN))
-            at = start
+            if start > at:
+                counters["garbage_bytes"] += len(buffer[at:start].translate(None, self.BETWEEN))
+                at = start
             if at == len(buffer):
                 break
             length, fault = self._extent(buffer, at)

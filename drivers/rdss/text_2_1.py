@@ -347,7 +347,7 @@ class Decoder(FrameDecoder):
 
 def _header_fault(header: bytes) -> str:
     """Name of what is wrong with the (perhaps not complete) name and comma behind `$`."""
-    if len(header) >= 5 and header[:4].isalpha() and header[4] == 0:
+    if len(header) >= 5 and header[:4].isalpha() and header[:4].isupper() and header[4] == 0:
         return "other_family"
     name = header[:5]
     if not name:

@@ -93,6 +93,15 @@ def test_a_chunk_without_a_size_is_the_end_of_what_is_understood(size: bytes) ->
     assert isinstance(reply.over, CasterRefusedError)
 
 
+@pytest.mark.parametrize("cut", range(62, 69))
+def test_the_longest_line_of_a_chunk_may_be_cut_anywhere(cut: int) -> None:
+    """Between its CR and its LF, too."""
+    wire = b"3;" + b"e" * 62 + b"\r\nabc\r\n"
+    reply = CasterReply()
+    assert reply.feed(CHUNKED + wire[:cut]) + reply.feed(wire[cut:]) == b"abc"
+    assert reply.over is None
+
+
 def test_the_last_chunk_is_the_end_and_takes_nothing_with_it() -> None:
     reply = CasterReply()
     assert reply.feed(CHUNKED + chunk(b"abc") + b"0\r\n\r\n") == b"abc"

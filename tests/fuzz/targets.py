@@ -2,7 +2,7 @@
 
 No exception escapes; every byte is accounted for; bytes in any split give the same; false headers
 do not multiply the work. The first byte of an input chooses the split and whether checks are mended
-first, so that a fuzzer reaches what stands behind them.
+first, so that a fuzzer reaches what stands behind them. What is no stream is in `documents`.
 """
 
 from __future__ import annotations
@@ -10,16 +10,14 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import tempfile
+import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
-from pathlib import Path
-from typing import Any
-from unittest.mock import patch
+from typing import Any, TypeVar
 
-from drivers.can import decoder as can_decoder
 from drivers.can.bus import CanFrame
+from drivers.can.dbc import MessagePlan
 from drivers.can.imu import CanImuDecoder, CanImuOptions
 from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
@@ -29,24 +27,47 @@ from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawGnssEpoch
+from drivers.raw.rtcm import load_pyrtcm
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
-from fusiond.files import tables
-from fusiond.files.csv_tables import TableError
-from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
-from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, sfrbx, ubx
+from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, ubx
+from tests.fuzz.documents import commands, csv, input_of, state
 
 EARLIEST = date(2014, 1, 1)
 
 
-def _input(data: bytes) -> tuple[int, bytes]:
-    return (data[0], data[1:]) if data else (0, b"")
+_EVERYWHERE = 15
+_PIECES = 8
 
 
-def _pieces(choice: int, stream: bytes) -> Iterator[bytes]:
-    size = (1, 2, 3, 7, 16, 61, 255, 5000)[choice & 7]
-    return (stream[i : i + size] for i in range(0, len(stream), size))
+def _pieces(choice: int, stream: bytes) -> list[bytes]:
+    """Of a size by the low bits of `choice`, everywhere or where its high ones say: a few pieces
+    between two long ones find what many do, at each place in turn, for a tenth of the work."""
+    size, place = (1, 2, 3, 7, 16, 61, 255, 5000)[choice & 7], choice >> 4
+    begin, end = 0, len(stream)
+    if place < _EVERYWHERE:
+        begin = end * place // _EVERYWHERE
+        end = min(end, begin + _PIECES * size)
+    cuts = (0, *range(begin, end, size), end, len(stream))
+    return [stream[a:b] for a, b in itertools.pairwise(cuts) if a < b]
+
+
+Reader = TypeVar("Reader")
+UNTRACED: dict[type, type] = {}
+"""Of a fuzzed reader, the same without the fuzzer's probes. A stream is read twice, to see that its
+split does not matter: where the pieces have shown which branches there are, the whole need not."""
+
+
+def untraced(reader: type[Reader]) -> type[Reader]:
+    """The reader itself where nothing is traced."""
+    return UNTRACED.get(reader, reader)
+
+
+def _whole_and_cut(
+    reader: type[Reader], choice: int, stream: bytes
+) -> tuple[tuple[type[Reader], list[bytes]], ...]:
+    return (untraced(reader), [stream]), (reader, _pieces(choice, stream))
 
 
 # --------------------------------------------------------------------------- NMEA, UBX, RTCM 3
@@ -69,8 +90,10 @@ def _mended(stream: bytes) -> bytes:
     return b"".join(mended)
 
 
-def _split(pieces: Iterator[bytes]) -> tuple[list[bytes], Counter[str], int]:
-    splitter = StreamSplitter()
+def _split(
+    kind: type[StreamSplitter], pieces: list[bytes]
+) -> tuple[list[bytes], Counter[str], int]:
+    splitter = kind()
     items = [item for piece in pieces for item in splitter.feed(piece)] + splitter.finish()
     assert splitter.waiting == 0
     return [item.raw for item in items], splitter.counters, splitter.summed
@@ -82,10 +105,12 @@ def _ends(data: bytes) -> int:
 
 def splitter(data: bytes) -> None:
     """Sentences and frames out of a stream: the same for any split, every byte accounted for."""
-    choice, stream = _input(data)
+    choice, stream = input_of(data)
     stream = _mended(stream) if choice & 8 else stream
-    items, counters, summed = _split(iter((stream,)))
-    assert (items, counters) == _split(_pieces(choice, stream))[:2]
+    (items, counters, summed), cut = (
+        _split(kind, pieces) for kind, pieces in _whole_and_cut(StreamSplitter, choice, stream)
+    )
+    assert (items, counters) == cut[:2]
     used = b"".join(items)
     garbage = len(stream) - _ends(stream) - (len(used) - _ends(used))
     assert counters["garbage_bytes"] == garbage
@@ -94,13 +119,16 @@ def splitter(data: bytes) -> None:
     assert summed <= 3 * len(stream)  # Fletcher's sums twice, the CRC once
 
 
+DECODING = NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True)
+
+
 def nmea(data: bytes) -> None:
     """Measurements out of NMEA: the same for any split, finite and plausible."""
-    choice, stream = _input(data)
+    choice, stream = input_of(data)
     stream = _mended(stream) if choice & 8 else stream
     found = []
-    for pieces in (iter((stream,)), _pieces(choice, stream)):
-        decoder = NmeaDecoder("fuzz", NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True))
+    for kind, pieces in _whole_and_cut(NmeaDecoder, choice, stream):
+        decoder = kind("fuzz", DECODING)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
         found.append((events + decoder.flush(), decoder.counters))
         assert not decoder.epoch_open
@@ -132,13 +160,18 @@ def _check_raw(events: Sequence[object]) -> None:
             assert math.isfinite(event.sqrt_a + event.mean_anomaly + event.clock_bias_s)
 
 
+# Most frames of an input are those of the one before, and pyrtcm takes longer than all else.
+_parse_rtcm = functools.lru_cache(4096)(load_pyrtcm())
+
+
 def raw(data: bytes) -> None:
     """UBX and RTCM 3 payloads: the same for any split, finite and plausible."""
-    choice, stream = _input(data)
+    choice, stream = input_of(data)
     stream = _mended(stream) if choice & 8 else stream
     found = []
-    for pieces in (iter((stream,)), _pieces(choice, stream)):
-        decoder = RawDecoder("fuzz", earliest=EARLIEST)
+    for kind, pieces in _whole_and_cut(RawDecoder, choice, stream):
+        decoder = kind("fuzz", earliest=EARLIEST)
+        decoder._rtcm._parse = _parse_rtcm  # type: ignore[union-attr]
         decoder.note_utc(1_500_000_000_000_000_000)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
         found.append((events + decoder.flush(), decoder.counters))
@@ -154,6 +187,9 @@ _WORDS: tuple[tuple[int, int, int, Callable[[int], list[int]]], ...] = (
     (2, 1, 16, inav_words),
 )
 """gnssId, sigId, bytes of information, words with good parity."""
+
+
+_SFRBX = b"\xb5\x62\x02\x13\0\0"
 
 
 def words(data: bytes) -> None:
@@ -175,7 +211,9 @@ def words(data: bytes) -> None:
             made[turned % len(made)] ^= 1 << (turned >> 3)
         if turned & 2 and turned & 4:
             made = made[: turned % len(made)]
-        frame = Frame("ubx", sfrbx(gnss, prn, sig, made))
+        # The decoder is handed frames that somebody has verified, so that none is summed here.
+        head = bytes((gnss, prn, sig, 0, len(made), 3, 2, 0))
+        frame = Frame("ubx", _SFRBX + head + struct.pack(f"<{len(made)}I", *made) + b"\0\0")
         before = decoder.counters.total()
         events = decoder.take(frame, 7)
         assert decoder.counters.total() == before + 1 + len(events)
@@ -185,7 +223,7 @@ def words(data: bytes) -> None:
 # --------------------------------------------------------------------------- NTRIP
 
 
-def _answer(pieces: Iterator[bytes]) -> tuple[bytes, type[Exception] | None]:
+def _answer(pieces: list[bytes]) -> tuple[bytes, type[Exception] | None]:
     reply, found = CasterReply(), bytearray()
     try:
         for piece in pieces:
@@ -197,8 +235,8 @@ def _answer(pieces: Iterator[bytes]) -> tuple[bytes, type[Exception] | None]:
 
 def ntrip(data: bytes) -> None:
     """A caster's answer: the same corrections and the same end for any split."""
-    choice, stream = _input(data)
-    whole = _answer(iter((stream,)))
+    choice, stream = input_of(data)
+    whole = _answer([stream])
     assert whole == _answer(_pieces(choice, stream))
     assert len(whole[0]) <= len(stream)
 
@@ -206,30 +244,38 @@ def ntrip(data: bytes) -> None:
 # --------------------------------------------------------------------------- RDSS
 
 
-def _rdss(family: type[FrameDecoder], between: bytes, stream: bytes, choice: int) -> None:
-    taken: list[bytes] = []
-    work = Counter[str]()
+@functools.cache
+def _watched(family: type[FrameDecoder]) -> Callable[[], Any]:
+    """A decoder that keeps the frames it took, how often it looked at a head, what it read."""
 
     class Watched(family):  # type: ignore[misc, valid-type]
+        def __init__(self) -> None:
+            super().__init__()
+            self.taken: list[bytes] = []
+            self.heads = self.read = 0
+
         def _extent(self, buffer: bytearray, at: int) -> Any:
-            work["extent"] += 1
+            self.heads += 1
             return super()._extent(buffer, at)
 
         def _read(self, whole: bytes) -> Message | None:
-            work["read"] += len(whole)
+            self.read += len(whole)
             message = super()._read(whole)
             if message is not None:
-                taken.append(whole)
+                self.taken.append(whole)
             return message
 
+    return Watched
+
+
+def _rdss(family: type[FrameDecoder], between: bytes, stream: bytes, choice: int) -> None:
     found = []
-    for pieces in ((stream,), tuple(_pieces(choice, stream))):
-        taken.clear()
-        work.clear()
-        decoder = Watched()
+    for kind, pieces in _whole_and_cut(family, choice, stream):
+        decoder = _watched(kind)()
         messages = [message for piece in pieces for message in decoder.feed(piece)]
         while decoder.awaited_bytes:
             messages += decoder.expire()
+        taken = decoder.taken
         used = b"".join(taken)
         rest = len(stream) - len(used)
         spaces = sum(stream.count(byte) - used.count(byte) for byte in between)
@@ -238,15 +284,15 @@ def _rdss(family: type[FrameDecoder], between: bytes, stream: bytes, choice: int
             len(messages) == len(taken) == decoder.counters["frames"] + decoder.counters["unknown"]
         )
         starts = stream.count(b"$")
-        assert work["extent"] <= 2 * starts + len(pieces) + 1
-        assert work["read"] <= 512 * starts
+        assert decoder.heads <= 2 * starts + len(pieces) + 1
+        assert decoder.read <= 512 * starts
         found.append((messages, decoder.counters))
     assert found[0] == found[1]
 
 
 def rdss_binary(data: bytes) -> None:
     """RDSS family 4.0: the same for any split, every byte accounted for."""
-    choice, stream = _input(data)
+    choice, stream = input_of(data)
     if choice & 8 and len(stream) > 6 and stream[:1] == b"$":
         head = stream[:5] + (len(stream) + 1 & 0xFFFF).to_bytes(2, "big") + stream[7:]
         stream = head + bytes((checksum(head),))
@@ -255,7 +301,7 @@ def rdss_binary(data: bytes) -> None:
 
 def rdss_text(data: bytes) -> None:
     """RDSS family 2.1: the same for any split, every byte accounted for."""
-    choice, stream = _input(data)
+    choice, stream = input_of(data)
     _rdss(text_2_1.Decoder, b"\r\n", _mended(stream) if choice & 8 else stream, choice)
 
 
@@ -272,16 +318,22 @@ _RACELOGIC = CanImuOptions(
     gyro=("IMU_602.ROLL_RATE", "IMU_602.PITCH_RATE", "IMU_600.YAW_RATE"),
     accel=("IMU_600.ACCEL_X", "IMU_601.ACCEL_Y", "IMU_603.ACCEL_Z"),
 )
-# Reading a DBC takes a hundred times as long as the frames of one input.
-_load_dbc = functools.cache(can_decoder.load_dbc)
+DEVICES = (_RACELOGIC, _SBG)
+# Reading a DBC and planning take a hundred times as long as the frames of one input, and a plan
+# does not change.
+_PLANS = [CanImuDecoder("imu", options)._plan() for options in DEVICES]
 _REFUSED = ("other_frames", "wrong_length", "undecodable", "not_finite", "out_of_range")
+
+
+class Planned(CanImuDecoder):
+    def _plan(self) -> tuple[list[MessagePlan], list[float]]:
+        return _PLANS[DEVICES.index(self._options)]
 
 
 def can(data: bytes) -> None:
     """Frames of an IMU, ten bytes each: identifier, time and data; every frame accounted for."""
-    choice, data = _input(data)
-    with patch.object(can_decoder, "load_dbc", _load_dbc):
-        decoder = CanImuDecoder("imu", _SBG if choice & 1 else _RACELOGIC)
+    choice, data = input_of(data)
+    decoder = Planned("imu", DEVICES[choice & 1])
     ids = [plan.message.frame_id for plan in decoder.plans]
     t_ns, frames, samples = 1_000_000_000, 0, 0
     last: dict[str, int] = {}
@@ -307,53 +359,7 @@ def can(data: bytes) -> None:
     assert accounted + whole <= frames
 
 
-# --------------------------------------------------------------------------- commands, tables
-
-
-def commands(data: bytes) -> None:
-    """A command's payload is one, or BadCommandError says why not."""
-    choice, payload = _input(data)
-    name = sorted(COMMANDS)[choice % len(COMMANDS)]
-    try:
-        command = parse(name, payload)
-    except BadCommandError as bad:
-        request_id = bad.id
-    else:
-        request_id = command.id
-        numbers = [value for value in command.model_dump().values() if isinstance(value, float)]
-        assert all(map(math.isfinite, numbers))
-    assert request_id is None or len(request_id) <= 64
-
-
-_READERS: tuple[Callable[[Path], Any], ...] = (
-    tables.read_imu,
-    tables.read_gnss,
-    tables.read_rdss,
-    tables.read_attitude,
-    tables.read_bearing,
-    tables.read_wheel,
-    tables.read_truth,
-    tables.read_barometer,
-)
-_SCRATCH = tempfile.TemporaryDirectory(prefix="fuzz-")
-
-
-def csv(data: bytes) -> None:
-    """A table is read with what is wrong named by line, or TableError says why not."""
-    choice, text = _input(data)
-    path = Path(_SCRATCH.name, "table.csv")
-    path.write_bytes(text)
-    try:
-        table = _READERS[choice % len(_READERS)](path)
-    except TableError:
-        return
-    t_s = table.t_s.tolist()
-    assert all(map(math.isfinite, t_s))
-    assert all(a < b for a, b in itertools.pairwise(t_s))
-    assert all(rejection.line >= 2 and rejection.reason for rejection in table.rejected)
-
-
+_STREAMS = (splitter, nmea, raw, words, rdss_binary, rdss_text, can, ntrip)
 TARGETS: dict[str, Callable[[bytes], None]] = {
-    one.__name__: one
-    for one in (splitter, nmea, raw, words, rdss_binary, rdss_text, can, commands, csv, ntrip)
+    one.__name__: one for one in (*_STREAMS, commands, state, csv)
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 import struct
 from typing import Any
@@ -69,6 +70,7 @@ def lnav_words(bits: int) -> list[int]:
     return words
 
 
+@functools.cache
 def _bch(eleven: int) -> int:
     rest = eleven << 4
     for bit in range(14, 3, -1):

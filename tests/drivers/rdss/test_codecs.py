@@ -117,6 +117,15 @@ def test_damage_is_named_and_the_next_frame_is_found(family: str, raw: bytes, co
     assert decoder.counters[counter] == 1
 
 
+@pytest.mark.parametrize("cut", range(6))
+def test_what_is_wrong_with_a_name_is_the_same_however_it_is_cut(cut: int) -> None:
+    """Names of binary frames are capitals; what else ends with a zero is no frame of theirs."""
+    decoder = text_2_1.Decoder()
+    stream = b"$CcRM\0"
+    assert decoder.feed(stream[:cut]) + decoder.feed(stream[cut:]) == []
+    assert decoder.counters == {"bad_name": 1, "garbage_bytes": len(stream)}
+
+
 @pytest.mark.parametrize("family", MODULES)
 def test_a_frame_that_never_ends_is_given_up(family: str) -> None:
     decoder = MODULES[family].Decoder()

@@ -1,0 +1,33 @@
+"""The parsers that are fuzzed: what of each is traced, and how long its inputs are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Parser(NamedTuple):
+    """`length`: bytes that hold two of the longest messages that matter; a run takes as long as its
+    input is, so that what only long ones reach has a pass of its own."""
+
+    modules: tuple[str, ...]
+    length: int
+
+
+_NMEA = ("decoder", "epochs", "fields", "time")
+_RAW = ("decoder", "rtcm", "ubx", "weeks")
+_WORDS = ("beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes", "weeks")
+
+PARSERS = {
+    "splitter": Parser(("drivers.nmea.framing",), 128),
+    "nmea": Parser(tuple(f"drivers.nmea.{m}" for m in _NMEA), 256),
+    "raw": Parser(tuple(f"drivers.raw.{m}" for m in _RAW), 192),
+    "words": Parser(tuple(f"drivers.raw.{m}" for m in _WORDS), 128),
+    "rdss_binary": Parser(("drivers.rdss.framing", "drivers.rdss.binary_4_0"), 128),
+    "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
+    "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 162),
+    "ntrip": Parser(("drivers.ntrip.reply",), 200),
+    "commands": Parser(("fusiond.outputs.commands",), 256),
+    "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
+    "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
+}
+"""By target."""
