@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from fusiond.aiding.base import State
+from fusiond.aiding.base import Innovation, State
 from fusiond.aiding.body_velocity import WheelSpeedAid
+from fusiond.aiding.standstill import ZeroRateAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.aiding.witnesses import SMOOTH_WINDOWS, Witnesses
 from fusiond.configuration.schema import Imu
@@ -127,6 +128,10 @@ def test_what_a_creep_may_turn_is_bounded_by_what_is_known_of_the_speed() -> Non
     assert runs.rest().creeps(_state(0.0, 0.2)) == pytest.approx([0.0, 0.0, turns], rel=1e-3)
     measured = runs.rest(witnesses=_fixes(0.0, 4)).creeps(_state(0.0, 0.2))
     assert measured == pytest.approx([0.0, 0.0, (0.05 / 5.0) ** 2], rel=1e-3)
+    aid = ZeroRateAid("zero_rate", round(END_S * 1e9), 0.9999, (0.0,) * 3, 1e-3, runs.rest())
+    innovation = aid.innovation(_state(0.0, 0.2))
+    assert isinstance(innovation, Innovation)
+    assert innovation.r == pytest.approx([1e-6, 1e-6, 1e-6 + turns], rel=1e-3)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 10])

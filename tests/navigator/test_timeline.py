@@ -20,8 +20,10 @@ from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.estimators.base import Outcome
+from fusiond.estimators.doubt import DOUBTED_RATE_RAD_S
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.isolation import Isolation
+from fusiond.navigation.error_model import RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
@@ -343,3 +345,28 @@ def test_a_wrong_heading_is_left_out() -> None:
     phi = runs.nav_error(timeline.estimator.nav, truth)[:3]
     assert abs(phi[2]) < 5.0 * math.sqrt(timeline.estimator.covariance[2, 2])
     assert abs(phi[2]) < math.radians(5.0)
+
+
+def test_sensors_that_may_have_changed_are_opened_before_an_aid(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By as much of a doubt's variance as may have come since the fix before."""
+    d = drive()
+    fixes = [aid for aid in d.aids if isinstance(aid, PositionAid)]
+    shares = dict.fromkeys((fix.t_ns for fix in fixes), 0.0)
+
+    def bias_sd_rad_s() -> float:
+        timeline = d.timeline()
+        timeline.imu.append(d.times, d.samples)
+        for fix in fixes:
+            timeline.insert(fix)
+        timeline.run()
+        slot = timeline.estimator.model.parameters(RATE_ERROR)[0]
+        return math.sqrt(timeline.estimator.covariance[slot, slot])
+
+    monkeypatch.setattr(Isolation, "unsettled", lambda _, t_ns: shares[t_ns])
+    settled = bias_sd_rad_s()
+    shares[fixes[-1].t_ns] = 0.25
+    opened = 0.5 * DOUBTED_RATE_RAD_S
+    assert bias_sd_rad_s() == pytest.approx(math.hypot(settled, opened), rel=0.02)
+    assert opened > 10.0 * settled
