@@ -235,7 +235,7 @@ class ErrorStateFilter:
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
-        start, hold_ns, options = imu.start, imu.hold_ns, self._options
+        start, options = imu.start, self._options
         if record:
             options |= RECORD
         if self._holding or self._carrying:
@@ -252,7 +252,7 @@ class ErrorStateFilter:
             imu.end,
             self.t_ns,
             target_ns,
-            min(self.gap_ns, hold_ns),
+            min(self.gap_ns, imu.hold_ns),
             options,
         )
         self.sample = first + start
