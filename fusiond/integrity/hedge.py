@@ -79,6 +79,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.means import SLOW
+from fusiond.integrity.moved import LEAST, Moved
 from fusiond.integrity.proof import Proof
 from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import Series
@@ -96,11 +97,11 @@ SELDOM = 10.83
 # What a turn at rest has left open fades by this with each innovation, as the slow mean's square;
 # below a hundredth of P's variance, half a percent of sigma, it is nothing, and so is what is left
 # open of a tilt, which is kept under its own name.
-FADES, LEAST, TILT = (1.0 - SLOW) ** 2, 0.01, " tilt"
+FADES, TILT = (1.0 - SLOW) ** 2, " tilt"
 # What may be a lateness or a heading that has turned is kept under names of their own, too.
 LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
-# So is what fixes share beyond chance.
-STRAYS = " strays"
+# So is what fixes share beyond chance, and what one that is believed again may be off by.
+STRAYS, MOVED = " strays", " moved"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -231,6 +232,21 @@ class Hedge:
             wider = _beyond_prior(state.xi, state.covariance, state.model.slots_of(wander))
         self._put(source + STRAYS, wider)
 
+    def moved(
+        self, source: str, records: Mapping[str, Series], record: Series, covariance: Array | None
+    ) -> Moved | None:
+        """A position was fused that may be off since it is believed again; P (n, n) of the filter.
+        What is left of that."""
+        moved = record.moved
+        if moved is None or moved.told(records.values()):
+            wider = None
+        else:
+            wider = moved.leaves_open(record.heard_ns)
+            own = 0.0 if covariance is None else LEAST * covariance.diagonal()[DR : DR + 3]
+            wider = wider if np.any(wider[:3] > own) else None
+        self._put(source + MOVED, wider)
+        return None if wider is None else moved
+
     def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
         """A series is fused, and what others left open that are silent may be its to tell now."""
         if not self.wider or not record.means.degrees:
@@ -242,6 +258,7 @@ class Hedge:
             fine = 0.0 < record.sd_m <= max(FINE_M, COARSER * other.sd_m)
             if fine if other.locates else other.moves and record.moves:
                 self.drop(source)
+                self._put(source + MOVED, None)
 
     def sits(self, angles: Sequence[float], sd: float) -> None:
         """The mounting's pitch and yaw (rad) as found so far, beyond what was configured with one
@@ -255,14 +272,14 @@ class Hedge:
         self._put(MOUNTING, wider)
 
     def drop(self, source: str) -> None:
-        """Nothing of a series is beyond chance, or P holds it."""
+        """Nothing of a series is beyond chance, or P holds it; what it may have moved by stays."""
         for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
             self._put(name, None)
 
 
 def _series_of(name: str) -> str:
     """Whose answer is awaited of what is kept under a name."""
-    for what in (TILT, LATE, STRAYS):
+    for what in (TILT, LATE, STRAYS, MOVED):
         name = name.removesuffix(what)
     return name
 

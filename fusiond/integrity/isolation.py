@@ -52,6 +52,7 @@ from fusiond.integrity import returns, support
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
+from fusiond.integrity.moved import Moved, back
 from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
@@ -183,11 +184,13 @@ class Isolation:
         self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
         self.hedge.wider = memory.wider
 
-    def reset(self, contradicted: bool = False, failed: bool = False) -> None:
+    def reset(
+        self, contradicted: bool = False, failed: bool = False, moved: Moved | None = None
+    ) -> None:
         """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
         their velocities are to prove themselves, as after an outage; and where one before it has
-        `failed`, that they are on time."""
-        self._begun, self._comes = Begun(contradicted, failed), returns.NOTHING
+        `failed`, that they are on time, or is open what they have `moved` by."""
+        self._begun, self._comes = Begun(contradicted, failed, moved), returns.NOTHING
         self._records, self._shared = {}, set()
         self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
 
@@ -222,6 +225,9 @@ class Isolation:
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
             passed = _passed(aid, outcome) and not repeats
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
+            if offset is not None and not record.excluded and covariance is not None:
+                out_ns, before = t_ns - record.refused_ns, record.moved
+                record.moved = back(record.device, t_ns, out_ns, record.trend, covariance, before)
             return Action.NONE
         if repeats:
             self._exclude(record, t_ns, REPEATS, jumped=True)
@@ -256,6 +262,8 @@ class Isolation:
             elif offer is not None:
                 self.hedge.late(aid.source, record.punctual, covariance)
             self.hedge.answered(self._records, record, t_ns)
+            if record.moved is not None:
+                record.moved = self.hedge.moved(aid.source, self._records, record, covariance)
             return Action.NONE
         self.shown = differ(record, offer or velocity, covariance)
         self.hedge.drop(aid.source)

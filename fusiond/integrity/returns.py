@@ -27,6 +27,7 @@ from fusiond.aiding.base import Aid, NotApplicable, State
 from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import gate_threshold
 from fusiond.integrity import support
+from fusiond.integrity.moved import Moved
 from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof, settled
 from fusiond.integrity.punctual import MOVING_M_S, Before, Punctual
 from fusiond.integrity.series import NEVER_NS, Series
@@ -43,10 +44,11 @@ SURPRISE = 1.96
 
 class Begun(NamedTuple):
     """How the filter was started: positions had been `contradicted` by their velocities; a filter
-    before it had `failed`."""
+    before it had `failed`; the source that it is made of has `moved` from that one."""
 
     contradicted: bool = False
     failed: bool = False
+    moved: Moved | None = None
 
 
 class Coming(NamedTuple):
@@ -101,6 +103,8 @@ def prove(
     suspect = begun.contradicted and first
     if begun.failed and first:
         record.punctual = Punctual(offer.t_ns, started=True)
+    if first and begun.moved is not None and begun.moved.device == record.device:
+        record.moved = begun.moved
     out = support.outage(records, offer.t_ns)
     if out and not (record.punctual and record.punctual.started):
         came = Punctual(offer.t_ns, expected=not comes.behind, before=comes.before)

@@ -12,6 +12,7 @@ from operator import attrgetter
 
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.integrity.means import Means
+from fusiond.integrity.moved import Moved
 from fusiond.integrity.proof import (
     DRIFT_SD_M_S,
     NO_TREND,
@@ -77,6 +78,8 @@ class Series:
     punctual: Punctual | None = None
     """Of one that came back, or that a filter was started from: until it would have shown that it
     is late."""
+    moved: Moved | None = None
+    """Of a position that is believed again, while it may be off still."""
     every_ns: int = 0
     """From the one before to the last that was heard."""
     slip: Slip = NO_SLIP

@@ -44,13 +44,15 @@ Records = Mapping[str, Series]
 
 class Lost(NamedTuple):
     """No position is believed: since when, whether `source` or `filter` is to blame, and how the
-    first of them ended (`jumped`, `drifts`, ...). `disputed`: a coarse position that is believed
-    says that the source is wrong. `returning`: one is on its way back."""
+    first of them ended (`jumped`, `drifts`, ...), and how far they are away (m). `disputed`: a
+    coarse position that is believed says that the source is wrong. `returning`: one is on its way
+    back."""
 
     since_ns: int
     cause: str
     device: str
     reason: str
+    away_m: float
     disputed: bool
     returning: bool = False
 
@@ -78,7 +80,7 @@ def lost(records: Records, t_ns: int) -> Lost | None:
     reason = first.excluded or "refused"
     cause = "source" if source else "filter"
     returning = any(r.excluded and r.returning for r in heard)
-    return Lost(first.refused_ns, cause, first.device, reason, disputed, returning)
+    return Lost(first.refused_ns, cause, first.device, reason, away_m, disputed, returning)
 
 
 def contested(records: Records, t_ns: int) -> str | None:

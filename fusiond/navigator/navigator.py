@@ -226,7 +226,8 @@ class Navigator:
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             if isinstance(self.estimator, InvariantFilter):
                 self.estimator.turns = start.turns
-            self.timeline.start(start.contradicted, start.used, self._standing.failed)
+            standing = self._standing
+            self.timeline.start(start.contradicted, start.used, standing.failed, standing.moved)
             self.verdicts.reset()
             self.started = start
             self._afterwards = Afterwards(alignment_options(self.config), start)

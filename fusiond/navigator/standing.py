@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.base import Estimator
 from fusiond.integrity.isolation import Isolation
+from fusiond.integrity.moved import Moved, left
 from fusiond.integrity.series import NEVER_NS
 from fusiond.integrity.support import Lost
 from fusiond.models.vehicle import MOUNTING
@@ -82,6 +83,8 @@ class Standing:
         self._from = self._fastest = 0.0
         self._changed = 0.0
         self._left = ""
+        self.moved: Moved | None = None
+        """By what the source that `left` names had left the solution before the start."""
         self._shaken: tuple[int, str | None] | None = None
 
     def started(self, t_ns: int) -> None:
@@ -127,7 +130,11 @@ class Standing:
         waited_ns = t_ns - lost.since_ns
         if waited_ns <= patience_ns:
             return None
-        self._left = lost.device if lost.cause == "source" else ""
+        by_source = lost.cause == "source"
+        self._left = lost.device if by_source else ""
+        before, self.moved = self.moved, None
+        if by_source:
+            self.moved = left(lost.device, t_ns, waited_ns, lost.away_m, before)
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
     def _watch(self, t_ns: int, isolation: Isolation, speed: float) -> None:

@@ -22,6 +22,7 @@ from fusiond.aiding.offers import Offer
 from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
+from fusiond.integrity.moved import Moved
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -102,13 +103,18 @@ class Timeline:
         self._mounting_sd = max(estimator.model.initial[self._mounting].tolist(), default=0.0)
 
     def start(
-        self, contradicted: bool = False, used: Collection[Offer] = (), failed: bool = False
+        self,
+        contradicted: bool = False,
+        used: Collection[Offer] = (),
+        failed: bool = False,
+        moved: Moved | None = None,
     ) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
         it was made of, `used`, once more. `contradicted`: positions have moved otherwise than their
-        velocities; `failed`: the navigation before this one was given up."""
+        velocities; `failed`: the navigation before this one was given up; `moved`: what is used had
+        left it."""
         self._next = 0
-        self.isolation.reset(contradicted, failed)
+        self.isolation.reset(contradicted, failed, moved)
         self._hedge()
         self._checkpoints = [
             _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())

@@ -1,0 +1,105 @@
+r"""A position that is believed again, and may be off still.
+
+A receiver that was left out comes back when the filter's own bound, grown meanwhile, allows it
+(fusiond.integrity.isolation), or is what navigation begins anew with. Either its fault is over, or
+it lasts and the bound has grown over it: a step of two metres is inside what an IMU keeps for a
+quarter of a minute, and of one receiver nobody can tell. From then on innovations are small, for
+the filter follows. With d what the two were apart, P the filter's own variance then, and T the time
+for which it had been left out, what is published of the position is wider than P by
+
+    (d^2 + P) T / (T + t)
+
+in each axis, t after the return. How long a fault lasts has no scale: what has lasted for T goes on
+for t more in T / (T + t) of the cases (the prior 1 / T of a duration that nothing is known of).
+What ends it sooner is another device's position that could tell: `TELLS` times as fine as what is
+open, and within half of it.
+
+Source: Jeffreys, Theory of Probability, 3rd ed. (1961), section 3.1 (the prior of a scale); Gott,
+Nature 363 (1993), 315 (a duration of which no more is known than for how long it has lasted).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.integrity.proof import Trend
+from fusiond.navigation.error_model import DR
+
+Array = NDArray[np.float64]
+
+# A device says which of two places is the right one, if they are five of its sigmas apart: its fix
+# is then on the nearer side of the middle but for six cases in a thousand.
+TELLS = 5.0
+# A hundredth of P's variance is half a percent of sigma.
+LEAST = 0.01
+
+
+class Witness(Protocol):
+    """What is known of another device's positions."""
+
+    device: str
+    locates: bool
+    fused_ns: int
+    sd_m: float
+    away_m: float
+
+    @property
+    def believed(self) -> bool: ...
+
+
+class Moved(NamedTuple):
+    """A `device` that is back since `since_ns` after `lasted_ns` without it, and what it may be off
+    by (m^2): north, east, down."""
+
+    device: str
+    since_ns: int
+    lasted_ns: int
+    squares: tuple[float, float, float]
+
+    def leaves_open(self, t_ns: int) -> Array:
+        """Variances (9,) that what is published is wider by."""
+        share = self.lasted_ns / (self.lasted_ns + max(0, t_ns - self.since_ns))
+        wider = np.zeros(9)
+        wider[:3] = self.squares
+        wider *= share
+        return wider
+
+    def told(self, positions: Iterable[Witness]) -> bool:
+        """Whether one of another device that was fused since has told that it is not off."""
+        apart = math.sqrt(self.squares[0] + self.squares[1])
+        return any(
+            r.locates
+            and r.device != self.device
+            and r.believed
+            and r.fused_ns > self.since_ns
+            and 0.0 < r.sd_m * TELLS <= apart
+            and r.away_m <= 0.5 * apart
+            for r in positions
+        )
+
+
+def left(device: str, t_ns: int, lasted_ns: int, away_m: float, before: Moved | None) -> Moved:
+    """Of a navigation that begins anew with a device that had left the one before it by `away_m`,
+    in which axes is not known any more; and what had been open `before`."""
+    square = 0.5 * away_m * away_m
+    if before is not None:
+        square += float(max(before.leaves_open(t_ns)[:3]))
+    return Moved(device, t_ns, lasted_ns, (square, square, square))
+
+
+def back(
+    device: str, t_ns: int, lasted_ns: int, trend: Trend, covariance: Array, before: Moved | None
+) -> Moved:
+    """Of a device that is believed again: its `trend` while it passed, P (n, n) of the filter, and
+    what was open of it `before` it was left out."""
+    squares = covariance.diagonal()[DR : DR + 3].copy()
+    squares[:2] += (trend.north / trend.n) ** 2, (trend.east / trend.n) ** 2
+    if before is not None:
+        squares += before.leaves_open(t_ns)[:3]
+    north, east, down = squares.tolist()
+    return Moved(device, t_ns, lasted_ns, (north, east, down))

@@ -1,0 +1,128 @@
+"""What a receiver that is believed again may be off by: open until another device has told."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+from fusiond.integrity.hedge import MOVED
+from fusiond.integrity.moved import Moved, left
+from fusiond.integrity.series import Series
+from fusiond.studies.faults import aid_faults as aid
+from fusiond.studies.faults.hours import around_town
+from fusiond.studies.faults.library import Fault
+from fusiond.studies.faults.recording import Drive
+from fusiond.studies.faults.runs import run
+from tests.integrity.series_bench import Bench, S
+
+OUT_NS = 20 * S
+SQUARES = (16.0, 9.0, 1.0)
+
+
+def test_what_has_lasted_for_so_long_goes_on_as_long_in_one_case_of_two() -> None:
+    moved = Moved("gnss", 100 * S, OUT_NS, SQUARES)
+    assert moved.leaves_open(100 * S).tolist() == [*SQUARES, *(0.0,) * 6]
+    assert moved.leaves_open(120 * S).tolist() == [8.0, 4.5, 0.5, *(0.0,) * 6]
+    assert moved.leaves_open(280 * S)[0] == pytest.approx(1.6)
+    assert moved.leaves_open(90 * S)[0] == 16.0  # a rewind to before its return
+
+
+def test_the_share_is_that_of_durations_nobody_knows_the_scale_of() -> None:
+    """Faults of all durations, looked at when they have lasted for 20 s at least."""
+    lasts = 20.0 / np.random.default_rng(5).random(100_000)  # p(T) ~ 1 / T^2 given T > 20
+    moved = Moved("gnss", 0, OUT_NS, (1.0, 1.0, 1.0))
+    for t_s in (10, 60, 300):
+        share = float(moved.leaves_open(t_s * S)[0])
+        assert share == pytest.approx(np.mean(lasts > 20.0 + t_s), abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("device", "sd_m", "away_m", "fused_ns", "tells"),
+    [
+        ("second", 1.0, 1.0, 101 * S, True),
+        ("gnss", 1.0, 1.0, 101 * S, False),  # its own position
+        ("second", 1.1, 1.0, 101 * S, False),  # too coarse for 5 m
+        ("second", 1.0, 3.0, 101 * S, False),  # nearer to the other place
+        ("second", 1.0, 1.0, 99 * S, False),  # before
+    ],
+)
+def test_another_device_tells_if_it_can(
+    device: str, sd_m: float, away_m: float, fused_ns: int, tells: bool
+) -> None:
+    other = Series(device, locates=True, moves=False, heard_ns=fused_ns)
+    other.fused_ns, other.sd_m, other.away_m = fused_ns, sd_m, away_m
+    moved = Moved("gnss", 100 * S, OUT_NS, SQUARES)
+    assert moved.told([other]) is tells
+
+
+def test_what_was_open_before_is_open_after_another_failure() -> None:
+    first = left("gnss", 100 * S, OUT_NS, 10.0, None)
+    assert first.squares == (50.0, 50.0, 50.0)
+    again = left("gnss", 120 * S, OUT_NS, 10.0, first)
+    assert again.squares == (75.0, 75.0, 75.0)
+
+
+def returned(off_m: float) -> tuple[Bench, int]:
+    """A receiver that stepped away, and is believed again `off_m` from a filter whose own error may
+    be 4 m by then; and for how many seconds it was left out. A second later it is fused."""
+    bench = Bench()
+    bench.covariance = np.diag([16.0 if 6 <= k < 9 else 1e-4 for k in range(9)])
+    bench.both(range(60))
+    bench.both(range(60, 80), north_m=30.0)
+    assert bench.isolation.excluded == {"gnss": "jumped"}
+    t = 80
+    while bench.isolation.excluded:
+        bench.both(range(t, t + 1), north_m=off_m)
+        t += 1
+    bench.both(range(t, t + 1))
+    return bench, t - 1 - 60
+
+
+def test_a_receiver_that_is_believed_again_leaves_open_what_it_may_be_off_by() -> None:
+    for off_m in (0.0, 1.5):
+        bench, out_s = returned(off_m)
+        wider = (out_s + 1) / out_s * bench.isolation.hedge.wider["gnss" + MOVED]
+        # Of some fifteen fixes of 1 m the mean.
+        assert math.sqrt(wider[0] - 16.0) == pytest.approx(off_m, abs=0.75)
+        assert wider[1:3] == pytest.approx(16.0, abs=0.6)
+        assert not wider[3:].any()
+
+
+def test_it_is_over_once_another_device_has_told() -> None:
+    bench, out_s = returned(0.0)
+    t = 60 + out_s + 2
+    bench.fix(t, source="second", sd_m=1.0)
+    bench.both(range(t + 1, t + 2))
+    assert "gnss" + MOVED not in bench.isolation.hedge.wider
+
+
+def test_it_is_taken_back_by_a_rewind() -> None:
+    bench, out_s = returned(0.0)
+    t = 60 + out_s + 2
+    memory = bench.isolation.snapshot()
+    bench.fix(t, source="second", sd_m=1.0)
+    bench.both(range(t + 1, t + 2))
+    bench.isolation.restore(memory)
+    bench.both(range(t, t + 1))
+    assert "gnss" + MOVED in bench.isolation.hedge.wider
+
+
+def test_without_a_fault_nothing_is_open() -> None:
+    bench = Bench()
+    bench.covariance = np.diag([16.0] * 9)
+    bench.both(range(600))
+    assert not any(name.endswith(MOVED) for name in bench.isolation.hedge.wider)
+
+
+@pytest.mark.parametrize(("step_m", "duration_s"), [(2.0, 140.0), (10.0, 240.0)])
+def test_a_step_that_stays_is_never_vouched_for(step_m: float, duration_s: float) -> None:
+    """Of one receiver nobody can tell: it is back once the filter's own bound has grown over two
+    metres, and after ten a new start is made of it."""
+    drive = Drive(around_town, duration_s=duration_s)
+    fault = Fault(partial(aid.step, north_m=step_m), duration_s, drive=drive)
+    found = run(fault, "navigating", seed=0)
+    assert found["verdict"] == "degraded and said so", found
+    assert found["largest_horizontal_m"] > 0.8 * step_m  # it is believed again, and is off
