@@ -53,7 +53,7 @@ from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
 from fusiond.integrity.moved import Moved, back
-from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own, residual
+from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Series, said, velocity_away
@@ -216,6 +216,8 @@ class Isolation:
         if offer is not None:
             offset = apart(offer, lat, lon, nav) if state is None else residual(offer, state)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
+            if outcome.name != "fused":
+                record.above_m = above(offer, nav)
         elif record.moves:
             record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
         moving = math.hypot(v_n, v_e) > MOVING_M_S
@@ -226,8 +228,7 @@ class Isolation:
             passed = _passed(aid, outcome) and not repeats
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
             if offset is not None and not record.excluded and covariance is not None:
-                out_ns, before = t_ns - record.refused_ns, record.moved
-                record.moved = back(record.device, t_ns, out_ns, record.trend, covariance, before)
+                record.moved = back(record, t_ns, covariance)
             return Action.NONE
         if repeats:
             self._exclude(record, t_ns, REPEATS, jumped=True)
@@ -373,8 +374,9 @@ class Isolation:
             record.means.restart()
             return
         if not record.passes:
-            record.passing_ns, record.trend = t_ns, NO_TREND
+            record.passing_ns, record.trend, record.rise_m = t_ns, NO_TREND, 0.0
         record.passes += 1
+        record.rise_m += record.above_m
         if whitened:
             record.means.add(whitened)
         if offset is not None:

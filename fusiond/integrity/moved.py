@@ -52,6 +52,17 @@ class Witness(Protocol):
     def believed(self) -> bool: ...
 
 
+class Returned(Protocol):
+    """What is known of a series of positions that was left out from `refused_ns` on."""
+
+    device: str
+    refused_ns: int
+    passes: int
+    rise_m: float
+    trend: Trend
+    moved: Moved | None
+
+
 class Moved(NamedTuple):
     """A `device` that is back since `since_ns` after `lasted_ns` without it, and what it may be off
     by (m^2): north, east, down."""
@@ -92,14 +103,15 @@ def left(device: str, t_ns: int, lasted_ns: int, away_m: float, before: Moved | 
     return Moved(device, t_ns, lasted_ns, (square, square, square))
 
 
-def back(
-    device: str, t_ns: int, lasted_ns: int, trend: Trend, covariance: Array, before: Moved | None
-) -> Moved:
-    """Of a device that is believed again: its `trend` while it passed, P (n, n) of the filter, and
-    what was open of it `before` it was left out."""
+def back(returned: Returned, t_ns: int, covariance: Array) -> Moved:
+    """Of what is believed again, by the means of what has passed and P (n, n) of the filter; what
+    was open of it before it was left out stays."""
+    trend, before = returned.trend, returned.moved
     squares = covariance.diagonal()[DR : DR + 3].copy()
-    squares[:2] += (trend.north / trend.n) ** 2, (trend.east / trend.n) ** 2
+    squares[0] += (trend.north / trend.n) ** 2
+    squares[1] += (trend.east / trend.n) ** 2
+    squares[2] += (returned.rise_m / returned.passes) ** 2
     if before is not None:
         squares += before.leaves_open(t_ns)[:3]
     north, east, down = squares.tolist()
-    return Moved(device, t_ns, lasted_ns, (north, east, down))
+    return Moved(returned.device, t_ns, t_ns - returned.refused_ns, (north, east, down))

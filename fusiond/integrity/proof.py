@@ -265,6 +265,15 @@ def residual(offer: PositionOffer, state: State) -> Offset:
     return Offset(north, east, max(sd_n, sd_e))
 
 
+def above(offer: PositionOffer, nav: Array) -> float:
+    """How far (m) the body's origin as measured is above where the filter with the state `nav`
+    (10,) is; 0 where no height was measured."""
+    if offer.height_m is None:
+        return 0.0
+    c, (x, y, z) = dcm_elements(nav[Q0:]), offer.lever
+    return float(offer.height_m + c[6] * x + c[7] * y + c[8] * z - nav[HEIGHT])
+
+
 def filters_own(offer: PositionOffer, covariance: Array) -> float:
     """The part (1) of the variance of a position's innovation that is the filter's own error, in P
     (n, n): of the axis where it is most."""

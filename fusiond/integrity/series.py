@@ -49,6 +49,8 @@ class Series:
     sd_m: float = 0.0
     away_m: float = 0.0
     """Horizontally, of a position: its last innovation."""
+    above_m: float = 0.0
+    """Of a position that was not fused: how far it was above the filter."""
     sd_m_s: float = 0.0
     """Of a velocity, horizontally."""
     refused: int = 0
@@ -60,6 +62,8 @@ class Series:
     passes: int = 0
     """While excluded: innovations in a row that passed, the first at `passing_ns`."""
     passing_ns: int = 0
+    rise_m: float = 0.0
+    """Of those that passed: the sum of how far they were above the filter."""
     trend: Trend = NO_TREND
     ran: bool = False
     """While excluded: it was seen to run away, faster than any slow drift."""

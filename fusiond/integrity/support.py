@@ -69,7 +69,7 @@ def lost(records: Records, t_ns: int) -> Lost | None:
         return None
     first = min(heard, key=lambda r: r.refused_ns)
     source = all(r.jumped or supported(records, r.device, t_ns) for r in heard)
-    away_m = min(r.away_m for r in heard)
+    away_m = min(math.hypot(r.away_m, r.above_m) for r in heard)
     disputed = any(
         r.locates
         and r.believed

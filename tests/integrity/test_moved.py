@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from fusiond.integrity.moved import Moved, left
 from fusiond.integrity.series import Series
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults.hours import around_town
-from fusiond.studies.faults.library import Fault
+from fusiond.studies.faults.library import Alter, Fault
 from fusiond.studies.faults.recording import Drive
 from fusiond.studies.faults.runs import run
 from tests.integrity.series_bench import Bench, S
@@ -117,12 +118,22 @@ def test_without_a_fault_nothing_is_open() -> None:
     assert not any(name.endswith(MOVED) for name in bench.isolation.hedge.wider)
 
 
+def staying(alter: Alter, duration_s: float) -> dict[str, Any]:
+    """The figures of a fault of the receiver that stays, in town."""
+    drive = Drive(around_town, duration_s=duration_s)
+    return run(Fault(alter, duration_s, drive=drive), "navigating", seed=0)
+
+
 @pytest.mark.parametrize(("step_m", "duration_s"), [(2.0, 140.0), (10.0, 240.0)])
 def test_a_step_that_stays_is_never_vouched_for(step_m: float, duration_s: float) -> None:
     """Of one receiver nobody can tell: it is back once the filter's own bound has grown over two
     metres, and after ten a new start is made of it."""
-    drive = Drive(around_town, duration_s=duration_s)
-    fault = Fault(partial(aid.step, north_m=step_m), duration_s, drive=drive)
-    found = run(fault, "navigating", seed=0)
+    found = staying(partial(aid.step, north_m=step_m), duration_s)
     assert found["verdict"] == "degraded and said so", found
     assert found["largest_horizontal_m"] > 0.8 * step_m  # it is believed again, and is off
+
+
+def test_nor_is_one_of_the_height() -> None:
+    found = staying(partial(aid.too_high, up_m=5.0), 140.0)
+    assert found["verdict"] == "degraded and said so", found
+    assert "readmitted" in {event["code"] for event in found["events"]}
