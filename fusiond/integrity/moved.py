@@ -11,8 +11,9 @@ for which it had been left out, what is published of the position is wider than 
 
 in each axis, t after the return. How long a fault lasts has no scale: what has lasted for T goes on
 for t more in T / (T + t) of the cases (the prior 1 / T of a duration that nothing is known of).
-What ends it sooner is another device's position that could tell: `TELLS` times as fine as what is
-open, and within half of it.
+Of a first fix after an outage of T, which nothing has contradicted, it is what d^2 is beyond 3.84 S
+(fusiond.integrity.returns). What ends it sooner is another device's position that could tell:
+`TELLS` times as fine as what is open, and within half of it.
 
 Source: Jeffreys, Theory of Probability, 3rd ed. (1961), section 3.1 (the prior of a scale); Gott,
 Nature 363 (1993), 315 (a duration of which no more is known than for how long it has lasted).

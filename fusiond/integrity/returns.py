@@ -1,9 +1,10 @@
 r"""What a position is asked once it is back after an outage, or a filter was started from it anew.
 
 That it goes with the motion (fusiond.integrity.proof) and is on time (fusiond.integrity.punctual).
-Until then what is published is the wider for it (fusiond.integrity.hedge); and where its first fix
-lies behind the filter by more than is likely, or the start was one after a failure, the mode says
-so, too: nothing else is known of it then, and an outage more does not tell either.
+Until then what is published is the wider for it (fusiond.integrity.hedge), and by what its first
+fix is off beyond what chance does once in twenty (fusiond.integrity.moved). Where that fix lies
+behind the filter by more than is likely, or the start was one after a failure, the mode says so,
+too: nothing else is known of it then, and an outage more does not tell either.
 
 A fix that is late by tau lies behind by tau v, along the track and nowhere else. So with the
 innovation z = estimate - fix, S its covariance and u the direction of the velocity, it is
@@ -27,6 +28,7 @@ from fusiond.aiding.base import Aid, NotApplicable, State
 from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import gate_threshold
 from fusiond.integrity import support
+from fusiond.integrity.means import LIKELY
 from fusiond.integrity.moved import Moved
 from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof, settled
 from fusiond.integrity.punctual import MOVING_M_S, Before, Punctual
@@ -53,12 +55,13 @@ class Begun(NamedTuple):
 
 class Coming(NamedTuple):
     """Of a position that is about to be fused: whether it lies `behind` by more than is likely,
-    the `gain` that the filter follows it with, the horizontal axes' mean, and what is known
-    `before` it."""
+    the `gain` that the filter follows it with, the horizontal axes' mean, what is known `before`
+    it, and what it is off by (m^2), north, east, down, beyond what is likely."""
 
     behind: bool = False
     gain: float = 0.0
     before: Before = Before()
+    beyond: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 NOTHING = Coming()
@@ -76,14 +79,17 @@ def coming(aid: Aid, state: State, covariance: Array) -> Coming:
     followed = max(0.0, 0.5 * float(np.trace(gain)))
     tilt, yaw = max(np.diag(covariance)[PHI : PHI + 2]), covariance[PHI + 2, PHI + 2]
     before = Before(math.inf, STANDARD_GRAVITY_M_S2 * math.sqrt(tilt), math.sqrt(yaw))
+    s = np.einsum("ij,jk,ik->i", rows.h, covariance, rows.h) + rows.r
+    north, east, *down = np.maximum(rows.z**2 - LIKELY * s, 0.0).tolist()
+    beyond = (north, east, down[0] if down else 0.0)
     v_n, v_e = float(state.nav[VN]), float(state.nav[VE])
     speed = math.hypot(v_n, v_e)
     if speed <= MOVING_M_S:
-        return Coming(gain=followed, before=before)
+        return Coming(gain=followed, before=before, beyond=beyond)
     along = np.array([v_n, v_e]) / speed
     sd = math.sqrt(float(along @ (own + r) @ along))
     behind = float(along @ rows.z[:2]) > SURPRISE * sd
-    return Coming(behind, followed, before._replace(late_s=sd / speed))
+    return Coming(behind, followed, before._replace(late_s=sd / speed), beyond)
 
 
 def prove(
@@ -109,6 +115,9 @@ def prove(
     if out and not (record.punctual and record.punctual.started):
         came = Punctual(offer.t_ns, expected=not comes.behind, before=comes.before)
         record.punctual = came if record.sd_m <= FINE_M else None
+        if any(comes.beyond):
+            out_ns = max(record.every_ns, support.OTHERS_NS)
+            record.moved = Moved(record.device, offer.t_ns, out_ns, comes.beyond)
     if record.punctual is not None:
         v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
         since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)

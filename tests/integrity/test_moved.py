@@ -15,7 +15,7 @@ from fusiond.integrity.series import Series
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults.hours import around_town
 from fusiond.studies.faults.library import Alter, Fault
-from fusiond.studies.faults.recording import Drive
+from fusiond.studies.faults.recording import Drive, Recording
 from fusiond.studies.faults.runs import run
 from tests.integrity.series_bench import Bench, S
 
@@ -131,6 +131,18 @@ def test_a_step_that_stays_is_never_vouched_for(step_m: float, duration_s: float
     found = staying(partial(aid.step, north_m=step_m), duration_s)
     assert found["verdict"] == "degraded and said so", found
     assert found["largest_horizontal_m"] > 0.8 * step_m  # it is believed again, and is off
+
+
+def off_after_an_outage(r: Recording, begin_s: float, length_s: float) -> Recording:
+    """No fixes for 15 s, and from then on they are too far to the north."""
+    return aid.step(aid.absent(r, begin_s, 15.0), begin_s + 15.0, length_s, north_m=5.0)
+
+
+def test_nor_is_one_that_begins_in_an_outage() -> None:
+    """It is within the outage's bound, of which chance makes such a part one time in twenty."""
+    found = staying(off_after_an_outage, 180.0)
+    assert found["verdict"] == "degraded and said so", found
+    assert found["largest_horizontal_m"] > 4.0
 
 
 def test_nor_is_one_of_the_height() -> None:
