@@ -116,7 +116,7 @@ class Hedge:
 
     def holds(self, source: str) -> bool:
         """Whether a series has left anything open."""
-        return source in self.wider or source + TILT in self.wider
+        return bool(self.wider) and (source in self.wider or source + TILT in self.wider)
 
     def look(
         self,
@@ -222,18 +222,20 @@ class Hedge:
             known = np.concatenate((own[DR : DR + 3], own[DV : DV + 3]))
             opened = np.maximum(punctual.leaves_open - known, 0.0)
             wider = np.concatenate((opened, np.zeros(3))) if opened.any() else None
-        self._put(source + LATE, wider)
+        if wider is not None or self.wider:
+            self._put(source + LATE, wider)
 
     def strays(self, source: str, wander: str, state: State | None) -> None:
         """A position was fused whose error has the block `wander`; the `state` after it."""
         wider = None
         if state is not None and state.covariance is not None:
             wider = _beyond_prior(state.xi, state.covariance, state.model.slots_of(wander))
-        self._put(source + STRAYS, wider)
+        if wider is not None or self.wider:
+            self._put(source + STRAYS, wider)
 
     def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
         """A series is fused, and what others left open that are silent may be its to tell now."""
-        if not self.wider or not record.means.degrees:
+        if not record.means.degrees:
             return
         for name in self.wider:
             other = records.get(source := _series_of(name))
@@ -256,8 +258,9 @@ class Hedge:
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it."""
-        for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
-            self._put(name, None)
+        if self.wider:
+            for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
+                self._put(name, None)
 
 
 def _series_of(name: str) -> str:

@@ -55,10 +55,10 @@ from fusiond.integrity.means import Means
 from fusiond.integrity.proof import NO_TREND, Offset, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
-from fusiond.integrity.series import DRIFTS, REPEATS, Series, said, velocity_away
+from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting
-from fusiond.navigation.strapdown import VD
+from fusiond.navigation.strapdown import LAT, LON, VD, VN
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ class Isolation:
         record = self._records.get(series)
         if record is None or not 0.0 < record.sd_m <= FINE_M:
             return False
-        return record.proof is not None or support.outage(self._records, t_ns)
+        return record.proof is not None or support.outage(self._records, record, t_ns)
 
     def coarseness(self, aid: Aid) -> float:
         """With how many times its stated sigma an aid counts, by how long its errors last."""
@@ -200,23 +200,29 @@ class Isolation:
         nav: Array,
         covariance: Array | None = None,
         state: State | None = None,
+        says: Said | None = None,
     ) -> Action:
         """Take in how an aid ended, fused, gated or only looked at; what the filter shall do.
 
-        `nav` (10,): what it was compared with; P (n, n) and the whole `state`, where known.
+        `nav` (10,): what it was compared with; P (n, n) and the whole `state`, where known; what it
+        `says`, where that has been asked before.
         """
         t_ns = aid.t_ns
         record = self._record(aid)
-        lat, lon, _, v_n, v_e = nav[:VD].tolist()
-        offer, velocity, value = said(aid.offers())
-        offset, self.shown = None, ()
+        offer, velocity, value = says or said(aid.offers())
+        offset, self.shown, repeats = None, (), False
         if offer is not None:
-            offset = apart(offer, lat, lon, nav) if state is None else residual(offer, state)
+            if state is not None:
+                offset = residual(offer, state)
+            else:
+                offset = apart(offer, float(nav[LAT]), float(nav[LON]), nav)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
         elif record.moves:
             record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
-        moving = math.hypot(v_n, v_e) > MOVING_M_S
-        repeats = value is not None and support.repeats(self._records, record, value, moving)
+        v_n, v_e = nav[VN:VD].tolist()
+        if value is not None:
+            moving = math.hypot(v_n, v_e) > MOVING_M_S
+            repeats = record.repeats_itself(value, moving) or support.hangs(self._records, record)
         if record.excluded:
             self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
@@ -243,23 +249,26 @@ class Isolation:
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
-        if aid.across_sd_m_s > 0.0 and state is not None:
+        if record.no_slip and state is not None and aid.across_sd_m_s > 0.0:
             self.hedge.goes_across(aid, record, state)
-        if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            proof, white = record.proof if aid.white or aid.wanders else None, aid.white
-            told = proof is not None and self.hedge.returns(aid.source, proof, covariance, white)
-            if not told and (record.means.unlikely or self.hedge.holds(aid.source)):
-                left = self._tilting.left(covariance)
-                self.hedge.look(aid, record, offer or velocity, nav, covariance, left)
-            if offer is not None and aid.wanders:
-                self.hedge.strays(aid.source, offer.wander, state)
-            elif offer is not None:
-                self.hedge.late(aid.source, record.punctual, covariance)
-            self.hedge.answered(self._records, record, t_ns)
-            return Action.NONE
-        self.shown = differ(record, offer or velocity, covariance)
-        self.hedge.drop(aid.source)
-        return self._doubted(self._blame(record, aid), t_ns)
+        hedge, proof = self.hedge, record.proof
+        if record.means.tested(outcome.whitened, t_ns, self._pass):
+            self.shown = differ(record, offer or velocity, covariance)
+            hedge.drop(aid.source)
+            return self._doubted(self._blame(record, aid), t_ns)
+        told, white = False, proof is not None and aid.white
+        if proof is not None and (white or aid.wanders):
+            told = hedge.returns(aid.source, proof, covariance, white)
+        if not told and (record.means.unlikely or hedge.holds(aid.source)):
+            left = self._tilting.left(covariance)
+            hedge.look(aid, record, offer or velocity, nav, covariance, left)
+        if offer is not None and aid.wanders:
+            hedge.strays(aid.source, offer.wander, state)
+        elif offer is not None:
+            hedge.late(aid.source, record.punctual, covariance)
+        if hedge.wider:
+            hedge.answered(self._records, record, t_ns)
+        return Action.NONE
 
     def comes(self, aid: Aid, state: State, covariance: Array) -> None:
         """A position that is not yet seen to go with the motion is about to be fused into a filter
@@ -275,7 +284,7 @@ class Isolation:
     def unsettled(self, t_ns: int) -> float:
         """Of a doubt's variances, the share by which the sensors' errors may have changed anew
         since the position or velocity before the one that comes."""
-        return support.unsettled(self._records, self._doubts, t_ns)
+        return support.unsettled(self._records, self._doubts, t_ns) if self._doubts else 0.0
 
     def correcting(self, nav: Array, covariance: Array) -> None:
         """A position or velocity is about to be fused into a filter with the state `nav` (10,) and

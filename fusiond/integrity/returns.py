@@ -101,7 +101,7 @@ def prove(
     suspect = begun.contradicted and first
     if begun.failed and first:
         record.punctual = Punctual(offer.t_ns, started=True)
-    out = support.outage(records, offer.t_ns)
+    out = support.outage(records, record, offer.t_ns)
     if out and not (record.punctual and record.punctual.started):
         came = Punctual(offer.t_ns, expected=not comes.behind, before=comes.before)
         record.punctual = came if record.sd_m <= FINE_M else None

@@ -138,11 +138,12 @@ class Series:
 _FIELDS = attrgetter(*Series.__slots__)
 
 
-def said(
-    offers: Sequence[Offer],
-) -> tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]:
-    """What an aid says of position and velocity, and what a sensor that hangs repeats to the
-    bit."""
+Said = tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]
+"""What an aid says of position and velocity, and what a sensor that hangs repeats to the bit."""
+
+
+def said(offers: Sequence[Offer]) -> Said:
+    """Of an aid, by what it offers."""
     position = velocity = value = None
     for offer in offers:
         said: tuple[float, ...] | None = None

@@ -23,6 +23,7 @@ from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
 from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
+from fusiond.integrity.series import Said, said
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
@@ -41,12 +42,13 @@ MOST_WAITING = 4096
 @dataclass(slots=True)
 class Entry:
     """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been looked at: a rewind applies it again. `assumed`: it counts
-    as coarser than it says, and its own errors have not shown that. `error` is what made it
-    `failed`; `raw` is kept where the timeline `keeps_raw`."""
+    `judged` that its innovation has been looked at: a rewind applies it again, and then what it
+    `says` is known. `assumed`: it counts as coarser than it says, and its own errors have not shown
+    that. `error` is what made it `failed`; `raw` is kept where the timeline `keeps_raw`."""
 
     key: Key
     aid: Aid
+    says: Said | None = None
     outcome: Outcome | None = None
     judged: bool = False
     assumed: bool = False
@@ -172,11 +174,11 @@ class Timeline:
     def run(self, record: bool = False) -> None:
         """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
         latest = self.imu.latest_ns
-        estimator = self.estimator
-        while self._next < len(self._entries) and self._keys[self._next][0] <= latest:
-            entry = self._entries[self._next]
-            if entry.key[0] > estimator.t_ns:
-                estimator.propagate(self.imu, entry.key[0], record)
+        estimator, entries = self.estimator, self._entries
+        while self._next < len(entries) and (t_ns := entries[self._next].key[0]) <= latest:
+            entry = entries[self._next]
+            if t_ns > estimator.t_ns:
+                estimator.propagate(self.imu, t_ns, record)
                 self._checkpoint()
             self._count(entry, self._apply(entry))
             self._next += 1
@@ -223,22 +225,27 @@ class Timeline:
 
     def _apply(self, entry: Entry) -> Outcome:
         estimator, isolation, aid = self.estimator, self.isolation, entry.aid
-        match aid.feedback:
-            case "release":
-                estimator.release()
-            case "hold":
-                estimator.hold()
+        feedback, isolates = aid.feedback, estimator.isolates
+        if feedback == "release":
+            estimator.release()
+        elif feedback == "hold":
+            estimator.hold()
         believed = isolation.believes(aid.source)
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
         tilts = (aid.locates or aid.moves) and estimator.model.sensor_errors
         if tilts:
-            if (share := isolation.unsettled(aid.t_ns)) and not estimator.isolates:
+            if (share := isolation.unsettled(aid.t_ns)) and not isolates:
                 estimator.unsettle(share)
             isolation.correcting(estimator.nav, estimator.covariance)
         try:
             aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            outcome = self._update(aid) if believed else estimator.look(aid)
+            if not believed:
+                outcome = estimator.look(aid)
+            elif isolates:
+                outcome = estimator.update(aid)
+            else:
+                outcome = self._update(aid)
             if not entry.judged:
                 entry.assumed = isolation.assumes(aid)
         except RAISED_BY_NUMBERS as error:
@@ -247,11 +254,13 @@ class Timeline:
         if outcome.name in TURNS:
             isolation.turns_at_rest(aid.felt_turn(estimator.state))
             self._hedge()
-        if outcome.name in JUDGED and not estimator.isolates:
-            known = estimator.nav, estimator.covariance, estimator.state
-            action = isolation.judge(aid, outcome, *known)
+        if outcome.name in JUDGED and not isolates:
+            says, state = entry.says, estimator.state
+            if says is None or aid is not entry.aid:
+                says = entry.says = said(aid.offers())
+            action = isolation.judge(aid, outcome, state.nav, state.covariance, state, says)
             if action is Action.NONE and outcome.name == "fused" and tilts:
-                after = estimator.nav, estimator.covariance, estimator.turned
+                after = state.nav, estimator.covariance, estimator.turned
                 action = isolation.corrected(aid.t_ns, *after)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
@@ -270,7 +279,7 @@ class Timeline:
     def _update(self, aid: Aid) -> Outcome:
         """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its
         errors last. In the first case its innovation says nothing of the sigma that it states."""
-        if self.estimator.isolates:
+        if not (aid.locates or aid.moves):
             return self.estimator.update(aid)
         if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
             self.isolation.comes(aid, self.estimator.state, self.estimator.covariance)
