@@ -43,6 +43,10 @@ from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
 
 Array = NDArray[np.float64]
 
+LENT_ROWS = 3
+"""Aids of so many rows at most write their innovations to what the filter lends them: nearly all
+do."""
+
 
 @lru_cache(maxsize=1024)
 def gate_threshold(probability: float, degrees: int) -> float:
@@ -189,7 +193,8 @@ class ErrorStateFilter:
         self._covs: Array = in_lines(count * width * width).reshape(count, width, width)
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
-        self._view = State(self.nav, self.xi, self.step, model, self._covariance)
+        lent = tuple(Innovation.unwritten(rows, model.size) for rows in range(LENT_ROWS + 1))
+        self._view = State(self.nav, self.xi, self.step, model, self._covariance, lent)
         self._dxs: Array = np.zeros((count, model.size))
         self._dx: Array = self._dxs[0]
         self._shares: Array = np.array(shares)
