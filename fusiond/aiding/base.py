@@ -28,6 +28,8 @@ Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
 """When the error estimate is fed back into the navigation state: right after the aid; not before an
 aid says so; or now, all that was held."""
+LENT_ROWS = 3
+"""Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
@@ -65,7 +67,7 @@ class State(NamedTuple):
     def rows(self, count: int) -> Innovation:
         """To write an innovation of so many rows to, of any content. What is lent holds until the
         next innovation is asked for."""
-        if count < len(self.lent):
+        if self.lent and count <= LENT_ROWS:
             return self.lent[count]
         return Innovation.unwritten(count, self.model.size)
 

@@ -130,7 +130,7 @@ class VelocityAid(Aid):
         return rows
 
     def coarser(self, factor: float) -> VelocityAid:
-        sd = tuple([factor * each for each in self.sd])
+        sd = tuple(map(factor.__mul__, self.sd))
         of_device = self.lever, self.time, self.rest, self.sd_time_s
         one = self.source, self.t_ns, self.gate, self.v_ned, sd
         return VelocityAid(*one, *of_device, robust=self.robust)

@@ -20,7 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.covariance import in_lines
 from fusiond.estimators.doubt import open_by, unsettle
 from fusiond.estimators.propagation import (
@@ -42,10 +42,6 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
 
 Array = NDArray[np.float64]
-
-LENT_ROWS = 3
-"""Aids of so many rows at most write their innovations to what the filter lends them: nearly all
-do."""
 
 
 @lru_cache(maxsize=1024)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import LENT_ROWS, ErrorStateFilter, Outcome, gate_threshold
+from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
+from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, work
 from fusiond.models.model import Model
@@ -35,8 +35,8 @@ class KalmanEstimator(ErrorStateFilter):
         if aid.screened:
             return self._update_by_rows(aid, innovation)
         degrees = innovation.z.shape[0]
-        threshold, kept = gate_threshold(aid.gate, degrees), degrees < len(self._work)
-        y, g = self._work[degrees] if kept else work(degrees, self.model.width)
+        threshold = gate_threshold(aid.gate, degrees)
+        y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
         state = self.nav, self.xi, self._cov, self._dx
         nis = fuse(*state, *innovation, threshold, self._holding, y, g)
         if nis <= threshold:

@@ -84,11 +84,13 @@ from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import Series
 from fusiond.integrity.support import COARSER, FINE_M, FORGET_NS
 from fusiond.models.vehicle import MOUNTING
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.strapdown import VE, VN
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Said = PositionOffer | VelocityOffer | None
 
 # Of a chi-square of one, by chance once in a thousand.
@@ -116,7 +118,7 @@ class Hedge:
 
     def holds(self, source: str) -> bool:
         """Whether a series has left anything open."""
-        return bool(self.wider) and (source in self.wider or source + TILT in self.wider)
+        return source in self.wider or source + TILT in self.wider
 
     def look(
         self,
@@ -228,8 +230,10 @@ class Hedge:
     def strays(self, source: str, wander: str, state: State | None) -> None:
         """A position was fused whose error has the block `wander`; the `state` after it."""
         wider = None
-        if state is not None and state.covariance is not None:
-            wider = _beyond_prior(state.xi, state.covariance, state.model.slots_of(wander))
+        if state is not None and (p := state.covariance) is not None:
+            slots = state.model.indices[wander]
+            if _any_beyond_prior(state.xi, p, slots):
+                wider = _beyond_prior(state.xi, p, slots.tolist())
         if wider is not None or self.wider:
             self._put(source + STRAYS, wider)
 
@@ -268,6 +272,16 @@ def _series_of(name: str) -> str:
     for what in (TILT, LATE, STRAYS):
         name = name.removesuffix(what)
     return name
+
+
+@compiled("b1(f8[::1], f8[:, :], i8[::1])")
+def _any_beyond_prior(xi: Array, covariance: Array, slots: Indices) -> bool:
+    """Whether `_beyond_prior` has anything: asked of every fix."""
+    for slot in slots:
+        shown = 1.0 - covariance[slot, slot]
+        if shown > 0.0 and xi[slot] * xi[slot] > SELDOM * shown:
+            return True
+    return False
 
 
 def _beyond_prior(xi: Array, covariance: Array, slots: Sequence[int]) -> Array | None:

@@ -142,8 +142,15 @@ class Isolation:
         return record.proof is not None or support.outage(self._records, record, t_ns)
 
     def coarseness(self, aid: Aid) -> float:
-        """With how many times its stated sigma an aid counts, by how long its errors last."""
-        return support.coarseness(self._records, aid)
+        """With how many times its stated sigma an aid counts, by how long its errors last; infinite
+        where its series is not believed."""
+        record = self._records.get(aid.source)
+        if record is None:
+            return 1.0
+        if record.excluded:
+            return math.inf
+        asked = aid.moves or (aid.locates and record.alike)
+        return support.coarseness(self._records, record, aid) if asked else 1.0
 
     def assumes(self, aid: Aid) -> bool:
         """Whether the aid counts as coarser than it says by what is assumed, or as it hangs: what
@@ -222,7 +229,8 @@ class Isolation:
         v_n, v_e = nav[VN:VD].tolist()
         if value is not None:
             moving = math.hypot(v_n, v_e) > MOVING_M_S
-            repeats = record.repeats_itself(value, moving) or support.hangs(self._records, record)
+            repeats = record.repeats_itself(value, moving)
+            repeats = repeats or (record.repeats > 0 and support.hangs(self._records, record))
         if record.excluded:
             self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
@@ -259,7 +267,7 @@ class Isolation:
         told, white = False, proof is not None and aid.white
         if proof is not None and (white or aid.wanders):
             told = hedge.returns(aid.source, proof, covariance, white)
-        if not told and (record.means.unlikely or hedge.holds(aid.source)):
+        if not told and (record.means.unlikely or (hedge.wider and hedge.holds(aid.source))):
             left = self._tilting.left(covariance)
             hedge.look(aid, record, offer or velocity, nav, covariance, left)
         if offer is not None and aid.wanders:

@@ -86,17 +86,28 @@ _SUMS = _WAITING - _SHOWN
 _LONG_AGO_NS = -(2**62)
 
 
-@compiled("void(f8[::1], f8[::1])")
-def _add(packed: Array, y: Array) -> None:
-    """Take in an innovation (d,); the first begins the means."""
-    d = y.shape[0]
+@compiled("void(f8[::1])", forceinline=True)
+def _begin(packed: Array) -> None:
+    """One innovation more; the first begins the means."""
     if packed[_COUNT] == 0.0:
         packed[_HEAD:] = 0.0
-    for i in range(d):
-        fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
-        packed[_HEAD + i] = fast + FAST * (y[i] - fast)
-        packed[_HEAD + d + i] = slow + SLOW * (y[i] - slow)
     packed[_COUNT] += 1.0
+
+
+@compiled("void(f8[::1], i8, i8, f8)", forceinline=True)
+def _approach(packed: Array, d: int, i: int, y: float) -> None:
+    """Take in component i of d."""
+    fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
+    packed[_HEAD + i] = fast + FAST * (y - fast)
+    packed[_HEAD + d + i] = slow + SLOW * (y - slow)
+
+
+@compiled("void(f8[::1], f8[::1])")
+def _add(packed: Array, y: Array) -> None:
+    """Take in an innovation (d,)."""
+    _begin(packed)
+    for i in range(y.shape[0]):
+        _approach(packed, y.shape[0], i, y[i])
 
 
 @compiled("void(f8[::1])")
@@ -114,6 +125,8 @@ def _believe(packed: Array) -> None:
     packed[_LEARNED] = min(packed[_LEARNED] + n, LEARN_COUNT)
 
 
+# What an innovation of fewer components has for the others.
+_NO_MORE = (0.0, 0.0, 0.0)
 # What a look at the means has shown.
 _NOTHING, _UNLIKELY, _BIASED, _TOO_FEW = 0, 1, 2, 3
 
@@ -179,6 +192,20 @@ def _open(packed: Array, p: Array, first: int, sd: Array, out: Array) -> None:
 def _take(packed: Array, y: Array, t_ns: int, limit: float) -> int:
     """`_add`, and `_look` at what has come of it; `_TOO_FEW` while there is no mean."""
     _add(packed, y)
+    return _look(packed, t_ns, limit, 0.0) if packed[_COUNT] >= FEWEST else _TOO_FEW
+
+
+@compiled("i8(f8[::1], i8, f8, f8, f8, f8)")
+def _take_few(packed: Array, t_ns: int, limit: float, x: float, y: float, z: float) -> int:
+    """`_take` of an innovation of up to three components: a third of the time of an array that is
+    made for it."""
+    d = (packed.shape[0] - _HEAD) // 2
+    _begin(packed)
+    _approach(packed, d, 0, x)
+    if d > 1:
+        _approach(packed, d, 1, y)
+    if d > 2:
+        _approach(packed, d, 2, z)
     return _look(packed, t_ns, limit, 0.0) if packed[_COUNT] >= FEWEST else _TOO_FEW
 
 
@@ -250,8 +277,14 @@ class Means:
         if not whitened:
             self.unlikely, d = False, self.degrees
             return d > 0 and self.biased(t_ns, gate_threshold(probability, d))
-        packed, limit = self._ready(len(whitened)), gate_threshold(probability, len(whitened))
-        found = _take(packed, np.array(whitened), t_ns, limit)
+        degrees, packed = len(whitened), self._packed
+        if packed.shape[0] != _HEAD + 2 * degrees:
+            packed = self._ready(degrees)
+        limit = gate_threshold(probability, degrees)
+        if degrees <= 3:
+            found = _take_few(packed, t_ns, limit, *whitened, *_NO_MORE[degrees:])
+        else:
+            found = _take(packed, np.array(whitened), t_ns, limit)
         self.unlikely = found == _UNLIKELY
         return found == _BIASED
 

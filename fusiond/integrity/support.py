@@ -159,12 +159,10 @@ def velocity_sd(records: Records, device: str) -> float:
     return max(found, default=0.0)
 
 
-def coarseness(records: Records, aid: Aid) -> float:
+def coarseness(records: Records, record: Series, aid: Aid) -> float:
     """With how many times its stated sigma a velocity counts: receivers filter theirs, so that its
     errors last for seconds (fusiond.integrity.means). A position has a state for what its fixes
     share. Both, where the device says the same to the bit again and again."""
-    if not (aid.moves or aid.locates) or (record := records.get(aid.source)) is None:
-        return 1.0
     hangs = _hangs(records, record, aid) if record.alike else 1.0
     if not aid.moves:
         return hangs

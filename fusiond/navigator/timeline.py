@@ -9,6 +9,7 @@ that is due comes first.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.offers import Offer
 from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
@@ -48,6 +49,7 @@ class Entry:
 
     key: Key
     aid: Aid
+    feedback: Feedback = "at_once"
     says: Said | None = None
     outcome: Outcome | None = None
     judged: bool = False
@@ -100,6 +102,7 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.isolation = Isolation()
         self._wider = self.isolation.hedge.wider
+        self._isolates = estimator.isolates
         self._mounting = estimator.model.slots_of(MOUNTING)
         self._mounting_sd = max(estimator.model.initial[self._mounting].tolist(), default=0.0)
 
@@ -149,8 +152,9 @@ class Timeline:
         # Of one instant, velocities come first: after an outage a false position passes its gate by
         # the outage's sigma and takes the velocity along, and then the honest velocity would fail.
         first = " " if aid.moves and not aid.locates else ""
-        key = (aid.t_ns, "" if aid.feedback == "release" else first + aid.source, serial)
-        entry = Entry(key, aid)
+        feedback = aid.feedback
+        key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
+        entry = Entry(key, aid, feedback)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
             return entry
@@ -225,27 +229,20 @@ class Timeline:
 
     def _apply(self, entry: Entry) -> Outcome:
         estimator, isolation, aid = self.estimator, self.isolation, entry.aid
-        feedback, isolates = aid.feedback, estimator.isolates
-        if feedback == "release":
+        if entry.feedback == "release":
             estimator.release()
-        elif feedback == "hold":
+        elif entry.feedback == "hold":
             estimator.hold()
-        believed = isolation.believes(aid.source)
         # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
         tilts = (aid.locates or aid.moves) and estimator.model.sensor_errors
         if tilts:
-            if (share := isolation.unsettled(aid.t_ns)) and not isolates:
+            if (share := isolation.unsettled(aid.t_ns)) and not self._isolates:
                 estimator.unsettle(share)
             isolation.correcting(estimator.nav, estimator.covariance)
         try:
             aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            if not believed:
-                outcome = estimator.look(aid)
-            elif isolates:
-                outcome = estimator.update(aid)
-            else:
-                outcome = self._update(aid)
+            outcome = estimator.update(aid) if self._isolates else self._update(aid)
             if not entry.judged:
                 entry.assumed = isolation.assumes(aid)
         except RAISED_BY_NUMBERS as error:
@@ -254,14 +251,13 @@ class Timeline:
         if outcome.name in TURNS:
             isolation.turns_at_rest(aid.felt_turn(estimator.state))
             self._hedge()
-        if outcome.name in JUDGED and not isolates:
-            says, state = entry.says, estimator.state
+        if outcome.name in JUDGED and not self._isolates:
+            says, known = entry.says, (estimator.nav, estimator.covariance)
             if says is None or aid is not entry.aid:
                 says = entry.says = said(aid.offers())
-            action = isolation.judge(aid, outcome, state.nav, state.covariance, state, says)
-            if action is Action.NONE and outcome.name == "fused" and tilts:
-                after = state.nav, estimator.covariance, estimator.turned
-                action = isolation.corrected(aid.t_ns, *after)
+            action = isolation.judge(aid, outcome, *known, estimator.state, says)
+            if action is Action.NONE and tilts and outcome.name == "fused":
+                action = isolation.corrected(aid.t_ns, *known, estimator.turned)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
             if aid.constraint and self._mounting:
@@ -277,15 +273,17 @@ class Timeline:
         self.estimator.wider[:] = sum(wider.values())
 
     def _update(self, aid: Aid) -> Outcome:
-        """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its
-        errors last. In the first case its innovation says nothing of the sigma that it states."""
-        if not (aid.locates or aid.moves):
-            return self.estimator.update(aid)
-        if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
-            self.isolation.comes(aid, self.estimator.state, self.estimator.covariance)
-            return self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
-        lasting = self.isolation.coarseness(aid)
-        return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
+        """Fold one aid in, or only look at it where its series is not believed; as coarser than it
+        says where its motion is yet to be seen, or its errors last. In the first case its
+        innovation says nothing of the sigma that it states."""
+        estimator, isolation = self.estimator, self.isolation
+        lasting = isolation.coarseness(aid)
+        if lasting == math.inf:
+            return estimator.look(aid)
+        if aid.locates and isolation.unproven(aid.source, aid.t_ns):
+            isolation.comes(aid, estimator.state, estimator.covariance)
+            return estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
+        return estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         before, entry.outcome = entry.outcome, outcome
