@@ -302,13 +302,7 @@ def _beyond_prior(xi: Array, covariance: Array, slots: Sequence[int]) -> Array |
 
 def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:
     """The square (rad^2) of the tilt that accelerates as a velocity has it."""
-    means = record.means
-    own: list[float] = covariance.diagonal()[DV : DV + 2].tolist()
-    axes = zip(means.beyond(SELDOM), own, said.sd, strict=False)
-    changes = 0.0
-    for square, p, sd in axes:
-        r = (means.coarse * sd) ** 2
-        changes += square * (p + r) * (p / r) ** 2
+    changes = record.means.follows(covariance, DV, said.sd, SELDOM)
     return changes / (record.every_ns * 1e-9 * STANDARD_GRAVITY_M_S2) ** 2
 
 

@@ -166,11 +166,34 @@ def _look(packed: Array, t_ns: int, limit: float, own: float) -> int:
     return _UNLIKELY if unlikely else _NOTHING
 
 
-@compiled("void(f8[::1], f8[:, :], i8, f8[::1], f8[::1])")
-def _open(packed: Array, p: Array, first: int, sd: Array, out: Array) -> None:
+@compiled("f8(f8[::1], f8[:, :], i8, f8, f8, f8)")
+def _follows(packed: Array, p: Array, first: int, chance: float, sd_0: float, sd_1: float) -> float:
+    """See `Means.follows`."""
+    d, sd = (packed.shape[0] - _HEAD) // 2, (sd_0, sd_1)
+    changes = 0.0
+    for i in range(min(d, 2)):
+        fast, slow = packed[_HEAD + i] ** 2, packed[_HEAD + d + i] ** 2
+        fast = fast if fast > chance * packed[_SPREAD] else 0.0
+        slow = slow if slow > chance * packed[_SPREAD + 1] else 0.0
+        own, r = p[first + i, first + i], (math.sqrt(packed[_COARSE]) * sd[i]) ** 2
+        changes += max(fast, slow) * (own + r) * (own / r) ** 2
+    return changes
+
+
+@compiled("void(f8[::1], f8[:, :], i8, f8, f8, f8, i8, f8[::1])")
+def _open(
+    packed: Array,
+    p: Array,
+    first: int,
+    sd_0: float,
+    sd_1: float,
+    sd_2: float,
+    axes: int,
+    out: Array,
+) -> None:
     """Add to `out` (9,) what the excess of each component leaves open."""
-    d = (packed.shape[0] - _HEAD) // 2
-    for i in range(min(d, sd.shape[0])):
+    d, sd = (packed.shape[0] - _HEAD) // 2, (sd_0, sd_1, sd_2)
+    for i in range(min(d, axes)):
         fast, slow, own = packed[_HEAD + i], packed[_HEAD + d + i], p[first + i, first + i]
         excess = fast * fast - LIKELY * packed[_SPREAD]
         excess = max(excess, slow * slow - LIKELY * packed[_SPREAD + 1])
@@ -209,14 +232,17 @@ def _take_few(packed: Array, t_ns: int, limit: float, x: float, y: float, z: flo
     return _look(packed, t_ns, limit, 0.0) if packed[_COUNT] >= FEWEST else _TOO_FEW
 
 
-@compiled("UniTuple(f8, 2)(f8[::1], f8)")
-def _lasting(packed: Array, assumed: float) -> tuple[float, float]:
-    """c^2 of the measurement that comes next, `assumed` where nothing is known, and the part of it
-    that is no more than that.
+@compiled("Tuple((f8, b1))(f8[::1], f8)")
+def _lasting(packed: Array, every_s: float) -> tuple[float, bool]:
+    """c of a receiver's velocity that comes next, `every_s` after the one before, and whether more
+    of c^2 is assumed than `ASSUMING`. Of velocities that nothing is known of half of their variance
+    is white.
 
     What the slow mean has shown beside white errors counts as far as it is taken for the series'
     nature: the part that chance explains is left out (James and Stein, 1961, positive part).
     """
+    rho = math.exp(-max(every_s, LEAST_S) / LASTS_S)
+    assumed = 1.0 + LASTING_SHARE * 2.0 * rho / (1.0 - rho)
     told = packed[_TOLD]
     beyond = packed[_SLOWLY] / WHITE_SLOW - 1.0
     new = (packed.shape[0] - _HEAD) // 2 * told * SLOW  # degrees of freedom of its squares
@@ -226,7 +252,7 @@ def _lasting(packed: Array, assumed: float) -> tuple[float, float]:
     likely = LIKELY_COUNT / (LIKELY_COUNT + packed[_COUNT])
     beyond = likely * (assumed - shown)
     packed[_COARSE] = square = max(1.0, shown + beyond)
-    return square, beyond
+    return math.sqrt(square), beyond > ASSUMING * square
 
 
 def _begun(assumed: float) -> Array:
@@ -314,18 +340,15 @@ class Means:
         """Variances (9,) of what is published, position, velocity (n, e, d) and attitude, that the
         excess of a mean leaves open (fusiond.integrity.hedge): of measurements with `sd` (d,) of
         the states from `first` on, of which a filter holds P (n, n)."""
-        out = np.zeros(9)
-        _open(self._packed, covariance, first, np.array(sd), out)
+        out, axes = np.zeros(9), len(sd)
+        _open(self._packed, covariance, first, *sd, *_NO_MORE[axes:], axes, out)
         return out
 
-    def beyond(self, chance: float) -> list[float]:
-        """Of each component (d,), of an innovation's variance (1), the larger square of its means
-        that is beyond `chance`, a chi-square of one; 0 where none is."""
-        d = (self._packed.shape[0] - _HEAD) // 2
-        squares = (self._packed[_HEAD:] ** 2).tolist()
-        fast, slow = (chance * self._packed[_SPREAD : _SPREAD + 2]).tolist()
-        pairs = zip(squares[:d], squares[d:], strict=True)
-        return [max(f if f > fast else 0.0, s if s > slow else 0.0) for f, s in pairs]
+    def follows(self, covariance: Array, first: int, sd: tuple[float, ...], chance: float) -> float:
+        """The square by which a filter that holds P (n, n) changes with each of these measurements,
+        as the larger of each horizontal component's means has it that is beyond `chance`, a
+        chi-square of one: sum (K m)^2 S of states from `first` on, measured with `sd`."""
+        return _follows(self._packed, covariance, first, chance, *sd[:2])
 
     @property
     def excess(self) -> list[float]:
@@ -358,12 +381,5 @@ class Means:
         """c: by how much (1, at least) a sigma is too small for errors that last, as the series has
         shown; the measurement that comes next counts with it. What is assumed of measurements
         `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
-        square, beyond = _lasting(self._packed, assumed(every_s))
-        self.assuming = beyond > ASSUMING * square
-        return math.sqrt(square)
-
-
-def assumed(every_s: float) -> float:
-    """c^2 of a receiver's velocities that nothing is known of: half of their variance white."""
-    rho = math.exp(-max(every_s, LEAST_S) / LASTS_S)
-    return 1.0 + LASTING_SHARE * 2.0 * rho / (1.0 - rho)
+        coarse, self.assuming = _lasting(self._packed, every_s)
+        return coarse
