@@ -34,11 +34,12 @@ class KalmanEstimator(ErrorStateFilter):
             return Outcome(innovation.outcome)
         if aid.screened:
             return self._update_by_rows(aid, innovation)
-        degrees = innovation.z.shape[0]
+        z, h, r = innovation
+        degrees = z.shape[0]
         threshold = gate_threshold(aid.gate, degrees)
         y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
-        state = self.nav, self.xi, self._cov, self._dx
-        nis = fuse(*state, *innovation, threshold, self._holding, y, g)
+        nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
+        nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):

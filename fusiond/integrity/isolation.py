@@ -57,7 +57,7 @@ from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
-from fusiond.integrity.tilt import Tilting
+from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.navigation.strapdown import LAT, LON, VD, VN
 
 Array = NDArray[np.float64]
@@ -297,12 +297,13 @@ class Isolation:
     def correcting(self, nav: Array, covariance: Array) -> None:
         """A position or velocity is about to be fused into a filter with the state `nav` (10,) and
         P (n, n)."""
-        self._tilting.before(nav, covariance)
+        remember(nav, covariance, self._tilting.before)
 
     def corrected(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> Action:
         """It was, and these are what came of it, P in axes that have `turned` (rad); what the
         filter shall do about the attitude, as fusiond.integrity.tilt has it."""
-        if not self._tilting.after(t_ns, nav, covariance, turned):
+        tilting = self._tilting
+        if not too_far(tilting.sums, t_ns, tilting.before, nav, covariance, turned):
             return Action.NONE
         self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)

@@ -242,7 +242,13 @@ class Timeline:
         try:
             aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            outcome = estimator.update(aid) if self._isolates else self._update(aid)
+            coarse = isolation.coarseness(aid)
+            if coarse == math.inf:
+                outcome = estimator.look(aid)
+            elif aid.locates and isolation.unproven(aid.source, aid.t_ns):
+                outcome = self._unproven(aid)
+            else:
+                outcome = estimator.update(aid if coarse == 1.0 else aid.coarser(coarse))
             if not entry.judged:
                 entry.assumed = isolation.assumes(aid)
         except RAISED_BY_NUMBERS as error:
@@ -252,12 +258,12 @@ class Timeline:
             isolation.turns_at_rest(aid.felt_turn(estimator.state))
             self._hedge()
         if outcome.name in JUDGED and not self._isolates:
-            says, known = entry.says, (estimator.nav, estimator.covariance)
+            says, nav, p = entry.says, estimator.nav, estimator.covariance
             if says is None or aid is not entry.aid:
                 says = entry.says = said(aid.offers())
-            action = isolation.judge(aid, outcome, *known, estimator.state, says)
+            action = isolation.judge(aid, outcome, nav, p, estimator.state, says)
             if action is Action.NONE and tilts and outcome.name == "fused":
-                action = isolation.corrected(aid.t_ns, *known, estimator.turned)
+                action = isolation.corrected(aid.t_ns, nav, p, estimator.turned)
             if action is not Action.NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
             if aid.constraint and self._mounting:
@@ -272,18 +278,12 @@ class Timeline:
         self._wider = wider = self.isolation.hedge.wider
         self.estimator.wider[:] = sum(wider.values())
 
-    def _update(self, aid: Aid) -> Outcome:
-        """Fold one aid in, or only look at it where its series is not believed; as coarser than it
-        says where its motion is yet to be seen, or its errors last. In the first case its
-        innovation says nothing of the sigma that it states."""
-        estimator, isolation = self.estimator, self.isolation
-        lasting = isolation.coarseness(aid)
-        if lasting == math.inf:
-            return estimator.look(aid)
-        if aid.locates and isolation.unproven(aid.source, aid.t_ns):
-            isolation.comes(aid, estimator.state, estimator.covariance)
-            return estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
-        return estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
+    def _unproven(self, aid: Aid) -> Outcome:
+        """Fold one aid in whose motion is yet to be seen, as coarser than it says: its innovation
+        says nothing of the sigma that it states."""
+        estimator = self.estimator
+        self.isolation.comes(aid, estimator.state, estimator.covariance)
+        return estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         before, entry.outcome = entry.outcome, outcome
