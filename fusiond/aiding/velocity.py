@@ -131,9 +131,18 @@ class VelocityAid(Aid):
 
     def coarser(self, factor: float) -> VelocityAid:
         sd = tuple(map(factor.__mul__, self.sd))
-        of_device = self.lever, self.time, self.rest, self.sd_time_s
-        one = self.source, self.t_ns, self.gate, self.v_ned, sd
-        return VelocityAid(*one, *of_device, robust=self.robust)
+        return VelocityAid(
+            self.source,
+            self.t_ns,
+            self.gate,
+            self.v_ned,
+            sd,
+            self.lever,
+            self.time,
+            self.rest,
+            self.sd_time_s,
+            robust=self.robust,
+        )
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

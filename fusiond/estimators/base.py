@@ -14,7 +14,6 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -44,10 +43,20 @@ from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
 Array = NDArray[np.float64]
 
 
-@lru_cache(maxsize=1024)
+class _Thresholds(dict[tuple[float, int], float]):
+    """Chi-square quantiles by gate probability and degrees of freedom, found once."""
+
+    def __missing__(self, key: tuple[float, int]) -> float:
+        found = self[key] = quantile(key[1], 1.0 - key[0])
+        return found
+
+
+THRESHOLDS = _Thresholds()
+
+
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
-    return quantile(degrees, 1.0 - probability)
+    return THRESHOLDS[probability, degrees]
 
 
 class Outcome(NamedTuple):

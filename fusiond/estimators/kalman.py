@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.base import THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import fuse, work
 from fusiond.models.model import Model
@@ -36,7 +36,7 @@ class KalmanEstimator(ErrorStateFilter):
             return self._update_by_rows(aid, innovation)
         z, h, r = innovation
         degrees = z.shape[0]
-        threshold = gate_threshold(aid.gate, degrees)
+        threshold = THRESHOLDS[aid.gate, degrees]
         y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
         nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
         nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)

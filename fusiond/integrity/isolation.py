@@ -40,7 +40,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +48,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import returns, support
+from fusiond.integrity.action import MOTION, NONE, Action
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
@@ -58,7 +58,7 @@ from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting, remember, too_far
-from fusiond.navigation.strapdown import LAT, LON, VD, VN
+from fusiond.navigation.strapdown import LAT, LON, VE, VN
 
 Array = NDArray[np.float64]
 
@@ -75,22 +75,6 @@ FALSE_ALARM = 1e-6
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
 # So many doubts of the filter are remembered.
 DOUBTS = 8
-
-
-class Action(Enum):
-    """What the filter shall do after a judgement."""
-
-    NONE = "none"
-    DOUBT_MEASURED = "doubt measured"
-    """What the series has said was taken over in part: widen by its innovation."""
-    DOUBT_MOTION = "doubt motion"
-    """The series is left out, but attitude and sensor errors may be what is wrong: widen them."""
-    DOUBT_FILTER = "doubt filter"
-    """Both."""
-
-
-MOTION = frozenset({Action.DOUBT_MOTION, Action.DOUBT_FILTER})
-MEASURED = frozenset({Action.DOUBT_MEASURED, Action.DOUBT_FILTER})
 
 
 class Memory(NamedTuple):
@@ -215,7 +199,12 @@ class Isolation:
         `says`, where that has been asked before.
         """
         t_ns = aid.t_ns
-        record = self._record(aid)
+        record = self._records.get(aid.source)
+        if record is None or aid.source in self._shared:
+            record = self._own(aid, record)
+        record.every_ns, record.heard_ns = t_ns - record.heard_ns, t_ns
+        if record.every_ns > FORGET_NS:
+            record.forget()
         offer, velocity, value = says or said(aid.offers())
         offset, self.shown, repeats = None, (), False
         if offer is not None:
@@ -226,7 +215,7 @@ class Isolation:
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
         elif record.moves:
             record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
-        v_n, v_e = nav[VN:VD].tolist()
+        v_n, v_e = nav.item(VN), nav.item(VE)
         if value is not None:
             moving = math.hypot(v_n, v_e) > MOVING_M_S
             repeats = record.repeats_itself(value, moving)
@@ -236,17 +225,17 @@ class Isolation:
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
             passed = _passed(aid, outcome) and not repeats
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
-            return Action.NONE
+            return NONE
         if repeats:
             self._exclude(record, t_ns, REPEATS, jumped=True)
             passed = _passed(aid, outcome)
-            return self._doubted(Action.DOUBT_MEASURED if passed else Action.NONE, t_ns)
+            return self._doubted(Action.DOUBT_MEASURED if passed else NONE, t_ns)
         if outcome.name != "fused":
             if aid.constraint:
                 self._slides(record, t_ns)
-                return Action.NONE
+                return NONE
             if _passed(aid, outcome):
-                return Action.NONE
+                return NONE
             away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
         begun, comes, self._comes = self._begun, self._comes, returns.NOTHING
@@ -276,7 +265,7 @@ class Isolation:
             hedge.late(aid.source, record.punctual, covariance)
         if hedge.wider:
             hedge.answered(self._records, record, t_ns)
-        return Action.NONE
+        return NONE
 
     def comes(self, aid: Aid, state: State, covariance: Array) -> None:
         """A position that is not yet seen to go with the motion is about to be fused into a filter
@@ -304,29 +293,19 @@ class Isolation:
         filter shall do about the attitude, as fusiond.integrity.tilt has it."""
         tilting = self._tilting
         if not too_far(tilting.sums, t_ns, tilting.before, nav, covariance, turned):
-            return Action.NONE
+            return NONE
         self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
-    def _record(self, aid: Aid) -> Series:
-        """The series of an aid, which is heard of now."""
-        t_ns = aid.t_ns
-        record = self._records.get(aid.source)
-        if record is None:
-            record = Series(aid.device, aid.locates, aid.moves, t_ns, aid.no_slip)
+    def _own(self, aid: Aid, known: Series | None) -> Series:
+        """The series of an aid, which may be changed: none was known, or a checkpoint has it."""
+        if known is None:
+            record = Series(aid.device, aid.locates, aid.moves, aid.t_ns, aid.no_slip)
             record.means = Means.begun(aid.white)
-            self._records[aid.source] = record
-            return record
-        if aid.source in self._shared:
+        else:
             self._shared.discard(aid.source)
-            record = self._records[aid.source] = record.copied()
-        record.every_ns = t_ns - record.heard_ns
-        if record.every_ns > FORGET_NS:
-            record.repeats = record.passes = 0
-            record.means.restart()
-            if not record.excluded:
-                record.refused, record.jumped = 0, False
-        record.heard_ns = t_ns
+            record = known.copied()
+        self._records[aid.source] = record
         return record
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
@@ -351,14 +330,14 @@ class Isolation:
             agrees = support.supported(self._records, record.device, t_ns)
             record.jumped = jumps(record, t_ns, nis, away, agrees)
         if record.refused < REFUSED_IN_A_ROW:
-            return Action.NONE
+            return NONE
         reason = "jumped" if record.jumped else "disagrees"
         self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
         # A jump is the source's. Else the motion may be what is wrong, and positions shall decide.
         # What is neither position nor velocity (a heading, a height) has nobody to decide: a doubt
         # would open the filter until it passes, which is patience by another name.
         if record.jumped or not (record.locates or record.moves):
-            return Action.NONE
+            return NONE
         return Action.DOUBT_MOTION
 
     @staticmethod

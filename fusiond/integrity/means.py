@@ -34,7 +34,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.base import gate_threshold
+from fusiond.estimators.base import THRESHOLDS
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DR, DV, PHI
 
@@ -302,11 +302,11 @@ class Means:
         `probability`. Where nothing is `whitened` the means are as they were."""
         if not whitened:
             self.unlikely, d = False, self.degrees
-            return d > 0 and self.biased(t_ns, gate_threshold(probability, d))
+            return d > 0 and self.biased(t_ns, THRESHOLDS[probability, d])
         degrees, packed = len(whitened), self._packed
         if packed.shape[0] != _HEAD + 2 * degrees:
             packed = self._ready(degrees)
-        limit = gate_threshold(probability, degrees)
+        limit = THRESHOLDS[probability, degrees]
         if degrees <= 3:
             found = _take_few(packed, t_ns, limit, *whitened, *_NO_MORE[degrees:])
         else:

@@ -88,6 +88,13 @@ class Series:
         copy.means = self.means.copied()
         return copy
 
+    def forget(self) -> None:
+        """It has not been heard of for long: it is judged anew, though not believed again."""
+        self.repeats = self.passes = 0
+        self.means.restart()
+        if not self.excluded:
+            self.refused, self.jumped = 0, False
+
     @property
     def drifted(self) -> bool:
         """While excluded: whether it was for a drift that may be as slow as any."""

@@ -22,7 +22,8 @@ from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.offers import Offer
 from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
+from fusiond.integrity.action import MEASURED, MOTION, NONE
+from fusiond.integrity.isolation import Isolation, Memory
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.integrity.series import Said, said
 from fusiond.models.vehicle import MOUNTING
@@ -42,14 +43,16 @@ MOST_WAITING = 4096
 
 @dataclass(slots=True)
 class Entry:
-    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been looked at: a rewind applies it again, and then what it
-    `says` is known. `assumed`: it counts as coarser than it says, and its own errors have not shown
-    that. `error` is what made it `failed`; `raw` is kept where the timeline `keeps_raw`."""
+    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart, `tilts`
+    that what it corrects the tilt by is added up (fusiond.integrity.tilt), `judged` that its
+    innovation has been looked at: a rewind applies it again, and then what it `says` is known.
+    `assumed`: it counts as coarser than it says, and its own errors have not shown that. `error` is
+    what made it `failed`; `raw` is kept where the timeline `keeps_raw`."""
 
     key: Key
     aid: Aid
     feedback: Feedback = "at_once"
+    tilts: bool = False
     says: Said | None = None
     outcome: Outcome | None = None
     judged: bool = False
@@ -154,7 +157,9 @@ class Timeline:
         first = " " if aid.moves and not aid.locates else ""
         feedback = aid.feedback
         key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
-        entry = Entry(key, aid, feedback)
+        # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
+        tilts = (aid.locates or aid.moves) and self.estimator.model.sensor_errors
+        entry = Entry(key, aid, feedback, tilts)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
             return entry
@@ -233,9 +238,7 @@ class Timeline:
             estimator.release()
         elif entry.feedback == "hold":
             estimator.hold()
-        # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
-        tilts = (aid.locates or aid.moves) and estimator.model.sensor_errors
-        if tilts:
+        if entry.tilts:
             if (share := isolation.unsettled(aid.t_ns)) and not self._isolates:
                 estimator.unsettle(share)
             isolation.correcting(estimator.nav, estimator.covariance)
@@ -258,13 +261,15 @@ class Timeline:
             isolation.turns_at_rest(aid.felt_turn(estimator.state))
             self._hedge()
         if outcome.name in JUDGED and not self._isolates:
-            says, nav, p = entry.says, estimator.nav, estimator.covariance
+            says, state = entry.says, estimator.state
+            nav, p = state.nav, state.covariance
+            assert p is not None, "of a filter"
             if says is None or aid is not entry.aid:
                 says = entry.says = said(aid.offers())
-            action = isolation.judge(aid, outcome, nav, p, estimator.state, says)
-            if action is Action.NONE and tilts and outcome.name == "fused":
+            action = isolation.judge(aid, outcome, nav, p, state, says)
+            if action is NONE and entry.tilts and outcome.name == "fused":
                 action = isolation.corrected(aid.t_ns, nav, p, estimator.turned)
-            if action is not Action.NONE:
+            if action is not NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
             if aid.constraint and self._mounting:
                 angle = estimator.xi.item

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome
-from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.action import Action
+from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.series import Said
 
 Array = NDArray[np.float64]
