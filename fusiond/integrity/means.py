@@ -340,8 +340,8 @@ class Means:
         """Variances (9,) of what is published, position, velocity (n, e, d) and attitude, that the
         excess of a mean leaves open (fusiond.integrity.hedge): of measurements with `sd` (d,) of
         the states from `first` on, of which a filter holds P (n, n)."""
-        out, axes = np.zeros(9), len(sd)
-        _open(self._packed, covariance, first, *sd, *_NO_MORE[axes:], axes, out)
+        out, (sd_0, sd_1, sd_2) = np.zeros(9), (*sd, *_NO_MORE)[:3]
+        _open(self._packed, covariance, first, sd_0, sd_1, sd_2, len(sd), out)
         return out
 
     def follows(self, covariance: Array, first: int, sd: tuple[float, ...], chance: float) -> float:
