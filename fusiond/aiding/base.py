@@ -28,6 +28,8 @@ Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
 """When the error estimate is fed back into the navigation state: right after the aid; not before an
 aid says so; or now, all that was held."""
+LENT_ROWS = 3
+"""Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
@@ -37,15 +39,37 @@ def immutable(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
     return dataclass(slots=True, eq=eq)
 
 
+class Innovation(NamedTuple):
+    """z (m,), H (m, n), r (m,) variances of uncorrelated noise."""
+
+    z: Array
+    h: Array
+    r: Array
+
+    @staticmethod
+    def unwritten(rows: int, size: int) -> Innovation:
+        """Of so many rows and states, for an aid to write it."""
+        return Innovation(np.empty(rows), np.empty((rows, size)), np.empty(rows))
+
+
 class State(NamedTuple):
     """What an aid may look at: navigation state (10,), parameters (n,), last step (27,), model, and
-    the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth)."""
+    the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth).
+    `lent` is what a filter lends aids to write their innovations to, by the number of rows."""
 
     nav: Array
     xi: Array
     step: Array
     model: Model
     covariance: Array | None = None
+    lent: tuple[Innovation, ...] = ()
+
+    def rows(self, count: int) -> Innovation:
+        """To write an innovation of so many rows to, of any content. What is lent holds until the
+        next innovation is asked for."""
+        if self.lent and count <= LENT_ROWS:
+            return self.lent[count]
+        return Innovation.unwritten(count, self.model.size)
 
     @property
     def dcm(self) -> Array:
@@ -68,14 +92,6 @@ class State(NamedTuple):
     def speed(self) -> float:
         """Horizontal speed, m/s."""
         return math.hypot(self.nav[VN], self.nav[VE])
-
-
-class Innovation(NamedTuple):
-    """z (m,), H (m, n), r (m,) variances of uncorrelated noise."""
-
-    z: Array
-    h: Array
-    r: Array
 
 
 class NotApplicable(NamedTuple):

@@ -28,6 +28,7 @@ T-RA 17 (2001), eq. 8; Groves, 2nd ed., sections 15.4.1 and 16.3 (scale and moun
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -61,10 +62,15 @@ SIGN_SIGMAS = 3.0
 """A velocity beyond as many of its sigmas has the other sign once in 740."""
 
 
+@lru_cache(maxsize=64)
+def _blocks(drift: str, scale: str, latency: str) -> tuple[tuple[str, int], ...]:
+    """The blocks of the parameters in order, with how many states each has."""
+    return (MOUNTING, 2), (AXLE_LEVER, 1), (drift, 1), (scale, 1), (latency, 1)
+
+
 def _slots(model: Model, drift: str, scale: str = "", latency: str = "") -> Indices:
     """Slots (6,) of the parameters, by the names of the blocks of drift, scale and latency."""
-    own = (AXLE_LEVER, 1), (drift, 1), (scale, 1), (latency, 1)
-    return model.slots_or_missing((MOUNTING, 2), *own)
+    return model.slots_or_missing(*_blocks(drift, scale, latency))
 
 
 @compiled("f8(f8[::1], i8)", forceinline=True)
@@ -90,7 +96,8 @@ def _rows(
     z: Array,
     h: Array,
 ) -> None:
-    """Write h(x^) of vehicle axes first, first + 1 ... to z (m,), and H (m, n), zero before."""
+    """Write h(x^) of vehicle axes first, first + 1 ... to z (m,), and H (m, n)."""
+    h[:] = 0.0
     c = dcm_elements(nav[Q0:])
     turn = np.array(
         rotation_vector_to_quaternion(0.0, _estimate(xi, slot[PITCH]), _estimate(xi, slot[YAW]))
@@ -170,15 +177,53 @@ def _rows(
                 h[i, slot[DRIFT]] = -1.0
 
 
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8, i8[::1],"
+    "f8[::1], f8[::1], f8[:, ::1], f8[::1])",
+    allocates=True,
+)
+def _speed(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    speed: float,
+    variance: float,
+    rounded: float,
+    rounding: Indices,
+    initial: Array,
+    z: Array,
+    h: Array,
+    r: Array,
+) -> None:
+    """Write z (1,), H (1, n) and r (1,) of a wheel's `speed` with that variance. `rounding` (0 or
+    1,): the slot of the share of a step `rounded` (m/s; 0: none) that its rounding takes off, of
+    whose sigma at the start, `initial` (n,), the variance is rid."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, FORWARD, z, h)
+    z[0] -= speed
+    r[0] = variance
+    if rounded != 0.0:
+        step_m_s = math.copysign(rounded, speed)
+        for share in rounding:
+            z[0] -= step_m_s * xi[share]
+            h[0, share] = step_m_s
+            r[0] -= (step_m_s * initial[share]) ** 2
+
+
 def _body_velocity(
     state: State, lever: Vector3, first: int, count: int, slots: Indices
-) -> tuple[Array, Array]:
-    """h(x^) (m,) and H (m, n) along `count` of the vehicle's axes from `first` on."""
-    model = state.model
-    z, h = np.empty(count), np.zeros((count, model.size))
+) -> Innovation:
+    """h(x^) (m,), H (m, n) along `count` of the vehicle's axes from `first` on; r is left."""
+    model, rows = state.model, state.rows(count)
+    z, h, _ = rows
     hold = model.hold_height
     _rows(state.nav, state.step, state.xi, model.column_of, hold, *lever, slots, first, z, h)
-    return z, h
+    return rows
 
 
 @immutable()
@@ -200,7 +245,7 @@ class NonHolonomicAid(Aid):
 
     def across(self, state: State) -> tuple[float, float]:
         slots = _slots(state.model, SIDE_DRIFT)
-        z, _ = _body_velocity(state, self.lever, RIGHT, 1, slots)
+        z, _, _ = _body_velocity(state, self.lever, RIGHT, 1, slots)
         # Backward, a heading that has turned goes across to the other side.
         way = math.copysign(1.0, float(state.dcm[:, 0] @ state.nav[VN : VN + 3]))
         drift = slots[DRIFT]
@@ -212,9 +257,10 @@ class NonHolonomicAid(Aid):
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
         count = 1 if state.model.hold_height else 2  # right, down
-        z, h = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model, SIDE_DRIFT))
+        rows = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model, SIDE_DRIFT))
         sds = (self.sd_m_s, self.sd_down_m_s)[:count]
-        return Innovation(z, h, np.array([sd * sd for sd in sds]))
+        rows.r[:] = [sd * sd for sd in sds]
+        return rows
 
 
 @immutable()
@@ -239,25 +285,21 @@ class WheelSpeedAid(Aid):
     shared_step_m_s: float = 0.0
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        slots = _slots(state.model, self.drift, self.scale, self.latency)
-        z, h = _body_velocity(state, self.lever, FORWARD, 1, slots)
+        nav, xi, step, model, p, _ = state
+        slots = _slots(model, self.drift, self.scale, self.latency)
         speed = self.speed_m_s
         if not self.signed:
-            forward, p = float(z[0]), state.covariance
+            z, h, _ = _body_velocity(state, self.lever, FORWARD, 1, slots)
+            forward = float(z[0])
             sd = 0.0 if p is None else math.sqrt(max(float(h[0] @ p @ h[0]), 0.0))
             if abs(forward) <= SIGN_SIGMAS * sd:
                 return NotApplicable("direction_unknown")
             speed = math.copysign(speed, forward)
-        z[0] -= speed
-        variance = self.sd_m_s**2
-        rounding = state.model.slots_of(self.rounding)
-        if rounding and self.shared_step_m_s:
-            (slot,) = rounding
-            step = math.copysign(self.shared_step_m_s, speed)
-            z[0] -= step * state.xi[slot]
-            h[0, slot] = step
-            variance -= (step * state.model.initial[slot]) ** 2
-        return Innovation(z, h, np.array([variance]))
+        at = nav, step, xi, model.column_of, model.hold_height, *self.lever, slots
+        rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
+        rows = state.rows(1)
+        _speed(*at, speed, self.sd_m_s**2, *rounding, *rows)
+        return rows
 
     def offers(self) -> tuple[SpeedOffer, ...]:
         return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)

@@ -116,10 +116,11 @@ def _position(
     h: Array,
     r: Array,
 ) -> None:
-    """Write z (m,), H (m, n), zero before, and r (m,) for the first m of north, east, down, with
-    what offset in time and lever arm leave out by P (n, n), or (0, 0) where none is known. `bias`
-    (up to 3,), `time` (0 or 1,), `rest` (0 or 3,), `wander` (0 or 2,): slots in `xi`."""
+    """Write z (m,), H (m, n) and r (m,) for the first m of north, east, down, with what offset in
+    time and lever arm leave out by P (n, n), or (0, 0) where none is known. `bias` (up to 3,),
+    `time` (0 or 1,), `rest` (0 or 3,), `wander` (0 or 2,): slots in `xi`."""
     m, n = h.shape
+    h[:] = 0.0
     share = (s0, s1, s2)
     r[0], r[1] = sd0 * sd0, sd1 * sd1
     if m > 2:
@@ -226,18 +227,14 @@ class PositionAid(Aid):
         return self.bias
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, xi, step, model, p = state
-        rows = 2 if self.height_m is None or model.hold_height else 3
-        height = 0.0 if self.height_m is None else self.height_m
-        z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
-        own = self.bias, (self.time,), (self.rest,), (self.wander,)
-        bias, time, rest, wander = model.slots_of_each(*own)
-        slots = model.column_of, bias, time, rest, wander
-        fix = self.lat_rad, self.lon_rad, height
+        nav, xi, step, model, p, _ = state
+        height, at = self.height_m, model.indices
+        rows = state.rows(2 if height is None or model.hold_height else 3)
+        slots = model.column_of, at[self.bias], at[self.time], at[self.rest], at[self.wander]
+        fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
         where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
-        of_time = _UNKNOWN if p is None else p
-        _position(nav, xi, step, *slots, *fix, *where, of_time, z, h, r)
-        return Innovation(z, h, r)
+        _position(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
+        return rows
 
     def coarser(self, factor: float) -> PositionAid:
         north, east, down = self.sd

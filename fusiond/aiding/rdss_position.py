@@ -80,10 +80,16 @@ class RdssPositionAid(Aid):
         for row, slot in enumerate(state.model.slots_of(BIAS_BLOCK)):
             h[row, slot] = -1.0
             z[row] += state.xi[slot]
-        nn, ne, ee = self.covariance
-        r = np.array([[nn, ne], [ne, ee]]) + np.outer(v, v) * self.sd_time_s**2
-        whiten = np.linalg.inv(np.linalg.cholesky(r))
-        return Innovation(whiten @ z, whiten @ h, np.ones(2))
+        # By the factor of R, [sd_n 0; k sd_e].
+        (nn, ne, ee), (v_n, v_e) = self.covariance, (self.sd_time_s * v).tolist()
+        sd_n = math.sqrt(nn + v_n * v_n)
+        k = (ne + v_n * v_e) / sd_n
+        sd_e = math.sqrt(ee + v_e * v_e - k * k)
+        for rows in (z, h):
+            rows[0] /= sd_n
+            rows[1] -= k * rows[0]
+            rows[1] /= sd_e
+        return Innovation(z, h, np.ones(2))
 
     def offers(self) -> tuple[PositionOffer, ...]:
         """The fix without its height, which is an aid of its own where it is believed."""

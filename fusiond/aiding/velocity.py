@@ -61,8 +61,9 @@ def _velocity(
     h: Array,
     r: Array,
 ) -> None:
-    """Write z (m,), H (m, n), zero before, and r (m,) for the first m of north, east, down.
-    `time` (0 or 1,), `rest` (0 or 3,): slots in `xi`."""
+    """Write z (m,), H (m, n) and r (m,) for the first m of north, east, down. `time` (0 or 1,),
+    `rest` (0 or 3,): slots in `xi`."""
+    h[:] = 0.0
     if rest.size:
         l0, l1, l2 = l0 + xi[rest[0]], l1 + xi[rest[1]], l2 + xi[rest[2]]
     c = dcm_elements(nav[Q0:])
@@ -118,22 +119,30 @@ class VelocityAid(Aid):
         return self.source.removesuffix(SUFFIX)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, xi, step, model, _ = state
-        rows = 2 if model.hold_height else len(self.v_ned)
-        z, h, r = np.empty(rows), np.zeros((rows, model.size)), np.empty(rows)
-        time, rest = model.slots_of_each((self.time,), (self.rest,))
-        slots = model.column_of, time, rest
+        nav, xi, step, model, _, _ = state
+        at = model.indices
+        rows = state.rows(2 if model.hold_height else len(self.v_ned))
+        slots = model.column_of, at[self.time], at[self.rest]
         north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
         sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
         measured = north, east, down, sd_n, sd_e, sd_d
-        _velocity(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, z, h, r)
-        return Innovation(z, h, r)
+        _velocity(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, *rows)
+        return rows
 
     def coarser(self, factor: float) -> VelocityAid:
-        sd = tuple([factor * each for each in self.sd])
-        of_device = self.lever, self.time, self.rest, self.sd_time_s
-        one = self.source, self.t_ns, self.gate, self.v_ned, sd
-        return VelocityAid(*one, *of_device, robust=self.robust)
+        sd = tuple(map(factor.__mul__, self.sd))
+        return VelocityAid(
+            self.source,
+            self.t_ns,
+            self.gate,
+            self.v_ned,
+            sd,
+            self.lever,
+            self.time,
+            self.rest,
+            self.sd_time_s,
+            robust=self.robust,
+        )
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

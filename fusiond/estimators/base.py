@@ -14,13 +14,12 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
+from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.covariance import in_lines
 from fusiond.estimators.doubt import open_by, unsettle
 from fusiond.estimators.propagation import (
@@ -44,10 +43,20 @@ from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
 Array = NDArray[np.float64]
 
 
-@lru_cache(maxsize=1024)
+class _Thresholds(dict[tuple[float, int], float]):
+    """Chi-square quantiles by gate probability and degrees of freedom, found once."""
+
+    def __missing__(self, key: tuple[float, int]) -> float:
+        found = self[key] = quantile(key[1], 1.0 - key[0])
+        return found
+
+
+THRESHOLDS = _Thresholds()
+
+
 def gate_threshold(probability: float, degrees: int) -> float:
     """Chi-square quantile for a gate probability."""
-    return quantile(degrees, 1.0 - probability)
+    return THRESHOLDS[probability, degrees]
 
 
 class Outcome(NamedTuple):
@@ -189,7 +198,8 @@ class ErrorStateFilter:
         self._covs: Array = in_lines(count * width * width).reshape(count, width, width)
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
-        self._view = State(self.nav, self.xi, self.step, model, self._covariance)
+        lent = tuple(Innovation.unwritten(rows, model.size) for rows in range(LENT_ROWS + 1))
+        self._view = State(self.nav, self.xi, self.step, model, self._covariance, lent)
         self._dxs: Array = np.zeros((count, model.size))
         self._dx: Array = self._dxs[0]
         self._shares: Array = np.array(shares)

@@ -10,28 +10,36 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
+from fusiond.estimators.base import THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import fuse
+from fusiond.estimators.update import fuse, work
+from fusiond.models.model import Model
 
 
 class KalmanEstimator(ErrorStateFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
+    def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
+        super().__init__(model, gap_s, shares)
+        self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
+
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
+        return self._fold_in(aid)
+
+    def _fold_in(self, aid: Linearised) -> Outcome:
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         if aid.screened:
             return self._update_by_rows(aid, innovation)
-        degrees = innovation.z.shape[0]
-        threshold, y = gate_threshold(aid.gate, degrees), np.empty(degrees)
-        state = self.nav, self.xi, self._cov, self._dx
-        nis = fuse(*state, *innovation, threshold, self._holding, y)
+        z, h, r = innovation
+        degrees = z.shape[0]
+        threshold = THRESHOLDS[aid.gate, degrees]
+        y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
+        nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
+        nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):

@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
+from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.doubt import open_by
 from fusiond.estimators.federated.options import local_of
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import fuse
+from fusiond.estimators.update import fuse, work
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ class SeparatedEstimator(KalmanEstimator):
     def __init__(self, model: Model, gap_s: float, devices: tuple[str, ...]) -> None:
         if not devices:
             raise ValueError("solution separation needs at least one device")
-        ErrorStateFilter.__init__(self, model, gap_s, (1.0,) * (1 + len(devices)))
+        super().__init__(model, gap_s, (1.0,) * (1 + len(devices)))
         self.devices = devices
         self._carrying = True
         self._device_of: dict[str, int | None] = {}
@@ -128,5 +128,6 @@ class SeparatedEstimator(KalmanEstimator):
                 if (s.codes == KEPT).any():
                     cov[:], dx[:] = s.cov, s.dx
             else:
-                threshold, y = gate_threshold(aid.gate, i.z.shape[0]), np.zeros(i.z.shape[0])
-                fuse(self.nav, self.xi, cov, dx, i.z, i.h, i.r, threshold, True, y)
+                threshold = gate_threshold(aid.gate, i.z.shape[0])
+                y, g = work(i.z.shape[0], cov.shape[1])
+                fuse(self.nav, self.xi, cov, dx, i.z, i.h, i.r, threshold, True, y, g)

@@ -186,9 +186,6 @@ class TiltAxesFilter(KalmanEstimator):
         if apart:
             self._carry_over(before)
 
-    def _fold_in(self, aid: Linearised) -> Outcome:
-        return super().update(aid)
-
     def _estimate(self) -> Array:
         """Nav (10,), the gyros' biases (0 or 3,), what is left of the lever arm (0 or 3,)."""
         return np.concatenate([self.nav, self.xi[self._gyros], self.xi[self._lever]])

@@ -121,9 +121,14 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
     nav[HEIGHT] += d[8]
 
 
+def work(rows: int, width: int) -> tuple[Array, Array]:
+    """What `fuse` needs beside a filter's own for so many rows: y (m,) and g (m, w)."""
+    return np.empty(rows), np.empty((rows, width))
+
+
 @compiled(
-    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1, f8[::1])",
-    allocates=True,
+    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, b1, f8[::1],"
+    "f8[:, ::1])"
 )
 def fuse(
     nav: Array,
@@ -136,16 +141,17 @@ def fuse(
     threshold: float,
     holding: bool,
     y: Array,
+    g: Array,
 ) -> float:
     """Gate, update and feedback in one; the normalised innovation squared.
 
     Nothing changes if it is above `threshold` or not finite. With `holding` the estimate `dx` (n,)
     is kept and added to instead of fed back; `z` is then the innovation before `dx` is taken off.
-    `y` (m,) is left as the whitened innovation.
+    `y` (m,) is left as the whitened innovation, `g` (m, w) as `whiten` leaves it.
     """
-    innovation, g = z, np.empty((z.shape[0], cov.shape[1]))
+    innovation = z
     if holding:
-        innovation = np.empty_like(z)
+        innovation = y  # each of its elements is read before it is written
         take_off(z, h, dx, innovation)
     nis = whiten(cov, innovation, h, r, y, g)
     if nis <= threshold:

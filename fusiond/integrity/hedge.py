@@ -85,11 +85,13 @@ from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import Series
 from fusiond.integrity.support import COARSER, FINE_M, FORGET_NS
 from fusiond.models.vehicle import MOUNTING
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DR, DV, PHI
 from fusiond.navigation.strapdown import VE, VN
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Said = PositionOffer | VelocityOffer | None
 
 # Of a chi-square of one, by chance once in a thousand.
@@ -223,14 +225,18 @@ class Hedge:
             known = np.concatenate((own[DR : DR + 3], own[DV : DV + 3]))
             opened = np.maximum(punctual.leaves_open - known, 0.0)
             wider = np.concatenate((opened, np.zeros(3))) if opened.any() else None
-        self._put(source + LATE, wider)
+        if wider is not None or self.wider:
+            self._put(source + LATE, wider)
 
     def strays(self, source: str, wander: str, state: State | None) -> None:
         """A position was fused whose error has the block `wander`; the `state` after it."""
         wider = None
-        if state is not None and state.covariance is not None:
-            wider = _beyond_prior(state.xi, state.covariance, state.model.slots_of(wander))
-        self._put(source + STRAYS, wider)
+        if state is not None and (p := state.covariance) is not None:
+            slots = state.model.indices[wander]
+            if _any_beyond_prior(state.xi, p, slots):
+                wider = _beyond_prior(state.xi, p, slots.tolist())
+        if wider is not None or self.wider:
+            self._put(source + STRAYS, wider)
 
     def moved(
         self, source: str, records: Mapping[str, Series], record: Series, covariance: Array | None
@@ -249,7 +255,7 @@ class Hedge:
 
     def answered(self, records: Mapping[str, Series], record: Series, t_ns: int) -> None:
         """A series is fused, and what others left open that are silent may be its to tell now."""
-        if not self.wider or not record.means.degrees:
+        if not record.means.degrees:
             return
         for name in self.wider:
             other = records.get(source := _series_of(name))
@@ -273,8 +279,9 @@ class Hedge:
 
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it; what it may have moved by stays."""
-        for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
-            self._put(name, None)
+        if self.wider:
+            for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
+                self._put(name, None)
 
 
 def _series_of(name: str) -> str:
@@ -282,6 +289,16 @@ def _series_of(name: str) -> str:
     for what in (TILT, LATE, STRAYS, MOVED):
         name = name.removesuffix(what)
     return name
+
+
+@compiled("b1(f8[::1], f8[:, :], i8[::1])")
+def _any_beyond_prior(xi: Array, covariance: Array, slots: Indices) -> bool:
+    """Whether `_beyond_prior` has anything: asked of every fix."""
+    for slot in slots:
+        shown = 1.0 - covariance[slot, slot]
+        if shown > 0.0 and xi[slot] * xi[slot] > SELDOM * shown:
+            return True
+    return False
 
 
 def _beyond_prior(xi: Array, covariance: Array, slots: Sequence[int]) -> Array | None:
@@ -302,13 +319,7 @@ def _beyond_prior(xi: Array, covariance: Array, slots: Sequence[int]) -> Array |
 
 def _tilt(record: Series, said: PositionOffer | VelocityOffer, covariance: Array) -> float:
     """The square (rad^2) of the tilt that accelerates as a velocity has it."""
-    means = record.means
-    own: list[float] = covariance.diagonal()[DV : DV + 2].tolist()
-    axes = zip(means.beyond(SELDOM), own, said.sd, strict=False)
-    changes = 0.0
-    for square, p, sd in axes:
-        r = (means.coarse * sd) ** 2
-        changes += square * (p + r) * (p / r) ** 2
+    changes = record.means.follows(covariance, DV, said.sd, SELDOM)
     return changes / (record.every_ns * 1e-9 * STANDARD_GRAVITY_M_S2) ** 2
 
 

@@ -40,7 +40,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +48,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.integrity import returns, support
+from fusiond.integrity.action import MOTION, NONE, Action
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
@@ -56,10 +56,10 @@ from fusiond.integrity.moved import Moved, back
 from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
-from fusiond.integrity.series import DRIFTS, REPEATS, Series, said, velocity_away
+from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
-from fusiond.integrity.tilt import Tilting
-from fusiond.navigation.strapdown import VD
+from fusiond.integrity.tilt import Tilting, remember, too_far
+from fusiond.navigation.strapdown import LAT, LON, VE, VN
 
 Array = NDArray[np.float64]
 
@@ -76,22 +76,6 @@ FALSE_ALARM = 1e-6
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
 # So many doubts of the filter are remembered.
 DOUBTS = 8
-
-
-class Action(Enum):
-    """What the filter shall do after a judgement."""
-
-    NONE = "none"
-    DOUBT_MEASURED = "doubt measured"
-    """What the series has said was taken over in part: widen by its innovation."""
-    DOUBT_MOTION = "doubt motion"
-    """The series is left out, but attitude and sensor errors may be what is wrong: widen them."""
-    DOUBT_FILTER = "doubt filter"
-    """Both."""
-
-
-MOTION = frozenset({Action.DOUBT_MOTION, Action.DOUBT_FILTER})
-MEASURED = frozenset({Action.DOUBT_MEASURED, Action.DOUBT_FILTER})
 
 
 class Memory(NamedTuple):
@@ -140,11 +124,18 @@ class Isolation:
         record = self._records.get(series)
         if record is None or not 0.0 < record.sd_m <= FINE_M:
             return False
-        return record.proof is not None or support.outage(self._records, t_ns)
+        return record.proof is not None or support.outage(self._records, record, t_ns)
 
     def coarseness(self, aid: Aid) -> float:
-        """With how many times its stated sigma an aid counts, by how long its errors last."""
-        return support.coarseness(self._records, aid)
+        """With how many times its stated sigma an aid counts, by how long its errors last; infinite
+        where its series is not believed."""
+        record = self._records.get(aid.source)
+        if record is None:
+            return 1.0
+        if record.excluded:
+            return math.inf
+        asked = aid.moves or (aid.locates and record.alike)
+        return support.coarseness(self._records, record, aid) if asked else 1.0
 
     def assumes(self, aid: Aid) -> bool:
         """Whether the aid counts as coarser than it says by what is assumed, or as it hangs: what
@@ -203,25 +194,37 @@ class Isolation:
         nav: Array,
         covariance: Array | None = None,
         state: State | None = None,
+        says: Said | None = None,
     ) -> Action:
         """Take in how an aid ended, fused, gated or only looked at; what the filter shall do.
 
-        `nav` (10,): what it was compared with; P (n, n) and the whole `state`, where known.
+        `nav` (10,): what it was compared with; P (n, n) and the whole `state`, where known; what it
+        `says`, where that has been asked before.
         """
         t_ns = aid.t_ns
-        record = self._record(aid)
-        lat, lon, _, v_n, v_e = nav[:VD].tolist()
-        offer, velocity, value = said(aid.offers())
-        offset, self.shown = None, ()
+        record = self._records.get(aid.source)
+        if record is None or aid.source in self._shared:
+            record = self._own(aid, record)
+        record.every_ns, record.heard_ns = t_ns - record.heard_ns, t_ns
+        if record.every_ns > FORGET_NS:
+            record.forget()
+        offer, velocity, value = says or said(aid.offers())
+        offset, self.shown, repeats = None, (), False
         if offer is not None:
-            offset = apart(offer, lat, lon, nav) if state is None else residual(offer, state)
+            if state is not None:
+                offset = residual(offer, state)
+            else:
+                offset = apart(offer, float(nav[LAT]), float(nav[LON]), nav)
             record.sd_m, record.away_m = offset.sd, math.hypot(offset.north, offset.east)
             if outcome.name != "fused":
                 record.above_m = above(offer, nav)
         elif record.moves:
             record.sd_m_s = 0.0 if velocity is None else max(velocity.sd[:2])
-        moving = math.hypot(v_n, v_e) > MOVING_M_S
-        repeats = value is not None and support.repeats(self._records, record, value, moving)
+        v_n, v_e = nav.item(VN), nav.item(VE)
+        if value is not None:
+            moving = math.hypot(v_n, v_e) > MOVING_M_S
+            repeats = record.repeats_itself(value, moving)
+            repeats = repeats or (record.repeats > 0 and support.hangs(self._records, record))
         if record.excluded:
             self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
@@ -229,17 +232,17 @@ class Isolation:
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
             if offset is not None and not record.excluded and covariance is not None:
                 record.moved = back(record, t_ns, covariance)
-            return Action.NONE
+            return NONE
         if repeats:
             self._exclude(record, t_ns, REPEATS, jumped=True)
             passed = _passed(aid, outcome)
-            return self._doubted(Action.DOUBT_MEASURED if passed else Action.NONE, t_ns)
+            return self._doubted(Action.DOUBT_MEASURED if passed else NONE, t_ns)
         if outcome.name != "fused":
             if aid.constraint:
                 self._slides(record, t_ns)
-                return Action.NONE
+                return NONE
             if _passed(aid, outcome):
-                return Action.NONE
+                return NONE
             away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
             return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
         begun, comes, self._comes = self._begun, self._comes, returns.NOTHING
@@ -250,25 +253,28 @@ class Isolation:
         if runs:
             self._exclude(record, t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
-        if aid.across_sd_m_s > 0.0 and state is not None:
+        if record.no_slip and state is not None and aid.across_sd_m_s > 0.0:
             self.hedge.goes_across(aid, record, state)
-        if not record.means.tested(outcome.whitened, t_ns, self._pass):
-            proof, white = record.proof if aid.white or aid.wanders else None, aid.white
-            told = proof is not None and self.hedge.returns(aid.source, proof, covariance, white)
-            if not told and (record.means.unlikely or self.hedge.holds(aid.source)):
-                left = self._tilting.left(covariance)
-                self.hedge.look(aid, record, offer or velocity, nav, covariance, left)
-            if offer is not None and aid.wanders:
-                self.hedge.strays(aid.source, offer.wander, state)
-            elif offer is not None:
-                self.hedge.late(aid.source, record.punctual, covariance)
-            self.hedge.answered(self._records, record, t_ns)
-            if record.moved is not None:
-                record.moved = self.hedge.moved(aid.source, self._records, record, covariance)
-            return Action.NONE
-        self.shown = differ(record, offer or velocity, covariance)
-        self.hedge.drop(aid.source)
-        return self._doubted(self._blame(record, aid), t_ns)
+        hedge, proof = self.hedge, record.proof
+        if record.means.tested(outcome.whitened, t_ns, self._pass):
+            self.shown = differ(record, offer or velocity, covariance)
+            hedge.drop(aid.source)
+            return self._doubted(self._blame(record, aid), t_ns)
+        told, white = False, proof is not None and aid.white
+        if proof is not None and (white or aid.wanders):
+            told = hedge.returns(aid.source, proof, covariance, white)
+        if not told and (record.means.unlikely or (hedge.wider and hedge.holds(aid.source))):
+            left = self._tilting.left(covariance)
+            hedge.look(aid, record, offer or velocity, nav, covariance, left)
+        if offer is not None and aid.wanders:
+            hedge.strays(aid.source, offer.wander, state)
+        elif offer is not None:
+            hedge.late(aid.source, record.punctual, covariance)
+        if hedge.wider:
+            hedge.answered(self._records, record, t_ns)
+        if record.moved is not None:
+            record.moved = hedge.moved(aid.source, self._records, record, covariance)
+        return NONE
 
     def comes(self, aid: Aid, state: State, covariance: Array) -> None:
         """A position that is not yet seen to go with the motion is about to be fused into a filter
@@ -284,40 +290,31 @@ class Isolation:
     def unsettled(self, t_ns: int) -> float:
         """Of a doubt's variances, the share by which the sensors' errors may have changed anew
         since the position or velocity before the one that comes."""
-        return support.unsettled(self._records, self._doubts, t_ns)
+        return support.unsettled(self._records, self._doubts, t_ns) if self._doubts else 0.0
 
     def correcting(self, nav: Array, covariance: Array) -> None:
         """A position or velocity is about to be fused into a filter with the state `nav` (10,) and
         P (n, n)."""
-        self._tilting.before(nav, covariance)
+        remember(nav, covariance, self._tilting.before)
 
     def corrected(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> Action:
         """It was, and these are what came of it, P in axes that have `turned` (rad); what the
         filter shall do about the attitude, as fusiond.integrity.tilt has it."""
-        if not self._tilting.after(t_ns, nav, covariance, turned):
-            return Action.NONE
+        tilting = self._tilting
+        if not too_far(tilting.sums, t_ns, tilting.before, nav, covariance, turned):
+            return NONE
         self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
-    def _record(self, aid: Aid) -> Series:
-        """The series of an aid, which is heard of now."""
-        t_ns = aid.t_ns
-        record = self._records.get(aid.source)
-        if record is None:
-            record = Series(aid.device, aid.locates, aid.moves, t_ns, aid.no_slip)
+    def _own(self, aid: Aid, known: Series | None) -> Series:
+        """The series of an aid, which may be changed: none was known, or a checkpoint has it."""
+        if known is None:
+            record = Series(aid.device, aid.locates, aid.moves, aid.t_ns, aid.no_slip)
             record.means = Means.begun(aid.white)
-            self._records[aid.source] = record
-            return record
-        if aid.source in self._shared:
+        else:
             self._shared.discard(aid.source)
-            record = self._records[aid.source] = record.copied()
-        record.every_ns = t_ns - record.heard_ns
-        if record.every_ns > FORGET_NS:
-            record.repeats = record.passes = 0
-            record.means.restart()
-            if not record.excluded:
-                record.refused, record.jumped = 0, False
-        record.heard_ns = t_ns
+            record = known.copied()
+        self._records[aid.source] = record
         return record
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
@@ -342,14 +339,14 @@ class Isolation:
             agrees = support.supported(self._records, record.device, t_ns)
             record.jumped = jumps(record, t_ns, nis, away, agrees)
         if record.refused < REFUSED_IN_A_ROW:
-            return Action.NONE
+            return NONE
         reason = "jumped" if record.jumped else "disagrees"
         self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
         # A jump is the source's. Else the motion may be what is wrong, and positions shall decide.
         # What is neither position nor velocity (a heading, a height) has nobody to decide: a doubt
         # would open the filter until it passes, which is patience by another name.
         if record.jumped or not (record.locates or record.moves):
-            return Action.NONE
+            return NONE
         return Action.DOUBT_MOTION
 
     @staticmethod

@@ -34,7 +34,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.base import gate_threshold
+from fusiond.estimators.base import THRESHOLDS
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import DR, DV, PHI
 
@@ -86,17 +86,28 @@ _SUMS = _WAITING - _SHOWN
 _LONG_AGO_NS = -(2**62)
 
 
-@compiled("void(f8[::1], f8[::1])")
-def _add(packed: Array, y: Array) -> None:
-    """Take in an innovation (d,); the first begins the means."""
-    d = y.shape[0]
+@compiled("void(f8[::1])", forceinline=True)
+def _begin(packed: Array) -> None:
+    """One innovation more; the first begins the means."""
     if packed[_COUNT] == 0.0:
         packed[_HEAD:] = 0.0
-    for i in range(d):
-        fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
-        packed[_HEAD + i] = fast + FAST * (y[i] - fast)
-        packed[_HEAD + d + i] = slow + SLOW * (y[i] - slow)
     packed[_COUNT] += 1.0
+
+
+@compiled("void(f8[::1], i8, i8, f8)", forceinline=True)
+def _approach(packed: Array, d: int, i: int, y: float) -> None:
+    """Take in component i of d."""
+    fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
+    packed[_HEAD + i] = fast + FAST * (y - fast)
+    packed[_HEAD + d + i] = slow + SLOW * (y - slow)
+
+
+@compiled("void(f8[::1], f8[::1])")
+def _add(packed: Array, y: Array) -> None:
+    """Take in an innovation (d,)."""
+    _begin(packed)
+    for i in range(y.shape[0]):
+        _approach(packed, y.shape[0], i, y[i])
 
 
 @compiled("void(f8[::1])")
@@ -114,6 +125,8 @@ def _believe(packed: Array) -> None:
     packed[_LEARNED] = min(packed[_LEARNED] + n, LEARN_COUNT)
 
 
+# What an innovation of fewer components has for the others.
+_NO_MORE = (0.0, 0.0, 0.0)
 # What a look at the means has shown.
 _NOTHING, _UNLIKELY, _BIASED, _TOO_FEW = 0, 1, 2, 3
 
@@ -153,11 +166,34 @@ def _look(packed: Array, t_ns: int, limit: float, own: float) -> int:
     return _UNLIKELY if unlikely else _NOTHING
 
 
-@compiled("void(f8[::1], f8[:, :], i8, f8[::1], f8[::1])")
-def _open(packed: Array, p: Array, first: int, sd: Array, out: Array) -> None:
+@compiled("f8(f8[::1], f8[:, :], i8, f8, f8, f8)")
+def _follows(packed: Array, p: Array, first: int, chance: float, sd_0: float, sd_1: float) -> float:
+    """See `Means.follows`."""
+    d, sd = (packed.shape[0] - _HEAD) // 2, (sd_0, sd_1)
+    changes = 0.0
+    for i in range(min(d, 2)):
+        fast, slow = packed[_HEAD + i] ** 2, packed[_HEAD + d + i] ** 2
+        fast = fast if fast > chance * packed[_SPREAD] else 0.0
+        slow = slow if slow > chance * packed[_SPREAD + 1] else 0.0
+        own, r = p[first + i, first + i], (math.sqrt(packed[_COARSE]) * sd[i]) ** 2
+        changes += max(fast, slow) * (own + r) * (own / r) ** 2
+    return changes
+
+
+@compiled("void(f8[::1], f8[:, :], i8, f8, f8, f8, i8, f8[::1])")
+def _open(
+    packed: Array,
+    p: Array,
+    first: int,
+    sd_0: float,
+    sd_1: float,
+    sd_2: float,
+    axes: int,
+    out: Array,
+) -> None:
     """Add to `out` (9,) what the excess of each component leaves open."""
-    d = (packed.shape[0] - _HEAD) // 2
-    for i in range(min(d, sd.shape[0])):
+    d, sd = (packed.shape[0] - _HEAD) // 2, (sd_0, sd_1, sd_2)
+    for i in range(min(d, axes)):
         fast, slow, own = packed[_HEAD + i], packed[_HEAD + d + i], p[first + i, first + i]
         excess = fast * fast - LIKELY * packed[_SPREAD]
         excess = max(excess, slow * slow - LIKELY * packed[_SPREAD + 1])
@@ -182,14 +218,31 @@ def _take(packed: Array, y: Array, t_ns: int, limit: float) -> int:
     return _look(packed, t_ns, limit, 0.0) if packed[_COUNT] >= FEWEST else _TOO_FEW
 
 
-@compiled("UniTuple(f8, 2)(f8[::1], f8)")
-def _lasting(packed: Array, assumed: float) -> tuple[float, float]:
-    """c^2 of the measurement that comes next, `assumed` where nothing is known, and the part of it
-    that is no more than that.
+@compiled("i8(f8[::1], i8, f8, f8, f8, f8)")
+def _take_few(packed: Array, t_ns: int, limit: float, x: float, y: float, z: float) -> int:
+    """`_take` of an innovation of up to three components: a third of the time of an array that is
+    made for it."""
+    d = (packed.shape[0] - _HEAD) // 2
+    _begin(packed)
+    _approach(packed, d, 0, x)
+    if d > 1:
+        _approach(packed, d, 1, y)
+    if d > 2:
+        _approach(packed, d, 2, z)
+    return _look(packed, t_ns, limit, 0.0) if packed[_COUNT] >= FEWEST else _TOO_FEW
+
+
+@compiled("Tuple((f8, b1))(f8[::1], f8)")
+def _lasting(packed: Array, every_s: float) -> tuple[float, bool]:
+    """c of a receiver's velocity that comes next, `every_s` after the one before, and whether more
+    of c^2 is assumed than `ASSUMING`. Of velocities that nothing is known of half of their variance
+    is white.
 
     What the slow mean has shown beside white errors counts as far as it is taken for the series'
     nature: the part that chance explains is left out (James and Stein, 1961, positive part).
     """
+    rho = math.exp(-max(every_s, LEAST_S) / LASTS_S)
+    assumed = 1.0 + LASTING_SHARE * 2.0 * rho / (1.0 - rho)
     told = packed[_TOLD]
     beyond = packed[_SLOWLY] / WHITE_SLOW - 1.0
     new = (packed.shape[0] - _HEAD) // 2 * told * SLOW  # degrees of freedom of its squares
@@ -199,7 +252,7 @@ def _lasting(packed: Array, assumed: float) -> tuple[float, float]:
     likely = LIKELY_COUNT / (LIKELY_COUNT + packed[_COUNT])
     beyond = likely * (assumed - shown)
     packed[_COARSE] = square = max(1.0, shown + beyond)
-    return square, beyond
+    return math.sqrt(square), beyond > ASSUMING * square
 
 
 def _begun(assumed: float) -> Array:
@@ -249,9 +302,15 @@ class Means:
         `probability`. Where nothing is `whitened` the means are as they were."""
         if not whitened:
             self.unlikely, d = False, self.degrees
-            return d > 0 and self.biased(t_ns, gate_threshold(probability, d))
-        packed, limit = self._ready(len(whitened)), gate_threshold(probability, len(whitened))
-        found = _take(packed, np.array(whitened), t_ns, limit)
+            return d > 0 and self.biased(t_ns, THRESHOLDS[probability, d])
+        degrees, packed = len(whitened), self._packed
+        if packed.shape[0] != _HEAD + 2 * degrees:
+            packed = self._ready(degrees)
+        limit = THRESHOLDS[probability, degrees]
+        if degrees <= 3:
+            found = _take_few(packed, t_ns, limit, *whitened, *_NO_MORE[degrees:])
+        else:
+            found = _take(packed, np.array(whitened), t_ns, limit)
         self.unlikely = found == _UNLIKELY
         return found == _BIASED
 
@@ -281,18 +340,15 @@ class Means:
         """Variances (9,) of what is published, position, velocity (n, e, d) and attitude, that the
         excess of a mean leaves open (fusiond.integrity.hedge): of measurements with `sd` (d,) of
         the states from `first` on, of which a filter holds P (n, n)."""
-        out = np.zeros(9)
-        _open(self._packed, covariance, first, np.array(sd), out)
+        out, (sd_0, sd_1, sd_2) = np.zeros(9), (*sd, *_NO_MORE)[:3]
+        _open(self._packed, covariance, first, sd_0, sd_1, sd_2, len(sd), out)
         return out
 
-    def beyond(self, chance: float) -> list[float]:
-        """Of each component (d,), of an innovation's variance (1), the larger square of its means
-        that is beyond `chance`, a chi-square of one; 0 where none is."""
-        d = (self._packed.shape[0] - _HEAD) // 2
-        squares = (self._packed[_HEAD:] ** 2).tolist()
-        fast, slow = (chance * self._packed[_SPREAD : _SPREAD + 2]).tolist()
-        pairs = zip(squares[:d], squares[d:], strict=True)
-        return [max(f if f > fast else 0.0, s if s > slow else 0.0) for f, s in pairs]
+    def follows(self, covariance: Array, first: int, sd: tuple[float, ...], chance: float) -> float:
+        """The square by which a filter that holds P (n, n) changes with each of these measurements,
+        as the larger of each horizontal component's means has it that is beyond `chance`, a
+        chi-square of one: sum (K m)^2 S of states from `first` on, measured with `sd`."""
+        return _follows(self._packed, covariance, first, chance, *sd[:2])
 
     @property
     def excess(self) -> list[float]:
@@ -325,12 +381,5 @@ class Means:
         """c: by how much (1, at least) a sigma is too small for errors that last, as the series has
         shown; the measurement that comes next counts with it. What is assumed of measurements
         `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
-        square, beyond = _lasting(self._packed, assumed(every_s))
-        self.assuming = beyond > ASSUMING * square
-        return math.sqrt(square)
-
-
-def assumed(every_s: float) -> float:
-    """c^2 of a receiver's velocities that nothing is known of: half of their variance white."""
-    rho = math.exp(-max(every_s, LEAST_S) / LASTS_S)
-    return 1.0 + LASTING_SHARE * 2.0 * rho / (1.0 - rho)
+        coarse, self.assuming = _lasting(self._packed, every_s)
+        return coarse

@@ -250,7 +250,8 @@ def settled(offer: PositionOffer, state: State) -> PositionOffer:
     """Without what the filter has found of its offset in time and of its lever arm: where a vehicle
     turns or brakes these move it by v tau and C dl, which is no drift. What the fixes share stays
     in: a drift goes into it. Of the lever arm's own motion, w x l tau, there is a centimetre."""
-    time, rest = state.model.slots_of_each((offer.time,), (offer.rest,))
+    at = state.model.indices
+    time, rest = at[offer.time], at[offer.rest]
     lat, lon = _settled(state.nav, state.xi, time, rest, offer.lat_rad, offer.lon_rad)
     return offer._replace(lat_rad=lat, lon_rad=lon)
 
@@ -258,11 +259,10 @@ def settled(offer: PositionOffer, state: State) -> PositionOffer:
 def residual(offer: PositionOffer, state: State) -> Offset:
     """From the body's origin, as the `settled` offer has it, to where the filter is, at once: asked
     of every fix."""
-    time, rest = state.model.slots_of_each((offer.time,), (offer.rest,))
-    place = offer.lat_rad, offer.lon_rad
-    north, east = _residual(state.nav, state.xi, time, rest, *place, *offer.lever)
+    at, place = state.model.indices, (offer.lat_rad, offer.lon_rad, *offer.lever)
+    north, east = _residual(state.nav, state.xi, at[offer.time], at[offer.rest], *place)
     sd_n, sd_e, _ = offer.sd
-    return Offset(north, east, max(sd_n, sd_e))
+    return Offset(north, east, sd_n if sd_n > sd_e else sd_e)
 
 
 def above(offer: PositionOffer, nav: Array) -> float:

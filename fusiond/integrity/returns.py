@@ -111,7 +111,7 @@ def prove(
         record.punctual = Punctual(offer.t_ns, started=True)
     if first and begun.moved is not None and begun.moved.device == record.device:
         record.moved = begun.moved
-    out = support.outage(records, offer.t_ns)
+    out = support.outage(records, record, offer.t_ns)
     if out and not (record.punctual and record.punctual.started):
         came = Punctual(offer.t_ns, expected=not comes.behind, before=comes.before)
         record.punctual = came if record.sd_m <= FINE_M else None

@@ -95,6 +95,13 @@ class Series:
         copy.means = self.means.copied()
         return copy
 
+    def forget(self) -> None:
+        """It has not been heard of for long: it is judged anew, though not believed again."""
+        self.repeats = self.passes = 0
+        self.means.restart()
+        if not self.excluded:
+            self.refused, self.jumped = 0, False
+
     @property
     def drifted(self) -> bool:
         """While excluded: whether it was for a drift that may be as slow as any."""
@@ -145,11 +152,12 @@ class Series:
 _FIELDS = attrgetter(*Series.__slots__)
 
 
-def said(
-    offers: Sequence[Offer],
-) -> tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]:
-    """What an aid says of position and velocity, and what a sensor that hangs repeats to the
-    bit."""
+Said = tuple[PositionOffer | None, VelocityOffer | None, tuple[float, ...] | None]
+"""What an aid says of position and velocity, and what a sensor that hangs repeats to the bit."""
+
+
+def said(offers: Sequence[Offer]) -> Said:
+    """Of an aid, by what it offers."""
     position = velocity = value = None
     for offer in offers:
         said: tuple[float, ...] | None = None

@@ -125,15 +125,11 @@ def unsettled(records: Records, doubts: Sequence[int], t_ns: int) -> float:
     return max(step_ns, 0) / max(since_ns, UNSETTLED_NS)
 
 
-def repeats(records: Records, record: Series, value: tuple[float, ...], moving: bool) -> bool:
-    """Whether a new value, of a vehicle that may be `moving`, is none: its series repeats itself,
-    or does so no less often than the position of the same device, so that the device hangs."""
-    return record.repeats_itself(value, moving) or (
-        record.repeats >= REPEATED
-        and any(
-            r.locates and r.device == record.device and r.repeats >= REPEATED
-            for r in records.values()
-        )
+def hangs(records: Records, record: Series) -> bool:
+    """Whether a series repeats itself no less often than the position of the same device, so that
+    the device hangs."""
+    return record.repeats >= REPEATED and any(
+        r.locates and r.device == record.device and r.repeats >= REPEATED for r in records.values()
     )
 
 
@@ -165,12 +161,10 @@ def velocity_sd(records: Records, device: str) -> float:
     return max(found, default=0.0)
 
 
-def coarseness(records: Records, aid: Aid) -> float:
+def coarseness(records: Records, record: Series, aid: Aid) -> float:
     """With how many times its stated sigma a velocity counts: receivers filter theirs, so that its
     errors last for seconds (fusiond.integrity.means). A position has a state for what its fixes
     share. Both, where the device says the same to the bit again and again."""
-    if not (aid.moves or aid.locates) or (record := records.get(aid.source)) is None:
-        return 1.0
     hangs = _hangs(records, record, aid) if record.alike else 1.0
     if not aid.moves:
         return hangs
@@ -239,8 +233,11 @@ def fine_enough(records: Records, record: Series, t_ns: int) -> bool:
     return others(records, record, t_ns, max(FINE_M, COARSER * record.sd_m))
 
 
-def outage(records: Records, t_ns: int) -> bool:
-    """Whether there were fine positions, and none has been fused for as long as makes coasting."""
+def outage(records: Records, record: Series, t_ns: int) -> bool:
+    """Whether there were fine positions, and none has been fused for as long as makes coasting;
+    `record` is that of a position."""
+    if record.sd_m <= FINE_M and t_ns - record.fused_ns <= OTHERS_NS:
+        return False  # itself has been, as nearly always
     latest_ns = NEVER_NS
     for r in records.values():
         if r.locates and r.sd_m <= FINE_M and r.fused_ns > latest_ns:

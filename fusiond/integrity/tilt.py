@@ -42,7 +42,8 @@ _SINCE, _C, _V, _SIZE = 0, 1, 3, 6
 
 
 @compiled("void(f8[::1], f8[:, :], f8[::1])")
-def _remember(nav: Array, covariance: Array, before: Array) -> None:
+def remember(nav: Array, covariance: Array, before: Array) -> None:
+    """What a filter holds before an update: the state `nav` (10,) and P (n, n)."""
     for i in range(4):
         before[i] = nav[Q0 + i]
     before[4], before[5], before[6] = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -61,10 +62,11 @@ def _turn(nn: float, ne: float, ee: float, psi: float) -> tuple[float, float, fl
 
 
 @compiled("b1(f8[::1], i8, f8[::1], f8[::1], f8[:, :], f8)")
-def _add(
+def too_far(
     sums: Array, t_ns: int, before: Array, nav: Array, covariance: Array, turned: float
 ) -> bool:
-    """Add an update to `sums`; whether they do not fit the covariance that they were made with."""
+    """Add that update to `sums`, after which a filter holds these, P in axes that have `turned`
+    (rad); whether the corrections do not fit the covariance that they were made with."""
     since_ns = sums[:1].view(np.int64)
     f = math.exp(-max(0, t_ns - since_ns[0]) * 1e-9 / LASTS_S)
     since_ns[0] = t_ns
@@ -89,41 +91,32 @@ def _add(
     if nn <= 0.0 or determinant <= 1e-9 * nn * ee:
         return False
     square = ee * north * north + nn * east * east - 2.0 * ne * north * east
-    too_far: bool = square > LIMIT * determinant
-    return too_far
+    beyond: bool = square > LIMIT * determinant
+    return beyond
 
 
 class Tilting:
-    """The sums at an instant, and what a filter held before the update that comes next."""
+    """The `sums` at an instant, and what a filter held `before` the update that comes next."""
 
-    __slots__ = ("_before", "_sums")
+    __slots__ = ("before", "sums")
 
     def __init__(self, sums: Array | None = None) -> None:
-        self._sums = np.zeros(_SIZE) if sums is None else sums
-        self._before = np.zeros(7)
+        self.sums = np.zeros(_SIZE) if sums is None else sums
+        self.before = np.zeros(7)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Tilting) and self._sums.tobytes() == other._sums.tobytes()
+        return isinstance(other, Tilting) and self.sums.tobytes() == other.sums.tobytes()
 
     __hash__ = None  # type: ignore[assignment]
 
     def copied(self) -> Tilting:
         """A copy for a checkpoint."""
-        return Tilting(self._sums.copy())
-
-    def before(self, nav: Array, covariance: Array) -> None:
-        """What a filter holds before an update: the state `nav` (10,) and P (n, n)."""
-        _remember(nav, covariance, self._before)
+        return Tilting(self.sums.copy())
 
     def left(self, covariance: Array | None) -> float:
         """What that update has left of the tilt's variance (1), after which a filter holds P
         (n, n); 1 where that is not known."""
-        before = float(self._before[4] + self._before[6])
+        before = float(self.before[4] + self.before[6])
         if covariance is None or before <= 0.0:
             return 1.0
         return min(float(covariance[0, 0] + covariance[1, 1]) / before, 1.0)
-
-    def after(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> bool:
-        """Add that update, after which it holds these, P in axes that have `turned` (rad); whether
-        the corrections do not fit the covariance that they were made with."""
-        return _add(self._sums, t_ns, self._before, nav, covariance, turned)

@@ -108,11 +108,13 @@ class Model:
 
     def slots_of_all(self, blocks: tuple[str, ...]) -> Indices:
         """The slots of blocks one after another (k,), as kernels take them; not to be written."""
-        found = self._joined.get(blocks)
-        if found is None:
-            slots = [slot for block in blocks for slot in self.slots_of(block)]
-            found = self._joined[blocks] = np.array(slots, dtype=np.int64)
-        return found
+        return self.indices[blocks]
+
+    @cached_property
+    def indices(self) -> _Indices:
+        """By the name of a block or by several names, `slots_of_all` of them: what aids ask at each
+        of their instants."""
+        return _Indices(self)
 
     def slots_of_each(self, *lists: tuple[str, ...]) -> tuple[Indices, ...]:
         """`slots_of_all` of several lists of blocks: what an aid asks at each of its instants."""
@@ -136,10 +138,6 @@ class Model:
 
     @cached_property
     def _each(self) -> dict[tuple[tuple[str, ...], ...], tuple[Indices, ...]]:
-        return {}
-
-    @cached_property
-    def _joined(self) -> dict[tuple[str, ...], Indices]:
         return {}
 
     @cached_property
@@ -187,4 +185,18 @@ class Model:
         found: dict[int, list[int]] = {}
         for slot, column in enumerate(self.column_of.tolist()):
             found.setdefault(column, []).append(slot)
+        return found
+
+
+class _Indices(dict[str | tuple[str, ...], Indices]):
+    """Slots of a model by the names of its blocks, found when they are first asked for."""
+
+    def __init__(self, model: Model) -> None:
+        super().__init__()
+        self._model = model
+
+    def __missing__(self, names: str | tuple[str, ...]) -> Indices:
+        blocks = (names,) if isinstance(names, str) else names
+        slots = [slot for block in blocks for slot in self._model.slots_of(block)]
+        found = self[names] = np.array(slots, dtype=np.int64)
         return found

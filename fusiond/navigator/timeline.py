@@ -9,6 +9,7 @@ that is due comes first.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
@@ -17,13 +18,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusiond.aiding.base import Aid
+from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.offers import Offer
 from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.integrity.isolation import MEASURED, MOTION, Action, Isolation, Memory
+from fusiond.integrity.action import MEASURED, MOTION, NONE
+from fusiond.integrity.isolation import Isolation, Memory
 from fusiond.integrity.moved import Moved
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
+from fusiond.integrity.series import Said, said
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
@@ -41,13 +44,17 @@ MOST_WAITING = 4096
 
 @dataclass(slots=True)
 class Entry:
-    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart,
-    `judged` that its innovation has been looked at: a rewind applies it again. `assumed`: it counts
-    as coarser than it says, and its own errors have not shown that. `error` is what made it
-    `failed`; `raw` is kept where the timeline `keeps_raw`."""
+    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart, `tilts`
+    that what it corrects the tilt by is added up (fusiond.integrity.tilt), `judged` that its
+    innovation has been looked at: a rewind applies it again, and then what it `says` is known.
+    `assumed`: it counts as coarser than it says, and its own errors have not shown that. `error` is
+    what made it `failed`; `raw` is kept where the timeline `keeps_raw`."""
 
     key: Key
     aid: Aid
+    feedback: Feedback = "at_once"
+    tilts: bool = False
+    says: Said | None = None
     outcome: Outcome | None = None
     judged: bool = False
     assumed: bool = False
@@ -99,6 +106,7 @@ class Timeline:
         self._checkpoints: list[_Checkpoint] = []
         self.isolation = Isolation()
         self._wider = self.isolation.hedge.wider
+        self._isolates = estimator.isolates
         self._mounting = estimator.model.slots_of(MOUNTING)
         self._mounting_sd = max(estimator.model.initial[self._mounting].tolist(), default=0.0)
 
@@ -153,8 +161,11 @@ class Timeline:
         # Of one instant, velocities come first: after an outage a false position passes its gate by
         # the outage's sigma and takes the velocity along, and then the honest velocity would fail.
         first = " " if aid.moves and not aid.locates else ""
-        key = (aid.t_ns, "" if aid.feedback == "release" else first + aid.source, serial)
-        entry = Entry(key, aid)
+        feedback = aid.feedback
+        key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
+        # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
+        tilts = (aid.locates or aid.moves) and self.estimator.model.sensor_errors
+        entry = Entry(key, aid, feedback, tilts)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
             return entry
@@ -178,11 +189,11 @@ class Timeline:
     def run(self, record: bool = False) -> None:
         """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
         latest = self.imu.latest_ns
-        estimator = self.estimator
-        while self._next < len(self._entries) and self._keys[self._next][0] <= latest:
-            entry = self._entries[self._next]
-            if entry.key[0] > estimator.t_ns:
-                estimator.propagate(self.imu, entry.key[0], record)
+        estimator, entries = self.estimator, self._entries
+        while self._next < len(entries) and (t_ns := entries[self._next].key[0]) <= latest:
+            entry = entries[self._next]
+            if t_ns > estimator.t_ns:
+                estimator.propagate(self.imu, t_ns, record)
                 self._checkpoint()
             self._count(entry, self._apply(entry))
             self._next += 1
@@ -229,22 +240,24 @@ class Timeline:
 
     def _apply(self, entry: Entry) -> Outcome:
         estimator, isolation, aid = self.estimator, self.isolation, entry.aid
-        match aid.feedback:
-            case "release":
-                estimator.release()
-            case "hold":
-                estimator.hold()
-        believed = isolation.believes(aid.source)
-        # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
-        tilts = (aid.locates or aid.moves) and estimator.model.sensor_errors
-        if tilts:
-            if (share := isolation.unsettled(aid.t_ns)) and not estimator.isolates:
+        if entry.feedback == "release":
+            estimator.release()
+        elif entry.feedback == "hold":
+            estimator.hold()
+        if entry.tilts:
+            if (share := isolation.unsettled(aid.t_ns)) and not self._isolates:
                 estimator.unsettle(share)
             isolation.correcting(estimator.nav, estimator.covariance)
         try:
             aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            outcome = self._update(aid) if believed else estimator.look(aid)
+            coarse = isolation.coarseness(aid)
+            if coarse == math.inf:
+                outcome = estimator.look(aid)
+            elif aid.locates and isolation.unproven(aid.source, aid.t_ns):
+                outcome = self._unproven(aid)
+            else:
+                outcome = estimator.update(aid if coarse == 1.0 else aid.coarser(coarse))
             if not entry.judged:
                 entry.assumed = isolation.assumes(aid)
         except RAISED_BY_NUMBERS as error:
@@ -253,13 +266,16 @@ class Timeline:
         if outcome.name in TURNS:
             isolation.turns_at_rest(aid.felt_turn(estimator.state))
             self._hedge()
-        if outcome.name in JUDGED and not estimator.isolates:
-            known = estimator.nav, estimator.covariance, estimator.state
-            action = isolation.judge(aid, outcome, *known)
-            if action is Action.NONE and outcome.name == "fused" and tilts:
-                after = estimator.nav, estimator.covariance, estimator.turned
-                action = isolation.corrected(aid.t_ns, *after)
-            if action is not Action.NONE:
+        if outcome.name in JUDGED and not self._isolates:
+            says, state = entry.says, estimator.state
+            nav, p = state.nav, state.covariance
+            assert p is not None, "of a filter"
+            if says is None or aid is not entry.aid:
+                says = entry.says = said(aid.offers())
+            action = isolation.judge(aid, outcome, nav, p, state, says)
+            if action is NONE and entry.tilts and outcome.name == "fused":
+                action = isolation.corrected(aid.t_ns, nav, p, estimator.turned)
+            if action is not NONE:
                 estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
             if aid.constraint and self._mounting:
                 angle = estimator.xi.item
@@ -273,16 +289,12 @@ class Timeline:
         self._wider = wider = self.isolation.hedge.wider
         self.estimator.wider[:] = sum(wider.values())
 
-    def _update(self, aid: Aid) -> Outcome:
-        """Fold one aid in; as coarser than it says where its motion is yet to be seen, or its
-        errors last. In the first case its innovation says nothing of the sigma that it states."""
-        if self.estimator.isolates:
-            return self.estimator.update(aid)
-        if aid.locates and self.isolation.unproven(aid.source, aid.t_ns):
-            self.isolation.comes(aid, self.estimator.state, self.estimator.covariance)
-            return self.estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
-        lasting = self.isolation.coarseness(aid)
-        return self.estimator.update(aid if lasting == 1.0 else aid.coarser(lasting))
+    def _unproven(self, aid: Aid) -> Outcome:
+        """Fold one aid in whose motion is yet to be seen, as coarser than it says: its innovation
+        says nothing of the sigma that it states."""
+        estimator = self.estimator
+        self.isolation.comes(aid, estimator.state, estimator.covariance)
+        return estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         before, entry.outcome = entry.outcome, outcome

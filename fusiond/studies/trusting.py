@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome
-from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.action import Action
+from fusiond.integrity.isolation import Isolation
+from fusiond.integrity.series import Said
 
 Array = NDArray[np.float64]
 
@@ -22,6 +24,7 @@ class Trusting(Isolation):
         nav: Array,
         covariance: Array | None = None,
         state: State | None = None,
+        says: Said | None = None,
     ) -> Action:
         """Nobody is ever suspected."""
         return Action.NONE

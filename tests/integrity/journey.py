@@ -13,7 +13,8 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.action import Action
+from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.proof import (
     Proof,
     metres_a_radian,

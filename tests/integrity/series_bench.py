@@ -12,7 +12,8 @@ from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.action import Action
+from fusiond.integrity.isolation import Isolation
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 
 GATE = 0.9999

@@ -12,8 +12,9 @@ from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.base import Outcome
+from fusiond.integrity.action import Action
 from fusiond.integrity.hedge import NOTHING
-from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.means import LIKELY, WHITE_FAST, WHITE_SLOW, Means
 from fusiond.integrity.proof import DRIFT_SD_M_S, SLOWEST_M_S, Offset, Trend
 from fusiond.integrity.support import HALVED

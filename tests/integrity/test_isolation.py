@@ -11,7 +11,8 @@ import pytest
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.base import Outcome
-from fusiond.integrity.isolation import MOTION, Action, Isolation
+from fusiond.integrity.action import MOTION, Action
+from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.means import ASSUMED, WHITE_SLOW, Means
 from tests.integrity.series_bench import GATE, LEVER, NAV, SD_M, Bench, S
 

@@ -16,7 +16,8 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
-from fusiond.integrity.isolation import Action, Isolation
+from fusiond.integrity.action import Action
+from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.proof import (
     UNPROVEN_SIGMAS,
     metres_a_radian,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.integrity.tilt import Tilting
+from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.navigation.rotation import quaternion_from_rpy, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import Q0
 
@@ -47,14 +47,15 @@ class Level:
             self.t_ns += round(EVERY_S * S)
             self.error += WALK_RAD * self.rng.standard_normal(2) + EVERY_S * np.array(rate)
             self.p = self.p + np.eye(2) * WALK_RAD**2
-            self.tilting.before(self.nav, self.p)
+            remember(self.nav, self.p, self.tilting.before)
             gain = self.p @ np.linalg.inv(self.p + np.eye(2) * MEASURED_RAD**2)
             d = -gain @ (self.error + MEASURED_RAD * self.rng.standard_normal(2))
             self.error += d
             turn = np.array(rotation_vector_to_quaternion(float(d[0]), float(d[1]), 0.0))
             self.q = multiplied(turn, self.q)
             self.p = (np.eye(2) - gain) @ self.p
-            if self.tilting.after(self.t_ns, self.nav, self.p):
+            sums, before = self.tilting.sums, self.tilting.before
+            if too_far(sums, self.t_ns, before, self.nav, self.p, 0.0):
                 return (k + 1) * EVERY_S
         return None
 
@@ -83,7 +84,7 @@ def test_a_heading_that_is_corrected_tilts_nothing() -> None:
     p = np.diag([1e-2, 1e-3]) ** 2
     for k in range(300):
         nav = np.concatenate((np.zeros(Q0), q))
-        tilting.before(nav, p)
+        remember(nav, p, tilting.before)
         share = 0.01
         d = np.linalg.cholesky(share * p) @ rng.standard_normal(2)
         psi = math.radians(2.0) * rng.standard_normal()
@@ -94,5 +95,5 @@ def test_a_heading_that_is_corrected_tilts_nothing() -> None:
         axes = np.array([[c, -s], [s, c]])
         p = axes @ ((1.0 - share) * p) @ axes.T
         nav = np.concatenate((np.zeros(Q0), q))
-        assert not tilting.after(k * S // 5, nav, p, psi)
+        assert not too_far(tilting.sums, k * S // 5, tilting.before, nav, p, psi)
         p = p / (1.0 - share)

@@ -41,7 +41,7 @@ from fusiond.estimators.multiscale.block import (
 from fusiond.estimators.multiscale.wavelet import wavelet_matrix
 from fusiond.estimators.reading import sigmas
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import fuse, update
+from fusiond.estimators.update import fuse, update, work
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 
@@ -162,11 +162,10 @@ class MultiscaleEstimator(ErrorStateFilter):
         """NIS and whitened innovation (m,); beyond `threshold` nothing has changed."""
         z, h, r = rows
         o = self._open()
-        total, y = z + h @ o.u, np.zeros(len(z))
-        on_block = rows_on(o.w, len(o.w) - 1, h)
-        nis = fuse(
-            self.nav, self.xi, o.block.cov, o.block.mean, total, on_block, r, threshold, True, y
-        )
+        total, (y, g) = z + h @ o.u, work(len(z), o.block.cov.shape[1])
+        on_block, state = rows_on(o.w, len(o.w) - 1, h), (self.nav, self.xi)
+        block = o.block.cov, o.block.mean
+        nis = fuse(*state, *block, total, on_block, r, threshold, True, y, g)
         if nis <= threshold:
             self._commit(o, total, h, r)
         return nis, y

@@ -81,12 +81,13 @@ def _recursions_for(width: int) -> Callable[..., None]:
     ) -> None:
         """`count` times: `cov` over h seconds, then `rows` (m, n) with variances `r` (m,)."""
         z, y, dx = np.zeros(r.shape[0]), np.zeros(r.shape[0]), np.zeros(xi.shape[0])
+        g = np.empty((r.shape[0], width))
         flat = cov.reshape(width * width)
         terms = (active, sensor_terms, rate_terms, noise, 1.0, work)
         for _ in range(count):
             propagate_covariance(flat, step, c, h, *terms)
             mirror(flat, width, xi.shape[0])
-            fuse(nav, xi, cov, dx, z, rows, r, math.inf, False, y)
+            fuse(nav, xi, cov, dx, z, rows, r, math.inf, False, y, g)
 
     return recursions
 
