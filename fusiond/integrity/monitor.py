@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +92,33 @@ def _slide(
     return q
 
 
+@compiled(
+    "void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[:, ::1], f8[:, ::1], f8[::1],"
+    " f8[::1], f8[:, ::1])"
+)
+def _slide_over(
+    rows: Array,
+    figures: Array,
+    products: Array,
+    sums: Array,
+    now: int,
+    window: int,
+    new: Array,
+    sizes: Array,
+    weights: Array,
+    rho: Array,
+    found: Array,
+) -> None:
+    """Epochs `now` and those after it, `new` (n, m), one after the other; write what is `found`
+    (n, 2) after each: the window's NIS in all, and Q. `sizes` (n, 2) NIS and energy of each."""
+    for i in range(new.shape[0]):
+        nis, energy = sizes[i, 0], sizes[i, 1]
+        found[i, 1] = _slide(
+            rows, figures, products, sums, now + i, window, new[i], nis, energy, weights, rho
+        )
+        found[i, 0] = sums[0]
+
+
 class ConsistencyMonitor:
     """Sliding window over the innovations of one kind of aid of one source.
 
@@ -141,53 +169,68 @@ class ConsistencyMonitor:
         row = white if self.options.whitened else nu
         with np.errstate(over="ignore"):
             nis, energy = float(white @ white), float(row @ row)
-        self._take(row, nis, energy)
+        self._take(row[None], np.array([[nis, energy]]))
 
-    def add_whitened(self, row: Array, nis: float) -> None:
-        """Take L^-1 nu (m,) whose square `nis` is known already: `add` without its checks."""
-        self._take(row, nis, nis)
+    def add_whitened(self, rows: Array, nis: Sequence[float]) -> list[Verdict]:
+        """Take L^-1 nu (n, m) of successive epochs whose squares are known already: `add` without
+        its checks. The verdict after each of them."""
+        sizes = np.array(nis)
+        return self._take(rows, np.column_stack((sizes, sizes)))
 
-    def _take(self, row: Array, nis: float, energy: float) -> None:
-        if not (math.isfinite(nis) and math.isfinite(energy)):
+    def _take(self, rows: Array, sizes: Array) -> list[Verdict]:
+        """Epochs (n, m), NIS and energy (n, 2)."""
+        if not np.isfinite(sizes).all():
+            if len(rows) > 1:
+                each = (slice(i, i + 1) for i in range(len(rows)))
+                return [verdict for row in each for verdict in self._take(rows[row], sizes[row])]
             self.rejected["not_finite"] += 1
-            return
-        if row.shape[0] != self._m:
+            return [self.verdict]
+        if rows.shape[1] != self._m:
             self.restarts += self._m > 0
-            self._m = row.shape[0]
+            self._m = rows.shape[1]
             self.reset()
-        self._test(row, nis, energy)
+        found: list[Verdict] = []
+        while (done := len(found)) < len(rows):
+            # While the window grows, its limits change with each epoch.
+            now = slice(done, len(rows) if self.k == self.options.window else done + 1)
+            found += self._test(rows[now], sizes[now])
+        return found
 
-    def _test(self, row: Array, nis: float, energy: float) -> None:
-        """Take the epoch in; the window's verdict, and the verdict contradicted long enough."""
+    def _test(self, rows: Array, sizes: Array) -> list[Verdict]:
+        """Take epochs in; the window's verdict, and the verdict contradicted long enough."""
         o = self.options
-        self._count += 1
+        first, self._count = self._count, self._count + len(rows)
         if self._count > LAGS and self.k < o.window:
             self.k += 1
         k = self.k
         if k != self._limits_k and k >= FEWEST:
             self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
             self._limits_k = k
-        q = _slide(
+        limits, figures = self._limits, np.empty((len(rows), 2))
+        _slide_over(
             self._rows,
             self._figures,
             self._products,
             self._sums,
-            self._count - 1,
+            first,
             o.window,
-            row,
-            nis,
-            energy,
-            self._limits.weights,
+            rows,
+            sizes,
+            limits.weights,
             self._rho,
+            figures,
         )
         if k < FEWEST:
-            return
-        dof = k * self._m
-        self._average = float(self._sums[0]) / dof
-        self.window_verdict = verdict_of(self._average, q, self._limits, o.shared)
-        self._contradicted = self._contradicted + 1 if self.window_verdict != self.verdict else 0
-        if self._contradicted >= k // 2:
-            self.verdict, self._contradicted = self.window_verdict, 0
+            return [self.verdict]
+        found, dof = [], k * self._m
+        for total, q in figures.tolist():
+            self._average = total / dof
+            seen = self.window_verdict = verdict_of(self._average, q, limits, o.shared)
+            self._contradicted = self._contradicted + 1 if seen != self.verdict else 0
+            if self._contradicted >= k // 2:
+                self.verdict, self._contradicted = seen, 0
+            found.append(self.verdict)
+        return found
 
     def report(self) -> Consistency:
         """The figures of the window and the verdict; changes nothing."""
