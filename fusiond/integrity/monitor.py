@@ -15,13 +15,15 @@ from fusiond.integrity.consistency import (
     LAGS,
     NO_LIMITS,
     TOO_FEW,
+    WORDS,
     Consistency,
     ConsistencyOptions,
     Verdict,
     judge,
     limits_of,
-    verdict_of,
+    verdict_index,
     whiten,
+    word,
 )
 from fusiond.navigation.compiled import compiled
 
@@ -93,8 +95,8 @@ def _slide(
 
 
 @compiled(
-    "void(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[:, ::1], f8[:, ::1], f8[::1],"
-    " f8[::1], f8[:, ::1])"
+    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[:, ::1], f8[:, ::1], f8[::1],"
+    " f8[::1], f8, f8, f8, i8, i8, i8[::1], i8[:, ::1])"
 )
 def _slide_over(
     rows: Array,
@@ -107,16 +109,39 @@ def _slide_over(
     sizes: Array,
     weights: Array,
     rho: Array,
-    found: Array,
-) -> None:
-    """Epochs `now` and those after it, `new` (n, m), one after the other; write what is `found`
-    (n, 2) after each: the window's NIS in all, and Q. `sizes` (n, 2) NIS and energy of each."""
+    low: float,
+    high: float,
+    most_q: float,
+    dof: int,
+    patience: int,
+    held: NDArray[np.int64],
+    turned: NDArray[np.int64],
+) -> int:
+    """Epochs `now` and those after it, `new` (n, m), one after the other; how often the verdict has
+    `turned` (n, 2): after which of them, and to which of `WORDS`.
+
+    `sizes` (n, 2) NIS and energy of each. `held` (3,): the verdict, the window's, and for how many
+    epochs the second has contradicted the first; after `patience` it takes its place. 0: the window
+    is too short for any.
+    """
+    turns = 0
     for i in range(new.shape[0]):
         nis, energy = sizes[i, 0], sizes[i, 1]
-        found[i, 1] = _slide(
+        q = _slide(
             rows, figures, products, sums, now + i, window, new[i], nis, energy, weights, rho
         )
-        found[i, 0] = sums[0]
+        if patience == 0:
+            continue
+        held[1] = verdict_index(sums[0] / dof, q, low, high, most_q)
+        held[2] = held[2] + 1 if held[1] != held[0] else 0
+        if held[2] >= patience:
+            held[0], held[2] = held[1], 0
+            turned[turns, 0], turned[turns, 1] = i, held[1]
+            turns += 1
+    return turns
+
+
+_TOO_FEW = WORDS.index("too_few")
 
 
 class ConsistencyMonitor:
@@ -149,10 +174,18 @@ class ConsistencyMonitor:
         self._sums = np.zeros(2 + LAGS)
         self._count = self.k = 0
         self._average, self._rho = math.nan, np.full(LAGS, math.nan)
-        self.verdict: Verdict = "too_few"
-        self.window_verdict: Verdict = "too_few"
-        self._contradicted = 0
+        self._held = np.array([_TOO_FEW, _TOO_FEW, 0])
         self._limits_k, self._limits = 0, NO_LIMITS
+
+    @property
+    def verdict(self) -> Verdict:
+        """With hysteresis."""
+        return word(int(self._held[0]), self.options.shared)
+
+    @property
+    def window_verdict(self) -> Verdict:
+        """Of this window alone."""
+        return word(int(self._held[1]), self.options.shared)
 
     def add(self, nu: Array, s: Array | None = None) -> None:
         """Take an innovation (m,): whitened, or as it is together with its covariance `s` (m, m).
@@ -171,32 +204,34 @@ class ConsistencyMonitor:
             nis, energy = float(white @ white), float(row @ row)
         self._take(row[None], np.array([[nis, energy]]))
 
-    def add_whitened(self, rows: Array, nis: Sequence[float]) -> list[Verdict]:
+    def add_whitened(self, rows: Array, nis: Sequence[float]) -> list[tuple[int, Verdict]]:
         """Take L^-1 nu (n, m) of successive epochs whose squares are known already: `add` without
-        its checks. The verdict after each of them."""
+        its checks. After which of them the verdict turned, and to what."""
         sizes = np.array(nis)
         return self._take(rows, np.column_stack((sizes, sizes)))
 
-    def _take(self, rows: Array, sizes: Array) -> list[Verdict]:
+    def _take(self, rows: Array, sizes: Array) -> list[tuple[int, Verdict]]:
         """Epochs (n, m), NIS and energy (n, 2)."""
-        if not np.isfinite(sizes).all():
-            if len(rows) > 1:
-                each = (slice(i, i + 1) for i in range(len(rows)))
-                return [verdict for row in each for verdict in self._take(rows[row], sizes[row])]
-            self.rejected["not_finite"] += 1
-            return [self.verdict]
+        finite = np.isfinite(sizes).all(axis=1)
+        if not finite.all():
+            places = np.flatnonzero(finite).tolist()
+            self.rejected["not_finite"] += len(rows) - len(places)
+            turned = self._take(rows[finite], sizes[finite]) if places else []
+            return [(places[i], to) for i, to in turned]
         if rows.shape[1] != self._m:
             self.restarts += self._m > 0
             self._m = rows.shape[1]
             self.reset()
-        found: list[Verdict] = []
-        while (done := len(found)) < len(rows):
+        found: list[tuple[int, Verdict]] = []
+        done = 0
+        while done < len(rows):
             # While the window grows, its limits change with each epoch.
-            now = slice(done, len(rows) if self.k == self.options.window else done + 1)
-            found += self._test(rows[now], sizes[now])
+            end = len(rows) if self.k == self.options.window else done + 1
+            found += [(done + i, to) for i, to in self._test(rows[done:end], sizes[done:end])]
+            done = end
         return found
 
-    def _test(self, rows: Array, sizes: Array) -> list[Verdict]:
+    def _test(self, rows: Array, sizes: Array) -> list[tuple[int, Verdict]]:
         """Take epochs in; the window's verdict, and the verdict contradicted long enough."""
         o = self.options
         first, self._count = self._count, self._count + len(rows)
@@ -206,8 +241,10 @@ class ConsistencyMonitor:
         if k != self._limits_k and k >= FEWEST:
             self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
             self._limits_k = k
-        limits, figures = self._limits, np.empty((len(rows), 2))
-        _slide_over(
+        limits, turned = self._limits, np.empty((len(rows), 2), dtype=np.int64)
+        low, high = limits.nis_limits
+        dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
+        turns = _slide_over(
             self._rows,
             self._figures,
             self._products,
@@ -218,19 +255,17 @@ class ConsistencyMonitor:
             sizes,
             limits.weights,
             self._rho,
-            figures,
+            low,
+            high,
+            limits.portmanteau,
+            dof,
+            patience,
+            self._held,
+            turned,
         )
-        if k < FEWEST:
-            return [self.verdict]
-        found, dof = [], k * self._m
-        for total, q in figures.tolist():
-            self._average = total / dof
-            seen = self.window_verdict = verdict_of(self._average, q, limits, o.shared)
-            self._contradicted = self._contradicted + 1 if seen != self.verdict else 0
-            if self._contradicted >= k // 2:
-                self.verdict, self._contradicted = seen, 0
-            found.append(self.verdict)
-        return found
+        if k >= FEWEST:
+            self._average = float(self._sums[0]) / dof
+        return [(i, word(to, o.shared)) for i, to in turned[:turns].tolist()] if turns else []
 
     def report(self) -> Consistency:
         """The figures of the window and the verdict; changes nothing."""

@@ -82,12 +82,8 @@ class Verdicts:
             waiting, series.waiting = series.waiting, []
             for _, alike in groupby(waiting, key=lambda each: len(each[1])):
                 numbers, rows, nis = zip(*alike, strict=True)
-                before = series.monitor.verdict
-                after = series.monitor.add_whitened(np.array(rows), nis)
-                for number, verdict in zip(numbers, after, strict=True):
-                    if verdict != before:
-                        turned.append((number, source, verdict))
-                    before = verdict
+                for row, verdict in series.monitor.add_whitened(np.array(rows), nis):
+                    turned.append((numbers[row], source, verdict))
         for _, source, verdict in sorted(turned):
             self._on_change(source, verdict)
 
