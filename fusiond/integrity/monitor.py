@@ -95,8 +95,8 @@ def _slide(
 
 
 @compiled(
-    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[:, ::1], f8[:, ::1], f8[::1],"
-    " f8[::1], f8, f8, f8, i8, i8, i8[::1], i8[:, ::1])"
+    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[:, ::1], f8[::1], f8[::1],"
+    " f8[::1], f8[::1], f8, f8, f8, i8, i8, i8[::1], i8[:, ::1])"
 )
 def _slide_over(
     rows: Array,
@@ -106,7 +106,8 @@ def _slide_over(
     now: int,
     window: int,
     new: Array,
-    sizes: Array,
+    nis: Array,
+    energy: Array,
     weights: Array,
     rho: Array,
     low: float,
@@ -120,16 +121,14 @@ def _slide_over(
     """Epochs `now` and those after it, `new` (n, m), one after the other; how often the verdict has
     `turned` (n, 2): after which of them, and to which of `WORDS`.
 
-    `sizes` (n, 2) NIS and energy of each. `held` (3,): the verdict, the window's, and for how many
+    `nis` and `energy` (n,) are theirs. `held` (3,): the verdict, the window's, and for how many
     epochs the second has contradicted the first; after `patience` it takes its place. 0: the window
     is too short for any.
     """
     turns = 0
     for i in range(new.shape[0]):
-        nis, energy = sizes[i, 0], sizes[i, 1]
-        q = _slide(
-            rows, figures, products, sums, now + i, window, new[i], nis, energy, weights, rho
-        )
+        of_epoch = new[i], nis[i], energy[i]
+        q = _slide(rows, figures, products, sums, now + i, window, *of_epoch, weights, rho)
         if patience == 0:
             continue
         held[1] = verdict_index(sums[0] / dof, q, low, high, most_q)
@@ -202,21 +201,21 @@ class ConsistencyMonitor:
         row = white if self.options.whitened else nu
         with np.errstate(over="ignore"):
             nis, energy = float(white @ white), float(row @ row)
-        self._take(row[None], np.array([[nis, energy]]))
+        self._take(row[None], np.array([nis]), np.array([energy]))
 
     def add_whitened(self, rows: Array, nis: Sequence[float]) -> list[tuple[int, Verdict]]:
         """Take L^-1 nu (n, m) of successive epochs whose squares are known already: `add` without
         its checks. After which of them the verdict turned, and to what."""
         sizes = np.array(nis)
-        return self._take(rows, np.column_stack((sizes, sizes)))
+        return self._take(rows, sizes, sizes)
 
-    def _take(self, rows: Array, sizes: Array) -> list[tuple[int, Verdict]]:
-        """Epochs (n, m), NIS and energy (n, 2)."""
-        finite = np.isfinite(sizes).all(axis=1)
+    def _take(self, rows: Array, nis: Array, energy: Array) -> list[tuple[int, Verdict]]:
+        """Epochs (n, m), their NIS and energy (n,)."""
+        finite = np.isfinite(nis + energy)
         if not finite.all():
             places = np.flatnonzero(finite).tolist()
             self.rejected["not_finite"] += len(rows) - len(places)
-            turned = self._take(rows[finite], sizes[finite]) if places else []
+            turned = self._take(rows[finite], nis[finite], energy[finite]) if places else []
             return [(places[i], to) for i, to in turned]
         if rows.shape[1] != self._m:
             self.restarts += self._m > 0
@@ -227,11 +226,13 @@ class ConsistencyMonitor:
         while done < len(rows):
             # While the window grows, its limits change with each epoch.
             end = len(rows) if self.k == self.options.window else done + 1
-            found += [(done + i, to) for i, to in self._test(rows[done:end], sizes[done:end])]
+            now = slice(done, end)
+            turned = self._test(rows[now], nis[now], energy[now])
+            found += [(done + i, to) for i, to in turned]
             done = end
         return found
 
-    def _test(self, rows: Array, sizes: Array) -> list[tuple[int, Verdict]]:
+    def _test(self, rows: Array, nis: Array, energy: Array) -> list[tuple[int, Verdict]]:
         """Take epochs in; the window's verdict, and the verdict contradicted long enough."""
         o = self.options
         first, self._count = self._count, self._count + len(rows)
@@ -252,7 +253,8 @@ class ConsistencyMonitor:
             first,
             o.window,
             rows,
-            sizes,
+            nis,
+            energy,
             limits.weights,
             self._rho,
             low,
