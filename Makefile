@@ -15,7 +15,8 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
 	--no-emit-trusted-host --no-emit-options
 
-# The tests start hundreds of processes: modules are compiled once, whatever the caller's habit.
+# Modules are compiled once, whatever the caller's habit: an installation leaves the bytecode of what
+# commands import, and the tests start hundreds of processes.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
@@ -33,12 +34,15 @@ $(BIN)/python:
 	@echo "creating $(VENV)"
 	$(PYTHON) -m venv $(VENV)
 
-# Of the packages little is ever imported: that is compiled when it is, not all of it here. The lock
-# of the tools holds all of the other in the same versions, and leaves what is there alone.
+# Of the packages little is ever imported: the bytecode of that is left by importing it once, 5 s of
+# the processor's time and 21 MB (all of eight packages: 11 s, 49 MB; pip would compile every one). A
+# container that writes none would compile it again at each start. The lock of the tools holds all of
+# the other in the same versions, and leaves what is there alone.
 $(RUNTIME): pyproject.toml requirements.lock | $(BIN)/python
 	@echo "installing locked dependencies and fusiond into $(VENV)"
 	$(PIP) install --quiet --no-compile --require-hashes -r requirements.lock
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m tools.bytecode
 	@touch $@
 
 $(STAMP): requirements-dev.lock $(RUNTIME)

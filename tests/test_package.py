@@ -106,3 +106,20 @@ def test_a_shipped_dbc_is_found_from_anywhere(installed: Path, tmp_path: Path) -
     assert 'dbc = "xsens_mti600"' in example.read_text()
     report = _run(installed / "fusiond", "check", example, folder=tmp_path)
     assert f"{example}: ok" in report.replace("\n", "")
+
+
+def test_an_installation_leaves_the_bytecode_of_what_commands_import(tmp_path: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    environment |= {
+        "PYTHONPYCACHEPREFIX": str(tmp_path / "bytecode"),
+        "NUMBA_CACHE_DIR": str(tmp_path / "kernels"),
+    }
+    command = (sys.executable, "-m", "tools.bytecode")
+    subprocess.run(command, cwd=REPOSITORY, env=environment, check=True)
+    left = [path.as_posix() for path in (tmp_path / "bytecode").rglob("*.pyc")]
+    for module in (
+        *("fusiond/commands/app", "fusiond/live/daemon", "fusiond/offline/process"),
+        *("drivers/can/driver", "drivers/rdss/driver", "numba/core/dispatcher", "pydantic/main"),
+    ):
+        assert any(f"{module}.{sys.implementation.cache_tag}" in path for path in left), module
+    assert not (tmp_path / "kernels").exists()  # they come with the first command that needs them

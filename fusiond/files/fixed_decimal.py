@@ -25,22 +25,42 @@ _COMMA, _NEWLINE, _POINT, _MINUS, _ZERO = 44, 10, 46, 45, 48
 _LIMIT = 1e18
 
 
-_UNITS = np.array([10**k for k in range(19)], dtype=np.uint64)
+_UNITS = np.array([10**k for k in range(19)], dtype=np.int64)
+_SCALES = np.array([10.0**k for k in range(MAX_DECIMALS + 1)])
 _PAIRS = np.array([_ZERO + digit for k in range(100) for digit in divmod(k, 10)], dtype=np.uint8)
 """The digits of 00 to 99: two at a time are half as many divisions."""
 
 
-@compiled("void(u1[::1], i8, i8, u8)", forceinline=True)
-def _write_digits(out: NDArray[np.uint8], at: int, count: int, number: np.uint64) -> None:
-    """Write the last `count` digits of `number` at `out[at:]`."""
-    k = at + count - 1
-    while k > at:
-        pair = np.uint64(2) * (number % np.uint64(100))
-        number //= np.uint64(100)
-        out[k - 1], out[k] = _PAIRS[pair], _PAIRS[pair + np.uint64(1)]
-        k -= 2
-    if k == at:
-        out[k] = _ZERO + number % np.uint64(10)
+@compiled("void(u1[::1], u8, u8, u8)", forceinline=True)
+def _write_digits(
+    out: NDArray[np.uint8], at: np.uint64, count: np.uint64, number: np.uint64
+) -> None:
+    """Write the last `count` digits of `number` at `out[at:]`.
+
+    Four at a time: their two divisions do not wait for each other. All is unsigned, since an index
+    that may be negative is looked at before each of them.
+    """
+    k = at + count
+    while count >= np.uint64(4):
+        rest = number // np.uint64(10000)
+        four = number - np.uint64(10000) * rest
+        first = four // np.uint64(100)
+        second = np.uint64(2) * (four - np.uint64(100) * first)
+        first *= np.uint64(2)
+        number = rest
+        count -= np.uint64(4)
+        k -= np.uint64(4)
+        out[k], out[k + np.uint64(1)] = _PAIRS[first], _PAIRS[first + np.uint64(1)]
+        out[k + np.uint64(2)], out[k + np.uint64(3)] = _PAIRS[second], _PAIRS[second + np.uint64(1)]
+    if count >= np.uint64(2):
+        rest = number // np.uint64(100)
+        pair = np.uint64(2) * (number - np.uint64(100) * rest)
+        number = rest
+        count -= np.uint64(2)
+        k -= np.uint64(2)
+        out[k], out[k + np.uint64(1)] = _PAIRS[pair], _PAIRS[pair + np.uint64(1)]
+    if count:
+        out[k - np.uint64(1)] = np.uint64(_ZERO) + number % np.uint64(10)
 
 
 @compiled("i8(f8[:, ::1], i8[::1], i8[::1], u1[:, ::1], u1[::1])", nogil=True)
@@ -66,22 +86,22 @@ def format_rows(
             if magnitude < _LIMIT:
                 d = decimals[j]
                 unit = _UNITS[d]
-                whole = np.uint64(magnitude)
-                part = np.uint64(np.rint((magnitude - np.float64(whole)) * np.float64(unit)))
+                whole = np.int64(magnitude)
+                part = np.int64(np.rint((magnitude - np.float64(whole)) * _SCALES[d]))
                 if part >= unit:
-                    whole += np.uint64(1)
+                    whole += 1
                     part -= unit
-                if v < 0.0 and (whole > np.uint64(0) or part > np.uint64(0)):
+                if v < 0.0 and (whole > 0 or part > 0):
                     out[at] = _MINUS
                     at += 1
                 digits = 1
                 while digits < _UNITS.shape[0] and whole >= _UNITS[digits]:
                     digits += 1
-                _write_digits(out, at, digits, whole)
+                _write_digits(out, np.uint64(at), np.uint64(digits), np.uint64(whole))
                 at += digits
                 if d > 0:
                     out[at] = _POINT
-                    _write_digits(out, at + 1, d, part)
+                    _write_digits(out, np.uint64(at + 1), np.uint64(d), np.uint64(part))
                     at += 1 + d
             elif magnitude >= _LIMIT:
                 if v < 0.0:

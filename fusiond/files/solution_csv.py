@@ -10,9 +10,12 @@ from typing import BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.files.csv_tables import Floats
+from fusiond.files.csv_tables import Flags, Floats
 from fusiond.files.fixed_decimal import MAX_CELL, format_rows
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.rotation import rpy_from_quaternion
 from fusiond.navigation.solution import Mode
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 SMOOTHED = "smoothed"
 """Instead of a mode: the row is of all measurements, not of those until then."""
@@ -42,6 +45,27 @@ def _label_table(labels: tuple[str, ...]) -> NDArray[np.uint8]:
     for row, label in zip(table, labels, strict=True):
         row[: len(label)] = np.frombuffer(label.encode("ascii"), dtype=np.uint8)
     return table
+
+
+@compiled("void(i8[::1], f8[:, ::1], f8[:, ::1], b1[::1], f8[:, ::1])")
+def _tabulate(
+    times: NDArray[np.int64], nav: Floats, sigmas: Floats, stated: Flags, values: Floats
+) -> None:
+    """Write `values` (n, 19), the numbers of a file's rows, of states as `SolutionWriter.states`
+    takes them."""
+    for i in range(times.shape[0]):
+        values[i, 0] = times[i] * 1e-9
+        values[i, 1] = nav[i, LAT] * _DEG
+        values[i, 2] = ((nav[i, LON] + np.pi) % (2.0 * np.pi) - np.pi) * _DEG
+        values[i, 3] = nav[i, HEIGHT]
+        q = nav[i, Q0:]
+        rpy = rpy_from_quaternion(q[0], q[1], q[2], q[3])
+        for axis in range(3):
+            values[i, 4 + axis] = nav[i, VN + axis]
+            values[i, 7 + axis] = rpy[axis] * _DEG
+        for k in range(9):
+            sd = sigmas[i, k] if stated[k] else np.nan
+            values[i, 10 + k] = sd if k < 6 else sd * _DEG
 
 
 class SolutionWriter:
@@ -88,9 +112,28 @@ class SolutionWriter:
             np.multiply(rpy_rad[part], _DEG, out=values[:, 7:10])
             values[:, 10:16] = sd[part, :6]
             np.multiply(sd[part, 6:], _DEG, out=values[:, 16:19])
-            codes = np.ascontiguousarray(status_code[part], dtype=np.int64)
-            size = format_rows(values, _DECIMALS, codes, self._labels, self._buffer)
-            self._stream.write(self._buffer[:size].data)
+            self._write(values, status_code[part])
+
+    def states(
+        self,
+        times: NDArray[np.int64],
+        nav: Floats,
+        sigmas: Floats,
+        stated: Flags,
+        status_code: NDArray[np.int64],
+    ) -> None:
+        """Append n rows: times (n,) ns, navigation states (n, 10) and one sigma (n, 9) as `rows`
+        has it, of which those that are `stated` (9,) are written."""
+        for start in range(0, len(times), _CHUNK_ROWS):
+            part = slice(start, min(start + _CHUNK_ROWS, len(times)))
+            values = self._values[: part.stop - start]
+            _tabulate(times[part], nav[part], sigmas[part], stated, values)
+            self._write(values, status_code[part])
+
+    def _write(self, values: Floats, status_code: NDArray[np.int64]) -> None:
+        codes = np.ascontiguousarray(status_code, dtype=np.int64)
+        size = format_rows(values, _DECIMALS, codes, self._labels, self._buffer)
+        self._stream.write(self._buffer[:size].data)
 
     def close(self) -> None:
         """Flush, and close the file if this writer opened it."""

@@ -42,6 +42,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.distributions import (
     f_quantile,
     f_tail,
@@ -55,6 +56,7 @@ Array = NDArray[np.float64]
 Verdict = Literal["consistent", "optimistic", "pessimistic", "cannot_tell", "coloured", "too_few"]
 Interval = tuple[float, float]
 
+WORDS: tuple[Verdict, ...] = ("consistent", "pessimistic", "optimistic", "coloured", "too_few")
 LAGS = 8
 """Lags of the paper's test."""
 FEWEST = 20
@@ -277,14 +279,25 @@ def judge(
     )
 
 
-def verdict_of(average: float, q: float, limits: Limits, shared: bool = False) -> Verdict:
-    """The average goes first: a covariance that is too small is worse than colour."""
-    low, high = limits.nis_limits
+@compiled("i8(f8, f8, f8, f8, f8)")
+def verdict_index(average: float, q: float, low: float, high: float, most_q: float) -> int:
+    """Which of `WORDS`. The average goes first: a covariance that is too small is worse than
+    colour."""
     if average > high:
-        return "optimistic"
+        return 2
     if average < low:
-        return "cannot_tell" if shared else "pessimistic"
-    return "coloured" if q > limits.portmanteau else "consistent"
+        return 1
+    return 3 if q > most_q else 0
+
+
+def verdict_of(average: float, q: float, limits: Limits, shared: bool = False) -> Verdict:
+    """The verdict of a window; with a `shared` error small innovations tell nothing."""
+    return word(verdict_index(average, q, *limits.nis_limits, limits.portmanteau), shared)
+
+
+def word(index: int, shared: bool) -> Verdict:
+    """One of `WORDS`."""
+    return "cannot_tell" if shared and WORDS[index] == "pessimistic" else WORDS[index]
 
 
 def whiten(nu: Array, s: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,13 +15,15 @@ from fusiond.integrity.consistency import (
     LAGS,
     NO_LIMITS,
     TOO_FEW,
+    WORDS,
     Consistency,
     ConsistencyOptions,
     Verdict,
     judge,
     limits_of,
-    verdict_of,
+    verdict_index,
     whiten,
+    word,
 )
 from fusiond.navigation.compiled import compiled
 
@@ -91,6 +94,55 @@ def _slide(
     return q
 
 
+@compiled(
+    "i8(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], i8, i8, f8[:, ::1], f8[::1], f8[::1],"
+    " f8[::1], f8[::1], f8, f8, f8, i8, i8, i8[::1], i8[:, ::1])"
+)
+def _slide_over(
+    rows: Array,
+    figures: Array,
+    products: Array,
+    sums: Array,
+    now: int,
+    window: int,
+    new: Array,
+    nis: Array,
+    energy: Array,
+    weights: Array,
+    rho: Array,
+    low: float,
+    high: float,
+    most_q: float,
+    dof: int,
+    patience: int,
+    held: NDArray[np.int64],
+    turned: NDArray[np.int64],
+) -> int:
+    """Epochs `now` and those after it, `new` (n, m), one after the other; how often the verdict has
+    `turned` (n, 2): after which of them, and to which of `WORDS`.
+
+    `nis` and `energy` (n,) are theirs. `held` (3,): the verdict, the window's, and for how many
+    epochs the second has contradicted the first; after `patience` it takes its place. 0: the window
+    is too short for any.
+    """
+    turns = 0
+    for i in range(new.shape[0]):
+        of_epoch = new[i], nis[i], energy[i]
+        q = _slide(rows, figures, products, sums, now + i, window, *of_epoch, weights, rho)
+        if patience == 0:
+            continue
+        held[1] = verdict_index(sums[0] / dof, q, low, high, most_q)
+        held[2] = held[2] + 1 if held[1] != held[0] else 0
+        if held[2] >= patience:
+            held[0], held[2] = held[1], 0
+            turned[turns, 0], turned[turns, 1] = i, held[1]
+            turns += 1
+    return turns
+
+
+_TOO_FEW = WORDS.index("too_few")
+
+
 class ConsistencyMonitor:
     """Sliding window over the innovations of one kind of aid of one source.
 
@@ -121,10 +173,18 @@ class ConsistencyMonitor:
         self._sums = np.zeros(2 + LAGS)
         self._count = self.k = 0
         self._average, self._rho = math.nan, np.full(LAGS, math.nan)
-        self.verdict: Verdict = "too_few"
-        self.window_verdict: Verdict = "too_few"
-        self._contradicted = 0
+        self._held = np.array([_TOO_FEW, _TOO_FEW, 0])
         self._limits_k, self._limits = 0, NO_LIMITS
+
+    @property
+    def verdict(self) -> Verdict:
+        """With hysteresis."""
+        return word(int(self._held[0]), self.options.shared)
+
+    @property
+    def window_verdict(self) -> Verdict:
+        """Of this window alone."""
+        return word(int(self._held[1]), self.options.shared)
 
     def add(self, nu: Array, s: Array | None = None) -> None:
         """Take an innovation (m,): whitened, or as it is together with its covariance `s` (m, m).
@@ -141,53 +201,73 @@ class ConsistencyMonitor:
         row = white if self.options.whitened else nu
         with np.errstate(over="ignore"):
             nis, energy = float(white @ white), float(row @ row)
-        self._take(row, nis, energy)
+        self._take(row[None], np.array([nis]), np.array([energy]))
 
-    def add_whitened(self, row: Array, nis: float) -> None:
-        """Take L^-1 nu (m,) whose square `nis` is known already: `add` without its checks."""
-        self._take(row, nis, nis)
+    def add_whitened(self, rows: Array, nis: Sequence[float]) -> list[tuple[int, Verdict]]:
+        """Take L^-1 nu (n, m) of successive epochs whose squares are known already: `add` without
+        its checks. After which of them the verdict turned, and to what."""
+        sizes = np.array(nis)
+        return self._take(rows, sizes, sizes)
 
-    def _take(self, row: Array, nis: float, energy: float) -> None:
-        if not (math.isfinite(nis) and math.isfinite(energy)):
-            self.rejected["not_finite"] += 1
-            return
-        if row.shape[0] != self._m:
+    def _take(self, rows: Array, nis: Array, energy: Array) -> list[tuple[int, Verdict]]:
+        """Epochs (n, m), their NIS and energy (n,)."""
+        finite = np.isfinite(nis + energy)
+        if not finite.all():
+            places = np.flatnonzero(finite).tolist()
+            self.rejected["not_finite"] += len(rows) - len(places)
+            turned = self._take(rows[finite], nis[finite], energy[finite]) if places else []
+            return [(places[i], to) for i, to in turned]
+        if rows.shape[1] != self._m:
             self.restarts += self._m > 0
-            self._m = row.shape[0]
+            self._m = rows.shape[1]
             self.reset()
-        self._test(row, nis, energy)
+        found: list[tuple[int, Verdict]] = []
+        done = 0
+        while done < len(rows):
+            # While the window grows, its limits change with each epoch.
+            end = len(rows) if self.k == self.options.window else done + 1
+            now = slice(done, end)
+            turned = self._test(rows[now], nis[now], energy[now])
+            found += [(done + i, to) for i, to in turned]
+            done = end
+        return found
 
-    def _test(self, row: Array, nis: float, energy: float) -> None:
-        """Take the epoch in; the window's verdict, and the verdict contradicted long enough."""
+    def _test(self, rows: Array, nis: Array, energy: Array) -> list[tuple[int, Verdict]]:
+        """Take epochs in; the window's verdict, and the verdict contradicted long enough."""
         o = self.options
-        self._count += 1
+        first, self._count = self._count, self._count + len(rows)
         if self._count > LAGS and self.k < o.window:
             self.k += 1
         k = self.k
         if k != self._limits_k and k >= FEWEST:
             self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
             self._limits_k = k
-        q = _slide(
+        limits, turned = self._limits, np.empty((len(rows), 2), dtype=np.int64)
+        low, high = limits.nis_limits
+        dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
+        turns = _slide_over(
             self._rows,
             self._figures,
             self._products,
             self._sums,
-            self._count - 1,
+            first,
             o.window,
-            row,
+            rows,
             nis,
             energy,
-            self._limits.weights,
+            limits.weights,
             self._rho,
+            low,
+            high,
+            limits.portmanteau,
+            dof,
+            patience,
+            self._held,
+            turned,
         )
-        if k < FEWEST:
-            return
-        dof = k * self._m
-        self._average = float(self._sums[0]) / dof
-        self.window_verdict = verdict_of(self._average, q, self._limits, o.shared)
-        self._contradicted = self._contradicted + 1 if self.window_verdict != self.verdict else 0
-        if self._contradicted >= k // 2:
-            self.verdict, self._contradicted = self.window_verdict, 0
+        if k >= FEWEST:
+            self._average = float(self._sums[0]) / dof
+        return [(i, word(to, o.shared)) for i, to in turned[:turns].tolist()] if turns else []
 
     def report(self) -> Consistency:
         """The figures of the window and the verdict; changes nothing."""

@@ -3,7 +3,9 @@ sigma."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +25,24 @@ from fusiond.models.model import Model
 Array = NDArray[np.float64]
 
 
+@dataclass(slots=True)
+class _Series:
+    """A monitor, and what it is to judge: number in the order of all, innovation (m,), its NIS."""
+
+    monitor: ConsistencyMonitor
+    waiting: list[tuple[int, Sequence[float] | Array, float]] = field(default_factory=list)
+
+
 class Verdicts:
     """Feeds the innovations that were fused to their sources' monitors.
 
     An aid may hold several series (`Aid.series`), each with a monitor of its own: a receiver's raw
     epochs have one for each satellite system, `<source>_<system>`.
 
-    `on_change(source, verdict)` hears when a verdict turns. Constraints are not judged. What the
-    aids of a source share by the states of `model` no innovation shows (`Aid.shares`).
+    Innovations are kept as they come, and judged together by `tell`: a run of minutes through files
+    has hundreds of them at once. `on_change(source, verdict)` hears then when a verdict turns.
+    Constraints are not judged. What the aids of a source share by the states of `model` no
+    innovation shows (`Aid.shares`).
     """
 
     def __init__(
@@ -38,41 +50,54 @@ class Verdicts:
     ) -> None:
         self._window, self._alpha, self._model = window, alpha, model
         self._on_change = on_change
-        self._monitors: dict[str, ConsistencyMonitor] = {}
+        self._series: dict[str, _Series] = {}
+        self._heard = 0
 
     def judge(self, aid: Aid, outcome: Outcome) -> None:
         """An aid has been fused; to be called once for each, though a rewind brings it again."""
         if aid.constraint or not outcome.whitened:
             return
         if not aid.screened:
-            self._add(aid.source, aid, np.array(outcome.whitened), outcome.nis)
+            self._hear(aid.source, aid, outcome.whitened, outcome.nis)
             return
         kept = np.array(outcome.rows) == KEPT
         for name, row in aid.series(outcome.whitened, kept).items():
-            self._add(f"{aid.source}_{name}", aid, row, float(row @ row))
+            self._hear(f"{aid.source}_{name}", aid, row, float(row @ row))
 
-    def _add(self, source: str, aid: Aid, row: Array, nis: float) -> None:
-        monitor = self._monitors.get(source)
-        if monitor is None:
+    def _hear(self, source: str, aid: Aid, row: Sequence[float] | Array, nis: float) -> None:
+        series = self._series.get(source)
+        if series is None:
             window = max(FEWEST, self._window // 2) if aid.late else self._window
             shared = self._model.slots_of_all(aid.shares).size > 0
             options = ConsistencyOptions(window, self._alpha, gate=aid.gate, shared=shared)
-            monitor = self._monitors[source] = ConsistencyMonitor(options)
-        before = monitor.verdict
-        monitor.add_whitened(row, nis)
-        if monitor.verdict != before:
-            self._on_change(source, monitor.verdict)
+            series = self._series[source] = _Series(ConsistencyMonitor(options))
+        self._heard += 1
+        series.waiting.append((self._heard, row, nis))
+
+    def tell(self) -> None:
+        """Judge what has come since the last time, and say which verdicts have turned, in the order
+        in which they did."""
+        turned: list[tuple[int, str, Verdict]] = []
+        for source, series in self._series.items():
+            waiting, series.waiting = series.waiting, []
+            for _, alike in groupby(waiting, key=lambda each: len(each[1])):
+                numbers, rows, nis = zip(*alike, strict=True)
+                for row, verdict in series.monitor.add_whitened(np.array(rows), nis):
+                    turned.append((numbers[row], source, verdict))
+        for _, source, verdict in sorted(turned):
+            self._on_change(source, verdict)
 
     def reset(self) -> None:
         """The filter starts anew: what came before says nothing of it."""
-        for monitor in self._monitors.values():
-            monitor.reset()
+        for series in self._series.values():
+            series.waiting.clear()
+            series.monitor.reset()
 
     def verdict(self, source: str) -> Verdict | None:
         """A source's verdict; None for one that is not judged."""
-        monitor = self._monitors.get(source)
-        return None if monitor is None else monitor.verdict
+        series = self._series.get(source)
+        return None if series is None else series.monitor.verdict
 
     def reports(self) -> dict[str, Consistency]:
         """The tests' figures by source."""
-        return {name: monitor.report() for name, monitor in self._monitors.items()}
+        return {name: series.monitor.report() for name, series in self._series.items()}

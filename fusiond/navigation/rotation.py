@@ -127,14 +127,6 @@ def rpy_from_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, 
     )
 
 
-@compiled("void(f8[:, :], f8[:, ::1])")
-def rpy_from_quaternions(q: Array, rpy: Array) -> None:
-    """Write roll, pitch and yaw (m, 3), rad, of quaternions (m, 4)."""
-    for i in range(q.shape[0]):
-        found = rpy_from_quaternion(q[i, 0], q[i, 1], q[i, 2], q[i, 3])
-        rpy[i, 0], rpy[i, 1], rpy[i, 2] = found
-
-
 def rotation_vector_from_dcm(dcm: Array) -> Array:
     """Rotation vector (3,) in rad of a rotation matrix, for angles below pi."""
     w = 0.5 * np.array([dcm[2, 1] - dcm[1, 2], dcm[0, 2] - dcm[2, 0], dcm[1, 0] - dcm[0, 1]])

@@ -235,6 +235,7 @@ class Navigator:
             self._standing.started(start.t_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
+        self.verdicts.tell()
         if (what := broken(self.estimator)) is not None:
             self._event("filter_not_finite", f"{what}: aligning anew")
             self.reset(what)
@@ -361,25 +362,27 @@ class Navigator:
         return name
 
     def _outcome(self, entry: Entry) -> None:
-        outcome, aid, t_ns = entry.outcome, entry.aid, entry.key[0]
+        outcome, aid = entry.outcome, entry.aid
         if outcome is None:
             return
-        name = outcome.name
+        name, source = outcome.name, aid.source
         if self.warm is not None and aid.locates:
-            self.warm.judge(aid.source, name)
+            self.warm.judge(source, name)
         if name == "fused":
             if outcome.whitened and not (entry.judged or entry.assumed):
                 entry.judged = True
                 self.verdicts.judge(aid, outcome)
-            self.last_fused_ns[aid.source] = max(t_ns, self.last_fused_ns.get(aid.source, 0))
-            if aid.locates:
-                self._last_position_ns = max(t_ns, self._last_position_ns)
+            t_ns = entry.key[0]
+            self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
+            if aid.locates and t_ns > self._last_position_ns:
+                self._last_position_ns = t_ns
         elif name == TURNS_AT_REST:
-            self._standing.turned(t_ns)
-        aid.judged(outcome.rows, outcome.whitened)
-        if name in JUDGED:
-            self._protection.look(aid)
+            self._standing.turned(entry.key[0])
+        if aid.screened:
+            aid.judged(outcome.rows, outcome.whitened)
+            if name in JUDGED:
+                self._protection.look(aid)
         if entry.error:
-            self._failed.tell(aid.source, entry.error)
+            self._failed.tell(source, entry.error)
         if self._on_outcome is not None:
             self._on_outcome(entry)

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.files.solution_csv import SolutionWriter
-from fusiond.navigation.rotation import rpy_from_quaternions
-from fusiond.navigation.strapdown import Q0
 
 Array = NDArray[np.float64]
 
@@ -39,19 +37,7 @@ class RowsWriter:
 
     def write(self, rows: Rows) -> None:
         """Append rows."""
-        nav = rows.nav
-        rpy = np.empty((len(nav), 3))
-        rpy_from_quaternions(nav[:, Q0:], rpy)
-        self._writer.rows(
-            np.asarray(rows.times * 1e-9, dtype=np.float64),
-            nav[:, 0],
-            (nav[:, 1] + np.pi) % (2.0 * np.pi) - np.pi,
-            nav[:, 2],
-            nav[:, 3:6],
-            rpy,
-            np.where(self._stated, rows.sigmas, np.nan),
-            rows.status,
-        )
+        self._writer.states(rows.times, rows.nav, rows.sigmas, self._stated, rows.status)
 
     def close(self) -> None:
         """Write out what is left."""

@@ -45,6 +45,7 @@ def _verdicts(*blocks: str) -> tuple[Verdicts, list[tuple[str, str]]]:
 def _hear(verdicts: Verdicts, aid: Aid, sd: float, rows: int = 2) -> None:
     for z in sd * np.random.default_rng(5).standard_normal((150, rows)):
         verdicts.judge(aid, Outcome("fused", float(z @ z), rows, tuple(z.tolist())))
+    verdicts.tell()
 
 
 def test_small_innovations_of_fixes_that_share_an_error_tell_nothing_of_sigma() -> None:

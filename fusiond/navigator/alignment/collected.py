@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import insort
+from bisect import bisect_left, insort
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -51,6 +51,10 @@ class Fix(NamedTuple):
 
     velocity: VelocityOffer
     position: PositionOffer
+
+
+def _instant(fix: Fix) -> int:
+    return fix.velocity.t_ns
 
 
 @dataclass(slots=True)
@@ -280,8 +284,8 @@ class Collected:
     def _keep(self, fix: Fix) -> None:
         """In order of validity."""
         oldest = max(fix.velocity.t_ns, self.fixes[-1].velocity.t_ns if self.fixes else 0)
-        kept = [f for f in self.fixes if f.velocity.t_ns >= oldest - FIXES_NS]
-        insort(kept, fix, key=lambda f: f.velocity.t_ns)
+        kept = self.fixes[bisect_left(self.fixes, oldest - FIXES_NS, key=_instant) :]
+        insort(kept, fix, key=_instant)
         self.fixes = kept[-MOST_FIXES:]
         if self._speed < self._options.course_speed_m_s:
             self.moving_since_ns = 0

@@ -122,8 +122,8 @@ def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 def from_gyrocompass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     """The direction of the Earth's rate, once the standstill is long enough for it."""
-    standing = by.known.levelled()
-    if standing is None or standing.seconds < by.options.gyrocompass_s:
+    standing = by.known.standing
+    if standing is None or standing.seconds < by.options.gyrocompass_s or not by.known.levelled():
         return None
     lat = float(place[1][0])
     bias = math.hypot(by.noise.rate_bias_initial, by.noise.rate_bias_instability)

@@ -102,10 +102,12 @@ class OffsetWatch:
 
     def _compare(self, t_ns: int, x: Array, p: Array) -> str:
         """Which offset has changed, in words; `changed` where that is no chance."""
+        moved = x - self._x
+        if np.abs(moved).max() <= SUSPECT_SIGMAS * FIRM_S:
+            return ""  # whatever was learned
         since_ns = (t_ns - self._t_ns)[:, None]
         before = self._p + self._walk * since_ns * 1e-9
         learned = np.maximum(before - p, 1e-15)
-        moved = x - self._x
         change = moved * before / learned
         sigmas = np.abs(moved) / np.sqrt(learned + FIRM_S**2)
         sigmas[(np.abs(change) < LATE_S) | (before <= p) | (since_ns > COMPARED_NS)] = 0.0

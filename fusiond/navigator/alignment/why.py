@@ -34,16 +34,17 @@ class Journal:
 
     def __init__(self, on_event: Callable[[str, str], None]) -> None:
         self._event = on_event
-        self._kind = self._told = ""
+        self._reason = self._kind = self._told = ""
         self._since_ns = 0
 
     def keep(self, reason: str, t_ns: int) -> None:
         """What is said at `t_ns`."""
-        kind = _NUMBER.sub("#", reason)
-        if kind != self._kind:
-            self._kind, self._since_ns = kind, t_ns
-        elif kind != self._told and t_ns - self._since_ns >= SETTLED_NS:
-            self._told = kind
+        if reason != self._reason:
+            self._reason, kind = reason, _NUMBER.sub("#", reason)
+            if kind != self._kind:
+                self._kind, self._since_ns = kind, t_ns
+        if self._kind != self._told and t_ns - self._since_ns >= SETTLED_NS:
+            self._told = self._kind
             self._event("not_aligned", reason)
 
 
@@ -51,15 +52,16 @@ def why_not(by: Basis, imu: ImuBuffer, latitude: float | None) -> str:
     """The sentence; `latitude` (rad) is None where no position is known."""
     said = []
     allowed = by.options.heading
+    level = bool(by.known.fixes) or by.track.running or by.known.levelled() is not None
     if latitude is None:
         said.append(NO_POSITION)
-    elif not by.known.levelled() and not by.known.fixes and not by.track.running:
+    elif not level:
         said.append("not at rest: no level yet")
     else:
         said.append(f"no heading yet (allowed: {', '.join(allowed)})")
     said += _rate(by, imu)
     if latitude is not None:
-        said += _rest(by, imu)
+        said += [] if level else _rest(by, imu)
         for source in allowed:
             said += _of_source(source, by, imu, latitude)
         said += by.known.poor_claims.values()
@@ -83,8 +85,6 @@ def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
 def _rest(by: Basis, imu: ImuBuffer) -> list[str]:
     """What a vehicle that must stand lacks to be level."""
     o, s = by.options, by.known.standing
-    if by.known.levelled() is not None or by.track.running or by.known.fixes:
-        return []
     if s is not None:
         if s.seconds >= o.levelling_s:
             return []

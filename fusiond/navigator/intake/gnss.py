@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from drivers.measurements import PositionFix, Vector3
 from drivers.plausible import SIGMA_M
@@ -52,9 +53,32 @@ that fixes by code share, and so has that one's correlation time, `bias_correlat
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
 # An operator who errs by six sigma is wrong.
 OPERATOR_GATE = 1.0 - 1e-9
-_SHARED = FIX_TIME, VELOCITY_TIME, ANTENNA_LEVER
 Motion = tuple[tuple[float, ...], tuple[float, ...]]
 """Velocity (m/s) north, east, and down where it is measured, and one sigma of each."""
+
+
+class _Receiver(NamedTuple):
+    """What the sections say of a receiver: its own, whether its raw data are the aid, what its
+    velocities are called, and the blocks of what its fixes share (`blocks`), empty where it is not
+    estimated."""
+
+    section: GnssAiding
+    raw: bool
+    velocities: str
+    time: str
+    velocity_time: str
+    lever: str
+    bias: tuple[str, ...]
+    wander: str
+
+
+def _receiver(source: str, sections: Sections) -> _Receiver:
+    o = sections.of(source, GnssAiding)
+    raw = isinstance(sections.aiding.get(source), RawAiding)
+    names = (sections.own(block, source, o) for block in (FIX_TIME, VELOCITY_TIME, ANTENNA_LEVER))
+    time, velocity_time, lever = names
+    bias, wander = _fix_bias(source, o, sections), _wander(source, o, sections)
+    return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander)
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -62,10 +86,12 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
 
     `raw_is_used`: the receiver's raw data are the aid, not its fixes.
     """
-    if isinstance(sections.aiding.get(m.source), RawAiding):
+    source = m.source
+    receiver = sections.made(source, _receiver)
+    if receiver.raw:
         return "raw_is_used"
-    o = sections.of(m.source, GnssAiding)
-    if m.sd_ned_m is not None and min(m.sd_ned_m) <= 0.0:
+    o, stated = receiver.section, m.sd_ned_m
+    if stated is not None and min(stated) <= 0.0:
         return "no_sigma"
     least = o.min_position_sd_m
     if least is None:
@@ -76,13 +102,12 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         math.hypot(max(e * scale, least), rounding[1]),
         math.hypot(max(d * scale, least), rounding[2]),
     )
-    time, velocity_time, rest = sections.each_own(_SHARED, m.source, o)
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
     by_phase = _by_phase(m, sections)
     motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
-    wander = "" if by_phase else _wander(m.source, o, sections)
+    wander = "" if by_phase else receiver.wander
     position = PositionAid(
-        m.source,
+        source,
         when.t_ns,
         o.gate_probability,
         m.lat_rad,
@@ -91,9 +116,9 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         sd,
         o.lever_arm_m,
         sd_time_s,
-        _fix_bias(m.source, o, sections),
-        time,
-        rest,
+        receiver.bias,
+        receiver.time,
+        receiver.lever,
         _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0),
         o.bias_sd_m == 0.0,
         wander,
@@ -103,14 +128,14 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         return [position]
     v, sd_v = motion
     velocity = VelocityAid(
-        f"{m.source}{SUFFIX}",
+        receiver.velocities,
         when.t_ns - round(o.velocity_delay_s * 1e9),
         o.gate_probability,
         v,
         sd_v,
         o.lever_arm_m,
-        velocity_time,
-        rest,
+        receiver.velocity_time,
+        receiver.lever,
         sd_time_s,
     )
     return [position, velocity]
@@ -124,10 +149,11 @@ def _by_phase(m: PositionFix, sections: Sections) -> bool:
         return True
     if m.sd_ned_m is None:
         return False
-    stated, told = max(m.sd_ned_m[:2]), (m.source, m.quality)
+    north, east, _ = m.sd_ned_m
+    stated = max(north, east)
     if stated >= CODE_FLOOR_M:
-        sections.by_code.add(told)
-    return stated < PHASE_SD_M and told not in sections.by_code
+        sections.by_code.add((m.source, m.quality))
+    return stated < PHASE_SD_M and (m.source, m.quality) not in sections.by_code
 
 
 def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:

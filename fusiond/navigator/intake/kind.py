@@ -14,6 +14,7 @@ from fusiond.models.blocks import Block
 from fusiond.navigator.raw_gnss import RawGnss
 
 S = TypeVar("S", bound=Aiding)
+T = TypeVar("T")
 
 
 class Instants(NamedTuple):
@@ -45,6 +46,7 @@ class Sections:
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
+        self._made: dict[tuple[str, object], Any] = {}
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section, of what comes from now on."""
@@ -54,6 +56,7 @@ class Sections:
         }
         self.aiding = {**self.aiding, **changed}
         self._found.clear()
+        self._made.clear()
         for name in self.receivers.keys() & gates:
             self.receivers[name].gate = gates[name]
 
@@ -73,6 +76,13 @@ class Sections:
             section = next((s for s in named if isinstance(s, kind)), None) or kind()
             self._found[source, kind] = section
         return section
+
+    def made(self, source: str, make: Callable[[str, Sections], T]) -> T:
+        """What the sections alone say of a source, made once for all that comes of it."""
+        found: T | None = self._made.get((source, make))
+        if found is None:
+            found = self._made[source, make] = make(source, self)
+        return found
 
     def robust(self, source: str) -> bool:
         """Whether the section that a measurement of the source was made with, as `of` found it,
