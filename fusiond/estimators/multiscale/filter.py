@@ -124,9 +124,9 @@ class MultiscaleEstimator(ErrorStateFilter):
             super().propagate(imu, target_ns)
             return
         # Sigmas at every sample want P at every sample.
-        n, noise, shares = self.model.size, self._covs, self._shares
+        n, noise, shares, p = self.model.size, self._covs, self._shares, self.covariance
         self._covs, self._shares = np.concatenate((np.zeros_like(noise), noise)), np.ones(2)
-        self._covs[0, :n, :n] = self.covariance
+        self._covs[0, :n, :n] = p
         super().propagate(imu, target_ns, record)
         noise[0] = self._covs[1]
         self._covs, self._shares = noise, shares
