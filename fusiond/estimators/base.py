@@ -14,23 +14,22 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.covariance import in_lines
 from fusiond.estimators.doubt import open_by, unsettle
+from fusiond.estimators.memory import GAP, memory
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
     RECORD,
     propagate_for,
-    scratch_size,
     sensor_estimates,
 )
-from fusiond.estimators.reading import WIDER, Published, sigmas, widen
+from fusiond.estimators.reading import Published, sigmas, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
@@ -38,7 +37,7 @@ from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE, step_before
+from fusiond.navigation.strapdown import step_before
 
 Array = NDArray[np.float64]
 
@@ -180,35 +179,35 @@ class ErrorStateFilter:
     `shares` (k,): filter i gets its process noise and its initial covariance divided by shares[i].
     """
 
+    carries_transition: ClassVar[bool] = False
+    """Whether `_phi` (width, width) is propagated, too."""
+
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         self.model = model
-        self.gap_ns = round(gap_s * 1e9)
         self.t_ns = 0
         self.sample = 0
-        count, width = len(shares), model.width
         self.published = Published(model.time_slot)
-        sizes = (scratch_size(width), NAV_SIZE, model.size, STEP_SIZE, WIDER, len(self.published))
-        self._state: Array = in_lines(sum(sizes))  # one array for the kernel
-        parts = np.split(self._state, np.cumsum(sizes)[:-1])
-        self.nav: Array
-        self.xi: Array
-        self.step: Array
-        self._scratch, self.nav, self.xi, self.step, self.wider, self._by = parts
-        self._by[:] = self.published
-        self._covs: Array = in_lines(count * width * width).reshape(count, width, width)
+        m = memory(model, round(gap_s * 1e9), shares, self.carries_transition)
+        self._memory, self._array, self.nav, self.xi, self.step = m, m.array, m.nav, m.xi, m.step
+        self.wider, self._phi, self._shares = m.wider, m.phi, m.shares
+        self._covs: Array = m.covs
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
         lent = tuple(Innovation.unwritten(rows, model.size) for rows in range(LENT_ROWS + 1))
         self._view = State(self.nav, self.xi, self.step, model, self._covariance, lent)
-        self._dxs: Array = np.zeros((count, model.size))
+        self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
-        self._shares: Array = np.array(shares)
-        self._phi: Array = np.zeros((0, 0))
+        m.published[:] = self.published
         self._holding = False
         self._carrying = False
         self.turned = 0.0
         self._options = HOLD_HEIGHT if model.hold_height else 0
-        self._kernel, self._model = propagate_for(width), model.packed
+        self._kernel = propagate_for(model.width)
+
+    @property
+    def gap_ns(self) -> int:
+        """No sample may stand for longer."""
+        return int(self._memory.head[GAP])
 
     @property
     def covariance(self) -> Array:
@@ -228,7 +227,7 @@ class ErrorStateFilter:
     def publish_by(self, published: Published) -> None:
         """From the next start on."""
         self.published = published
-        self._by[:] = published
+        self._memory.published[:] = published
 
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
@@ -245,27 +244,14 @@ class ErrorStateFilter:
 
     def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
-        start, options = imu.start, self._options
+        options = self._options
         if record:
             options |= RECORD
         if self._holding or self._carrying:
             options |= CARRY
-        first, self.t_ns = self._kernel(
-            self._state,
-            self._covs,
-            self._dxs,
-            self._shares,
-            self._phi,
-            self._model,
-            imu.packed,
-            self.sample - start,
-            imu.end,
-            self.t_ns,
-            target_ns,
-            min(self.gap_ns, imu.hold_ns),
-            options,
+        self.sample, self.t_ns = self._kernel(
+            self._array, imu.packed, self.sample, self.t_ns, target_ns, options
         )
-        self.sample = first + start
 
     @property
     def state(self) -> State:

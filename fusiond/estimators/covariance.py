@@ -33,15 +33,6 @@ Indices = NDArray[np.int64]
 # Where the factors of `decays` begin: behind the interval that they are of, and 1 if one of them is
 # not 1; two more let them begin a line of the cache.
 KEPT = 4
-LINE = 64
-
-
-def in_lines(size: int) -> Array:
-    """Zeros (size,) that begin a line of the cache: rows as long as some lines are then read and
-    written by whole ones."""
-    memory = np.zeros(size + LINE // 8)
-    first = -memory.ctypes.data % LINE // 8
-    return memory[first : first + size]
 
 
 def work_size(width: int) -> int:
@@ -56,21 +47,21 @@ def kept_part(work: Array, width: int) -> Array:
     return work[15 * width + 24 * CORE_STRIDE + 12 :]
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[::1])", forceinline=True)
+@compiled("void(f8[::1], i8[::1], f8[::1])", forceinline=True)
 def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
     """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (27,)."""
     for i in range(12):
         weight[i] = 0.0
-        if sensor_terms[1, i] == PLAIN:
+        if sensor_terms[12 + i] == PLAIN:
             weight[i] = 1.0
-        elif sensor_terms[1, i] == SCALE:
+        elif sensor_terms[12 + i] == SCALE:
             weight[i] = step[3 + i // 2]
 
 
-@compiled("void(f8, f8[:, ::1], i8, f8[::1])", forceinline=True)
+@compiled("void(f8, f8[::1], i8, f8[::1])", forceinline=True)
 def decays(h: float, noise: Array, width: int, kept: Array) -> None:
     """Write what each parameter decays by in h seconds, 1 where it does not, to `kept` from its
-    `KEPT` on, and `width` behind it the variance that each state grows by; `noise` (3, n) as of the
+    `KEPT` on, and `width` behind it the variance that each state grows by; `noise` (3 n,) as of the
     model.
 
     They are kept from one interval to the next, which is most often as long: an exponential a
@@ -78,11 +69,12 @@ def decays(h: float, noise: Array, width: int, kept: Array) -> None:
     """
     if kept[0] != h:
         kept[0], kept[1] = h, 0.0
-        for i in range(noise.shape[1]):
-            decay, variance = 1.0, h * noise[1, i]
-            if noise[0, i] > 0.0:
-                decay, kept[1] = math.exp(-h * noise[0, i]), 1.0
-                variance += noise[2, i] * (1.0 - decay * decay)
+        n = noise.shape[0] // 3
+        for i in range(n):
+            decay, variance = 1.0, h * noise[n + i]
+            if noise[i] > 0.0:
+                decay, kept[1] = math.exp(-h * noise[i]), 1.0
+                variance += noise[2 * n + i] * (1.0 - decay * decay)
             kept[KEPT + i], kept[KEPT + width + i] = decay, variance
 
 
@@ -152,8 +144,7 @@ def covariance_for(width: int) -> Callable[..., None]:
     gather, columns, apply = _gather_for(width), _columns_for(width), apply_for(width)
 
     @compiled(
-        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "f8, f8[::1])",
+        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[::1], i8[::1], f8[::1], f8, f8[::1])",
         variant=width,
     )
     def propagate_covariance(
@@ -171,11 +162,11 @@ def covariance_for(width: int) -> Callable[..., None]:
         """Advance the covariance (width, width), `flat` (width^2,), in place by h seconds with
         transition coefficients `c`; neither read nor written is P21, which `mirror` makes.
 
-        The model's arrays are (n,); rows and columns from n on are zero and stay so. `work` has
+        The model's arrays are flat; rows and columns from n on are zero and stay so. `work` has
         work_size(width) doubles.
         """
-        n = noise.shape[1]
-        sensor_slot = sensor_terms[0]
+        n = noise.shape[0] // 3
+        sensor_slot = sensor_terms[:12]
         sensor, top = work[: 6 * width], work[6 * width : 15 * width]
         core_work = work[15 * width : 15 * width + 24 * CORE_STRIDE]
         turned = core_work[: 9 * CORE_STRIDE]
@@ -201,8 +192,9 @@ def covariance_for(width: int) -> Callable[..., None]:
         apply_to_core(turned, core_sensor, c, core)
         _keep_active(core, CORE_STRIDE, active)
 
-        for k in range(rate_terms.shape[1]):
-            offset, rate = rate_terms[0, k], rate_terms[1, k]
+        rates = rate_terms.shape[0] // 2
+        for k in range(rates):
+            offset, rate = rate_terms[k], rate_terms[rates + k]
             for i in range(CORE_SIZE):
                 top[i * width + offset] += h * top[i * width + rate]
             for j in range(width):
@@ -245,7 +237,7 @@ def transition_for(width: int) -> Callable[..., None]:
     gather, apply = _gather_for(width), apply_for(width)
 
     @compiled(
-        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1], f8[::1])",
+        "void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[::1], i8[::1], f8[::1], f8[::1])",
         variant=width,
     )
     def propagate_transition(
@@ -266,18 +258,19 @@ def transition_for(width: int) -> Callable[..., None]:
         kept = work[15 * width + 24 * CORE_STRIDE + 12 :]
         decay = kept[KEPT : KEPT + width]
         _weights(step, sensor_terms, weight)
-        gather(flat, sensor_terms[0], weight, sensor)
+        gather(flat, sensor_terms[:12], weight, sensor)
         apply(flat, sensor, c, top)
         _keep_active(top, width, active)
         for i in range(CORE_SIZE * width):
             flat[i] = top[i]
-        for k in range(rate_terms.shape[1]):
-            offset, rate = rate_terms[0, k], rate_terms[1, k]
+        rates = rate_terms.shape[0] // 2
+        for k in range(rates):
+            offset, rate = rate_terms[k], rate_terms[rates + k]
             for j in range(width):
                 flat[offset * width + j] += h * flat[rate * width + j]
         decays(h, noise, width, kept)
         if kept[1] != 0.0:
-            for i in range(CORE_SIZE, noise.shape[1]):
+            for i in range(CORE_SIZE, noise.shape[0] // 3):
                 of_row = decay[i]
                 for j in range(decay.shape[0]):
                     flat[i * width + j] *= of_row
@@ -285,17 +278,18 @@ def transition_for(width: int) -> Callable[..., None]:
     return propagate_transition
 
 
-@compiled("void(f8[::1], f8, i8[:, ::1], f8[::1])", forceinline=True)
+@compiled("void(f8[::1], f8, i8[::1], f8[::1])", forceinline=True)
 def propagate_parameters(x: Array, h: float, rate_terms: Indices, kept: Array) -> None:
     """x (n,), parameters or their errors, over h seconds: offsets grow, Markov states decay by what
     `decays` has `kept` for it."""
-    for k in range(rate_terms.shape[1]):
-        x[rate_terms[0, k]] += h * x[rate_terms[1, k]]
+    rates = rate_terms.shape[0] // 2
+    for k in range(rates):
+        x[rate_terms[k]] += h * x[rate_terms[rates + k]]
     for i in range(CORE_SIZE, x.shape[0]):
         x[i] *= kept[KEPT + i]
 
 
-@compiled("void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[::1], f8[::1])")
+@compiled("void(f8[::1], f8[::1], f8[::1], f8, b1[::1], i8[::1], i8[::1], f8[::1], f8[::1])")
 def propagate_error(
     dx: Array,
     step: Array,
@@ -316,7 +310,7 @@ def propagate_error(
     _weights(step, sensor_terms, weight)
     sensor[:] = 0.0
     for i in range(12):
-        sensor[i // 2 * CORE_STRIDE] += weight[i] * dx[sensor_terms[0, i]]
+        sensor[i // 2 * CORE_STRIDE] += weight[i] * dx[sensor_terms[i]]
     rows[:] = 0.0
     for i in range(CORE_SIZE):
         rows[i * CORE_STRIDE] = dx[i]

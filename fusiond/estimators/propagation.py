@@ -22,11 +22,26 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
-from fusiond.estimators.reading import WIDER, in_fix_time, sigmas, widen
+from fusiond.estimators.memory import (
+    GAP,
+    LINE,
+    NAV_AT,
+    PUBLISHED_AT,
+    RECORDED,
+    ROOM,
+    SCRATCH_AT,
+    SIZE,
+    STEP_AT,
+    TRANSITION,
+    USED,
+    WIDER_AT,
+    scratch_size,
+)
+from fusiond.estimators.reading import in_fix_time, sigmas, widen
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
-from fusiond.navigation.imu_buffer import ROW_SIZE
+from fusiond.navigation.imu_buffer import END, HEAD_SIZE, HOLD, ROW_SIZE, START
 from fusiond.navigation.rotation import rpy_from_quaternion
 from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, strapdown_step
 
@@ -47,11 +62,6 @@ HOLD_HEIGHT, RECORD, CARRY, TURN_TILT = 1, 2, 4, 8
 UPRIGHT = 0.5
 
 
-def scratch_size(width: int) -> int:
-    """Doubles of `propagate`'s scratch for a row width."""
-    return COEFFICIENTS + 24 + work_size(width)
-
-
 @compiled("void(f8[::1], i8[::1], i8[::1], f8[::1])")
 def sensor_estimates(
     xi: Array, sensor_slot: Indices, sensor_kind: Indices, estimate: Array
@@ -66,28 +76,31 @@ def sensor_estimates(
             estimate[6 + i // 2] += xi[sensor_slot[i]]
 
 
-@compiled("void(f8[:, ::1], i8, f8[::1], f8[::1], f8[::1])")
+@compiled("void(f8[::1], i8, f8[::1], f8[::1], f8[::1])")
 def compensate(samples: Array, i: int, estimate: Array, rate: Array, force: Array) -> None:
-    """Write `rate` and `force` (3,) of sample i of `samples` (m, 6), `estimate` (12,) taken out."""
+    """Write `rate` and `force` (3,) of sample i of `samples` (6 m,), `estimate` (12,) taken out."""
+    at = 6 * i
     for j in range(3):
-        rate[j] = (samples[i, j] - estimate[j]) / (1.0 + estimate[6 + j])
-        force[j] = (samples[i, 3 + j] - estimate[3 + j]) / (1.0 + estimate[9 + j])
+        rate[j] = (samples[at + j] - estimate[j]) / (1.0 + estimate[6 + j])
+        force[j] = (samples[at + 3 + j] - estimate[3 + j]) / (1.0 + estimate[9 + j])
 
 
-@compiled("b1(i8[::1], f8[:, ::1], i8, i8, f8[::1], f8[::1])", forceinline=True)
+@compiled("b1(i8[::1], f8[::1], i8, i8, f8[::1], f8[::1])", forceinline=True)
 def slopes(
     times: Indices, samples: Array, i: int, gap_ns: int, rate_slope: Array, force_slope: Array
 ) -> bool:
-    """Write the slopes (3,), a second, of rate and force over sample i; whether a gap precedes it.
+    """Write the slopes (3,), a second, of rate and force over sample i of `samples` (6 m,); whether
+    a gap precedes it.
 
     Zero where the sample before holds over another length of time: beside a gap, at the start.
     """
     silent = i > 0 and times[i] - times[i - 1] > gap_ns
     if i > 1 and not silent and times[i - 1] - times[i - 2] <= gap_ns:
         between = 2e9 / (times[i] - times[i - 2])
+        at, before = 6 * i, 6 * i - 6
         for j in range(3):
-            rate_slope[j] = (samples[i, j] - samples[i - 1, j]) * between
-            force_slope[j] = (samples[i, 3 + j] - samples[i - 1, 3 + j]) * between
+            rate_slope[j] = (samples[at + j] - samples[before + j]) * between
+            force_slope[j] = (samples[at + 3 + j] - samples[before + 3 + j]) * between
     else:
         for j in range(3):
             rate_slope[j] = 0.0
@@ -113,7 +126,7 @@ def widen_for_gap(
             cov[at] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
 
 
-@compiled("void(f8[::1], i8, b1[::1], f8[::1], f8[:, ::1], i8, f8)", forceinline=True)
+@compiled("void(f8[::1], i8, b1[::1], f8[::1], f8[::1], i8, f8)", forceinline=True)
 def shake(
     cov: Array,
     width: int,
@@ -124,9 +137,10 @@ def shake(
     h: float,
 ) -> None:
     """Add to `cov`, flat and of `width` rows, what h seconds of noise of a row of `densities`
-    (m, 6), body axes, leave: C diag(n) C^T h."""
+    (6 m,), body axes, leave: C diag(n) C^T h."""
     for first in (0, 3):
-        if densities[row, first] + densities[row, first + 1] + densities[row, first + 2] == 0.0:
+        at = 6 * row + first
+        if densities[at] + densities[at + 1] + densities[at + 2] == 0.0:
             continue
         for i in range(3):
             for j in range(3):
@@ -134,7 +148,7 @@ def shake(
                     total = 0.0
                     for k in range(3):
                         a, b = step[STEP_DCM + 3 * i + k], step[STEP_DCM + 3 * j + k]
-                        total += a * b * densities[row, first + k]
+                        total += a * b * densities[at + k]
                     cov[(first + i) * width + first + j] += h * total
 
 
@@ -204,7 +218,7 @@ def published_ahead(
     if ahead_s > 0.0:
         nav = nav.copy()
         rate, force, zero = np.empty(3), np.empty(3), np.zeros(3)
-        compensate(samples, newest, estimate, rate, force)
+        compensate(samples.reshape(samples.size), newest, estimate, rate, force)
         strapdown_step(nav, rate, force, zero, zero, ahead_s, hold_height, np.zeros(STEP_SIZE))
     published = out[:NAV_SIZE]
     in_fix_time(nav, xi, step, time_slot, published)
@@ -216,67 +230,52 @@ def published_ahead(
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
     propagate_covariance, propagate_transition = covariance_for(width), transition_for(width)
-    worked, scratched = work_size(width), scratch_size(width)
+    worked, behind, square = work_size(width), SCRATCH_AT + scratch_size(width), width * width
 
-    @compiled(
-        "UniTuple(i8, 2)(f8[::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], u1[::1], f8[::1],"
-        "i8, i8, i8, i8, i8, i8)",
-        variant=width,
-    )
+    @compiled("UniTuple(i8, 2)(f8[::1], f8[::1], i8, i8, i8, i8)", variant=width)
     def propagate(
-        state: Array,
-        covs: Array,
-        dxs: Array,
-        shares: Array,
-        phi: Array,
-        model: NDArray[np.uint8],
-        imu: Array,
-        first: int,
-        end: int,
-        now: int,
-        target: int,
-        gap_ns: int,
-        options: int,
+        state: Array, imu: Array, sample: int, now: int, target: int, options: int
     ) -> tuple[int, int]:
-        """Propagate from `now` to `target` (ns); return the next sample's index and the new time.
+        """Propagate from `now` to `target` (ns); return the next sample's number and the new time.
 
-        A call costs 25 ns an argument: what belongs together comes as one.
-        `state` is scratch_size(width) doubles, zero at first, nav (10,), xi (n,), the last step
-        (27,), the variances (9,) that what is published is wider by, and `Published`; `model` and
-        `imu` are `Model.packed` and `ImuBuffer.packed`. Of the IMU's m rows `times` and `samples`
-        (rate, force): sample i holds over (times[i-1], times[i]], with noise of `densities` beyond
-        `noise`. Samples first ... end-1 may be used; the last one only as far as `target`, so a
-        target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD, with which the
-        solution and the sigmas of covariance 0 at the end of each whole sample go into the IMU's
-        rows, CARRY, with which the error estimates `dxs` (k, n) are propagated too,
-        and TURN_TILT, with which a turn that is not known turns the axes of a tilt. `covs`
-        (k, width, width) are covariances, their noise divided by `shares` (k,). `phi`
-        (width, width) is propagated unless it is (0, 0).
+        `state` is `Memory.array` and `imu` `ImuBuffer.packed`. Of the IMU's rows `times` and
+        `samples` (rate, force): row i holds over (times[i-1], times[i]], with noise of `densities`
+        beyond `noise`. Samples from `sample` on may be used; the last one only as far as `target`,
+        so a target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD, with which the
+        solution and a covariance's sigmas at the end of each whole sample go into the IMU's rows,
+        CARRY, with which the error estimates are propagated too, and TURN_TILT, with which a turn
+        that is not known turns the axes of a tilt. Each covariance has its noise divided by its
+        share.
         """
         hold_height = (options & HOLD_HEIGHT) != 0
         record, carry = (options & RECORD) != 0, (options & CARRY) != 0
         turning = (options & TURN_TILT) != 0
-        n, m = dxs.shape[1], imu.shape[0] // ROW_SIZE
-        work, scratch, rest = state[:worked], state[worked:scratched], state[scratched:]
-        nav, xi = rest[:NAV_SIZE], rest[NAV_SIZE : NAV_SIZE + n]
-        step = rest[NAV_SIZE + n : NAV_SIZE + n + STEP_SIZE]
-        wider = rest[NAV_SIZE + n + STEP_SIZE : NAV_SIZE + n + STEP_SIZE + WIDER]
-        by = NAV_SIZE + n + STEP_SIZE + WIDER
-        time_slot, clock_sd_s, axes_sd_rad = int(rest[by]), rest[by + 1], rest[by + 2]
-        noise = model[: 24 * n].view(np.float64).reshape((3, n))
-        sensor_terms = model[24 * n : 24 * n + 192].view(np.int64).reshape((2, 12))
-        rates = model[24 * n + 192 : model.shape[0] - n].view(np.int64)
-        rate_terms = rates.reshape((2, rates.shape[0] // 2))
-        active = model[model.shape[0] - n :].view(np.bool_)
-        times = imu[:m].view(np.int64)
-        samples, densities = imu[m : 7 * m].reshape((m, 6)), imu[7 * m : 13 * m].reshape((m, 6))
-        nav_out = imu[13 * m : 23 * m].reshape((m, 10))
-        sigma_out = imu[23 * m :].reshape((m, 9))
-        sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
+        head, imu_head = state[:LINE].view(np.int64), imu[:HEAD_SIZE].view(np.int64)
+        n, room, used = head[SIZE], head[ROOM], head[USED]
+        gap_ns = min(head[GAP], imu_head[HOLD])
+        start, end = imu_head[START], imu_head[END]
+        nav, step = state[NAV_AT:STEP_AT], state[STEP_AT:WIDER_AT]
+        wider, by = state[WIDER_AT:PUBLISHED_AT], state[PUBLISHED_AT:SCRATCH_AT]
+        time_slot, clock_sd_s, axes_sd_rad = int(by[0]), by[1], by[2]
+        work, scratch = state[SCRATCH_AT : SCRATCH_AT + worked], state[SCRATCH_AT + worked : behind]
+        rest = state[behind:]
+        covs, rest = rest[: room * square], rest[room * square :]
+        of = head[RECORDED] * square
+        recorded, transition = covs[of : of + square].reshape((width, width)), head[TRANSITION]
+        phi, rest = rest[: transition * square], rest[transition * square :]
+        xi, dxs, rest = rest[:n], rest[n : n + room * n], rest[n + room * n :]
+        shares, model = rest[:room], rest[room:]
+        noise, sensor_terms = model[: 3 * n], model[3 * n : 3 * n + 24].view(np.int64)
+        flags = model.shape[0] - (n + 7) // 8
+        rate_terms, active = model[3 * n + 24 : flags].view(np.int64), model[flags:].view(np.bool_)
+        rows = imu[HEAD_SIZE:]
+        m = rows.shape[0] // ROW_SIZE
+        times = rows[:m].view(np.int64)
+        samples, densities = rows[m : 7 * m], rows[7 * m : 13 * m]
+        nav_out, sigma_out = rows[13 * m : 23 * m], rows[23 * m :]
+        sensor_slot, sensor_kind = sensor_terms[:12], sensor_terms[12:]
         c = scratch[:COEFFICIENTS]
         kept = kept_part(work, width)
-        flats, first_cov = covs.reshape((covs.shape[0], width * width)), covs[0]
-        flat_phi = phi.reshape(phi.size)
         rate, force = (
             scratch[COEFFICIENTS : COEFFICIENTS + 3],
             scratch[COEFFICIENTS + 3 : COEFFICIENTS + 6],
@@ -284,11 +283,11 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         rate_slope = scratch[COEFFICIENTS + 6 : COEFFICIENTS + 9]
         force_slope = scratch[COEFFICIENTS + 9 : COEFFICIENTS + 12]
         estimate = scratch[COEFFICIENTS + 12 : COEFFICIENTS + 24]
-        decaying = rate_terms.shape[1] > 0
-        for j in range(CORE_SIZE, xi.shape[0]):
-            decaying = decaying or noise[0, j] > 0.0
+        decaying = rate_terms.shape[0] > 0
+        for j in range(CORE_SIZE, n):
+            decaying = decaying or noise[j] > 0.0
         sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
-        i = first
+        i = sample - start
         while i < end and now < target:
             stop = min(times[i], target)
             if stop > now:
@@ -299,8 +298,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 coefficients(nav, step, h, c)
                 # The held sample of a gap is a guess: its error acts over the whole of it.
                 whole = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
-                for k in range(covs.shape[0]):
-                    cov, q = flats[k], 1.0 / shares[k]
+                for k in range(used):
+                    cov, q = covs[k * square : (k + 1) * square], 1.0 / shares[k]
                     known = cov[2 * width + 2]
                     north, east = cov[0], cov[width + 1]
                     propagate_covariance(
@@ -330,9 +329,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                             grown_north,
                             grown_east,
                         )
-                if phi.shape[0]:
+                if transition:
                     propagate_transition(
-                        flat_phi,
+                        phi,
                         step,
                         c,
                         h,
@@ -343,9 +342,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         work,
                     )
                 if carry:
-                    for k in range(dxs.shape[0]):
+                    for k in range(room):
                         propagate_error(
-                            dxs[k],
+                            dxs[k * n : (k + 1) * n],
                             step,
                             c,
                             h,
@@ -361,14 +360,14 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             now = stop
             if now == times[i]:
                 if record:
-                    in_fix_time(nav, xi, step, time_slot, nav_out[i])
-                    out = sigma_out[i]
-                    sigmas(first_cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
+                    in_fix_time(nav, xi, step, time_slot, nav_out[10 * i : 10 * i + 10])
+                    out = sigma_out[9 * i : 9 * i + 9]
+                    sigmas(recorded, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
                     widen(wider, out)
                 i += 1
-        for k in range(covs.shape[0]):
-            mirror(flats[k], width, n)
-        return i, now
+        for k in range(used):
+            mirror(covs[k * square : (k + 1) * square], width, n)
+        return i + start, now
 
     return propagate
 

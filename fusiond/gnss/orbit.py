@@ -77,12 +77,25 @@ def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
 
 
 # Columns of the elements' array.
-_COLUMNS = 29
+_COLUMNS = 31
 (
-    _WEEK, _TOE, _TOC, _GM, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _I0, _NODE, _PERIGEE, _M0,
-    _DN, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC, _CIS, _A0, _A1, _A2,
-    _COS_TILT, _SIN_TILT, _TOC_WEEK,
+    _WEEK, _TOE, _TOC, _GM, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _COS_I0, _SIN_I0, _NODE,
+    _COS_PERIGEE, _SIN_PERIGEE, _M0, _DN, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC, _CIS,
+    _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK,
 ) = range(_COLUMNS)  # fmt: skip
+
+
+SMALL_RAD = 1e-3
+"""Below it `turned` is exact to rounding."""
+
+
+@compiled("UniTuple(f8, 2)(f8, f8, f8)", forceinline=True)
+def turned(cosine: float, sine: float, small: float) -> tuple[float, float]:
+    """Cosine and sine of an angle that is greater by `small` (rad): a tenth of asking for them."""
+    square = small * small
+    c = 1.0 - square * (0.5 - square / 24.0)
+    s = small * (1.0 - square * (1.0 / 6.0 - square / 120.0))
+    return cosine * c - sine * s, sine * c + cosine * s
 
 
 @compiled("void(f8[:, ::1], f8, f8[::1], b1, f8[:, ::1])")
@@ -91,7 +104,7 @@ def satellite_states(
 ) -> None:
     """Write (n, 8): position m, velocity m/s, clock offset s and drift s/s.
 
-    `elements` (n, 29) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
+    `elements` (n, 31) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
     satellite's own clock has it if `by_satellite_clock`.
     """
     for k in range(elements.shape[0]):
@@ -111,30 +124,35 @@ def satellite_states(
         n = math.sqrt(q[_GM] / axis) / axis + q[_DN]
         mean = q[_M0] + n * tk
         anomaly = mean + ecc * math.sin(mean)
+        cos_e, sin_e = math.cos(anomaly), math.sin(anomaly)
         for _ in range(12):  # Newton: two steps at e = 0.02; one more is the last one squared
-            change = (anomaly - ecc * math.sin(anomaly) - mean) / (1.0 - ecc * math.cos(anomaly))
+            change = (anomaly - ecc * sin_e - mean) / (1.0 - ecc * cos_e)
             anomaly -= change
+            if abs(change) < SMALL_RAD:
+                cos_e, sin_e = turned(cos_e, sin_e, -change)
+            else:
+                cos_e, sin_e = math.cos(anomaly), math.sin(anomaly)
             if abs(change) < 1e-8:
                 break
-        sin_e, cos_e = math.sin(anomaly), math.cos(anomaly)
         nearness = 1.0 - ecc * cos_e
         anomaly_rate = n / nearness
         root = math.sqrt(1.0 - ecc * ecc)
-        phi = math.atan2(root * sin_e, cos_e - ecc) + q[_PERIGEE]
+        sin_true, cos_true = root * sin_e / nearness, (cos_e - ecc) / nearness
+        cos_phi = cos_true * q[_COS_PERIGEE] - sin_true * q[_SIN_PERIGEE]
+        sin_phi = sin_true * q[_COS_PERIGEE] + cos_true * q[_SIN_PERIGEE]
         phi_rate = root * anomaly_rate / nearness
-        s2, c2 = math.sin(2.0 * phi), math.cos(2.0 * phi)
-        u = phi + q[_CUS] * s2 + q[_CUC] * c2
+        s2, c2 = 2.0 * sin_phi * cos_phi, (cos_phi - sin_phi) * (cos_phi + sin_phi)
         u_rate = phi_rate * (1.0 + 2.0 * (q[_CUS] * c2 - q[_CUC] * s2))
         r = axis * nearness + q[_CRS] * s2 + q[_CRC] * c2
         r_rate = axis * ecc * sin_e * anomaly_rate + 2.0 * phi_rate * (q[_CRS] * c2 - q[_CRC] * s2)
-        inc = q[_I0] + q[_I_RATE] * tk + q[_CIS] * s2 + q[_CIC] * c2
         inc_rate = q[_I_RATE] + 2.0 * phi_rate * (q[_CIS] * c2 - q[_CIC] * s2)
         we = q[_RATE]
         geo = q[_GEO] > 0.0
         node_rate = q[_NODE_RATE] if geo else q[_NODE_RATE] - we
         node = q[_NODE] + node_rate * tk - we * q[_OWN_TOE]
-        su, cu = math.sin(u), math.cos(u)
-        si, ci = math.sin(inc), math.cos(inc)
+        cu, su = turned(cos_phi, sin_phi, q[_CUS] * s2 + q[_CUC] * c2)
+        lean = q[_I_RATE] * tk + q[_CIS] * s2 + q[_CIC] * c2
+        ci, si = turned(q[_COS_I0], q[_SIN_I0], lean)
         so, co = math.sin(node), math.cos(node)
         px, py = r * cu, r * su
         px_rate = r_rate * cu - py * u_rate
@@ -162,7 +180,7 @@ def satellite_states(
 
 
 def elements_row(ephemeris: Ephemeris) -> Array:
-    """One ephemeris as the row (29,) that `satellite_states` takes."""
+    """One ephemeris as the row (31,) that `satellite_states` takes."""
     e = ephemeris
     constants = CONSTANTS[e.system]
     week, toe = gps_time(e.system, e.week, e.toe_s)
@@ -171,7 +189,8 @@ def elements_row(ephemeris: Ephemeris) -> Array:
     toc_week = week + round((toe - toc) / WEEK_S)
     values = (
         week, toe, toc, *constants, is_beidou_geo(e.system, e.prn), e.toe_s, e.sqrt_a,
-        e.eccentricity, e.inclination, e.ascending_node, e.perigee, e.mean_anomaly,
+        e.eccentricity, math.cos(e.inclination), math.sin(e.inclination), e.ascending_node,
+        math.cos(e.perigee), math.sin(e.perigee), e.mean_anomaly,
         e.mean_motion_correction, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
         e.crs, e.cic, e.cis, e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
         math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week,
@@ -190,7 +209,7 @@ class SatelliteStates(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Orbits:
-    """Ephemerides of n satellites, stacked once: `elements` (n, 29)."""
+    """Ephemerides of n satellites, stacked once: `elements` (n, 31)."""
 
     elements: Array
 

@@ -86,7 +86,7 @@ def range_rows(
     """Write (20, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 29), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
+    `elements` (n, 31), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
     BeiDou's coefficients; `noise` (8,).
     """
     n = elements.shape[0]
@@ -131,7 +131,9 @@ def range_rows(
             north = -sp * cl * lx - sp * sl * ly + cp * lz
             up = cp * cl * lx + cp * sl * ly + sp * lz
             elevation = math.asin(min(max(up, -1.0), 1.0))
-            azimuth = math.atan2(east, north) % (2.0 * math.pi)
+            azimuth = math.atan2(east, north)
+            if azimuth < 0.0:
+                azimuth += 2.0 * math.pi
             dry_map, wet_map = mapping(elevation, q)
             tropo = dry * dry_map + wet * wet_map
             model = signals[k, IONO_MODEL]

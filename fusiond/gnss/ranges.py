@@ -218,8 +218,9 @@ class RangeModel:
         ):
             self._plan = plan = self._make_plan(epoch, keys, now)
         serving = map(epoch.signals.__getitem__, plan.serving)
-        values = np.array(list(chain.from_iterable(map(_MEASURED, serving))), float)
-        measured = values.reshape(len(plan.serving), rk.MEASURED_COLUMNS)
+        n, values = len(plan.serving), chain.from_iterable(map(_MEASURED, serving))
+        measured = np.fromiter(values, float, n * rk.MEASURED_COLUMNS)
+        measured = measured.reshape(n, rk.MEASURED_COLUMNS)
         return Picked(plan, epoch.week, epoch.tow_s, measured)
 
     def evaluate(self, picked: Picked, receiver: Array) -> Rows:

@@ -141,11 +141,13 @@ class Model:
         return {}
 
     @cached_property
-    def packed(self) -> NDArray[np.uint8]:
-        """`noise`, `sensor_terms`, `rate_terms` and `active` one after another in bytes, which a
-        kernel takes for less than four arrays."""
-        parts = (self.noise, self.sensor_terms, self.rate_terms, self.active)
-        return np.concatenate([part.ravel().view(np.uint8) for part in parts])
+    def packed(self) -> Array:
+        """`noise`, `sensor_terms`, `rate_terms` and `active` one after another in whole doubles,
+        which a kernel finds in an array with all else."""
+        active = np.zeros(-(-self.size // 8) * 8, dtype=np.bool_)
+        active[: self.size] = self.active
+        parts = (self.noise, self.sensor_terms, self.rate_terms, active)
+        return np.concatenate([part.ravel().view(np.float64) for part in parts])
 
     @cached_property
     def stated(self) -> NDArray[np.bool_]:

@@ -32,6 +32,9 @@ PERIOD_WINDOW, PERIOD_CHANGE = 256, 0.5
 # What a row holds beside its time: rate and force, their densities, solution, sigmas.
 ROW_WIDTHS = (6, 6, NAV_SIZE, 9)
 ROW_SIZE = 1 + sum(ROW_WIDTHS)
+# What `packed` begins with, as int64: `start`, `end` and `hold_ns`; a line of the cache.
+HEAD_SIZE = 8
+START, END, HOLD = 0, 1, 2
 # Rows kept before the oldest needed one: the slopes of a sample use the two before it.
 MARGIN = 3
 
@@ -120,6 +123,7 @@ class ImuBuffer:
         self._configured_ns = self._period_ns = 1e9 / rate_hz
         self.hold_ns = self._hold()
         """A sample may stand for this long at most; beyond it the covariance grows as for a gap."""
+        self._head[HOLD] = self.hold_ns
         self._intervals: list[Stamps] = []
         self._unjudged = 0
         self._offset_ns = round(time_offset_s * 1e9)
@@ -128,12 +132,14 @@ class ImuBuffer:
 
     def _allocate(self, capacity: int) -> None:
         """Room for so many rows, all arrays in one: `packed`, which a kernel takes for less."""
-        self.packed: Array = np.zeros(ROW_SIZE * capacity)
-        self.times: NDArray[np.int64] = self.packed[:capacity].view(np.int64)
+        self.packed: Array = np.zeros(HEAD_SIZE + ROW_SIZE * capacity)
+        self._head: NDArray[np.int64] = self.packed[:HEAD_SIZE].view(np.int64)
+        behind = self.packed[HEAD_SIZE:]
+        self.times: NDArray[np.int64] = behind[:capacity].view(np.int64)
         parts: list[Array] = []
         first = 1
         for width in ROW_WIDTHS:
-            rows = self.packed[first * capacity : (first + width) * capacity]
+            rows = behind[first * capacity : (first + width) * capacity]
             parts.append(rows.reshape(capacity, width))
             first += width
         self.samples, self.densities, self.nav, self.sigmas = parts
@@ -162,6 +168,7 @@ class ImuBuffer:
     def restart(self) -> None:
         """Forget all samples: the next may have any stamp."""
         self.start, self.end, self.needed = self.next_sample, 0, None
+        self._head[START], self._head[END] = self.start, 0
         self.latest_ns = 0
         self.backward_in_a_row = 0
 
@@ -225,7 +232,7 @@ class ImuBuffer:
             seen = 0.5 * float(middle[half - 1] + middle[half])
             if abs(seen - self._period_ns) > PERIOD_CHANGE * self._period_ns:
                 self._period_ns = seen
-                self.hold_ns = self._hold()
+                self.hold_ns = self._head[HOLD] = self._hold()
             intervals = intervals[PERIOD_WINDOW:]
         self._intervals, self._unjudged = [intervals], len(intervals)
 
@@ -241,6 +248,7 @@ class ImuBuffer:
                 array[: self.end - drop] = array[drop : self.end].copy()
             self.start += drop
             self.end -= drop
+            self._head[START] = self.start
             if self.end + count > len(self.times):
                 self._grow(2 * (self.end + count))
         rows = slice(self.end, self.end + count)
@@ -254,12 +262,13 @@ class ImuBuffer:
             self._crosstalk.follow(self.samples[rows], self.densities[rows])
         self.nav[rows] = np.nan
         self.end += count
+        self._head[END] = self.end
         self.latest_ns = int(times[-1])
 
     def _grow(self, capacity: int) -> None:
         """More rows: the IMU is faster than configured, or the filter has not run for long."""
-        held = self.times, self.samples, self.densities, self.nav, self.sigmas
+        held = self._head, self.times, self.samples, self.densities, self.nav, self.sigmas
         self._allocate(capacity)
-        grown = self.times, self.samples, self.densities, self.nav, self.sigmas
+        grown = self._head, self.times, self.samples, self.densities, self.nav, self.sigmas
         for array, before in zip(grown, held, strict=True):
             array[: len(before)] = before

@@ -169,7 +169,9 @@ class RawGnss:
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
-        scale = self._section.sigma_scale**2
+        scale, variances = self._section.sigma_scale**2, (rows.total_variance, rows.rate_variance)
+        if scale != 1.0:
+            variances = rows.total_variance * scale, rows.rate_variance * scale
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -179,8 +181,7 @@ class RawGnss:
             rows.velocity,
             rows.pseudorange_m,
             rows.rate_m_s,
-            rows.total_variance * scale,
-            rows.rate_variance * scale,
+            *variances,
             self._clock[rows.system],
             self._section.lever_arm_m,
             aid.epoch.clock_reset,

@@ -105,16 +105,16 @@ def test_markov_parameters_decay_and_constants_stay() -> None:
 
 
 def test_a_markov_state_settles_at_its_steady_variance() -> None:
-    model, estimator, _ = started("planar15")
+    model, first, _ = started("planar15")
+    estimator = KalmanEstimator(model, gap_s=60.0)
     estimator.initialise(
-        0, 0, estimator.nav.copy(), np.zeros(model.size), np.zeros((model.size, model.size))
+        0, 0, first.nav.copy(), np.zeros(model.size), np.zeros((model.size, model.size))
     )
     count = 3000  # 10 s each: more than eight correlation times
     times = 10 * runs.SECOND * np.arange(1, count + 1)
     buffer = runs.filled_buffer(
         Imu(rate_hz=0.1, gap_s=60.0), times, np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (count, 1))
     )
-    estimator.gap_ns = 60 * runs.SECOND
     estimator.propagate(buffer, int(times[-1]))
     slots = model.slots_of("gyro_markov")
     steady = next(b.steady for b in model.blocks if b.name == "gyro_markov")

@@ -235,6 +235,17 @@ def test_recording_tells_sigmas_and_changes_nothing() -> None:
     np.testing.assert_allclose(buffer.sigmas[buffer.end - 1], recorded.sigmas(), rtol=1e-9)
 
 
+def test_what_is_recorded_has_all_noise_since_the_last_epoch() -> None:
+    model, buffer, aids, start, sd = drive()
+    estimator = MultiscaleEstimator(model, IMU.gap_s)
+    begun(estimator, start, sd)
+    run(estimator, buffer, aids[:5])
+    row = buffer.index_after(estimator.t_ns) + 40
+    for k in (20, 40):  # nobody measures anything between
+        estimator.propagate(buffer, int(buffer.times[row - 40 + k]), record=True)
+    np.testing.assert_allclose(buffer.sigmas[row], estimator.sigmas(), rtol=1e-9)
+
+
 def test_covariance_stays_symmetric_and_positive() -> None:
     model, buffer, aids, start, sd = drive()
     estimator = MultiscaleEstimator(model, IMU.gap_s, 4)

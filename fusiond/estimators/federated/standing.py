@@ -61,13 +61,14 @@ class StandingFilter(FederatedFilter):
     Bank: 0 ... N - 1 the local filters, N the master's own part in `rescale`.
     """
 
+    carries_transition = True
+
     def __init__(
         self, model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
     ) -> None:
         self._rescales = options.mode == "rescale"
         self._bank_shares: Array = np.ones(len(names) + self._rescales)
         super().__init__(model, gap_s, names, options, len(names) + self._rescales)
-        self._phi = np.eye(model.width)
         self._unit: Array = np.eye(model.width)
         self._before: Array = np.zeros((model.width, model.width))
 

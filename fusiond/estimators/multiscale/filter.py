@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.doubt import open_by
+from fusiond.estimators.memory import RECORDED, USED
 from fusiond.estimators.multiscale.block import (
     Block,
     Window,
@@ -72,11 +73,14 @@ class MultiscaleEstimator(ErrorStateFilter):
     carries, 1 what was fed back since the last epoch apart from a measurement.
     """
 
+    carries_transition = True
+
     def __init__(self, model: Model, gap_s: float, scales: int = 2, wavelet: str = "haar") -> None:
-        super().__init__(model, gap_s)
-        self._dxs = np.zeros((2, model.size))
+        super().__init__(model, gap_s, (1.0, 1.0))
+        # Behind Q there is room for P while its sigmas are recorded.
+        self._covs, self._shares, self._p = self._covs[:1], self._shares[:1], self._covs[1]
+        self._memory.head[USED], self._memory.head[RECORDED] = 1, 1
         self._w = wavelet_matrix(wavelet, scales).copy()  # kernels take no read-only array
-        self._phi = np.eye(model.width)
         self._window: Window | None = None
         self._blocks: list[Block] = []
         self._starts: list[tuple[Array, Array]] = []
@@ -124,12 +128,11 @@ class MultiscaleEstimator(ErrorStateFilter):
             super().propagate(imu, target_ns)
             return
         # Sigmas at every sample want P at every sample.
-        n, noise, shares = self.model.size, self._covs, self._shares
-        self._covs, self._shares = np.concatenate((np.zeros_like(noise), noise)), np.ones(2)
-        self._covs[0, :n, :n] = self.covariance
+        n = self.model.size
+        self._p[:n, :n] = self.covariance
+        self._memory.head[USED] = 2
         super().propagate(imu, target_ns, record)
-        noise[0] = self._covs[1]
-        self._covs, self._shares = noise, shares
+        self._memory.head[USED] = 1
 
     def _begin_anew(self, p: Array) -> None:
         """No epoch yet: what follows starts from P (n, n)."""

@@ -61,6 +61,8 @@ class TapedKalman(TiltAxesFilter):
     that has ended.
     """
 
+    carries_transition = True
+
     def __init__(
         self, model: Model, gap_s: float, on_ended: Callable[[Node], None] = lambda newest: None
     ) -> None:
@@ -69,7 +71,6 @@ class TapedKalman(TiltAxesFilter):
         self.rewound = NEVER
         """The oldest sample that was taken back since somebody set this to `NEVER`."""
         self.on_ended = on_ended
-        self._phi = np.eye(model.width)
         self._before: Array = np.zeros_like(self._covs[0])
         self._rows: Innovation | NotApplicable = NotApplicable("")
         self._ops: list[Array] = []

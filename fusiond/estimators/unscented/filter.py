@@ -22,7 +22,6 @@ import numpy as np
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome
-from fusiond.estimators.covariance import work_size
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.propagation import propagate_points, turn_attitude
 from fusiond.estimators.unscented.sigma_points import factor, linear_form, spread_states
@@ -133,6 +132,6 @@ class UnscentedEstimator(KalmanEstimator):
             imu.nav,
             imu.sigmas,
             self._holding,
-            self._scratch[: work_size(self.model.width)],
+            self._memory.work,
         )
         self.sample = first + imu.start

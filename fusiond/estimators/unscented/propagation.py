@@ -200,6 +200,9 @@ def propagate_points(
     n, width = xi.shape[0], cov.shape[0]
     flat, kept = cov.reshape(width * width), kept_part(work, width)
     sensor_slot, sensor_kind = sensor_terms[0], sensor_terms[1]
+    flat_samples, flat_densities = samples.reshape(samples.size), densities.reshape(densities.size)
+    rates = rate_terms.reshape(rate_terms.size)
+    terms = (active, sensor_terms.reshape(24), rates, noise.reshape(3 * n), 1.0, work)
     root, odd = np.empty((POINTS, width)), np.empty((POINTS, width))
     even = np.empty((POINTS, CORE_SIZE))
     c, estimate, d, mean = np.zeros(COEFFICIENTS), np.empty(12), np.empty(n), np.empty(n)
@@ -215,17 +218,16 @@ def propagate_points(
         stop = min(times[i], target)
         if stop > now:
             h = (stop - now) * 1e-9
-            silent = slopes(times, samples, i, gap_ns, rate_slope, force_slope)
+            silent = slopes(times, flat_samples, i, gap_ns, rate_slope, force_slope)
             split(cov, root)
             before[:] = nav
             sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
-            compensate(samples, i, estimate, rate, force)
+            compensate(flat_samples, i, estimate, rate, force)
             strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
             scale[0] = meridian_radius(nav[LAT]) + nav[HEIGHT]
             scale[1] = (transverse_radius(nav[LAT]) + nav[HEIGHT]) * math.cos(nav[LAT])
 
             coefficients(nav, step, h, c)
-            terms = (active, sensor_terms, rate_terms, noise, 1.0, work)
             if width == WIDTHS[0]:
                 _covariance_narrow(flat, step, c, h, *terms)
             elif width == WIDTHS[1]:
@@ -256,7 +258,7 @@ def propagate_points(
                 xi_true[:] = xi
                 feed_back(true, xi_true, d)
                 sensor_estimates(xi_true, sensor_slot, sensor_kind, estimate)
-                compensate(samples, i, estimate, rate, force)
+                compensate(flat_samples, i, estimate, rate, force)
                 strapdown_step(true, rate, force, rate_slope, force_slope, h, hold_height, unused)
                 error_of(nav, true, scale, off[which])
                 if which < 2:
@@ -268,7 +270,7 @@ def propagate_points(
                     if not active[j]:
                         odd[k, j] = 0.0
                         even[k, j] = 0.0
-                propagate_parameters(odd[k, :n], h, rate_terms, kept)
+                propagate_parameters(odd[k, :n], h, rates, kept)
 
             mean[:] = 0.0
             for j in range(CORE_SIZE):
@@ -284,14 +286,14 @@ def propagate_points(
                     mean[a] += factor / spread
                     for b in range(CORE_SIZE):
                         cov[a, b] += factor * even[k, b]
-            propagate_parameters(xi, h, rate_terms, kept)
+            propagate_parameters(xi, h, rates, kept)
             if carry:
                 for j in range(CORE_SIZE):
                     dx[j] = mean[j]
-                propagate_parameters(dx, h, rate_terms, kept)
+                propagate_parameters(dx, h, rates, kept)
             else:
                 feed_back(nav, xi, mean)
-            shake(flat, width, active, step, densities, i, h)
+            shake(flat, width, active, step, flat_densities, i, h)
             if silent:
                 # The held sample is a guess: its error acts over the whole of the gap.
                 widen_for_gap(flat, width, active, (times[i] - times[i - 1]) * 1e-9, h)

@@ -58,8 +58,8 @@ def _recursions_for(width: int) -> Callable[..., None]:
     propagate_covariance = covariance_for(width)
 
     @compiled(
-        "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[:, ::1], i8[:, ::1], f8[:, ::1],"
-        "f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])",
+        "void(i8, f8[:, ::1], f8[::1], f8[::1], f8, b1[::1], i8[::1], i8[::1], f8[::1], f8[::1],"
+        "f8[:, ::1], f8[::1], f8[::1], f8[::1])",
         variant=width,
         allocates=True,
     )
@@ -110,7 +110,7 @@ def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
         start = time.process_time_ns()
         kernel(
             *(RECURSIONS, cov, step, c, h),
-            *(of.active, of.sensor_terms, of.rate_terms, of.noise, work),
+            *(of.active, of.sensor_terms.ravel(), of.rate_terms.ravel(), of.noise.ravel(), work),
             *(rows, r, nav.copy(), xi),
         )
         return (time.process_time_ns() - start) * 1e-9 / RECURSIONS

@@ -260,12 +260,14 @@ def imu_buffer(samples: Array, rate_hz: float = IMU.rate_hz) -> ImuBuffer:
 class _Transitions(ErrorStateFilter):
     """The filters' own propagation, asked for the transition and noise of a second."""
 
+    carries_transition = True
+
     def over_a_second(self, buffer: ImuBuffer, nav: Array, second: int) -> tuple[Array, Array]:
         """Transition (n, n) and noise (n, n) from `second` on, from the true state (10,) there."""
         n, width = self.model.size, self.model.width
         self.nav[:], self.t_ns = nav, second * EPOCH_NS
         self.sample = round(second * IMU.rate_hz)
-        self._phi = np.eye(width)
+        self._phi[:] = np.eye(width)
         self._phi[n:] = 0.0
         self._covs[:] = 0.0
         self.propagate(buffer, self.t_ns + EPOCH_NS)
