@@ -35,11 +35,8 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
-import numpy as np
 from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.typing.typeof import typeof_impl
-from numba.np.numpy_support import from_dtype, map_layout
 
 from fusiond.navigation.kernel_cache import KernelCache, remove_strays
 
@@ -75,14 +72,6 @@ _gathered: list[Callable[[], None]] | None = None
 
 # 2^48 starts: no two processes that filled a cache count through the same numbers.
 setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48)))  # noqa: B010
-
-
-@typeof_impl.register(np.ndarray)
-def _array_type(array: Any, _: object) -> Any:
-    """As numba's own, which first asks whether it is a masked array: no kernel gets one, and to ask
-    imports `numpy.ma`, a thirtieth of a start."""
-    dtype, layout = from_dtype(array.dtype), map_layout(array)
-    return numba.types.Array(dtype, array.ndim, layout, readonly=not array.flags.writeable)
 
 
 def compiled(
