@@ -11,7 +11,7 @@ import numpy as np
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import sensor_to_body
-from fusiond.files.csv_tables import Floats, Rejection, counts
+from fusiond.files.csv_tables import Rejection, counts
 from fusiond.files.tables import ImuTable
 from fusiond.navigator.imu_units import CourseTurns, force_unit, rms_unit
 from fusiond.offline.aid_files import Arrival
@@ -43,14 +43,8 @@ def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str
     """The sentence, where forces or rates are not in the units that the columns' names say."""
     if not len(imu.t_s):
         return None
-    median = _median(np.linalg.norm(imu.accel, axis=1))
+    median = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     return force_unit(median) or _rate_unit(imu, section, arrivals)
-
-
-def _median(values: Floats) -> float:
-    """As numpy's own, which imports `numpy.ma` to look for what is no number: 0.04 s of a start."""
-    middle = [(len(values) - 1) // 2, len(values) // 2]
-    return float(np.partition(values, middle)[middle].mean())
 
 
 def _rate_unit(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
