@@ -173,7 +173,6 @@ def test_files_that_are_named_exist() -> None:
 
 
 NOT_IN_THE_PROGRAM = {
-    "fusiond.files.fixed_decimal.MAX_DECIMALS": "the domain of what it is a bound of",
     "fusiond.navigation.error_model.dense_transition": "what the kernels never form",
     "fusiond.simulation.can.aids.SIM_BAROMETER": "a device for who simulates one",
     "fusiond.studies.observability.gramian_stable": "an equation of paper 002",
