@@ -23,12 +23,13 @@ aids that are fused correct its tilt more than its P allows (fusiond.integrity.t
 An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
 over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
 filter's own bound, grown as the IMU's errors let it, or another source then supports it. Patience
-does not. The filter's error, P / (P + R) of a position's variance, is the same in all of them, and
-c no less: a filter that has gone astray by one of its sigmas could never be corrected else. After
-an outage of all positions the first that comes back is taken at once, but counts less until it is
-seen to go with the motion (fusiond.integrity.proof), and, where it lies behind the filter by more
-than is likely, is not vouched for until a lateness would have shown (fusiond.integrity.returns);
-what is published is no surer than that meanwhile (fusiond.integrity.punctual).
+does not; what it may be off by still is open (fusiond.integrity.moved). The filter's error,
+P / (P + R) of a position's variance, is the same in all of them, and c no less: a filter that has
+gone astray by one of its sigmas could never be corrected else. After an outage of all positions the
+first that comes back is taken at once, but counts less until it is seen to go with the motion
+(fusiond.integrity.proof), and, where it lies behind the filter by more than is likely, is not
+vouched for until a lateness would have shown (fusiond.integrity.returns); what is published is no
+surer than that meanwhile (fusiond.integrity.punctual).
 
 With all series of position refused, how it began tells who is wrong (fusiond.integrity.jumps).
 
