@@ -81,6 +81,15 @@ class Moved(NamedTuple):
         wider *= share
         return wider
 
+    def joined(self, before: Moved | None) -> Moved:
+        """With what was open of it `before` as well; it fades as the longer of both."""
+        if before is None:
+            return self
+        kept = np.array(self.squares) + before.leaves_open(self.since_ns)[:3]
+        north, east, down = kept.tolist()
+        lasted_ns = max(self.lasted_ns, before.lasted_ns)
+        return self._replace(lasted_ns=lasted_ns, squares=(north, east, down))
+
     def told(self, positions: Iterable[Witness]) -> bool:
         """Whether one of another device that was fused since has told that it is not off."""
         apart = math.sqrt(self.squares[0] + self.squares[1])
@@ -99,20 +108,17 @@ def left(device: str, t_ns: int, lasted_ns: int, away_m: float, before: Moved | 
     """Of a navigation that begins anew with a device that had left the one before it by `away_m`,
     in which axes is not known any more; and what had been open `before`."""
     square = 0.5 * away_m * away_m
-    if before is not None:
-        square += float(max(before.leaves_open(t_ns)[:3]))
-    return Moved(device, t_ns, lasted_ns, (square, square, square))
+    return Moved(device, t_ns, lasted_ns, (square, square, square)).joined(before)
 
 
 def back(returned: Returned, t_ns: int, covariance: Array) -> Moved:
     """Of what is believed again, by the means of what has passed and P (n, n) of the filter; what
     was open of it before it was left out stays."""
-    trend, before = returned.trend, returned.moved
+    trend = returned.trend
     squares = covariance.diagonal()[DR : DR + 3].copy()
     squares[0] += (trend.north / trend.n) ** 2
     squares[1] += (trend.east / trend.n) ** 2
     squares[2] += (returned.rise_m / returned.passes) ** 2
-    if before is not None:
-        squares += before.leaves_open(t_ns)[:3]
     north, east, down = squares.tolist()
-    return Moved(returned.device, t_ns, t_ns - returned.refused_ns, (north, east, down))
+    out_ns = t_ns - returned.refused_ns
+    return Moved(returned.device, t_ns, out_ns, (north, east, down)).joined(returned.moved)

@@ -117,7 +117,8 @@ def prove(
         record.punctual = came if record.sd_m <= FINE_M else None
         if any(comes.beyond):
             out_ns = max(record.every_ns, support.OTHERS_NS)
-            record.moved = Moved(record.device, offer.t_ns, out_ns, comes.beyond)
+            moved = Moved(record.device, offer.t_ns, out_ns, comes.beyond)
+            record.moved = moved.joined(record.moved)
     if record.punctual is not None:
         v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour
         since = record.punctual.with_one(offer.t_ns, v_n, v_e, sd)

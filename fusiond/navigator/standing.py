@@ -132,9 +132,8 @@ class Standing:
             return None
         by_source = lost.cause == "source"
         self._left = lost.device if by_source else ""
-        before, self.moved = self.moved, None
         if by_source:
-            self.moved = left(lost.device, t_ns, waited_ns, lost.away_m, before)
+            self.moved = left(lost.device, t_ns, waited_ns, lost.away_m, self.moved)
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
     def _watch(self, t_ns: int, isolation: Isolation, speed: float) -> None:

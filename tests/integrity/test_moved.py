@@ -11,12 +11,14 @@ import pytest
 
 from fusiond.integrity.hedge import MOVED
 from fusiond.integrity.moved import Moved, left
+from fusiond.integrity.returns import Begun, Coming, prove
 from fusiond.integrity.series import Series
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults.hours import around_town
 from fusiond.studies.faults.library import Alter, Fault
 from fusiond.studies.faults.recording import Drive, Recording
 from fusiond.studies.faults.runs import run
+from tests.integrity.journey import Journey
 from tests.integrity.series_bench import Bench, S
 
 OUT_NS = 20 * S
@@ -64,6 +66,25 @@ def test_what_was_open_before_is_open_after_another_failure() -> None:
     assert first.squares == (50.0, 50.0, 50.0)
     again = left("gnss", 120 * S, OUT_NS, 10.0, first)
     assert again.squares == (75.0, 75.0, 75.0)
+
+
+def test_a_return_takes_nothing_back_that_was_open() -> None:
+    """A short outage later, whose first fix is off by a little: it fades no sooner for that."""
+    first = Moved("gnss", 100 * S, OUT_NS, SQUARES)
+    again = Moved("gnss", 120 * S, OUT_NS // 2, (1.0, 0.0, 0.0)).joined(first)
+    assert again.leaves_open(120 * S)[:3].tolist() == [9.0, 4.5, 0.5]
+    assert again.leaves_open(140 * S)[0] == 4.5
+    assert first.joined(None) is first
+
+
+def test_nor_does_a_first_fix_after_an_outage() -> None:
+    offer, nav = Journey(1).at(600)
+    record = Series("gnss", locates=True, moves=False, heard_ns=offer.t_ns)
+    record.fused_ns, record.every_ns, record.sd_m = offer.t_ns - OUT_NS, OUT_NS, 0.8
+    record.moved = Moved("gnss", record.fused_ns, OUT_NS, SQUARES)
+    comes = Coming(beyond=(1.0, 0.0, 0.0))
+    prove({"gnss": record}, record, offer, nav, None, Begun(), comes, 1.0 - 1e-6)
+    assert record.moved.leaves_open(offer.t_ns)[:3].tolist() == [9.0, 4.5, 0.5]
 
 
 def returned(off_m: float) -> tuple[Bench, int]:

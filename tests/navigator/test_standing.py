@@ -177,12 +177,15 @@ class Left(Isolation):
     def __init__(self) -> None:
         super().__init__()
         self.since_ns: int | None = 0
+        self.cause = "source"
         self.supported = self.returning = False
 
     def lost(self, t_ns: int) -> Lost | None:
         if self.since_ns is None:
             return None
-        return Lost(self.since_ns, "source", "gnss", "jumped", False, self.returning)
+        reason = "jumped" if self.cause == "source" else "disagrees"
+        away_m, disputed = 50.0, False
+        return Lost(self.since_ns, self.cause, "gnss", reason, away_m, disputed, self.returning)
 
     def supported_by_another(self, device: str) -> bool:
         assert device == "gnss"
@@ -202,6 +205,20 @@ def test_a_start_from_a_receiver_that_had_jumped_away_coasts_until_another_devic
     assert standing.shaken(at(100_001), isolation) is None
     isolation.supported = False
     assert standing.shaken(at(100_002), isolation) is None
+
+
+def test_what_a_start_may_be_off_by_outlasts_a_failure_of_the_filter() -> None:
+    isolation, standing = Left(), Standing(150.0)
+    still = np.zeros(10)
+    assert standing.moved is None
+    assert standing.failure(61 * S, isolation, still) is not None
+    moved = standing.moved
+    assert moved is not None
+    assert (moved.device, moved.since_ns, moved.lasted_ns) == ("gnss", 61 * S, 61 * S)
+    assert moved.squares == (1250.0, 1250.0, 1250.0)
+    isolation.cause = "filter"
+    assert standing.failure(90 * S, isolation, still) is not None
+    assert standing.moved == moved
 
 
 def test_what_is_on_its_way_back_is_waited_for() -> None:
