@@ -37,7 +37,7 @@ from dataclasses import field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
@@ -55,10 +55,14 @@ RANGE_BIAS = ("range_bias", "range_bias_down")
 NO_CLOCK = -1
 """In place of a clock offset: the range knows no receiver clock."""
 
+# Rows of an epoch's values.
+_VALUES = 10
+_X, _VX, _RANGE, _RATE, _RANGE_VARIANCE, _RATE_VARIANCE = 0, 3, 6, 7, 8, 9
+
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1],"
-    "i8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])"
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], i8[::1], i8[::1], i8[::1],"
+    "i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])"
 )
 def _rows(
     nav: Array,
@@ -66,10 +70,7 @@ def _rows(
     step: Array,
     column_of: Indices,
     active: NDArray[np.bool_],
-    position: Array,
-    velocity: Array,
-    ranges: Array,
-    rates: Array,
+    values: Array,
     clock: Indices,
     offsets: Indices,
     drifts: Indices,
@@ -106,11 +107,12 @@ def _rows(
 
     row = 0
     for kind in range(2):
-        for i in range(ranges.shape[0]):
-            if not math.isfinite(ranges[i] if kind == 0 else rates[i]):
+        for i in range(clock.shape[0]):
+            measured = values[_RANGE + kind, i]
+            if not math.isfinite(measured):
                 continue
             # From the antenna to the satellite, north, east, down.
-            e0, e1, e2 = position[i, 0] - x, position[i, 1] - y, position[i, 2] - zed
+            e0, e1, e2 = values[_X, i] - x, values[_X + 1, i] - y, values[_X + 2, i] - zed
             m0 = -sl * co * e0 - sl * so * e1 + cl * e2 - a0
             m1 = -so * e0 + co * e1 - a1
             m2 = -cl * co * e0 - cl * so * e1 - sl * e2 - a2
@@ -118,7 +120,7 @@ def _rows(
             u0, u1, u2 = m0 / distance, m1 / distance, m2 / distance
             g = h[row]
             if kind == 0:
-                z[row] = distance - ranges[i]
+                z[row] = distance - measured
                 g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
                 g[6], g[7], g[8] = -u0, -u1, -u2
                 if clock[i] >= 0:
@@ -126,12 +128,12 @@ def _rows(
                     z[row] += xi[slot]
                     g[slot] = -1.0
             else:
-                e0, e1, e2 = velocity[i, 0], velocity[i, 1], velocity[i, 2]
+                e0, e1, e2 = values[_VX, i], values[_VX + 1, i], values[_VX + 2, i]
                 q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
                 q1 = -so * e0 + co * e1 - v1
                 q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
                 along = u0 * q0 + u1 * q1 + u2 * q2
-                z[row] = along - rates[i]
+                z[row] = along - measured
                 k0 = (along * u0 - q0) / distance
                 k1 = (along * u1 - q1) / distance
                 k2 = (along * u2 - q2) / distance
@@ -177,29 +179,22 @@ _WRONG = {
 }
 
 
-@compiled("UniTuple(i8, 4)(f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1])")
-def _measured(
-    ranges: Array,
-    rates: Array,
-    range_variance: Array,
-    rate_variance: Array,
-    clock: Indices,
-    r: Array,
-) -> tuple[int, int, int, int]:
+@compiled("UniTuple(i8, 4)(f8[:, ::1], i8[::1], f8[::1])")
+def _measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, int]:
     """Write the variances of the finite ranges and then of the finite rates to r (2 n,); how many
     ranges and rates those are, how many clocks they have, and what is wrong with them."""
-    n = ranges.shape[0]
+    n = clock.shape[0]
     row = finite = timed = clocks = 0
     wrong = _SOUND
     for i in range(n):
         clocks = max(clocks, clock[i] + 1)
-        if math.isfinite(ranges[i]):
-            r[row] = range_variance[i]
+        if math.isfinite(values[_RANGE, i]):
+            r[row] = values[_RANGE_VARIANCE, i]
             row += 1
     finite = row
     for i in range(n):
-        if math.isfinite(rates[i]):
-            r[row] = rate_variance[i]
+        if math.isfinite(values[_RATE, i]):
+            r[row] = values[_RATE_VARIANCE, i]
             row += 1
             timed += clock[i] >= 0
     if 0 < timed < row - finite:
@@ -210,11 +205,10 @@ def _measured(
     return finite, row - finite, clocks, wrong
 
 
-@compiled("void(i8[::1], f8[::1], f8[::1], b1[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1])")
+@compiled("void(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1])")
 def _by_clock(
+    values: Array,
     clock: Indices,
-    ranges: Array,
-    rates: Array,
     kept: NDArray[np.bool_],
     whitened: Array,
     means: Array,
@@ -227,15 +221,15 @@ def _by_clock(
     """
     row = 0
     for kind in range(2):
-        for i in range(ranges.shape[0]):
-            if not math.isfinite(ranges[i] if kind == 0 else rates[i]):
+        for i in range(clock.shape[0]):
+            if not math.isfinite(values[_RANGE + kind, i]):
                 continue
             if kept[row] and clock[i] >= 0:
                 means[clock[i], kind] += whitened[row]
                 counts[clock[i], kind] += 1.0
             row += 1
     first[:] = NO_CLOCK
-    for i in range(ranges.shape[0] - 1, -1, -1):
+    for i in range(clock.shape[0] - 1, -1, -1):
         k = clock[i]
         if k >= 0 and counts[k, 0] > 0.0 and counts[k, 1] > 0.0:
             first[k] = i
@@ -244,23 +238,33 @@ def _by_clock(
             means[k, kind] /= math.sqrt(max(counts[k, kind], 1.0))
 
 
-_ARRAYS = (
-    *((name, np.float64, (3,)) for name in ("position", "velocity")),
-    *((name, np.float64, ()) for name in ("ranges", "rates", "range_variance", "rate_variance")),
-    ("clock", np.int64, ()),
-)
-"""Of an epoch of n satellites: kind and shape, (n, ...)."""
+def epoch_values(
+    position: ArrayLike,
+    velocity: ArrayLike,
+    ranges: ArrayLike,
+    rates: ArrayLike,
+    range_variance: ArrayLike,
+    rate_variance: ArrayLike,
+) -> Array:
+    """The values of an epoch of n satellites as the aid takes them (10, n), from positions and
+    velocities (n, 3) and ranges, rates and their variances (n,); ValueError for other shapes."""
+    rows = (ranges, rates, range_variance, rate_variance)
+    parts = [np.asarray(part, float).T for part in (position, velocity, *rows)]
+    if any(part.shape[-1:] != parts[2].shape for part in parts):
+        raise ValueError(f"shapes differ: {[part.T.shape for part in parts]}")
+    return np.ascontiguousarray(np.vstack(parts))
 
 
 @immutable(eq=False)
 class PseudorangeAid(Aid):
     """Ranges and rates of one epoch to n satellites, all else than geometry and clock taken off.
 
-    `position`, `velocity` (n, 3): ECEF at transmission, turned to the axes at reception (m, m/s).
-    `ranges` (m), `rates` (m/s; positive: going away), their variances (m^2, (m/s)^2), each (n,);
-    NaN is not measured. `clock` (n,): which of the states of the model's block `clock_offset` each
-    range has, or NO_CLOCK; a rate of a satellite with NO_CLOCK has no drift either. `lever` (m,
-    body axes) of the antenna. `clock_reset`: the receiver has set its clock.
+    `values` (10, n) has as its rows `position` and `velocity` (three each, ECEF at transmission,
+    turned to the axes at reception, m, m/s), `ranges` (m), `rates` (m/s; positive: going away) and
+    their variances (m^2, (m/s)^2); NaN is not measured. `clock` (n,): which of the states of the
+    model's block `clock_offset` each range has, or NO_CLOCK; a rate of a satellite with NO_CLOCK
+    has no drift either. `lever` (m, body axes) of the antenna. `clock_reset`: the receiver has set
+    its clock.
     Rows: the finite ranges in order, then the finite rates (`labels`).
 
     ValueError for shapes that do not fit, a variance that is not positive where there is a value,
@@ -271,12 +275,7 @@ class PseudorangeAid(Aid):
     locates: ClassVar[bool] = True
 
     satellites: tuple[str, ...]
-    position: Array
-    velocity: Array
-    ranges: Array
-    rates: Array
-    range_variance: Array
-    rate_variance: Array
+    values: Array
     clock: Indices
     lever: Vector3 = (0.0, 0.0, 0.0)
     clock_reset: bool = False
@@ -285,18 +284,44 @@ class PseudorangeAid(Aid):
 
     def __post_init__(self) -> None:
         n = len(self.satellites)
-        for name, kind, shape in _ARRAYS:
-            value = np.ascontiguousarray(getattr(self, name), dtype=kind)
-            if value.shape != (n, *shape):
-                raise ValueError(f"{name} has shape {value.shape}, not {(n, *shape)}")
-            object.__setattr__(self, name, value)
-        r, variances = np.empty(2 * n), (self.range_variance, self.rate_variance)
-        found = _measured(self.ranges, self.rates, *variances, self.clock, r)
-        ranges, rates, clocks, wrong = found
+        if self.values.shape != (_VALUES, n) or self.clock.shape != (n,):
+            raise ValueError(f"shapes {self.values.shape} and {self.clock.shape} of {n} satellites")
+        r = np.empty(2 * n)
+        ranges, rates, clocks, wrong = _measured(self.values, self.clock, r)
         if wrong != _SOUND:
             raise ValueError(_WRONG[wrong])
         object.__setattr__(self, "_r", r[: ranges + rates])
         object.__setattr__(self, "_clocks", clocks)
+
+    @property
+    def position(self) -> Array:
+        """(n, 3), m."""
+        return self.values[_X:_VX].T
+
+    @property
+    def velocity(self) -> Array:
+        """(n, 3), m/s."""
+        return self.values[_VX:_RANGE].T
+
+    @property
+    def ranges(self) -> Array:
+        """(n,), m."""
+        return self.values[_RANGE, :]
+
+    @property
+    def rates(self) -> Array:
+        """(n,), m/s."""
+        return self.values[_RATE, :]
+
+    @property
+    def range_variance(self) -> Array:
+        """(n,), m^2."""
+        return self.values[_RANGE_VARIANCE, :]
+
+    @property
+    def rate_variance(self) -> Array:
+        """(n,), (m/s)^2."""
+        return self.values[_RATE_VARIANCE, :]
 
     @property
     def labels(self) -> list[tuple[str, str]]:
@@ -316,12 +341,7 @@ class PseudorangeAid(Aid):
             self.t_ns,
             self.gate,
             tuple(s for s, k in zip(self.satellites, mask, strict=True) if k),
-            self.position[mask],
-            self.velocity[mask],
-            self.ranges[mask],
-            self.rates[mask],
-            self.range_variance[mask],
-            self.rate_variance[mask],
+            self.values.compress(mask, axis=1),
             self.clock[mask],
             self.lever,
             self.clock_reset,
@@ -336,8 +356,8 @@ class PseudorangeAid(Aid):
         """
         means, counts = np.zeros((2, self._clocks, 2))
         first = np.empty(self._clocks, dtype=np.int64)
-        used, values = np.asarray(kept, dtype=bool), np.array(whitened, float)
-        _by_clock(self.clock, self.ranges, self.rates, used, values, means, counts, first)
+        used, y = np.asarray(kept, dtype=bool), np.fromiter(whitened, float, len(whitened))
+        _by_clock(self.values, self.clock, used, y, means, counts, first)
         order = sorted((at, k) for k, at in enumerate(first.tolist()) if at != NO_CLOCK)
         return {self.satellites[at][0]: means[k] for at, k in order}
 
@@ -357,10 +377,7 @@ class PseudorangeAid(Aid):
             state.step,
             model.column_of,
             model.active,
-            self.position,
-            self.velocity,
-            self.ranges,
-            self.rates,
+            self.values,
             self.clock,
             offsets,
             drifts,

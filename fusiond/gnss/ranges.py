@@ -25,9 +25,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, compress
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -115,45 +115,69 @@ class RangeOptions:
     signal_in_space_m: dict[System, float] = field(default_factory=lambda: SIGNAL_IN_SPACE_M)
 
 
-class Rows(NamedTuple):
+class _Of:
+    """A view (n,) or (n, 3) of the values of rows."""
+
+    def __init__(self, which: int | slice) -> None:
+        self._which = which
+
+    def __get__(self, rows: Rows, _: type[Rows]) -> Array:
+        found: Array = rows.values[self._which].T
+        return found
+
+
+@dataclass(slots=True, eq=False)
+class Rows:
     """What serves of an epoch, n rows; ECEF is the frame of the instant of reception.
 
     `pseudorange_m` and `rate_m_s` (n,) corrected, so that range + clock offset of the receiver and
     its rate are left (NaN where no rate was measured); `position` and `velocity` (n, 3) of the
     satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
-    that was assumed; `system` (n,) indices into `SYSTEMS`; `measured_at` (n,) into the epoch's
-    signals; `variance` and `rate_variance` (n,) of what is independent, `ionosphere_sigma_m` (n,)
-    of what is common, `total_variance` (n,) of both; `troposphere_m` and `ionosphere_m` (n,) were
-    taken out; `refused` pairs of satellite and reason.
+    that was assumed; `system` (n,) indices into `SYSTEMS`, `clock` (n,) into the systems in use;
+    `measured_at` (n,) into the epoch's signals; `variance` and `rate_variance` (n,) of what is
+    independent, `ionosphere_sigma_m` (n,) of what is common, `total_variance` (n,) of both;
+    `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
+    `values` (20, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
     system: npt.NDArray[np.intp]
+    clock: npt.NDArray[np.int64]
     measured_at: npt.NDArray[np.intp]
-    pseudorange_m: Array
-    rate_m_s: Array
-    position: Array
-    velocity: Array
-    line_of_sight: Array
-    range_m: Array
-    elevation_rad: Array
-    azimuth_rad: Array
-    variance: Array
-    rate_variance: Array
-    troposphere_m: Array
-    ionosphere_m: Array
-    ionosphere_sigma_m: Array
-    total_variance: Array
+    values: Array
     refused: tuple[tuple[str, str], ...]
+
+    position = _Of(slice(rk.X, rk.X + 3))
+    velocity = _Of(slice(rk.VX, rk.VX + 3))
+    line_of_sight = _Of(slice(rk.LX, rk.LX + 3))
+    pseudorange_m = _Of(rk.CORRECTED)
+    rate_m_s = _Of(rk.CORRECTED_RATE)
+    range_m = _Of(rk.RANGE)
+    elevation_rad = _Of(rk.ELEVATION)
+    azimuth_rad = _Of(rk.AZIMUTH)
+    variance = _Of(rk.VARIANCE)
+    rate_variance = _Of(rk.RATE_VARIANCE)
+    troposphere_m = _Of(rk.TROPOSPHERE)
+    ionosphere_m = _Of(rk.IONOSPHERE)
+    ionosphere_sigma_m = _Of(rk.COMMON)
+    total_variance = _Of(rk.TOTAL_VARIANCE)
+
+    def only(self, keep: npt.NDArray[np.bool_]) -> Rows:
+        """Those marked in `keep` (n,)."""
+        return Rows(
+            tuple(compress(self.satellites, keep)),
+            tuple(compress(self.signals, keep)),
+            self.system[keep],
+            self.clock[keep],
+            self.measured_at[keep],
+            self.values.compress(keep, axis=1),
+            self.refused,
+        )
 
     def without(self, satellites: Collection[str]) -> Rows:
         """The same without some satellites."""
-        keep = np.array([s not in satellites for s in self.satellites], bool)
-        changed: dict[str, Any] = {n: getattr(self, n)[keep] for n in self._fields[2:-1]}
-        for name in ("satellites", "signals"):
-            changed[name] = tuple(v for v, k in zip(getattr(self, name), keep, strict=True) if k)
-        return self._replace(**changed)
+        return self.only(np.array([s not in satellites for s in self.satellites], bool))
 
 
 class _Plan(NamedTuple):
@@ -167,6 +191,7 @@ class _Plan(NamedTuple):
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
     system: npt.NDArray[np.intp]
+    clock: npt.NDArray[np.int64]
     orbits: Orbits
     fixed: Array
     ionosphere: Array
@@ -240,45 +265,17 @@ class RangeModel:
             options.cno_mask_db_hz,
             out,
         )
-        satellites, signals, system, index, refused = (
-            plan.satellites,
-            plan.signals,
-            plan.system,
-            plan.measured_at,
-            plan.refused,
+        satellites, signals, refused = plan.satellites, plan.signals, plan.refused
+        rows = Rows(satellites, signals, plan.system, plan.clock, plan.measured_at, out, refused)
+        if not lost:
+            return rows
+        weak = picked.measured[:, rk.CNO] < options.cno_mask_db_hz
+        drop = weak | (out[rk.ELEVATION] < options.elevation_mask_rad)
+        rows.refused += tuple(
+            (satellites[k], "weak_signal" if weak[k] else "low_elevation")
+            for k in np.flatnonzero(drop)
         )
-        if lost:
-            weak = picked.measured[:, rk.CNO] < options.cno_mask_db_hz
-            drop = weak | (out[rk.ELEVATION] < options.elevation_mask_rad)
-            refused += tuple(
-                (satellites[k], "weak_signal" if weak[k] else "low_elevation")
-                for k in np.flatnonzero(drop)
-            )
-            keep = np.flatnonzero(~drop)
-            satellites = tuple(satellites[k] for k in keep)
-            signals = tuple(signals[k] for k in keep)
-            system, index, out = system[keep], index[keep], out[:, keep]
-        return Rows(
-            satellites,
-            signals,
-            system,
-            index,
-            out[rk.CORRECTED],
-            out[rk.CORRECTED_RATE],
-            out[rk.X : rk.VX].T,
-            out[rk.VX : rk.LX].T,
-            out[rk.LX : rk.RANGE].T,
-            out[rk.RANGE],
-            out[rk.ELEVATION],
-            out[rk.AZIMUTH],
-            out[rk.VARIANCE],
-            out[rk.RATE_VARIANCE],
-            out[rk.TROPOSPHERE],
-            out[rk.IONOSPHERE],
-            out[rk.COMMON],
-            out[rk.TOTAL_VARIANCE],
-            refused,
-        )
+        return rows.only(~drop)
 
     def _make_plan(
         self, epoch: RawGnssEpoch, keys: list[tuple[System, int, str]], now: float
@@ -308,6 +305,7 @@ class RangeModel:
             tuple(s.satellite for _, s, _ in chosen),
             tuple(s.signal for _, s, _ in chosen),
             np.array([SYSTEMS.index(s.system) for _, s, _ in chosen], np.intp),
+            np.array([self.options.systems.index(s.system) for _, s, _ in chosen], np.int64),
             Orbits.of([e for _, _, e in chosen]),
             np.array(fixed, float).reshape(len(fixed), rk.SIGNAL_COLUMNS),
             self._ionosphere(),

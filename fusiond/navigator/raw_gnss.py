@@ -16,13 +16,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw.messages import SYSTEMS, Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
-from fusiond.aiding.pseudorange import NO_CLOCK, RANGE_BIAS, PseudorangeAid
+from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
+from fusiond.gnss.range_kernel import AID_ROWS, RATE_VARIANCE, TOTAL_VARIANCE
 from fusiond.gnss.ranges import Picked, RangeModel, RangeOptions, Rows
 from fusiond.gnss.selection import best_four
 from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
@@ -55,8 +56,7 @@ class Sky:
     seen: dict[str, Seen] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class _Corrected:
+class _Corrected(NamedTuple):
     """An epoch for a vehicle at about `guess` (ECEF, m), computed from `place` (rad, rad, m)."""
 
     place: tuple[float, float, float]
@@ -131,8 +131,6 @@ class RawGnss:
             section.systems, math.radians(section.elevation_mask_deg), section.cno_mask_db_hz
         )
         self._model = RangeModel(self._store, options)
-        clocks = [section.systems.index(s) if s in section.systems else NO_CLOCK for s in SYSTEMS]
-        self._clock = np.array(clocks, dtype=np.int64)
         self._guess: Array | None = None
         self._left_out: dict[str, str] = {}
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
@@ -169,20 +167,17 @@ class RawGnss:
         if self._section.best_four and (best := best_four(rows.line_of_sight)) is not None:
             chosen = {rows.satellites[k] for k in best[0]}
             rows = rows.without([s for s in rows.satellites if s not in chosen])
-        scale, variances = self._section.sigma_scale**2, (rows.total_variance, rows.rate_variance)
+        scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
         if scale != 1.0:
-            variances = rows.total_variance * scale, rows.rate_variance * scale
+            values = values.copy()
+            values[[TOTAL_VARIANCE, RATE_VARIANCE]] *= scale
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
             aid.gate,
             rows.satellites,
-            rows.position,
-            rows.velocity,
-            rows.pseudorange_m,
-            rows.rate_m_s,
-            *variances,
-            self._clock[rows.system],
+            values,
+            rows.clock,
             self._section.lever_arm_m,
             aid.epoch.clock_reset,
             robust=aid.robust,

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, NotApplicable, State
-from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
+from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid, epoch_values
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.blocks import clock_blocks
@@ -78,12 +78,14 @@ def _aid(nav: Array, clock: object = (0, 0, 1, 1, 0), off: float = 0.0) -> Pseud
         0,
         0.999,
         names,
-        s,
-        s_dot,
-        ranges + off,
-        rates + off,
-        np.arange(1.0, 6.0),
-        np.arange(1.0, 6.0) * 0.01,
+        epoch_values(
+            s,
+            s_dot,
+            ranges + off,
+            rates + off,
+            np.arange(1.0, 6.0),
+            np.arange(1.0, 6.0) * 0.01,
+        ),
         np.array(clock),
         LEVER,
     )
@@ -161,12 +163,14 @@ def test_what_is_not_measured_has_no_row() -> None:
         0,
         0.999,
         whole.satellites,
-        whole.position,
-        whole.velocity,
-        ranges,
-        rates,
-        whole.range_variance,
-        whole.rate_variance,
+        epoch_values(
+            whole.position,
+            whole.velocity,
+            ranges,
+            rates,
+            whole.range_variance,
+            whole.rate_variance,
+        ),
         whole.clock,
         LEVER,
     )

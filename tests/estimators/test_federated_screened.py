@@ -13,7 +13,7 @@ import pytest
 
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
-from fusiond.aiding.pseudorange import PseudorangeAid
+from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Estimator, Outcome
 from fusiond.estimators.federated.isolation import INNOVATION
@@ -106,9 +106,12 @@ def sky(range_error_m: float, set_at: int = 99) -> list[list[Linearised]]:
         ranges_m = up.range_m + (3000.0 if k >= set_at else 5.0) + 3.0 * rng.standard_normal(n)
         if k == BAD_AT:
             ranges_m[up.satellites.index(BAD)] += range_error_m
+        values = epoch_values(
+            *(up.position_ecef_m, up.velocity_ecef_m_s, ranges_m),
+            *(np.full(n, np.nan), np.full(n, 9.0), np.ones(n)),
+        )
         raw = PseudorangeAid(
-            *("raw", fix.t_ns, 1 - 1e-9, up.satellites, up.position_ecef_m, up.velocity_ecef_m_s),
-            *(ranges_m, np.full(n, np.nan), np.full(n, 9.0), np.ones(n)),
+            *("raw", fix.t_ns, 1 - 1e-9, up.satellites, values),
             *(np.zeros(n, dtype=np.int64), LEVER),
         )
         assert isinstance(fix, PositionAid)

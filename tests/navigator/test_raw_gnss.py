@@ -13,6 +13,7 @@ import pytest
 from drivers.measurements import MonotonicStamp, PositionFix
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, RawGnssEpoch
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.aiding.pseudorange import epoch_values
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config, Imu
 from fusiond.configuration.settings import imu_noise
@@ -189,7 +190,9 @@ def test_a_system_without_rates_has_no_figure() -> None:
     raw = informed()
     aid = raw.aid(receiver().epoch(0), 0).at(place(0))
     rates = np.where([s[0] == "G" for s in aid.satellites], np.nan, aid.rates)
-    silent = replace(aid, rates=rates)
+    variances = aid.range_variance, aid.rate_variance
+    values = epoch_values(aid.position, aid.velocity, aid.ranges, rates, *variances)
+    silent = replace(aid, values=values)
     rows = len(silent.labels)
     found = silent.series((1.0,) * rows, np.ones(rows, dtype=bool))
     assert set(found) == {"C"}

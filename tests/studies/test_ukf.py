@@ -14,7 +14,7 @@ import pytest
 
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S
 from fusiond.aiding.base import Innovation, State
-from fusiond.aiding.pseudorange import PseudorangeAid
+from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
 from fusiond.navigation.strapdown import STEP_RATE_B, STEP_SIZE
 from fusiond.studies import STUDIES
 from fusiond.studies.live_filter import LiveFilter, drive_samples, drive_truth
@@ -130,7 +130,10 @@ def test_a_clock_that_is_set_unannounced_is_found(name: str) -> None:
         assert isinstance(aid, PseudorangeAid)
         before = live.estimator.xi[slot]
         if k >= 10:
-            aid = replace(aid, ranges=aid.ranges + SPEED_OF_LIGHT_M_S * 1e-3)
+            jumped = aid.ranges + SPEED_OF_LIGHT_M_S * 1e-3
+            variances = aid.range_variance, aid.rate_variance
+            values = epoch_values(aid.position, aid.velocity, jumped, aid.rates, *variances)
+            aid = replace(aid, values=values)
         live.advance(k + 1.0, [aid])
         if k == 10:
             moved = live.estimator.xi[slot] - before

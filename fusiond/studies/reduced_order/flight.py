@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.bearing import BearingAid
-from fusiond.aiding.pseudorange import PseudorangeAid
+from fusiond.aiding.pseudorange import PseudorangeAid, epoch_values
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import ErrorStateFilter
@@ -210,12 +210,14 @@ def aids(scene: Scene, values: Array) -> Aids:
         scene.t_ns,
         GATE,
         scene.names,
-        scene.position,
-        scene.velocity,
-        values[:n],
-        values[n : 2 * n],
-        np.full(n, RANGE_SD_M**2),
-        np.full(n, RATE_SD_M_S**2),
+        epoch_values(
+            scene.position,
+            scene.velocity,
+            values[:n],
+            values[n : 2 * n],
+            np.full(n, RANGE_SD_M**2),
+            np.full(n, RATE_SD_M_S**2),
+        ),
         np.zeros(n, dtype=np.int64),
     )
     bearing = BearingAid(

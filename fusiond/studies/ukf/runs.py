@@ -28,7 +28,7 @@ from scipy.signal import lfilter
 
 from fusiond.aiding.base import Aid, NotApplicable
 from fusiond.aiding.height import HeightAid
-from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid
+from fusiond.aiding.pseudorange import NO_CLOCK, PseudorangeAid, epoch_values
 from fusiond.aiding.rdss_geometry import GEOSTATIONARY_RADIUS_M, LONGITUDES_DEG, RdssGeometry
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import DEG, imu_noise
@@ -235,12 +235,14 @@ def _pseudoranges(rng: np.random.Generator, number: int) -> tuple[list[list[Aid]
                     round(t * 1e9),
                     GATE,
                     tuple(names[i] for i in chosen),
-                    position[k, chosen],
-                    velocity[k, chosen],
-                    distance + offset[sample] + RANGE_SD_M * rng.standard_normal(n),
-                    along + drift[sample] + RATE_SD_M_S * rng.standard_normal(n),
-                    np.full(n, RANGE_SD_M**2),
-                    np.full(n, RATE_SD_M_S**2),
+                    epoch_values(
+                        position[k, chosen],
+                        velocity[k, chosen],
+                        distance + offset[sample] + RANGE_SD_M * rng.standard_normal(n),
+                        along + drift[sample] + RATE_SD_M_S * rng.standard_normal(n),
+                        np.full(n, RANGE_SD_M**2),
+                        np.full(n, RATE_SD_M_S**2),
+                    ),
                     np.zeros(n, dtype=np.int64),
                     LEVER,
                 )
@@ -269,12 +271,14 @@ def _double_star(rng: np.random.Generator) -> tuple[list[list[Aid]], float]:
                     t_ns,
                     GATE,
                     ("east", "west"),
-                    satellites,
-                    np.zeros((2, 3)),
-                    ranges,
-                    nothing,
-                    np.full(2, SLANT_SD_M**2),
-                    nothing,
+                    epoch_values(
+                        satellites,
+                        np.zeros((2, 3)),
+                        ranges,
+                        nothing,
+                        np.full(2, SLANT_SD_M**2),
+                        nothing,
+                    ),
                     np.full(2, NO_CLOCK),
                     LEVER,
                 ),
