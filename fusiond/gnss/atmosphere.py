@@ -47,8 +47,9 @@ RELATIVE_HUMIDITY = 0.7
 MAX_HEIGHT_M = 10_000.0
 LAYER_M = 375_000.0
 BEIDOU_RADIUS_M = 6_378_000.0
-MIN_ELEVATION_RAD = math.radians(2.0)
-"""Models are asked no lower than this: Niell fitted his functions down to 3 degrees."""
+MIN_SINE = math.sin(math.radians(2.0))
+"""Of the elevation that models are asked for at least: Niell fitted his functions down to 3
+degrees."""
 DAY_S = 86400.0
 YEAR_D = 365.25
 
@@ -116,24 +117,31 @@ def mapping_coefficients(lat_rad: float, height_m: float, gps_days: float, out: 
 
 
 @compiled("UniTuple(f8, 2)(f8, f8[::1])")
-def mapping(elevation_rad: float, q: Array) -> tuple[float, float]:
-    """Hydrostatic and wet mapping function at an elevation, from `mapping_coefficients`."""
-    sine = math.sin(max(elevation_rad, MIN_ELEVATION_RAD))
+def mapping(sine: float, q: Array) -> tuple[float, float]:
+    """Hydrostatic and wet mapping function by the sine of an elevation, from
+    `mapping_coefficients`."""
+    sine = max(sine, MIN_SINE)
     height_term = 1.0 / sine - _fraction(sine, _HEIGHT[0], _HEIGHT[1], _HEIGHT[2])
     dry = _fraction(sine, q[0], q[1], q[2]) + height_term * q[6]
     return dry, _fraction(sine, q[3], q[4], q[5])
 
 
-@compiled("f8(f8[::1], f8, f8, f8, f8, f8)")
+@compiled("f8(f8[::1], f8, f8, f8, f8, f8, f8)")
 def klobuchar_gps(
-    q: Array, tow_s: float, lat_rad: float, lon_rad: float, elevation_rad: float, azimuth_rad: float
+    q: Array,
+    tow_s: float,
+    lat_rad: float,
+    lon_rad: float,
+    elevation_rad: float,
+    cos_azimuth: float,
+    sin_azimuth: float,
 ) -> float:
     """Delay in m at GPS L1; `q` (8,) alpha, beta; GPS second of week; receiver's position."""
     e = max(elevation_rad, 0.0) / math.pi  # semicircles, as all angles of this model
     arc = 0.0137 / (e + 0.11) - 0.022
-    lat = lat_rad / math.pi + arc * math.cos(azimuth_rad)
+    lat = lat_rad / math.pi + arc * cos_azimuth
     lat = min(max(lat, -0.416), 0.416)
-    lon = lon_rad / math.pi + arc * math.sin(azimuth_rad) / math.cos(lat * math.pi)
+    lon = lon_rad / math.pi + arc * sin_azimuth / math.cos(lat * math.pi)
     lat += 0.064 * math.cos((lon - 1.617) * math.pi)
     local = (43200.0 * lon + tow_s) % DAY_S
     slant = 1.0 + 16.0 * (0.53 - e) ** 3
@@ -146,20 +154,26 @@ def klobuchar_gps(
     return SPEED_OF_LIGHT_M_S * slant * (5e-9 + day)
 
 
-@compiled("f8(f8[::1], f8, f8, f8, f8, f8)")
+@compiled("f8(f8[::1], f8, f8, f8, f8, f8, f8)")
 def klobuchar_beidou(
-    q: Array, tow_s: float, lat_rad: float, lon_rad: float, elevation_rad: float, azimuth_rad: float
+    q: Array,
+    tow_s: float,
+    lat_rad: float,
+    lon_rad: float,
+    sin_elevation: float,
+    cos_azimuth: float,
+    sin_azimuth: float,
 ) -> float:
     """Delay in m at B1I; `q` (8,) alpha, beta; BeiDou second of week; receiver's position."""
-    e = max(elevation_rad, 0.0)
-    se, ce = math.sin(e), math.cos(e)
+    se = max(sin_elevation, 0.0)
+    ce = math.sqrt(1.0 - se * se)
     # The angle at the layer; the arc to its point is pi/2 less this and the elevation.
     sine = BEIDOU_RADIUS_M / (BEIDOU_RADIUS_M + LAYER_M) * ce
     cosine = math.sqrt(1.0 - sine * sine)
     sin_arc, cos_arc = ce * cosine - se * sine, se * cosine + ce * sine
-    north = math.sin(lat_rad) * cos_arc + math.cos(lat_rad) * sin_arc * math.cos(azimuth_rad)
+    north = math.sin(lat_rad) * cos_arc + math.cos(lat_rad) * sin_arc * cos_azimuth
     lat = math.asin(north)
-    lon = lon_rad + math.asin(sin_arc * math.sin(azimuth_rad) / math.sqrt(1.0 - north * north))
+    lon = lon_rad + math.asin(sin_arc * sin_azimuth / math.sqrt(1.0 - north * north))
     local = (tow_s + 43200.0 * lon / math.pi) % DAY_S
     s = abs(lat) / math.pi
     amplitude = max(q[0] + s * (q[1] + s * (q[2] + s * q[3])), 0.0)
@@ -171,7 +185,7 @@ def klobuchar_beidou(
 
 
 @compiled("f8(f8)")
-def slant(elevation_rad: float) -> float:
+def slant(sine: float) -> float:
     """Mapping 1.001 / sqrt(0.002001 + sin^2 E) that the troposphere's sigma is stated with."""
-    s = math.sin(max(elevation_rad, 0.0))
+    s = max(sine, 0.0)
     return 1.001 / math.sqrt(0.002001 + s * s)

@@ -79,9 +79,9 @@ def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
 # Columns of the elements' array.
 _COLUMNS = 31
 (
-    _WEEK, _TOE, _TOC, _GM, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _COS_I0, _SIN_I0, _NODE,
-    _COS_PERIGEE, _SIN_PERIGEE, _M0, _DN, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC, _CIS,
-    _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK,
+    _WEEK, _TOE, _TOC, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _ROOT, _COS_I0, _SIN_I0, _NODE,
+    _COS_PERIGEE, _SIN_PERIGEE, _M0, _MOTION, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC,
+    _CIS, _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK,
 ) = range(_COLUMNS)  # fmt: skip
 
 
@@ -121,8 +121,7 @@ def satellite_states(
         sqrt_a = q[_SQRT_A]
         ecc = q[_E]
         axis = sqrt_a * sqrt_a
-        n = math.sqrt(q[_GM] / axis) / axis + q[_DN]
-        mean = q[_M0] + n * tk
+        mean = q[_M0] + q[_MOTION] * tk
         anomaly = mean + ecc * math.sin(mean)
         cos_e, sin_e = math.cos(anomaly), math.sin(anomaly)
         for _ in range(12):  # Newton: two steps at e = 0.02; one more is the last one squared
@@ -135,8 +134,7 @@ def satellite_states(
             if abs(change) < 1e-8:
                 break
         nearness = 1.0 - ecc * cos_e
-        anomaly_rate = n / nearness
-        root = math.sqrt(1.0 - ecc * ecc)
+        anomaly_rate, root = q[_MOTION] / nearness, q[_ROOT]
         sin_true, cos_true = root * sin_e / nearness, (cos_e - ecc) / nearness
         cos_phi = cos_true * q[_COS_PERIGEE] - sin_true * q[_SIN_PERIGEE]
         sin_phi = sin_true * q[_COS_PERIGEE] + cos_true * q[_SIN_PERIGEE]
@@ -187,11 +185,14 @@ def elements_row(ephemeris: Ephemeris) -> Array:
     _, toc = gps_time(e.system, e.week, e.toc_s)
     # toc lies in the week nearest to toe: the two differ by hours, unless the week turned between
     toc_week = week + round((toe - toc) / WEEK_S)
+    axis = e.sqrt_a * e.sqrt_a
+    motion = math.sqrt(constants.gm / axis) / axis + e.mean_motion_correction
     values = (
-        week, toe, toc, *constants, is_beidou_geo(e.system, e.prn), e.toe_s, e.sqrt_a,
-        e.eccentricity, math.cos(e.inclination), math.sin(e.inclination), e.ascending_node,
-        math.cos(e.perigee), math.sin(e.perigee), e.mean_anomaly,
-        e.mean_motion_correction, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
+        week, toe, toc, constants.earth_rate, constants.relativity,
+        is_beidou_geo(e.system, e.prn), e.toe_s, e.sqrt_a, e.eccentricity,
+        math.sqrt(1.0 - e.eccentricity * e.eccentricity), math.cos(e.inclination),
+        math.sin(e.inclination), e.ascending_node, math.cos(e.perigee), math.sin(e.perigee),
+        e.mean_anomaly, motion, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
         e.crs, e.cic, e.cis, e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
         math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week,
     )  # fmt: skip

@@ -52,11 +52,11 @@ NO_MODEL, GPS_MODEL, BEIDOU_MODEL = 0.0, 1.0, 2.0
 MEASURED_COLUMNS = 5
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = range(MEASURED_COLUMNS)
 # Results; the first ten are what an aid takes (fusiond.aiding.pseudorange).
-ROW_COLUMNS = 20
+ROW_COLUMNS = 21
 AID_ROWS = 10
 (
     X, Y, Z, VX, VY, VZ, CORRECTED, CORRECTED_RATE, TOTAL_VARIANCE, RATE_VARIANCE,
-    LX, LY, LZ, RANGE, ELEVATION, AZIMUTH, VARIANCE, TROPOSPHERE, IONOSPHERE, COMMON,
+    LX, LY, LZ, RANGE, ELEVATION, NORTH, EAST, VARIANCE, TROPOSPHERE, IONOSPHERE, COMMON,
 ) = range(ROW_COLUMNS)  # fmt: skip
 # Noise.
 NOISE_VALUES = 8
@@ -84,7 +84,7 @@ def range_rows(
     least_cno: float,
     out: Array,
 ) -> int:
-    """Write (20, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
+    """Write (21, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
     `elements` (n, 31), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
@@ -124,34 +124,36 @@ def range_rows(
         vy = c * states[k, 4] - s * states[k, 3]
         vz = states[k, 5]
         lx, ly, lz = dx / distance, dy / distance, dz / distance
-        elevation, azimuth = 0.5 * math.pi, 0.0
+        elevation, north, east, up = 0.5 * math.pi, 0.0, 0.0, 1.0
         tropo, iono = 0.0, 0.0
         iono_sigma = 0.0
         if on_earth:
             east = -sl * lx + cl * ly
             north = -sp * cl * lx - sp * sl * ly + cp * lz
             up = cp * cl * lx + cp * sl * ly + sp * lz
-            elevation = math.asin(min(max(up, -1.0), 1.0))
-            azimuth = math.atan2(east, north)
-            if azimuth < 0.0:
-                azimuth += 2.0 * math.pi
-            dry_map, wet_map = mapping(elevation, q)
+            up = min(max(up, -1.0), 1.0)
+            elevation = math.asin(up)
+            level = math.hypot(north, east)
+            cos_azimuth, sin_azimuth = (north / level, east / level) if level > 0.0 else (1.0, 0.0)
+            dry_map, wet_map = mapping(up, q)
             tropo = dry * dry_map + wet * wet_map
             model = signals[k, IONO_MODEL]
             if model == GPS_MODEL:
-                iono = klobuchar_gps(ionosphere[0], tow, lat, lon, elevation, azimuth)
+                iono = klobuchar_gps(
+                    ionosphere[0], tow, lat, lon, elevation, cos_azimuth, sin_azimuth
+                )
             elif model == BEIDOU_MODEL:
                 bdt = tow - BDT_BEHIND_GPS_S
-                iono = klobuchar_beidou(ionosphere[1], bdt, lat, lon, elevation, azimuth)
+                iono = klobuchar_beidou(ionosphere[1], bdt, lat, lon, up, cos_azimuth, sin_azimuth)
             iono *= signals[k, IONO_SCALE]
             iono_sigma = noise[IONO_SHARE] * iono
             if model == NO_MODEL:
-                iono_sigma = noise[IONO_UNMODELLED] * slant(elevation) * signals[k, IONO_SCALE]
+                iono_sigma = noise[IONO_UNMODELLED] * slant(up) * signals[k, IONO_SCALE]
         out[X, k], out[Y, k], out[Z, k] = x, y, z
         out[VX, k], out[VY, k], out[VZ, k] = vx, vy, vz
         out[LX, k], out[LY, k], out[LZ, k] = lx, ly, lz
         out[RANGE, k] = distance
-        out[ELEVATION, k], out[AZIMUTH, k] = elevation, azimuth
+        out[ELEVATION, k], out[NORTH, k], out[EAST, k] = elevation, north, east
         out[TROPOSPHERE, k], out[IONOSPHERE, k], out[COMMON, k] = tropo, iono, iono_sigma
         clock = SPEED_OF_LIGHT_M_S * states[k, 6] - signals[k, GROUP_DELAY_M]
         out[CORRECTED, k] = measured[k, PSEUDORANGE] + clock - tropo - iono
@@ -160,7 +162,7 @@ def range_rows(
         ) / SPEED_OF_LIGHT_M_S
         drift = SPEED_OF_LIGHT_M_S * states[k, 7]
         out[CORRECTED_RATE, k] = measured[k, RATE] * (1.0 + inertial) + drift
-        thin = slant(elevation)
+        thin = slant(up)
         code = noise[CODE_ZENITH] * thin
         cno = measured[k, CNO]
         refused += elevation < least_elevation or cno < least_cno

@@ -23,10 +23,9 @@ its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from itertools import chain, compress
-from operator import attrgetter
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -137,7 +136,7 @@ class Rows:
     `measured_at` (n,) into the epoch's signals; `variance` and `rate_variance` (n,) of what is
     independent, `ionosphere_sigma_m` (n,) of what is common, `total_variance` (n,) of both;
     `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
-    `values` (20, n) has all of them, as `range_kernel.range_rows` writes it.
+    `values` (21, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
@@ -155,13 +154,18 @@ class Rows:
     rate_m_s = _Of(rk.CORRECTED_RATE)
     range_m = _Of(rk.RANGE)
     elevation_rad = _Of(rk.ELEVATION)
-    azimuth_rad = _Of(rk.AZIMUTH)
     variance = _Of(rk.VARIANCE)
     rate_variance = _Of(rk.RATE_VARIANCE)
     troposphere_m = _Of(rk.TROPOSPHERE)
     ionosphere_m = _Of(rk.IONOSPHERE)
     ionosphere_sigma_m = _Of(rk.COMMON)
     total_variance = _Of(rk.TOTAL_VARIANCE)
+
+    @property
+    def azimuth_rad(self) -> Array:
+        """(n,), from north to east, 0 .. 2 pi."""
+        found: Array = np.arctan2(self.values[rk.EAST], self.values[rk.NORTH]) % (2.0 * np.pi)
+        return found
 
     def only(self, keep: npt.NDArray[np.bool_]) -> Rows:
         """Those marked in `keep` (n,)."""
@@ -207,12 +211,6 @@ class Picked(NamedTuple):
     measured: Array
 
 
-_KEY: Callable[[RawSignal], tuple[System, int, str]] = attrgetter("system", "prn", "signal")
-_MEASURED: Callable[[RawSignal], tuple[float, ...]] = attrgetter(
-    "pseudorange_m", "range_rate_m_s", "cno_db_hz", "sd_pseudorange_m", "sd_range_rate_m_s"
-)
-
-
 class RangeModel:
     """Turns epochs into rows with the ephemerides of a store."""
 
@@ -232,7 +230,7 @@ class RangeModel:
 
     def pick(self, epoch: RawGnssEpoch) -> Picked:
         """Choose the signals that serve."""
-        keys = list(map(_KEY, epoch.signals))
+        keys = [(s.system, s.prn, s.signal) for s in epoch.signals]
         now = epoch.week * WEEK_S + epoch.tow_s
         plan = self._plan
         if (
@@ -242,10 +240,12 @@ class RangeModel:
             or plan.keys != keys
         ):
             self._plan = plan = self._make_plan(epoch, keys, now)
-        serving = map(epoch.signals.__getitem__, plan.serving)
-        n, values = len(plan.serving), chain.from_iterable(map(_MEASURED, serving))
-        measured = np.fromiter(values, float, n * rk.MEASURED_COLUMNS)
-        measured = measured.reshape(n, rk.MEASURED_COLUMNS)
+        values: list[float | None] = []
+        for k in plan.serving:
+            s = epoch.signals[k]
+            values += (s.pseudorange_m, s.range_rate_m_s, s.cno_db_hz)
+            values += (s.sd_pseudorange_m, s.sd_range_rate_m_s)
+        measured = np.fromiter(values, float, len(values)).reshape(-1, rk.MEASURED_COLUMNS)
         return Picked(plan, epoch.week, epoch.tow_s, measured)
 
     def evaluate(self, picked: Picked, receiver: Array) -> Rows:

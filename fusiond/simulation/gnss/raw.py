@@ -269,9 +269,9 @@ class GnssRaw:
             satellite = self._true[i]
             system, e = satellite.system, float(elevation[i])
             hz = CARRIER_HZ[system, signal[0]]
-            m_dry, m_wet = mapping(e, niell)
+            m_dry, m_wet = mapping(math.sin(e), niell)
             ionosphere = (CARRIER_HZ["G", "1"] / hz) ** 2 * klobuchar_gps(
-                self._coefficients, tow_s, lat, lon, e, float(azimuth[i])
+                self._coefficients, tow_s, lat, lon, e, math.cos(azimuth[i]), math.sin(azimuth[i])
             )
             cno = 36.0 + 12.0 * math.sin(e)
             weaker = 10.0 ** ((45.0 - cno) / 20.0)
