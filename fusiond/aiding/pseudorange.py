@@ -60,9 +60,17 @@ _VALUES = 10
 _X, _VX, _RANGE, _RATE, _RANGE_VARIANCE, _RATE_VARIANCE = 0, 3, 6, 7, 8, 9
 
 
+@compiled("void(b1[::1], f8[::1])", forceinline=True)
+def _hold(active: NDArray[np.bool_], g: Array) -> None:
+    """Nothing is told of navigation errors that are not estimated: zero in the row `g` (n,)."""
+    for j in range(CORE_SIZE):
+        if not active[j]:
+            g[j] = 0.0
+
+
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], b1[::1], f8[:, ::1], i8[::1], i8[::1], i8[::1],"
-    "i8[::1], f8, f8, f8, f8[::1], f8[:, ::1])"
+    "i8[::1], f8, f8, f8, i8, f8[::1], f8[:, ::1])"
 )
 def _rows(
     nav: Array,
@@ -78,10 +86,12 @@ def _rows(
     l0: float,
     l1: float,
     l2: float,
+    rate_row: int,
     z: Array,
     h: Array,
 ) -> None:
-    """Write z (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates.
+    """Write z (m,) and H (m, n), zero before: rows of the finite ranges, then of the rates, of
+    which `rate_row` is the first.
 
     Slots of the clocks' offsets, of their drift and of the displacement; none where the model has
     no such state.
@@ -105,70 +115,73 @@ def _rows(
     x, y = radius_n * cl * co, radius_n * cl * so
     zed = (transverse * (1.0 - ECCENTRICITY_SQUARED) + height) * sl
 
-    row = 0
-    for kind in range(2):
-        for i in range(clock.shape[0]):
-            measured = values[_RANGE + kind, i]
-            if not math.isfinite(measured):
-                continue
-            # From the antenna to the satellite, north, east, down.
-            e0, e1, e2 = values[_X, i] - x, values[_X + 1, i] - y, values[_X + 2, i] - zed
-            m0 = -sl * co * e0 - sl * so * e1 + cl * e2 - a0
-            m1 = -so * e0 + co * e1 - a1
-            m2 = -cl * co * e0 - cl * so * e1 - sl * e2 - a2
-            distance = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
-            u0, u1, u2 = m0 / distance, m1 / distance, m2 / distance
-            g = h[row]
-            if kind == 0:
-                z[row] = distance - measured
-                g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
-                g[6], g[7], g[8] = -u0, -u1, -u2
-                if clock[i] >= 0:
-                    slot = offsets[clock[i]]
-                    z[row] += xi[slot]
-                    g[slot] = -1.0
-            else:
-                e0, e1, e2 = values[_VX, i], values[_VX + 1, i], values[_VX + 2, i]
-                q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
-                q1 = -so * e0 + co * e1 - v1
-                q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
-                along = u0 * q0 + u1 * q1 + u2 * q2
-                z[row] = along - measured
-                k0 = (along * u0 - q0) / distance
-                k1 = (along * u1 - q1) / distance
-                k2 = (along * u2 - q2) / distance
-                g[0] = b1 * u2 - b2 * u1 + k1 * a2 - k2 * a1
-                g[1] = b2 * u0 - b0 * u2 + k2 * a0 - k0 * a2
-                g[2] = b0 * u1 - b1 * u0 + k0 * a1 - k1 * a0
-                g[3], g[4], g[5] = -u0, -u1, -u2
-                # The axes turn by [dr_e, -dr_n R_N / R_M, -dr_e tan(lat)] / R_N.
-                p0, p1, p2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
-                g[6] = k0 + p1 / radius_m
-                g[7] = k1 + (p2 * sl / cl - p0) / radius_n
-                g[8] = k2
-                # C^T u x l, by axis.
-                n0 = c00 * u0 + c10 * u1 + c20 * u2
-                n1 = c01 * u0 + c11 * u1 + c21 * u2
-                n2 = c02 * u0 + c12 * u1 + c22 * u2
-                for slot in range(CORE_SIZE, column_of.shape[0]):
-                    axis = column_of[slot] - RATE_ERROR
-                    if axis == 0:
-                        g[slot] = n1 * l2 - n2 * l1
-                    elif axis == 1:
-                        g[slot] = n2 * l0 - n0 * l2
-                    elif axis == 2:
-                        g[slot] = n0 * l1 - n1 * l0
-                if clock[i] >= 0:
-                    z[row] += xi[drifts[0]]
-                    g[drifts[0]] = -1.0
-            for j in range(CORE_SIZE):
-                if not active[j]:
-                    g[j] = 0.0
-            if kind == 0:
-                for axis in range(displacement.shape[0]):
-                    g[displacement[axis]] = -g[6 + axis]
-                    z[row] += g[6 + axis] * xi[displacement[axis]]
-            row += 1
+    begin = end = CORE_SIZE
+    for slot in range(column_of.shape[0] - 1, CORE_SIZE - 1, -1):
+        if 0 <= column_of[slot] - RATE_ERROR < 3:
+            begin, end = slot, max(end, slot + 1)
+
+    range_row = 0
+    for i in range(clock.shape[0]):
+        # From the antenna to the satellite, north, east, down.
+        e0, e1, e2 = values[_X, i] - x, values[_X + 1, i] - y, values[_X + 2, i] - zed
+        m0 = -sl * co * e0 - sl * so * e1 + cl * e2 - a0
+        m1 = -so * e0 + co * e1 - a1
+        m2 = -cl * co * e0 - cl * so * e1 - sl * e2 - a2
+        distance = math.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+        u0, u1, u2 = m0 / distance, m1 / distance, m2 / distance
+        if math.isfinite(values[_RANGE, i]):
+            g = h[range_row]
+            innovation = distance - values[_RANGE, i]
+            g[0], g[1], g[2] = a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0
+            g[6], g[7], g[8] = -u0, -u1, -u2
+            if clock[i] >= 0:
+                slot = offsets[clock[i]]
+                innovation += xi[slot]
+                g[slot] = -1.0
+            _hold(active, g)
+            for axis in range(displacement.shape[0]):
+                g[displacement[axis]] = -g[6 + axis]
+                innovation += g[6 + axis] * xi[displacement[axis]]
+            z[range_row] = innovation
+            range_row += 1
+        if math.isfinite(values[_RATE, i]):
+            g = h[rate_row]
+            e0, e1, e2 = values[_VX, i], values[_VX + 1, i], values[_VX + 2, i]
+            q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
+            q1 = -so * e0 + co * e1 - v1
+            q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
+            along = u0 * q0 + u1 * q1 + u2 * q2
+            innovation = along - values[_RATE, i]
+            k0 = (along * u0 - q0) / distance
+            k1 = (along * u1 - q1) / distance
+            k2 = (along * u2 - q2) / distance
+            g[0] = b1 * u2 - b2 * u1 + k1 * a2 - k2 * a1
+            g[1] = b2 * u0 - b0 * u2 + k2 * a0 - k0 * a2
+            g[2] = b0 * u1 - b1 * u0 + k0 * a1 - k1 * a0
+            g[3], g[4], g[5] = -u0, -u1, -u2
+            # The axes turn by [dr_e, -dr_n R_N / R_M, -dr_e tan(lat)] / R_N.
+            p0, p1, p2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
+            g[6] = k0 + p1 / radius_m
+            g[7] = k1 + (p2 * sl / cl - p0) / radius_n
+            g[8] = k2
+            # C^T u x l, by axis.
+            n0 = c00 * u0 + c10 * u1 + c20 * u2
+            n1 = c01 * u0 + c11 * u1 + c21 * u2
+            n2 = c02 * u0 + c12 * u1 + c22 * u2
+            for slot in range(begin, end):
+                axis = column_of[slot] - RATE_ERROR
+                if axis == 0:
+                    g[slot] = n1 * l2 - n2 * l1
+                elif axis == 1:
+                    g[slot] = n2 * l0 - n0 * l2
+                elif axis == 2:
+                    g[slot] = n0 * l1 - n1 * l0
+            if clock[i] >= 0:
+                innovation += xi[drifts[0]]
+                g[drifts[0]] = -1.0
+            _hold(active, g)
+            z[rate_row] = innovation
+            rate_row += 1
 
 
 # What is wrong with the values of an epoch.
@@ -205,37 +218,37 @@ def _measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, i
     return finite, row - finite, clocks, wrong
 
 
-@compiled("void(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1], f8[:, ::1], i8[::1])")
+# What a clock's row of an epoch adds up to: sums and numbers of ranges and rates, first satellite.
+_SUMS, _NUMBERS, _FIRST, _SERIES_COLUMNS = 0, 2, 4, 5
+
+
+@compiled("void(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1])")
 def _by_clock(
-    values: Array,
-    clock: Indices,
-    kept: NDArray[np.bool_],
-    whitened: Array,
-    means: Array,
-    counts: Array,
-    first: Indices,
+    values: Array, clock: Indices, kept: NDArray[np.bool_], whitened: Array, out: Array
 ) -> None:
-    """Add up in `means` (k, 2), zero before, what is `whitened` and `kept` (m,) of the ranges and
-    of the rates that have each of k clocks, over the root of how many those are (`counts` (k, 2),
-    zero before). `first` (k,) satellite of each clock; NO_CLOCK where it has no range or no rate.
-    """
+    """Write to `out` (k, 5) of each of k clocks the sums of what is `whitened` and `kept` (m,) of
+    its ranges and of its rates, each over the root of its number, these numbers, and its first
+    satellite, NO_CLOCK where it has no range or no rate."""
+    for k in range(out.shape[0]):
+        for column in range(_FIRST):
+            out[k, column] = 0.0
+        out[k, _FIRST] = NO_CLOCK
     row = 0
     for kind in range(2):
         for i in range(clock.shape[0]):
             if not math.isfinite(values[_RANGE + kind, i]):
                 continue
             if kept[row] and clock[i] >= 0:
-                means[clock[i], kind] += whitened[row]
-                counts[clock[i], kind] += 1.0
+                out[clock[i], _SUMS + kind] += whitened[row]
+                out[clock[i], _NUMBERS + kind] += 1.0
             row += 1
-    first[:] = NO_CLOCK
     for i in range(clock.shape[0] - 1, -1, -1):
         k = clock[i]
-        if k >= 0 and counts[k, 0] > 0.0 and counts[k, 1] > 0.0:
-            first[k] = i
-    for k in range(first.shape[0]):
+        if k >= 0 and out[k, _NUMBERS] > 0.0 and out[k, _NUMBERS + 1] > 0.0:
+            out[k, _FIRST] = i
+    for k in range(out.shape[0]):
         for kind in range(2):
-            means[k, kind] /= math.sqrt(max(counts[k, kind], 1.0))
+            out[k, _SUMS + kind] /= math.sqrt(max(out[k, _NUMBERS + kind], 1.0))
 
 
 def epoch_values(
@@ -280,6 +293,7 @@ class PseudorangeAid(Aid):
     lever: Vector3 = (0.0, 0.0, 0.0)
     clock_reset: bool = False
     _r: Array = field(init=False, repr=False)
+    _ranges: int = field(init=False, repr=False)
     _clocks: int = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -291,6 +305,7 @@ class PseudorangeAid(Aid):
         if wrong != _SOUND:
             raise ValueError(_WRONG[wrong])
         object.__setattr__(self, "_r", r[: ranges + rates])
+        object.__setattr__(self, "_ranges", ranges)
         object.__setattr__(self, "_clocks", clocks)
 
     @property
@@ -354,12 +369,12 @@ class PseudorangeAid(Aid):
         White innovations give N(0, 1) whatever the number of satellites, so that epochs of any sky
         form one series. A system without a range or without a rate in the epoch has none.
         """
-        means, counts = np.zeros((2, self._clocks, 2))
-        first = np.empty(self._clocks, dtype=np.int64)
+        found = np.empty((self._clocks, _SERIES_COLUMNS))
         used, y = np.asarray(kept, dtype=bool), np.fromiter(whitened, float, len(whitened))
-        _by_clock(self.values, self.clock, used, y, means, counts, first)
-        order = sorted((at, k) for k, at in enumerate(first.tolist()) if at != NO_CLOCK)
-        return {self.satellites[at][0]: means[k] for at, k in order}
+        _by_clock(self.values, self.clock, used, y, found)
+        firsts = [(row[_FIRST], k) for k, row in enumerate(found.tolist())]
+        order = [(int(at), k) for at, k in sorted(firsts) if at != NO_CLOCK]
+        return {self.satellites[at][0]: found[k, :_NUMBERS] for at, k in order}
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model = state.model
@@ -383,6 +398,7 @@ class PseudorangeAid(Aid):
             drifts,
             displacement,
             *self.lever,
+            self._ranges,
             z,
             h,
         )
