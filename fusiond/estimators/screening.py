@@ -33,6 +33,193 @@ _DETERMINED = 1e-6
 FEWEST_JUMPING = 3
 
 
+@compiled("i8(f8[:, ::1], b1[:, ::1], i8[::1], i8[::1], i8[:, ::1], f8[:, ::1])")
+def _grouped(
+    h: Array, used: NDArray[np.bool_], begin: Codes, counts: Codes, columns: Codes, values: Array
+) -> int:
+    """Find groups of successive rows of h (m, n) that measure about the same states; how many.
+
+    Group k has the rows from `begin[k]` to `begin[k + 1]` and measures `counts[k]` states, whose
+    slots are `columns[k]` in their order; `values[p]` (m,) is what rows have for the p-th of their
+    group. `used` (m + 1, n) is work space. A row begins a group where more than a quarter of its
+    states are new.
+    """
+    m, n = h.shape
+    groups = 0
+    marks = used[0]
+    for i in range(n):
+        marks[i] = False
+    for a in range(m):
+        row = h[a]
+        own = new = 0
+        for i in range(n):
+            there = row[i] != 0.0
+            own += there
+            new += there & (not marks[i])
+        if a == 0 or 4 * new > own:
+            begin[groups] = a
+            marks = used[groups]
+            groups += 1
+            for i in range(n):
+                marks[i] = row[i] != 0.0
+        elif new > 0:
+            for i in range(n):
+                marks[i] |= row[i] != 0.0
+    begin[groups] = m
+    for k in range(groups):
+        count = 0
+        rows = h[begin[k] : begin[k + 1]]
+        for i in range(n):
+            if used[k, i]:
+                columns[k, count] = i
+                of_state = values[count, begin[k] : begin[k + 1]]
+                for a in range(of_state.shape[0]):
+                    of_state[a] = rows[a, i]
+                count += 1
+        counts[k] = count
+    return groups
+
+
+@compiled(
+    "void(f8[:, ::1], f8[::1], f8[::1], f8[::1], f8, i8, i8[::1], i8[::1], i8[:, ::1], f8[:, ::1],"
+    "f8[::1], f8[::1], f8[::1])"
+)
+def _residuals(
+    cov: Array,
+    dx: Array,
+    z: Array,
+    r: Array,
+    sign: float,
+    groups: int,
+    begin: Codes,
+    counts: Codes,
+    columns: Codes,
+    values: Array,
+    work: Array,
+    residual: Array,
+    variance: Array,
+) -> None:
+    """Write z - h dx and r + h P h^T, r - h P h^T with a `sign` of -1, of every row (m,)."""
+    for k in range(groups):
+        own, first, last = columns[k], begin[k], begin[k + 1]
+        v, s, t = residual[first:last], variance[first:last], work[first:last]
+        z_k, r_k = z[first:last], r[first:last]
+        for a in range(s.shape[0]):
+            v[a], s[a] = z_k[a], r_k[a]
+        for p in range(counts[k]):
+            i = own[p]
+            c = values[p, first:last]
+            for a in range(s.shape[0]):
+                v[a] -= c[a] * dx[i]
+                t[a] = 0.5 * c[a] * cov[i, i]
+            for q in range(p):
+                common, d = cov[i, own[q]], values[q, first:last]
+                for a in range(s.shape[0]):
+                    t[a] += d[a] * common
+            for a in range(s.shape[0]):
+                s[a] += sign * 2.0 * c[a] * t[a]
+
+
+@compiled("void(f8[:, ::1], i8, f8[:, ::1])", forceinline=True)
+def _take_off(cov: Array, i: int, g: Array) -> None:
+    """Take g^T g, of `g` (k, w), off row `i` of `cov`: by four rows in one pass, in their order."""
+    row, width, fours = cov[i], cov.shape[0], g.shape[0] // 4
+    for q in range(fours):
+        g0, g1, g2, g3 = g[4 * q], g[4 * q + 1], g[4 * q + 2], g[4 * q + 3]
+        c0, c1, c2, c3 = g0[i], g1[i], g2[i], g3[i]
+        for j in range(width):
+            row[j] = row[j] - c0 * g0[j] - c1 * g1[j] - c2 * g2[j] - c3 * g3[j]
+    for b in range(4 * fours, g.shape[0]):
+        g0, c0 = g[b], g[b, i]
+        for j in range(width):
+            row[j] -= c0 * g0[j]
+
+
+@compiled(
+    "f8(f8[::1], f8[::1], i8[::1], i8, i8[::1], i8[::1], i8[:, ::1], f8[:, ::1], f8[:, ::1],"
+    "i8[::1], f8[::1], f8[:, ::1], f8[::1])"
+)
+def _fold_in(
+    z: Array,
+    r: Array,
+    codes: Codes,
+    groups: int,
+    begin: Codes,
+    counts: Codes,
+    columns: Codes,
+    values: Array,
+    g: Array,
+    taken: Codes,
+    y: Array,
+    cov: Array,
+    dx: Array,
+) -> float:
+    """Fold the rows that are KEPT, one after another, into `cov` and `dx`, in place; y and what is
+    returned as of `screened_update`.
+
+    What a row takes off P goes to `g` (m + 1, w) behind a row of zeros; `taken` (n,) says how many
+    of these are off each row of P: those that the group does not measure wait until one measures
+    them, and the last one is taken off in the pass that reads P for the next.
+    """
+    n, width = dx.shape[0], cov.shape[0]
+    nis = 0.0
+    last = 0
+    for j in range(width):
+        g[0, j] = 0.0
+    for i in range(n):
+        taken[i] = 0
+    for k in range(groups):
+        own, count = columns[k], counts[k]
+        for p in range(count):
+            _take_off(cov, own[p], g[taken[own[p]] : last])
+        for a in range(begin[k], begin[k + 1]):
+            y[a] = 0.0
+            if codes[a] != KEPT:
+                continue
+            u, before = g[last + 1], g[last]
+            last += 1
+            innovation = z[a]
+            for p in range(count):
+                innovation -= values[p, a] * dx[own[p]]
+            for j in range(width):
+                u[j] = 0.0
+            for q in range(count // 2):
+                i0, i1 = own[2 * q], own[2 * q + 1]
+                c0, c1 = values[2 * q, a], values[2 * q + 1, a]
+                b0, b1, p0, p1 = before[i0], before[i1], cov[i0], cov[i1]
+                for j in range(width):
+                    x0, x1 = p0[j] - b0 * before[j], p1[j] - b1 * before[j]
+                    p0[j], p1[j] = x0, x1
+                    u[j] = u[j] + c0 * x0 + c1 * x1
+            if count % 2:
+                i0, c0 = own[count - 1], values[count - 1, a]
+                b0, p0 = before[i0], cov[i0]
+                for j in range(width):
+                    x0 = p0[j] - b0 * before[j]
+                    p0[j] = x0
+                    u[j] += c0 * x0
+            s, hk = r[a], 0.0
+            for p in range(count):
+                s += values[p, a] * u[own[p]]
+            for p in range(count):
+                hk += values[p, a] * (u[own[p]] / s)
+            y[a] = innovation / math.sqrt(s)
+            nis += y[a] * y[a]
+            gain = innovation / s
+            for i in range(n):
+                dx[i] += u[i] * gain
+            # Joseph form of one row, as in fusiond.estimators.update, with the gain u / s: what it
+            # takes away is (1 + ((1 - h k) s - r) / s) u u^T / s, a square of its root.
+            root = math.sqrt((1.0 + ((1.0 - hk) * s - r[a]) / s) / s)
+            for i in range(width):
+                u[i] *= root
+        for p in range(count):
+            taken[own[p]] = last
+    for i in range(n):
+        _take_off(cov, i, g[taken[i] : last + 1])
+    return nis
+
+
 @compiled(
     "f8(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, i8[::1], f8[::1], f8[:, ::1],"
     "f8[::1])",
@@ -59,73 +246,40 @@ def screened_update(
     """
     m, n = h.shape
     width = cov.shape[0]
-    columns, values = np.empty((m, n), dtype=np.int64), np.empty((m, n))
-    counts = np.zeros(m, dtype=np.int64)
+    begin, counts = np.empty(m + 1, dtype=np.int64), np.empty(m, dtype=np.int64)
+    columns, used = np.empty((m, n), dtype=np.int64), np.empty((m + 1, n), dtype=np.bool_)
+    values, g, taken = np.empty((n, m)), np.empty((m + 1, width)), np.empty(n, dtype=np.int64)
+    work, residual, variance = np.empty(m), np.empty(m), np.empty(m)
+    groups = _grouped(h, used, begin, counts, columns, values)
+    _residuals(
+        *(cov, dx, z, r, 1.0, groups, begin, counts, columns, values),
+        *(work, residual, variance),
+    )
     for a in range(m):
-        for i in range(n):
-            if h[a, i] != 0.0:
-                columns[a, counts[a]] = i
-                values[a, counts[a]] = h[a, i]
-                counts[a] += 1
-    for a in range(m):
-        innovation, s = z[a], r[a]
-        for p in range(counts[a]):
-            i, c = columns[a, p], values[a, p]
-            innovation -= c * dx[i]
-            half = 0.5 * c * cov[i, i]
-            for q in range(p):
-                half += values[a, q] * cov[i, columns[a, q]]
-            s += 2.0 * c * half
-        if codes[a] == KEPT and not innovation * innovation <= threshold * s:
+        if codes[a] == KEPT and not residual[a] * residual[a] <= threshold * variance[a]:
             codes[a] = GATED
-    u = np.empty(width)
     while True:
-        cov_out[:] = cov
-        dx_out[:] = dx
-        nis = 0.0
-        for a in range(m):
-            y[a] = 0.0
-            if codes[a] != KEPT:
-                continue
-            u[:] = 0.0
-            innovation = z[a]
-            for p in range(counts[a]):
-                i, c = columns[a, p], values[a, p]
-                innovation -= c * dx_out[i]
-                for j in range(width):
-                    u[j] += c * cov_out[i, j]
-            s, hk = r[a], 0.0
-            for p in range(counts[a]):
-                s += values[a, p] * u[columns[a, p]]
-            for p in range(counts[a]):
-                hk += values[a, p] * (u[columns[a, p]] / s)
-            y[a] = innovation / math.sqrt(s)
-            nis += y[a] * y[a]
-            gain = innovation / s
-            for i in range(n):
-                dx_out[i] += u[i] * gain
-            # Joseph form of one row, as in fusiond.estimators.update, with the gain u / s: what it
-            # takes away is (1 + ((1 - h k) s - r) / s) u u^T / s, a square of its root.
-            root = math.sqrt((1.0 + ((1.0 - hk) * s - r[a]) / s) / s)
-            for i in range(width):
-                u[i] *= root
-            for i in range(n):
-                for j in range(width):
-                    cov_out[i, j] -= u[i] * u[j]
+        for i in range(width):
+            for j in range(width):
+                cov_out[i, j] = cov[i, j]
+        for i in range(n):
+            dx_out[i] = dx[i]
+        nis = _fold_in(
+            *(z, r, codes, groups, begin, counts, columns, values),
+            *(g, taken, y, cov_out, dx_out),
+        )
+        _residuals(
+            *(cov_out, dx_out, z, r, -1.0, groups, begin, counts, columns, values),
+            *(work, residual, variance),
+        )
         worst, greatest = -1, threshold
         for a in range(m):
-            if codes[a] != KEPT:
-                continue
-            residual, variance = z[a], r[a]
-            for p in range(counts[a]):
-                i, c = columns[a, p], values[a, p]
-                residual -= c * dx_out[i]
-                half = 0.5 * c * cov_out[i, i]
-                for q in range(p):
-                    half += values[a, q] * cov_out[i, columns[a, q]]
-                variance -= 2.0 * c * half
-            if variance > _DETERMINED * r[a] and residual * residual > greatest * variance:
-                worst, greatest = a, residual * residual / variance
+            if (
+                codes[a] == KEPT
+                and variance[a] > _DETERMINED * r[a]
+                and residual[a] * residual[a] > greatest * variance[a]
+            ):
+                worst, greatest = a, residual[a] * residual[a] / variance[a]
         if worst < 0:
             return nis
         codes[worst] = RESIDUAL
