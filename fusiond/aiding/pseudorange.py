@@ -218,37 +218,39 @@ def _measured(values: Array, clock: Indices, r: Array) -> tuple[int, int, int, i
     return finite, row - finite, clocks, wrong
 
 
-# What a clock's row of an epoch adds up to: sums and numbers of ranges and rates, first satellite.
-_SUMS, _NUMBERS, _FIRST, _SERIES_COLUMNS = 0, 2, 4, 5
-
-
-@compiled("void(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1])")
+@compiled("i8(f8[:, ::1], i8[::1], b1[::1], f8[::1], f8[:, ::1], i8[::1])")
 def _by_clock(
-    values: Array, clock: Indices, kept: NDArray[np.bool_], whitened: Array, out: Array
-) -> None:
-    """Write to `out` (k, 5) of each of k clocks the sums of what is `whitened` and `kept` (m,) of
-    its ranges and of its rates, each over the root of its number, these numbers, and its first
-    satellite, NO_CLOCK where it has no range or no rate."""
-    for k in range(out.shape[0]):
-        for column in range(_FIRST):
-            out[k, column] = 0.0
-        out[k, _FIRST] = NO_CLOCK
-    row = 0
-    for kind in range(2):
-        for i in range(clock.shape[0]):
-            if not math.isfinite(values[_RANGE + kind, i]):
-                continue
-            if kept[row] and clock[i] >= 0:
-                out[clock[i], _SUMS + kind] += whitened[row]
-                out[clock[i], _NUMBERS + kind] += 1.0
-            row += 1
-    for i in range(clock.shape[0] - 1, -1, -1):
-        k = clock[i]
-        if k >= 0 and out[k, _NUMBERS] > 0.0 and out[k, _NUMBERS + 1] > 0.0:
-            out[k, _FIRST] = i
-    for k in range(out.shape[0]):
+    values: Array,
+    clock: Indices,
+    kept: NDArray[np.bool_],
+    whitened: Array,
+    sums: Array,
+    first: Indices,
+) -> int:
+    """Write to `sums` (k, 2), for each clock that has both, the sum of what is `whitened` and
+    `kept` (m,) of its ranges and that of its rates, each over the root of its number; to `first`
+    (k,) the clocks' first satellites, by which they are ordered. How many clocks that are."""
+    found = 0
+    for i in range(clock.shape[0]):
+        new = clock[i] >= 0
+        for k in range(i):
+            new &= clock[k] != clock[i]
+        if not new:
+            continue
+        row, whole = 0, True
         for kind in range(2):
-            out[k, _SUMS + kind] /= math.sqrt(max(out[k, _NUMBERS + kind], 1.0))
+            total, count = 0.0, 0
+            for k in range(clock.shape[0]):
+                if math.isfinite(values[_RANGE + kind, k]):
+                    if kept[row] and clock[k] == clock[i]:
+                        total += whitened[row]
+                        count += 1
+                    row += 1
+            sums[found, kind] = total / math.sqrt(max(count, 1))
+            whole &= count > 0
+        first[found] = i
+        found += whole
+    return found
 
 
 def epoch_values(
@@ -369,12 +371,11 @@ class PseudorangeAid(Aid):
         White innovations give N(0, 1) whatever the number of satellites, so that epochs of any sky
         form one series. A system without a range or without a rate in the epoch has none.
         """
-        found = np.empty((self._clocks, _SERIES_COLUMNS))
-        used, y = np.asarray(kept, dtype=bool), np.fromiter(whitened, float, len(whitened))
-        _by_clock(self.values, self.clock, used, y, found)
-        firsts = [(row[_FIRST], k) for k, row in enumerate(found.tolist())]
-        order = [(int(at), k) for at, k in sorted(firsts) if at != NO_CLOCK]
-        return {self.satellites[at][0]: found[k, :_NUMBERS] for at, k in order}
+        sums, first = np.empty((self._clocks, 2)), np.empty(self._clocks, dtype=np.int64)
+        y = np.fromiter(whitened, float, len(whitened))
+        found = _by_clock(self.values, self.clock, kept, y, sums, first)
+        firsts = first[:found].tolist()
+        return {self.satellites[at][0]: sums[k] for k, at in enumerate(firsts)}
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model = state.model
