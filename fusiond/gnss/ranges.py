@@ -23,6 +23,7 @@ its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import compress
@@ -191,6 +192,7 @@ class _Plan(NamedTuple):
     version: int
     gps_s: float
     serving: list[int]
+    doubles: struct.Struct
     measured_at: npt.NDArray[np.intp]
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
@@ -243,9 +245,18 @@ class RangeModel:
         values: list[float | None] = []
         for k in plan.serving:
             s = epoch.signals[k]
-            values += (s.pseudorange_m, s.range_rate_m_s, s.cno_db_hz)
-            values += (s.sd_pseudorange_m, s.sd_range_rate_m_s)
-        measured = np.fromiter(values, float, len(values)).reshape(-1, rk.MEASURED_COLUMNS)
+            values += (
+                s.pseudorange_m,
+                s.range_rate_m_s,
+                s.cno_db_hz,
+                s.sd_pseudorange_m,
+                s.sd_range_rate_m_s,
+            )
+        measured = np.empty((len(plan.serving), rk.MEASURED_COLUMNS))
+        try:
+            plan.doubles.pack_into(measured.data, 0, *values)  # half of what numpy takes
+        except struct.error:  # what a receiver does not say is None
+            measured[:] = np.array(values, float).reshape(measured.shape)
         return Picked(plan, epoch.week, epoch.tow_s, measured)
 
     def evaluate(self, picked: Picked, receiver: Array) -> Rows:
@@ -301,6 +312,7 @@ class RangeModel:
             self.store.version,
             now,
             serving,
+            struct.Struct(f"{len(serving) * rk.MEASURED_COLUMNS}d"),
             np.array(serving, np.intp),
             tuple(s.satellite for _, s, _ in chosen),
             tuple(s.signal for _, s, _ in chosen),
