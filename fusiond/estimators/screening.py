@@ -198,19 +198,19 @@ def _fold_in(
                     x0 = p0[j] - b0 * before[j]
                     p0[j] = x0
                     u[j] += c0 * x0
-            s, hk = r[a], 0.0
+            s, spread = r[a], 0.0
             for p in range(count):
-                s += values[p, a] * u[own[p]]
-            for p in range(count):
-                hk += values[p, a] * (u[own[p]] / s)
+                common = values[p, a] * u[own[p]]
+                s += common
+                spread += common
             y[a] = innovation / math.sqrt(s)
             nis += y[a] * y[a]
             gain = innovation / s
             for i in range(n):
                 dx[i] += u[i] * gain
-            # Joseph form of one row, as in fusiond.estimators.update, with the gain u / s: what it
-            # takes away is (1 + ((1 - h k) s - r) / s) u u^T / s, a square of its root.
-            root = math.sqrt((1.0 + ((1.0 - hk) * s - r[a]) / s) / s)
+            # Joseph form of one row with the gain u / s: what it takes away is
+            # (1 + (s - h u - r) / s) u u^T / s, a square of its root.
+            root = math.sqrt((1.0 + (s - spread - r[a]) / s) / s)
             for i in range(width):
                 u[i] *= root
         for p in range(count):
