@@ -253,19 +253,11 @@ def _by_clock(
     return found
 
 
-def epoch_values(
-    position: ArrayLike,
-    velocity: ArrayLike,
-    ranges: ArrayLike,
-    rates: ArrayLike,
-    range_variance: ArrayLike,
-    rate_variance: ArrayLike,
-) -> Array:
-    """The values of an epoch of n satellites as the aid takes them (10, n), from positions and
-    velocities (n, 3) and ranges, rates and their variances (n,); ValueError for other shapes."""
-    rows = (ranges, rates, range_variance, rate_variance)
+def epoch_values(position: ArrayLike, velocity: ArrayLike, *rows: ArrayLike) -> Array:
+    """The values of an epoch of n satellites as the aid takes them (10, n): positions, velocities
+    (n, 3), and as `rows` (n,) ranges, rates, and their variances. ValueError for other shapes."""
     parts = [np.asarray(part, float).T for part in (position, velocity, *rows)]
-    if any(part.shape[-1:] != parts[2].shape for part in parts):
+    if any(part.shape[-1:] != parts[-1].shape for part in parts):
         raise ValueError(f"shapes differ: {[part.T.shape for part in parts]}")
     return np.ascontiguousarray(np.vstack(parts))
 
