@@ -11,6 +11,7 @@ import pytest
 from drivers.measurements import MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.studies.faults.faulty_hours import (
     APART_S,
+    JUDGED_S,
     LASTS_S,
     SETTLED_S,
     Happening,
@@ -150,6 +151,7 @@ def test_quiet_is_what_is_far_from_the_fault_and_navigating(minutes: dict[str, A
     assert MINUTES_S - near_s - 60.0 < quiet_s < MINUTES_S - near_s - 10.0  # it aligns first
     for series in ("gnss", "gnss_velocity"):
         assert minutes["tests"][series] == pytest.approx(quiet_s, abs=2.0)
+        assert minutes["judged"][series] == pytest.approx(quiet_s - JUDGED_S, abs=2.0)
 
 
 def test_its_noise_is_that_of_the_hour_with_nothing_wrong(minutes: dict[str, Any]) -> None:
@@ -165,6 +167,8 @@ def test_its_noise_is_that_of_the_hour_with_nothing_wrong(minutes: dict[str, Any
 
 def test_the_tables_hold_both(minutes: dict[str, Any]) -> None:
     text = TABLES["faulty"]([minutes])
+    judged_h = minutes["judged"]["gnss"] / minutes["tests"]["gnss"] * minutes["hours"]
+    assert f"| town | {judged_h:.4g} | verdict of gnss | 0 |" in text
     assert "| fix_frozen | 1 | 1 of 1 |" in text
     assert f"| town | {minutes['hours']:.4g} | isolated | 0 | 0 |" in text
     assert "1 faults in 0.125 hours simulated; 0 ended the navigator." in text

@@ -8,8 +8,8 @@ have a drawn length (`LASTS_S`). Of two receivers one, the other or both are wro
 A fault answers for all that follows it until the next begins. It is noticed if an event or another
 mode than `navigating` comes within `SETTLED_S` of its end. Quiet is every second in mode
 `navigating` that is further from any fault: what is told then is a false alarm, and stands beside
-what is stated for so many tests (`hours.rates`). Verdicts judge a hundred innovations, of a
-receiver of one fix a second those of the last 100 s: they may still tell of the fault then.
+what is stated for so many tests (`hours.rates`). A verdict judges the last hundred innovations, and
+tells of the fault for `JUDGED_S` longer.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from fusiond.studies.faults.judge import (
     LIE_S,
     NAVIGATING,
     Course,
+    Event,
     Sample,
     judge,
     longest_lie_s,
@@ -53,6 +54,8 @@ LASTS_S = (20.0, 60.0)
 """Least and most of those that last to the end of the matrix's drive."""
 SETTLED_S = 60.0
 """What is told so long after a fault's end is of the fault."""
+JUDGED_S = 100.0
+"""A hundred fixes of one a second."""
 RECEIVERS = ("gnss", "second")
 NOTHING_WRONG = (*USUAL, "verdict_cannot_tell")
 
@@ -121,20 +124,22 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     course = navigate(config, recording, truth, watch)
     modes = [sample.mode for sample in course.samples]
 
-    def calm(t_s: float) -> bool:
-        return not any(h.begin_s <= t_s <= h.end_s + SETTLED_S for h in happened)
+    def calm(t_s: float, settled_s: float = SETTLED_S) -> bool:
+        return not any(h.begin_s <= t_s <= h.end_s + settled_s for h in happened)
 
-    def quiet(t_s: float) -> bool:
+    def quiet(t_s: float, settled_s: float = SETTLED_S) -> bool:
         """By the mode of the last whole second before."""
         row = math.ceil(t_s) - 2
-        return 0 <= row < len(modes) and modes[row] == NAVIGATING and calm(t_s)
+        return 0 <= row < len(modes) and modes[row] == NAVIGATING and calm(t_s, settled_s)
+
+    def alarms(event: Event) -> bool:
+        judged = SETTLED_S + JUDGED_S if event.code.startswith("verdict_") else SETTLED_S
+        return event.code not in USUAL and quiet(event.t_s, judged)
 
     aligned = course.samples[modes.index(NAVIGATING) if NAVIGATING in modes else len(modes) :]
     samples = [s if calm(s.t_s) else replace(s, mode="") for s in aligned]
     vouched = [s.ratios for s in samples if s.mode == NAVIGATING]
-    told = Counter(
-        named(e.code, e.text) for e in course.events if quiet(e.t_s) and e.code not in USUAL
-    )
+    told = Counter(named(e.code, e.text) for e in course.events if alarms(e))
     ends = [*(h.begin_s for h in happened[1:]), duration_s]
     return {
         "kind": name,
@@ -149,6 +154,9 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "told": dict(told),
         "doubts": sum(quiet(t_ns * 1e-9) for t_ns in doubts),
         "tests": tests_of(r for r in recording.received if quiet(r.seen_ns * 1e-9)),
+        "judged": tests_of(
+            r for r in recording.received if quiet(r.seen_ns * 1e-9, SETTLED_S + JUDGED_S)
+        ),
         "limits": kind.twice,
         "not_navigating_s": sum(s.mode not in ("", NAVIGATING) for s in samples),
         "beyond_s": beyond_s(vouched),

@@ -238,39 +238,45 @@ def tests_of(received: Iterable[Received]) -> dict[str, int]:
 
 def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """By kind and alarm: how often it was told, in 24 hours with the exact interval of a Poisson
-    count at 99 %, and what is stated for so many tests."""
+    count at 99 %, and what is stated for so many tests; a verdict's of those that it may tell of,
+    where a row has them as `judged`."""
     lines = []
     for name in dict.fromkeys(row["kind"] for row in found):
         rows = [row for row in found if row["kind"] == name]
-        hours = sum(row["hours"] for row in rows)
+        if not (hours := sum(row["hours"] for row in rows)):
+            continue
         told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
         tests: Counter[str] = sum((Counter(row["tests"]) for row in rows), Counter())
+        judged: Counter[str] = sum(
+            (Counter(row.get("judged", row["tests"])) for row in rows), Counter()
+        )
         n = sum(tests.values())
         alarms = {
-            "isolated": (_starting(told, "isolated"), 2.0 * FALSE_ALARM * n),
-            "doubt of the filter": (sum(row["doubts"] for row in rows), TILT * n),
+            "isolated": (_starting(told, "isolated"), 2.0 * FALSE_ALARM * n, hours),
+            "doubt of the filter": (sum(row["doubts"] for row in rows), TILT * n, hours),
             **{
                 f"verdict of {series}": (
                     sum(k for what, k in told.items() if _verdict_of(what) == series),
                     BEGUN * count,
+                    hours * count / tests[series],
                 )
-                for series, count in tests.items()
+                for series, count in judged.items()
             },
         }
         if rows[0]["limits"]:
             limit = Config().integrity.false_alarm_per_hour * hours
-            alarms["protection"] = _starting(told, "protection"), limit
+            alarms["protection"] = _starting(told, "protection"), limit, hours
         known = ("isolated", "verdict_", "protection")
         other = sum(k for what, k in told.items() if not what.startswith(known))
-        alarms["anything else"] = other, 0.0
-        for what, (times, stated) in alarms.items():
+        alarms["anything else"] = other, 0.0, hours
+        for what, (times, stated, heard) in alarms.items():
             low = chi2.ppf(0.5 - CONFIDENCE / 2, 2 * times) / 2 if times else 0.0
             high = chi2.ppf(0.5 + CONFIDENCE / 2, 2 * times + 2) / 2
-            a_day = 24.0 / hours
+            a_day = 24.0 / heard
             lines.append(
                 {
                     "kind": name,
-                    "hours": hours,
+                    "hours": heard,
                     "what": what,
                     "times": times,
                     "per_24_h": times * a_day,
