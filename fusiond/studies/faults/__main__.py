@@ -1,4 +1,5 @@
-"""Run the fault matrix or rows of it, how well faults are detected, or how often none is one."""
+"""Run the fault matrix or rows of it, how well faults are detected, how often none is one, or what
+becomes of those that happen now and then."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from fusiond.studies.faults.faulty_hours import faulty_hour_of
 from fusiond.studies.faults.hours import hour_of
 from fusiond.studies.faults.library import ALL, FAULTS
 from fusiond.studies.faults.more import EVERY
@@ -29,6 +31,7 @@ def main() -> int:
     parser.add_argument("--phase", choices=ALL, help="one phase")
     parser.add_argument("--power", type=int, metavar="RUNS", help="detection, so many runs a size")
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
+    parser.add_argument("--faulty", type=int, metavar="HOURS", help="hours with faults in them")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
     parser.add_argument("--recording", type=Path, metavar="P", help="tables or a CAN log, instead")
@@ -51,6 +54,9 @@ def main() -> int:
     elif asked.alarms is not None:
         kind = "alarms"
         found = _run(hour_of, range(asked.seed, asked.seed + asked.alarms), asked.workers)
+    elif asked.faulty is not None:
+        kind = "faulty"
+        found = _run(faulty_hour_of, range(asked.seed, asked.seed + asked.faulty), asked.workers)
     else:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
         if asked.only not in {None, *FAULTS}:

@@ -77,12 +77,12 @@ def null_island(r: Recording, begin_s: float, length_s: float) -> Recording:
 
 
 def frozen(r: Recording, begin_s: float, length_s: float) -> Recording:
-    """Position and velocity of the first fix of the window, at new instants."""
-    first: list[PositionFix] = []
+    """Position and velocity of each receiver's first fix of the window, at new instants."""
+    first: dict[str, PositionFix] = {}
 
     def repeat(fix: PositionFix, _: float) -> PositionFix:
-        first.append(fix)
-        return replace(first[0], t_seen_ns=fix.t_seen_ns, stamp=fix.stamp)
+        frozen = first.setdefault(fix.source, fix)
+        return replace(frozen, t_seen_ns=fix.t_seen_ns, stamp=fix.stamp)
 
     return _changed(r, begin_s, length_s, PositionFix, repeat)
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as File
 from typing import Any
@@ -39,13 +40,14 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import Leg, Path, follow
-from fusiond.studies.faults.judge import NAVIGATING, QUANTITIES, longest_lie_s
+from fusiond.studies.faults.judge import MOST_SIGMA, NAVIGATING, QUANTITIES, longest_lie_s
 from fusiond.studies.faults.library import with_wheels
 from fusiond.studies.faults.recording import (
     REST_S,
     TOWN_LEGS,
     WHEEL_EVERY_S,
     Drive,
+    Received,
     Recording,
     gnss_fixes,
 )
@@ -59,7 +61,10 @@ BEGUN = 0.015e-3
 """False verdicts begun an innovation with a window of 100 (docs/consistency.md)."""
 TILT = 1e-6
 CONFIDENCE = 0.99
-USUAL = ("aligned", "calibrated", "readmitted", "protection_restored", "verdict_consistent")
+USUAL = (
+    *("aligned", "calibrated", "readmitted", "protection_restored", "verdict_consistent"),
+    *("imu_sound", "imu_units_well"),
+)
 """Events that say nothing is wrong, or no more."""
 MOTORWAY_LEGS = (
     Leg(60),
@@ -178,7 +183,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     course = navigate(config, recording, truth, watch)
     since_s = next((s.t_s for s in course.samples if s.mode == NAVIGATING), duration_s)
     told = Counter(
-        _named(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
+        named(e.code, e.text) for e in course.events if e.t_s > since_s and e.code not in USUAL
     )
     after = [s for s in course.samples if s.t_s > since_s]
     vouched = [s.ratios for s in after if s.mode == NAVIGATING]
@@ -188,30 +193,39 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "hours": duration_s / 3600.0,
         "told": dict(told),
         "doubts": len(doubts),
-        "tests": _tests(recording),
+        "tests": tests_of(recording.received),
         "limits": kind.twice,
         "not_navigating_s": len(after) - len(vouched),
-        "beyond_s": {q: sum(not r[k] <= 5.0 for r in vouched) for k, q in enumerate(QUANTITIES)},
+        "beyond_s": beyond_s(vouched),
         "rms": np.sqrt(np.mean(np.square(vouched), axis=0)).round(3).tolist() if vouched else [],
         "longest_lie_s": longest_lie_s(course.samples),
-        "resident_mb": int(File("/proc/self/statm").read_text().split()[1])
-        * os.sysconf("SC_PAGESIZE")
-        / 1e6,
+        "resident_mb": resident_mb(),
         "crash": course.crash,
     }
 
 
-def _named(code: str, text: str) -> str:
+def beyond_s(vouched: Sequence[Sequence[float]]) -> dict[str, int]:
+    """Seconds beyond five sigma by quantity, of the ratios of each second."""
+    return {q: sum(not r[k] <= MOST_SIGMA for r in vouched) for k, q in enumerate(QUANTITIES)}
+
+
+def resident_mb() -> float:
+    """Of this process, MB of 10^6 bytes."""
+    pages = int(File("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def named(code: str, text: str) -> str:
     """An event with the source that it is about."""
     if code.startswith("verdict_"):
         return f"{code} {text.rpartition(' ')[2]}"
     return f"{code} {text.partition(' ')[0]}" if code == "isolated" else code
 
 
-def _tests(recording: Recording) -> dict[str, int]:
+def tests_of(received: Iterable[Received]) -> dict[str, int]:
     """Innovations by series; those of constraints are not counted."""
     found: Counter[str] = Counter()
-    for item in recording.received:
+    for item in received:
         m = item.measurement
         match m:
             case PositionFix():
@@ -224,39 +238,45 @@ def _tests(recording: Recording) -> dict[str, int]:
 
 def rates(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """By kind and alarm: how often it was told, in 24 hours with the exact interval of a Poisson
-    count at 99 %, and what is stated for so many tests."""
+    count at 99 %, and what is stated for so many tests; a verdict's of those that it may tell of,
+    where a row has them as `judged`."""
     lines = []
     for name in dict.fromkeys(row["kind"] for row in found):
         rows = [row for row in found if row["kind"] == name]
-        hours = sum(row["hours"] for row in rows)
+        if not (hours := sum(row["hours"] for row in rows)):
+            continue
         told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
         tests: Counter[str] = sum((Counter(row["tests"]) for row in rows), Counter())
+        judged: Counter[str] = sum(
+            (Counter(row.get("judged", row["tests"])) for row in rows), Counter()
+        )
         n = sum(tests.values())
         alarms = {
-            "isolated": (_starting(told, "isolated"), 2.0 * FALSE_ALARM * n),
-            "doubt of the filter": (sum(row["doubts"] for row in rows), TILT * n),
+            "isolated": (_starting(told, "isolated"), 2.0 * FALSE_ALARM * n, hours),
+            "doubt of the filter": (sum(row["doubts"] for row in rows), TILT * n, hours),
             **{
                 f"verdict of {series}": (
                     sum(k for what, k in told.items() if _verdict_of(what) == series),
                     BEGUN * count,
+                    hours * count / tests[series],
                 )
-                for series, count in tests.items()
+                for series, count in judged.items()
             },
         }
         if rows[0]["limits"]:
             limit = Config().integrity.false_alarm_per_hour * hours
-            alarms["protection"] = _starting(told, "protection"), limit
+            alarms["protection"] = _starting(told, "protection"), limit, hours
         known = ("isolated", "verdict_", "protection")
         other = sum(k for what, k in told.items() if not what.startswith(known))
-        alarms["anything else"] = other, 0.0
-        for what, (times, stated) in alarms.items():
+        alarms["anything else"] = other, 0.0, hours
+        for what, (times, stated, heard) in alarms.items():
             low = chi2.ppf(0.5 - CONFIDENCE / 2, 2 * times) / 2 if times else 0.0
             high = chi2.ppf(0.5 + CONFIDENCE / 2, 2 * times + 2) / 2
-            a_day = 24.0 / hours
+            a_day = 24.0 / heard
             lines.append(
                 {
                     "kind": name,
-                    "hours": hours,
+                    "hours": heard,
                     "what": what,
                     "times": times,
                     "per_24_h": times * a_day,

@@ -128,8 +128,8 @@ def powers(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "noticed": len(noticed),
                 "median_s": statistics.median(noticed) if noticed else None,
                 "slowest_s": max(noticed, default=None),
-                "largest_horizontal_m": _largest(rows, "largest_horizontal_m"),
-                "largest_ratio": _largest(rows, "largest_ratio"),
+                "largest_horizontal_m": largest(rows, "largest_horizontal_m"),
+                "largest_ratio": largest(rows, "largest_ratio"),
                 "lies": sum(row["longest_lie_s"] > LIE_S for row in rows),
                 "longest_lie_s": max(row["longest_lie_s"] for row in rows),
             }
@@ -137,7 +137,7 @@ def powers(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def _largest(rows: list[dict[str, Any]], key: str) -> float | None:
+def largest(rows: list[dict[str, Any]], key: str) -> float | None:
     """None where one of them is not finite."""
     values = [row[key] for row in rows]
     return None if any(value is None for value in values) else max(values)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from fusiond.studies.faults.faulty_hours import by_fault
 from fusiond.studies.faults.hours import rates
 from fusiond.studies.faults.power import powers
 
@@ -38,8 +39,20 @@ POWER = (
     "longest, s",
 )
 ALARMS = ("vehicle", "hours", "alarm", "times", "in 24 h", "99 % interval", "stated in 24 h")
-
-
+HAPPENED = (
+    "fault",
+    "times",
+    "noticed",
+    "after, s (median)",
+    "at most",
+    "recovered",
+    "after, s (median)",
+    "at most",
+    "largest error/sigma",
+    "beyond, s",
+    "lies",
+    "longest, s",
+)
 SLOW_S = 60.0
 """Nothing takes longer to recover from what is over."""
 
@@ -107,6 +120,48 @@ def power(found: Rows) -> str:
 
 def alarms(found: Rows) -> str:
     """A line a vehicle and alarm, and how long an error was beyond what the mode vouched for."""
+    hours = sum(row["hours"] for row in found)
+    other_s = sum(row["not_navigating_s"] for row in found)
+    return (
+        f"{_told(found)}\n\n{hours:.4g} hours simulated; of them {other_s:g} s in another "
+        f"mode than `navigating` after the start. {_beyond(found)}\n"
+    )
+
+
+def faulty(found: Rows) -> str:
+    """A line a fault, those of `alarms` of the quiet between faults, and the same of that."""
+    lines = [
+        (
+            row["fault"],
+            str(row["times"]),
+            f"{row['noticed']} of {row['begun']}",
+            _number(row["noticed_median_s"], "-"),
+            _number(row["noticed_slowest_s"], "-"),
+            f"{row['recovered']} of {row['begun']}",
+            _number(row["recovered_median_s"], "-"),
+            _number(row["recovered_slowest_s"], "-"),
+            _number(row["largest_ratio"], "inf"),
+            str(row["beyond_s"]),
+            str(row["lies"]),
+            _number(row["longest_lie_s"], "-"),
+        )
+        for row in by_fault(found)
+    ]
+    happened = [fault for row in found for fault in row["faults"]]
+    beyond_s = sum(fault["beyond_s"] for fault in happened)
+    crashes = sum(row["crash"] is not None for row in found)
+    hours = sum(row["simulated_hours"] for row in found)
+    quiet = sum(row["hours"] for row in found)
+    other_s = sum(row["not_navigating_s"] for row in found)
+    return (
+        f"{_table(HAPPENED, lines)}\n\n{len(happened)} faults in {hours:.4g} hours simulated; "
+        f"{crashes} ended the navigator. Beyond five sigma in mode `navigating`: {beyond_s} s.\n"
+        f"\n{_told(found)}\n\n{quiet:.4g} hours quiet, and {other_s:g} s as far from any fault in "
+        f"another mode than `navigating`. {_beyond(found)}\n"
+    )
+
+
+def _told(found: Rows) -> str:
     lines = [
         (
             row["kind"],
@@ -119,22 +174,21 @@ def alarms(found: Rows) -> str:
         )
         for row in rates(found)
     ]
-    hours = sum(row["hours"] for row in found)
+    return _table(ALARMS, lines)
+
+
+def _beyond(found: Rows) -> str:
     beyond: Counter[str] = sum((Counter(row["beyond_s"]) for row in found), Counter())
     counted = ", ".join(f"{q} {s} s" for q, s in beyond.items()) or "none"
     lie_s = max(row["longest_lie_s"] for row in found)
-    other_s = sum(row["not_navigating_s"] for row in found)
-    return (
-        f"{_table(ALARMS, lines)}\n\n{hours:.4g} hours simulated; of them {other_s:g} s in another "
-        f"mode than `navigating` after the start. Beyond five sigma in mode `navigating`: "
-        f"{counted}; at most {lie_s:g} s together.\n"
-    )
+    return f"Beyond five sigma in mode `navigating`: {counted}; at most {lie_s:g} s together."
 
 
 TABLES: Mapping[str, Callable[[Rows], str]] = {
     "matrix": matrix,
     "power": power,
     "alarms": alarms,
+    "faulty": faulty,
     "recorded": recorded,
 }
 

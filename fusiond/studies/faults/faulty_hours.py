@@ -1,0 +1,220 @@
+"""Hours in which a fault of the library happens now and then, and what is told while none does.
+
+The vehicles of `hours`, with the same noise for the same seed. Faults are those that alter a
+recording over a window and need no other drive or configuration; the seed draws which, and when:
+each begins `APART_S` after the last one began. Those that last to the end of the matrix's drive
+have a drawn length (`LASTS_S`). Of two receivers one, the other or both are wrong.
+
+A fault answers for all that follows it until the next begins. It is noticed if an event or another
+mode than `navigating` comes within `SETTLED_S` of its end. Quiet is every second in mode
+`navigating` that is further from any fault: what is told then is a false alarm, and stands beside
+what is stated for so many tests (`hours.rates`). A verdict judges the last hundred innovations, and
+tells of the fault for `JUDGED_S` longer.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults.hours import (
+    HOUR_S,
+    KINDS,
+    USUAL,
+    Kind,
+    beyond_s,
+    named,
+    resident_mb,
+    tests_of,
+)
+from fusiond.studies.faults.judge import (
+    LIE_S,
+    NAVIGATING,
+    Course,
+    Event,
+    Sample,
+    judge,
+    longest_lie_s,
+)
+from fusiond.studies.faults.library import TO_THE_END
+from fusiond.studies.faults.more import EVERY
+from fusiond.studies.faults.power import largest
+from fusiond.studies.faults.recording import Recording, town
+from fusiond.studies.faults.runs import navigate
+
+APART_S = (180.0, 480.0)
+"""Least and most between the begins of two faults, and before the first."""
+LASTS_S = (20.0, 60.0)
+"""Least and most of those that last to the end of the matrix's drive."""
+SETTLED_S = 60.0
+"""What is told so long after a fault's end is of the fault."""
+JUDGED_S = 100.0
+"""A hundred fixes of one a second."""
+RECEIVERS = ("gnss", "second")
+NOTHING_WRONG = (*USUAL, "verdict_cannot_tell")
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """A fault of the library from `begin_s` to `end_s`, of all receivers but one it may spare."""
+
+    fault: str
+    begin_s: float
+    end_s: float
+    spares: str | None = None
+
+    def put_into(self, whole: Recording) -> Recording:
+        """The recording with it."""
+        alter = EVERY[self.fault].alter
+        assert alter is not None
+        spared = [r for r in whole.received if r.measurement.source == self.spares]
+        others = [r for r in whole.received if r.measurement.source != self.spares]
+        part = replace(whole, received=tuple(others))
+        altered = alter(part, self.begin_s, self.end_s - self.begin_s)
+        return altered.with_received([*altered.received, *spared])
+
+
+def faults_of(kind: Kind) -> tuple[str, ...]:
+    """The names of those that can happen to a vehicle, at any time."""
+    return tuple(
+        name
+        for name, fault in EVERY.items()
+        if fault.alter is not None and fault.configure is None and fault.begin_s is None
+        if fault.drive.path is town and not fault.drive.spare
+        if kind.drive.wheels or not fault.drive.wheels
+    )
+
+
+def happenings(kind: Kind, seed: int, duration_s: float) -> list[Happening]:
+    """What happens; the last so long before the end as two are apart at least."""
+    rng = np.random.default_rng([seed, 3])
+    names, found = faults_of(kind), []
+    begin_s = 0.0
+    while (begin_s := round(begin_s + rng.uniform(*APART_S), 1)) <= duration_s - APART_S[0]:
+        name = names[rng.integers(len(names))]
+        fault, drawn_s = EVERY[name], round(rng.uniform(*LASTS_S))
+        spares = (None, *RECEIVERS)[rng.integers(3)]
+        length_s = drawn_s if fault.length_s == TO_THE_END else fault.length_s
+        of_two = kind.twice and not fault.of_imu
+        found.append(Happening(name, begin_s, begin_s + length_s, spares if of_two else None))
+    return found
+
+
+def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
+    """An hour of the kind that is the seed's turn: the figures of `judge` of each fault until the
+    next, and of the quiet what `hours.hour_of` has of an hour with nothing wrong."""
+    name = tuple(KINDS)[seed % len(KINDS)]
+    kind = KINDS[name]
+    config = kind.config()
+    truth, recording = kind.recorded(config, seed, duration_s)
+    happened = happenings(kind, seed, duration_s)
+    for happening in happened:
+        recording = happening.put_into(recording)
+    doubts: set[int] = set()
+
+    def watch(navigator: Navigator) -> None:
+        doubts.update(navigator.timeline.isolation.doubts)
+
+    course = navigate(config, recording, truth, watch)
+    modes = [sample.mode for sample in course.samples]
+
+    def calm(t_s: float, settled_s: float = SETTLED_S) -> bool:
+        return not any(h.begin_s <= t_s <= h.end_s + settled_s for h in happened)
+
+    def quiet(t_s: float, settled_s: float = SETTLED_S) -> bool:
+        """By the mode of the last whole second before."""
+        row = math.ceil(t_s) - 2
+        return 0 <= row < len(modes) and modes[row] == NAVIGATING and calm(t_s, settled_s)
+
+    def alarms(event: Event) -> bool:
+        judged = SETTLED_S + JUDGED_S if event.code.startswith("verdict_") else SETTLED_S
+        return event.code not in USUAL and quiet(event.t_s, judged)
+
+    aligned = course.samples[modes.index(NAVIGATING) if NAVIGATING in modes else len(modes) :]
+    samples = [s if calm(s.t_s) else replace(s, mode="") for s in aligned]
+    vouched = [s.ratios for s in samples if s.mode == NAVIGATING]
+    told = Counter(named(e.code, e.text) for e in course.events if alarms(e))
+    ends = [*(h.begin_s for h in happened[1:]), duration_s]
+    return {
+        "kind": name,
+        "seed": seed,
+        "simulated_hours": duration_s / 3600.0,
+        "faults": [
+            _figures(course, happening, until_s)
+            for happening, until_s in zip(happened, ends, strict=False)
+            if happening.begin_s < len(modes)
+        ],
+        "hours": len(vouched) / 3600.0,
+        "told": dict(told),
+        "doubts": sum(quiet(t_ns * 1e-9) for t_ns in doubts),
+        "tests": tests_of(r for r in recording.received if quiet(r.seen_ns * 1e-9)),
+        "judged": tests_of(
+            r for r in recording.received if quiet(r.seen_ns * 1e-9, SETTLED_S + JUDGED_S)
+        ),
+        "limits": kind.twice,
+        "not_navigating_s": sum(s.mode not in ("", NAVIGATING) for s in samples),
+        "beyond_s": beyond_s(vouched),
+        "longest_lie_s": longest_lie_s(samples),
+        "resident_mb": resident_mb(),
+        "crash": course.crash,
+    }
+
+
+def _figures(course: Course, h: Happening, until_s: float) -> dict[str, Any]:
+    """Of a fault, as if the course ended before the next: beside one in which nothing is told."""
+    before = [s.mode for s in course.samples if s.t_s < h.begin_s]
+    samples = [s for s in course.samples if h.begin_s <= s.t_s < until_s]
+    events = [
+        e for e in course.events if h.begin_s <= e.t_s < until_s and e.code not in NOTHING_WRONG
+    ]
+    usual = Course([Sample(s.t_s, NAVIGATING) for s in samples], ())
+    found = judge(Course(samples, events), usual, h.begin_s, h.end_s)
+    noticed_s = found.pop("noticed_s")
+    in_time = noticed_s is not None and h.begin_s + noticed_s <= h.end_s + SETTLED_S
+    return {
+        "fault": h.fault,
+        "spares": h.spares,
+        "begin_s": h.begin_s,
+        "end_s": h.end_s,
+        "mode": before[-1],
+        "noticed_s": noticed_s if in_time else None,
+        **{key: value for key, value in found.items() if key not in ("verdict", "crash")},
+    }
+
+
+def by_fault(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line a fault, of the hours of `faulty_hour_of`, in the library's order; noticed and
+    recovered from can be what begins while the mode is `navigating`."""
+    happened = [fault for row in found for fault in row["faults"]]
+    lines = []
+    for name in EVERY:
+        rows = [row for row in happened if row["fault"] == name]
+        if not rows:
+            continue
+        begun = [row for row in rows if row["mode"] == NAVIGATING]
+        noticed = [row["noticed_s"] for row in begun if row["noticed_s"] is not None]
+        recovered = [row["recovered_s"] for row in begun if row["recovered_s"] is not None]
+        lines.append(
+            {
+                "fault": name,
+                "times": len(rows),
+                "begun": len(begun),
+                "noticed": len(noticed),
+                "noticed_median_s": statistics.median(noticed) if noticed else None,
+                "noticed_slowest_s": max(noticed, default=None),
+                "recovered": len(recovered),
+                "recovered_median_s": statistics.median(recovered) if recovered else None,
+                "recovered_slowest_s": max(recovered, default=None),
+                "largest_ratio": largest(rows, "largest_ratio"),
+                "beyond_s": sum(row["beyond_s"] for row in rows),
+                "lies": sum(row["longest_lie_s"] > LIE_S for row in rows),
+                "longest_lie_s": max(row["longest_lie_s"] for row in rows),
+            }
+        )
+    return lines
