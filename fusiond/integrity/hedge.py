@@ -239,15 +239,21 @@ class Hedge:
             self._put(source + STRAYS, wider)
 
     def moved(
-        self, source: str, records: Mapping[str, Series], record: Series, covariance: Array | None
+        self,
+        source: str,
+        records: Mapping[str, Series],
+        record: Series,
+        nav: Array,
+        covariance: Array | None,
     ) -> Moved | None:
-        """A position was fused that may be off since it is believed again; P (n, n) of the filter.
-        What is left of that."""
+        """A position was fused that may be off since it is believed again; the state `nav` (10,)
+        and P (n, n) of the filter. What is left of that."""
         moved = record.moved
         if moved is None or moved.told(records.values()):
             wider = None
         else:
-            wider = moved.leaves_open(record.heard_ns)
+            speed = math.hypot(nav.item(VN), nav.item(VE))
+            wider = moved.leaves_open(record.heard_ns, speed)
             own = 0.0 if covariance is None else LEAST * covariance.diagonal()[DR : DR + 3]
             wider = wider if np.any(wider[:3] > own) else None
         self._put(source + MOVED, wider)
