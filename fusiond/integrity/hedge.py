@@ -28,6 +28,12 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
+A velocity that is refused, by chance one in ten thousand, is apart by u, and none was T before.
+Either it is wrong, or the unit has felt an acceleration that was none: until the next has told
+velocity, position and tilt are open by
+
+    u^2        (u T / 2)^2        (u / (g T))^2
+
 Where the filter has a state for a slip that lasts, the innovations say less of it than that state
 does (fusiond.integrity.slip): what is beyond the slips that the vehicle has shown is open as well.
 
@@ -237,6 +243,18 @@ class Hedge:
                 wider = _beyond_prior(state.xi, p, slots.tolist())
         if wider is not None or self.wider:
             self._put(source + STRAYS, wider)
+
+    def refused(self, source: str, by: tuple[float, float], since_s: float) -> None:
+        """A velocity was refused that is apart `by` (m/s) from the filter's, north and east, after
+        `since_s` in which nothing of it was."""
+        if since_s <= 0.0:
+            return
+        north, east = by[0] ** 2, by[1] ** 2
+        wider = np.zeros(9)
+        wider[3:5] = north, east
+        wider[:2] = wider[3:5] * (0.5 * since_s) ** 2
+        wider[6:8] = (north + east) / (STANDARD_GRAVITY_M_S2 * since_s) ** 2
+        self._put(source, wider)
 
     def moved(
         self,

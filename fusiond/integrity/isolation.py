@@ -251,6 +251,8 @@ class Isolation:
                 return NONE
             by = (0.0, 0.0) if velocity is None else parts_by(velocity, v_n, v_e)
             away = record.away_m if aid.locates else math.hypot(*by)
+            if record.moves and not aid.locates:
+                self.hedge.refused(aid.source, by, (t_ns - record.fused_ns) * 1e-9)
             action = self._refuse(record, t_ns, outcome.nis, away)
             if record.moves and action in MOTION:
                 record.parted = Parted(record.refused_ns, *by)
