@@ -28,6 +28,12 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
+A velocity that is refused, by chance one in ten thousand, is apart by u, and none was T before.
+Either it is wrong, or the unit has felt an acceleration that was none: until the next has told
+velocity, position and tilt are open by
+
+    u^2        (u T / 2)^2        (u / (g T))^2
+
 Where the filter has a state for a slip that lasts, the innovations say less of it than that state
 does (fusiond.integrity.slip): what is beyond the slips that the vehicle has shown is open as well.
 
@@ -238,16 +244,34 @@ class Hedge:
         if wider is not None or self.wider:
             self._put(source + STRAYS, wider)
 
+    def refused(self, source: str, by: tuple[float, float], since_s: float) -> None:
+        """A velocity was refused that is apart `by` (m/s) from the filter's, north and east, after
+        `since_s` in which nothing of it was."""
+        if since_s <= 0.0:
+            return
+        north, east = by[0] ** 2, by[1] ** 2
+        wider = np.zeros(9)
+        wider[3:5] = north, east
+        wider[:2] = wider[3:5] * (0.5 * since_s) ** 2
+        wider[6:8] = (north + east) / (STANDARD_GRAVITY_M_S2 * since_s) ** 2
+        self._put(source, wider)
+
     def moved(
-        self, source: str, records: Mapping[str, Series], record: Series, covariance: Array | None
+        self,
+        source: str,
+        records: Mapping[str, Series],
+        record: Series,
+        nav: Array,
+        covariance: Array | None,
     ) -> Moved | None:
-        """A position was fused that may be off since it is believed again; P (n, n) of the filter.
-        What is left of that."""
+        """A position was fused that may be off since it is believed again; the state `nav` (10,)
+        and P (n, n) of the filter. What is left of that."""
         moved = record.moved
         if moved is None or moved.told(records.values()):
             wider = None
         else:
-            wider = moved.leaves_open(record.heard_ns)
+            speed = math.hypot(nav.item(VN), nav.item(VE))
+            wider = moved.leaves_open(record.heard_ns, speed)
             own = 0.0 if covariance is None else LEAST * covariance.diagonal()[DR : DR + 3]
             wider = wider if np.any(wider[:3] > own) else None
         self._put(source + MOVED, wider)

@@ -53,11 +53,11 @@ from fusiond.integrity.action import MOTION, NONE, Action
 from fusiond.integrity.hedge import NOTHING, Hedge, differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.means import Means
-from fusiond.integrity.moved import Moved, back
+from fusiond.integrity.moved import Moved, Parted, back
 from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.returns import Begun
-from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
+from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, parts_by, said
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.navigation.strapdown import LAT, LON, VE, VN
@@ -75,6 +75,9 @@ FALSE_ALARM = 1e-6
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
 # its constraint is refused. A corner taken too fast is over by then.
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
+# A step of a velocity is known by its mean when that shows all of it or, of one that the gate just
+# lets pass, a third: so many times what it shows is in the middle.
+SHOWN_OF_STEP = 2.0
 # So many doubts of the filter are remembered.
 DOUBTS = 8
 
@@ -231,6 +234,8 @@ class Isolation:
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
             passed = _passed(aid, outcome) and not repeats
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
+            if record.parted is not None and not record.excluded:
+                self._followed(record, record.parted, t_ns)
             if offset is not None and not record.excluded and covariance is not None:
                 record.moved = back(record, t_ns, covariance)
             return NONE
@@ -244,8 +249,14 @@ class Isolation:
                 return NONE
             if _passed(aid, outcome):
                 return NONE
-            away = record.away_m if aid.locates else velocity_away(velocity, v_n, v_e)
-            return self._doubted(self._refuse(record, t_ns, outcome.nis, away), t_ns)
+            by = (0.0, 0.0) if velocity is None else parts_by(velocity, v_n, v_e)
+            away = record.away_m if aid.locates else math.hypot(*by)
+            if record.moves and not aid.locates:
+                self.hedge.refused(aid.source, by, (t_ns - record.fused_ns) * 1e-9)
+            action = self._refuse(record, t_ns, outcome.nis, away)
+            if record.moves and action in MOTION:
+                record.parted = Parted(record.refused_ns, *by)
+            return self._doubted(action, t_ns)
         begun, comes, self._comes = self._begun, self._comes, returns.NOTHING
         runs = offer is not None and returns.prove(
             self._records, record, offer, nav, state, begun, comes, self._pass
@@ -260,7 +271,12 @@ class Isolation:
         if record.means.tested(outcome.whitened, t_ns, self._pass):
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
-            return self._doubted(self._blame(record, aid), t_ns)
+            action = self._blame(record, aid)
+            if record.moves and action in MOTION and self.shown:
+                record.parted = Parted(t_ns, *(SHOWN_OF_STEP * by for by in self.shown[:2]))
+                if not record.excluded:
+                    self._followed(record, record.parted, t_ns)
+            return self._doubted(action, t_ns)
         told, white = False, proof is not None and aid.white
         if proof is not None and (white or aid.wanders):
             told = hedge.returns(aid.source, proof, covariance, white)
@@ -274,7 +290,7 @@ class Isolation:
         if hedge.wider:
             hedge.answered(self._records, record, t_ns)
         if record.moved is not None:
-            record.moved = hedge.moved(aid.source, self._records, record, covariance)
+            record.moved = hedge.moved(aid.source, self._records, record, nav, covariance)
         return NONE
 
     def comes(self, aid: Aid, state: State, covariance: Array) -> None:
@@ -390,6 +406,17 @@ class Isolation:
             record.excluded, record.fused_ns, record.back_ns = "", t_ns, t_ns
             record.refused, record.jumped, record.proof = 0, False, None
             record.means.restart()
+
+    def _followed(self, record: Series, parted: Parted, t_ns: int) -> None:
+        """A velocity that had parted from the filter is believed again, or still: what it may take
+        the position of its device along by is open."""
+        what, record.parted = parted.followed(record.device, t_ns), None
+        for name, other in self._records.items():
+            if other.locates and other.device == record.device:
+                if name in self._shared:
+                    self._shared.discard(name)
+                    self._records[name] = other = other.copied()
+                other.moved = what.joined(other.moved)
 
     def _blame(self, record: Series, aid: Aid) -> Action:
         """A bias inside the gate: the series', where something else supports the filter."""

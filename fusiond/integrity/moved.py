@@ -15,6 +15,17 @@ Of a first fix after an outage of T, which nothing has contradicted, it is what 
 (fusiond.integrity.returns). What ends it sooner is another device's position that could tell:
 `TELLS` times as fine as what is open, and within half of it.
 
+A velocity that had parted from the filter, and is believed again because the filter has followed
+the receiver, is no different: the filter was wrong, or position and velocity drift away together.
+With u what the two were apart then, and T the time until the operator is told that all is well,
+velocity and position are open by
+
+    u^2 T / (T + t)                 u^2 (T + t)^2 T / (T + t)
+
+and a vehicle's heading, which follows a velocity across, by the angle that u makes of its speed. A
+drift may go on for ever and take the position anywhere: what is left after 19 T is one case in
+twenty, and is left out.
+
 Source: Jeffreys, Theory of Probability, 3rd ed. (1961), section 3.1 (the prior of a scale); Gott,
 Nature 363 (1993), 315 (a duration of which no more is known than for how long it has lasted).
 """
@@ -22,7 +33,7 @@ Nature 363 (1993), 315 (a duration of which no more is known than for how long i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -38,6 +49,10 @@ Array = NDArray[np.float64]
 TELLS = 5.0
 # A hundredth of P's variance is half a percent of sigma.
 LEAST = 0.01
+# What goes on in fewer cases than one in twenty is not likely, as everywhere (means.LIKELY).
+UNLIKELY = 0.05
+# Once the motion was in doubt nothing is vouched for for so long (ns).
+VOUCHED_NS = 10_000_000_000
 
 
 class Witness(Protocol):
@@ -45,9 +60,13 @@ class Witness(Protocol):
 
     device: str
     locates: bool
+    moves: bool
     fused_ns: int
     sd_m: float
     away_m: float
+    sd_m_s: float
+    moved: Moved | None
+    parted: Parted | None
 
     @property
     def believed(self) -> bool: ...
@@ -66,18 +85,26 @@ class Returned(Protocol):
 
 class Moved(NamedTuple):
     """A `device` that is back since `since_ns` after `lasted_ns` without it, and what it may be off
-    by (m^2): north, east, down."""
+    by (m^2): north, east, down; and may go on to run away with (m^2/s^2): north, east."""
 
     device: str
     since_ns: int
     lasted_ns: int
     squares: tuple[float, float, float]
+    speeds: tuple[float, float] = (0.0, 0.0)
 
-    def leaves_open(self, t_ns: int) -> Array:
-        """Variances (9,) that what is published is wider by."""
-        share = self.lasted_ns / (self.lasted_ns + max(0, t_ns - self.since_ns))
+    def leaves_open(self, t_ns: int, speed: float = math.inf) -> Array:
+        """Variances (9,) that what is published is wider by, at that speed (m/s)."""
+        elapsed_ns = self.lasted_ns + max(0, t_ns - self.since_ns)
+        share = self.lasted_ns / elapsed_ns
         wider = np.zeros(9)
         wider[:3] = self.squares
+        if share >= UNLIKELY:
+            wider[3:5] = self.speeds
+            wider[:2] += wider[3:5] * (elapsed_ns * 1e-9) ** 2
+            runs = sum(self.speeds)
+            if runs:
+                wider[8] = runs / max(speed * speed, TELLS * TELLS * runs)
         wider *= share
         return wider
 
@@ -85,23 +112,48 @@ class Moved(NamedTuple):
         """With what was open of it `before` as well; it fades as the longer of both."""
         if before is None:
             return self
-        kept = np.array(self.squares) + before.leaves_open(self.since_ns)[:3]
-        north, east, down = kept.tolist()
+        opened = before.leaves_open(self.since_ns)
+        north, east, down = (np.array(self.squares) + opened[:3]).tolist()
+        runs_n, runs_e = np.maximum(self.speeds, opened[3:5]).tolist()
         lasted_ns = max(self.lasted_ns, before.lasted_ns)
-        return self._replace(lasted_ns=lasted_ns, squares=(north, east, down))
-
-    def told(self, positions: Iterable[Witness]) -> bool:
-        """Whether one of another device that was fused since has told that it is not off."""
-        apart = math.sqrt(self.squares[0] + self.squares[1])
-        return any(
-            r.locates
-            and r.device != self.device
-            and r.believed
-            and r.fused_ns > self.since_ns
-            and 0.0 < r.sd_m * TELLS <= apart
-            and r.away_m <= 0.5 * apart
-            for r in positions
+        return self._replace(
+            lasted_ns=lasted_ns, squares=(north, east, down), speeds=(runs_n, runs_e)
         )
+
+    def told(self, series: Collection[Witness]) -> bool:
+        """Whether one of another device that was fused since has told that it is not off. A device
+        that may be off itself does not tell: both may be carried off together."""
+        open_too = {self.device, *(r.device for r in series if r.moved or r.parted)}
+        fused = [
+            r
+            for r in series
+            if r.device not in open_too and r.believed and r.fused_ns > self.since_ns
+        ]
+        runs = math.sqrt(sum(self.speeds))
+        return any(
+            self._told_by(r) if r.locates else r.moves and 0.0 < r.sd_m_s * TELLS <= runs
+            for r in fused
+        )
+
+    def _told_by(self, position: Witness) -> bool:
+        way_s = (self.lasted_ns + max(0, position.fused_ns - self.since_ns)) * 1e-9
+        apart = math.sqrt(sum(self.squares[:2]) + sum(self.speeds) * way_s * way_s)
+        return 0.0 < position.sd_m * TELLS <= apart and position.away_m <= 0.5 * apart
+
+
+class Parted(NamedTuple):
+    """By how much (m/s), north and east, a velocity had parted from the filter from `since_ns` on,
+    when the motion was doubted for it."""
+
+    since_ns: int
+    north: float
+    east: float
+
+    def followed(self, device: str, t_ns: int) -> Moved:
+        """It is believed again, or still, at `t_ns`."""
+        lasted_ns = max(t_ns - self.since_ns, VOUCHED_NS)
+        speeds = self.north**2, self.east**2
+        return Moved(device, self.since_ns + lasted_ns, lasted_ns, (0.0, 0.0, 0.0), speeds)
 
 
 def left(device: str, t_ns: int, lasted_ns: int, away_m: float, before: Moved | None) -> Moved:

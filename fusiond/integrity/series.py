@@ -12,7 +12,7 @@ from operator import attrgetter
 
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.integrity.means import Means
-from fusiond.integrity.moved import Moved
+from fusiond.integrity.moved import Moved, Parted
 from fusiond.integrity.proof import (
     DRIFT_SD_M_S,
     NO_TREND,
@@ -84,6 +84,8 @@ class Series:
     is late."""
     moved: Moved | None = None
     """Of a position that is believed again, while it may be off still."""
+    parted: Parted | None = None
+    """Of a velocity that is left out, where the motion was doubted for it."""
     every_ns: int = 0
     """From the one before to the last that was heard."""
     slip: Slip = NO_SLIP
@@ -172,9 +174,7 @@ def said(offers: Sequence[Offer]) -> Said:
     return position, velocity, value
 
 
-def velocity_away(velocity: VelocityOffer | None, north: float, east: float) -> float:
-    """How far a measured velocity is from the filter's (m/s); a lever arm that turns is left to the
-    sigma. 0 where none was measured."""
-    if velocity is None:
-        return 0.0
-    return math.hypot(velocity.v_ned[0] - north, velocity.v_ned[1] - east)
+def parts_by(velocity: VelocityOffer, north: float, east: float) -> tuple[float, float]:
+    """What a measured velocity and the filter's differ by, north and east (m/s); a lever arm that
+    turns is left to the sigma."""
+    return velocity.v_ned[0] - north, velocity.v_ned[1] - east

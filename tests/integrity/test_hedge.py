@@ -334,3 +334,17 @@ def test_a_velocity_that_is_corrected_again_and_again_leaves_a_tilt_open() -> No
         if before is not None and after is not None:
             assert after[6] >= 0.9 * before[6]
     assert name not in made.isolation.hedge.wider
+
+
+def test_a_velocity_that_is_refused_opens_what_it_says_until_the_next() -> None:
+    """Half a metre a second within a second: an acceleration, or 3 deg of tilt, that was none."""
+    bench = Bench()
+    bench.covariance = np.diag([1e-4] * 9)
+    bench.both(range(60))
+    assert "gnss_velocity" not in bench.isolation.hedge.wider
+    bench.velocity(60, bias=12.0, east_m_s=3.5)
+    opened = bench.isolation.hedge.wider["gnss_velocity"]
+    tilt = (0.5 / 9.80665) ** 2
+    assert opened == pytest.approx([0.0, 0.0625, 0.0, 0.0, 0.25, 0.0, tilt, tilt, 0.0])
+    bench.velocity(61)
+    assert "gnss_velocity" not in bench.isolation.hedge.wider

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fusiond.integrity.hedge import MOVED
-from fusiond.integrity.moved import Moved, left
+from fusiond.integrity.moved import VOUCHED_NS, Moved, Parted, left
 from fusiond.integrity.returns import Begun, Coming, prove
 from fusiond.integrity.series import Series
 from fusiond.studies.faults import aid_faults as aid
@@ -59,6 +59,70 @@ def test_another_device_tells_if_it_can(
     other.fused_ns, other.sd_m, other.away_m = fused_ns, sd_m, away_m
     moved = Moved("gnss", 100 * S, OUT_NS, SQUARES)
     assert moved.told([other]) is tells
+
+
+RUNS = Moved("gnss", 10 * S, 10 * S, (0.0, 0.0, 0.0), (0.25, 0.0))
+"""A velocity that had parted by 0.5 m/s to the north, believed again after ten seconds."""
+
+
+def test_a_velocity_that_was_followed_may_run_away_with_the_position() -> None:
+    assert RUNS.leaves_open(10 * S, 20.0).tolist() == pytest.approx(
+        [25.0, 0.0, 0.0, 0.25, *(0.0,) * 4, 0.25 / 400.0]
+    )
+    assert RUNS.leaves_open(30 * S)[[0, 3]].tolist() == pytest.approx([75.0, 0.25 / 3.0])
+    # Slow, a heading is told by no less than five times the velocity that may be wrong.
+    assert RUNS.leaves_open(10 * S, 0.1)[8] == pytest.approx(1.0 / 25.0)
+    assert RUNS.leaves_open(199 * S)[0] == pytest.approx(0.25 * 199.0**2 * 10.0 / 199.0)
+    assert not RUNS.leaves_open(201 * S).any()  # one case in twenty and less
+
+
+def test_as_far_as_drifts_of_all_durations_have_gone() -> None:
+    """Drifts that had lasted for ten seconds at least, looked at when that was known: those that go
+    on are off by all of the way, the others are seen to come back."""
+    lasts = 10.0 / np.random.default_rng(6).random(100_000)
+    for t_s in (10.0, 60.0, 120.0):
+        off = np.where(lasts > 10.0 + t_s, 0.5 * (10.0 + t_s), 0.0)
+        opened = RUNS.leaves_open(round((10.0 + t_s) * S))[0]
+        assert opened == pytest.approx(np.mean(off**2), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("device", "sd_m_s", "tells"),
+    [("second", 0.1, True), ("gnss", 0.1, False), ("second", 0.2, False), ("wheel", 0.0, False)],
+)
+def test_another_devices_velocity_tells(device: str, sd_m_s: float, tells: bool) -> None:
+    """One as fine; a wheel's speed has none across, and no sigma of a velocity."""
+    other = Series(device, locates=False, moves=True, heard_ns=20 * S)
+    other.fused_ns, other.sd_m_s = 20 * S, sd_m_s
+    assert RUNS.told([other]) is tells
+
+
+def test_one_that_may_be_carried_off_as_well_does_not_tell() -> None:
+    other = Series("second", locates=False, moves=True, heard_ns=20 * S)
+    other.fused_ns, other.sd_m_s = 20 * S, 0.1
+    position = Series("second", locates=True, moves=False, heard_ns=20 * S)
+    assert RUNS.told([other, position])
+    position.moved = RUNS._replace(device="second")
+    assert not RUNS.told([other, position])
+    position.moved, other.parted = None, Parted(10 * S, 0.5, 0.0)
+    assert not RUNS.told([other, position])
+
+
+def test_a_coarse_position_tells_once_it_would_be_far_away() -> None:
+    other = Series("rdss", locates=True, moves=False, heard_ns=0)
+    other.sd_m, other.away_m = 10.0, 4.0
+    told = []
+    for t_s in (90, 110):  # it would be 45 and 55 m away
+        other.fused_ns = t_s * S
+        told.append(RUNS.told([other]))
+    assert told == [False, True]
+
+
+def test_what_ran_away_before_is_kept_where_it_had_got_to() -> None:
+    again = Parted(25 * S, 0.0, 0.4).followed("gnss", 30 * S).joined(RUNS)
+    assert again.since_ns == 25 * S + VOUCHED_NS
+    assert again.squares == pytest.approx((0.25 * 35.0 * 10.0, 0.0, 0.0))
+    assert again.speeds == pytest.approx((0.25 / 3.5, 0.16))
 
 
 def test_what_was_open_before_is_open_after_another_failure() -> None:
@@ -139,6 +203,39 @@ def test_without_a_fault_nothing_is_open() -> None:
     assert not any(name.endswith(MOVED) for name in bench.isolation.hedge.wider)
 
 
+def parted(north_m_s: float, seconds: range) -> Bench:
+    """A velocity that parts, is left out, and passes again while it is still off."""
+    bench = Bench()
+    bench.covariance = np.diag([1e-4] * 9)
+    bench.both(range(seconds.start))
+    for t in seconds:
+        bench.fix(t)
+        bench.velocity(t, bias=12.0 if t < seconds.start + 3 else 0.0, east_m_s=3.0 + north_m_s)
+    return bench
+
+
+def test_a_velocity_that_parted_leaves_its_device_open_once_it_is_believed_again() -> None:
+    bench = parted(0.5, range(60, 63))
+    assert bench.isolation.excluded == {"gnss_velocity": "disagrees"}
+    assert "gnss" + MOVED not in bench.isolation.hedge.wider
+    bench = parted(0.5, range(60, 75))
+    assert not bench.isolation.excluded
+    wider = bench.isolation.hedge.wider["gnss" + MOVED]
+    assert wider[:6] == pytest.approx([0.0, 0.25 * 14.0**2 / 1.4, 0.0, 0.0, 0.25 / 1.4, 0.0])
+    assert wider[8] == pytest.approx(0.25 / 1.4 / (8.0**2 + 3.0**2))
+
+
+def test_it_is_taken_back_by_a_rewind_to_before_its_return() -> None:
+    bench = parted(0.5, range(60, 64))
+    memory = bench.isolation.snapshot()
+    for t in range(64, 75):
+        bench.both(range(t, t + 1))
+    assert "gnss" + MOVED in bench.isolation.hedge.wider
+    bench.isolation.restore(memory)
+    bench.fix(64)
+    assert "gnss" + MOVED not in bench.isolation.hedge.wider
+
+
 def staying(alter: Alter, duration_s: float) -> dict[str, Any]:
     """The figures of a fault of the receiver that stays, in town."""
     drive = Drive(around_town, duration_s=duration_s)
@@ -168,5 +265,21 @@ def test_nor_is_one_that_begins_in_an_outage() -> None:
 
 def test_nor_is_one_of_the_height() -> None:
     found = staying(partial(aid.too_high, up_m=5.0), 140.0)
+    assert found["verdict"] == "degraded and said so", found
+    assert "readmitted" in {event["code"] for event in found["events"]}
+
+
+@pytest.mark.parametrize(
+    "alter",
+    [
+        aid.carried_off,
+        partial(aid.carried_off, north_m_s=2.0),
+        partial(aid.velocity_bias, north_m_s=0.5),
+    ],
+)
+def test_nor_is_one_that_carries_the_filter_off(alter: Alter) -> None:
+    """Position and velocity that drift away together, as of a receiver that is spoofed, and a
+    velocity alone: the velocity is left out, and follows once the motion was doubted."""
+    found = staying(alter, 130.0)
     assert found["verdict"] == "degraded and said so", found
     assert "readmitted" in {event["code"] for event in found["events"]}

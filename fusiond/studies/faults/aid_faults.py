@@ -105,8 +105,17 @@ def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIF
     )
 
 
+def carried_off(
+    r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIFT_M_S
+) -> Recording:
+    """Positions drift to the north and velocities go along, as a receiver's that is spoofed: what
+    is false agrees with itself."""
+    drifting = drift(r, begin_s, length_s, north_m_s)
+    return velocity_bias(drifting, begin_s, length_s, north_m_s)
+
+
 def velocity_bias(r: Recording, begin_s: float, length_s: float, north_m_s: float) -> Recording:
-    """Velocities too fast to the north, position honest."""
+    """Velocities too fast to the north, positions as they are."""
 
     def faster(fix: PositionFix, _: float) -> PositionFix:
         assert fix.v_ned_m_s is not None

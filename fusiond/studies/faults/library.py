@@ -161,6 +161,8 @@ FAULTS: dict[str, Fault] = {
     "step_10m_to_the_end": Fault(partial(aid.step, north_m=10.0), phases=UNDER_WAY),
     "step_500m_to_the_end": Fault(aid.step, phases=UNDER_WAY),
     "velocity_ramp_0.1_m_s2": Fault(aid.velocity_ramp, 60.0),
+    # In an outage a velocity is not known as well as that: nobody can tell.
+    "carried_off_0.5_m_s": Fault(aid.carried_off, 60.0, phases=("navigating",)),
     "fixes_late_0.8s": Fault(aid.late, phases=UNDER_WAY),
     "fixes_always_late_0.8s": _from_start(aid.late),
     "false_burst_1khz": Fault(aid.false_burst, 0.5),
