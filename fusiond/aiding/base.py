@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import Offer
+from fusiond.aiding.packed import Packed
 from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
@@ -184,6 +185,11 @@ class Aid:
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
         raise NotImplementedError
+
+    def packed(self, model: Model) -> Packed | None:
+        """What it is to a kernel that writes its innovation (fusiond.aiding.rows); None where there
+        is none for it, or where its innovation is not always all that it says."""
+        return None
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         """How it ended, for a receiver that keeps count of its rows (fusiond.estimators.screening);

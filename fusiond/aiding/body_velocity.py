@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import SpeedOffer
+from fusiond.aiding.packed import SPEED, Packed, slots_of
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -182,7 +183,7 @@ def _rows(
     "f8[::1], f8[::1], f8[:, ::1], f8[::1])",
     allocates=True,
 )
-def _speed(
+def speed_rows(
     nav: Array,
     step: Array,
     xi: Array,
@@ -298,8 +299,20 @@ class WheelSpeedAid(Aid):
         at = nav, step, xi, model.column_of, model.hold_height, *self.lever, slots
         rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
         rows = state.rows(1)
-        _speed(*at, speed, self.sd_m_s**2, *rounding, *rows)
+        speed_rows(*at, speed, self.sd_m_s**2, *rounding, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        if self.robust or not self.signed:
+            return None
+        kept = model.packed_slots
+        key = SPEED, self.drift, self.scale, self.latency, self.rounding
+        slots = kept.get(key)
+        if slots is None:
+            own = _slots(model, self.drift, self.scale, self.latency)
+            slots = kept[key] = slots_of(SPEED, 1, own, model.indices[self.rounding])
+        measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
+        return Packed(slots, np.array((*self.lever, *measured)))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
         return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)

@@ -233,7 +233,7 @@ class Hedge:
         wider = None
         if state is not None and (p := state.covariance) is not None:
             slots = state.model.indices[wander]
-            if _any_beyond_prior(state.xi, p, slots):
+            if any_beyond_prior(state.xi, p, slots):
                 wider = _beyond_prior(state.xi, p, slots.tolist())
         if wider is not None or self.wider:
             self._put(source + STRAYS, wider)
@@ -292,7 +292,7 @@ def _series_of(name: str) -> str:
 
 
 @compiled("b1(f8[::1], f8[:, :], i8[::1])")
-def _any_beyond_prior(xi: Array, covariance: Array, slots: Indices) -> bool:
+def any_beyond_prior(xi: Array, covariance: Array, slots: Indices) -> bool:
     """Whether `_beyond_prior` has anything: asked of every fix."""
     for slot in slots:
         shown = 1.0 - covariance[slot, slot]

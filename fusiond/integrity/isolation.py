@@ -40,26 +40,36 @@ Srinath, IEEE Trans. AC 32 (1987), 1133.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome, gate_threshold
+from fusiond.estimators.update import Plain
 from fusiond.integrity import returns, support
 from fusiond.integrity.action import MOTION, NONE, Action
-from fusiond.integrity.hedge import NOTHING, Hedge, differ
+from fusiond.integrity.hedge import differ
 from fusiond.integrity.jumps import jumps
-from fusiond.integrity.means import Means
-from fusiond.integrity.moved import Moved, back
+from fusiond.integrity.kept import Kept
+from fusiond.integrity.moved import back
+from fusiond.integrity.ordinary import (
+    BIAS,
+    STRAYS,
+    TILTED,
+    UNUSUAL,
+    Ordinary,
+    Taken,
+    may_be,
+    ordinary,
+    take,
+)
 from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
-from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting, remember, too_far
+from fusiond.models.model import Model
 from fusiond.navigation.strapdown import LAT, LON, VE, VN
 
 Array = NDArray[np.float64]
@@ -79,33 +89,18 @@ SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
 DOUBTS = 8
 
 
-class Memory(NamedTuple):
-    """All that a later restore needs."""
-
-    records: dict[str, Series]
-    doubts: tuple[int, ...]
-    tilting: Tilting
-    wider: Mapping[str, Array]
-
-
 def _passed(aid: Aid, outcome: Outcome) -> bool:
     """Whether an innovation has passed its gate, fused or only looked at."""
     return outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
 
 
-class Isolation:
+class Isolation(Kept):
     """Judges each aid once it has been looked at; a function of the aids in order alone."""
 
     def __init__(self, false_alarm: float = FALSE_ALARM) -> None:
-        self._records: dict[str, Series] = {}
-        self._shared: set[str] = set()
-        """Series whose record a checkpoint has too: copied before it is changed."""
-        self._doubts: tuple[int, ...] = ()
-        self._tilting = Tilting()
-        self.hedge = Hedge()
+        super().__init__()
         self.shown: tuple[float, ...] = ()
         """By how much (m, m/s) the series that was judged last was off, if it had a bias."""
-        self._begun, self._comes = Begun(), returns.NOTHING
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -159,32 +154,9 @@ class Isolation:
         """Whether a velocity that comes is not believed."""
         return support.velocity_left_out(self._records, t_ns)
 
-    @property
-    def doubts(self) -> tuple[int, ...]:
-        """Instants (ns) at which the filter was in doubt, the last `DOUBTS` of them."""
-        return self._doubts
-
-    def snapshot(self) -> Memory:
-        """A copy of everything."""
-        self._shared = set(self._records)
-        mine = self._records.copy(), self._doubts, self._tilting.copied(), self.hedge.wider
-        return Memory(*mine)
-
-    def restore(self, memory: Memory) -> None:
-        """Back to a snapshot."""
-        self._records, self._shared = memory.records.copy(), set(memory.records)
-        self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
-        self.hedge.wider = memory.wider
-
-    def reset(
-        self, contradicted: bool = False, failed: bool = False, moved: Moved | None = None
-    ) -> None:
-        """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
-        their velocities are to prove themselves, as after an outage; and where one before it has
-        `failed`, that they are on time, or is open what they have `moved` by."""
-        self._begun, self._comes = Begun(contradicted, failed, moved), returns.NOTHING
-        self._records, self._shared = {}, set()
-        self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
+    def ordinary(self, aid: Aid, model: Model, tilts: bool) -> Ordinary | None:
+        """What `take` wants of an aid for filters of a model; None where it is never ordinary."""
+        return ordinary(aid, model, tilts, self._pass)
 
     # ------------------------------------------------------------------ judgement
 
@@ -209,7 +181,8 @@ class Isolation:
         record.every_ns, record.heard_ns = t_ns - record.heard_ns, t_ns
         if record.every_ns > FORGET_NS:
             record.forget()
-        offer, velocity, value = says or said(aid.offers())
+        says = says or said(aid.offers())
+        offer, velocity, value = says
         offset, self.shown, repeats = None, (), False
         if offer is not None:
             if state is not None:
@@ -256,11 +229,25 @@ class Isolation:
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
         if record.no_slip and state is not None and aid.across_sd_m_s > 0.0:
             self.hedge.goes_across(aid, record, state)
-        hedge, proof = self.hedge, record.proof
-        if record.means.tested(outcome.whitened, t_ns, self._pass):
+        biased = record.means.tested(outcome.whitened, t_ns, self._pass)
+        return self._fused(aid, record, says, biased, nav, covariance, state)
+
+    def _fused(
+        self,
+        aid: Aid,
+        record: Series,
+        says: Said,
+        biased: bool,
+        nav: Array,
+        covariance: Array | None,
+        state: State | None,
+    ) -> Action:
+        """Of an aid that was fused: what its series leaves open, whose means may be `biased`."""
+        (offer, velocity, _), hedge, proof = says, self.hedge, record.proof
+        if biased:
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
-            return self._doubted(self._blame(record, aid), t_ns)
+            return self._doubted(self._blame(record, aid), aid.t_ns)
         told, white = False, proof is not None and aid.white
         if proof is not None and (white or aid.wanders):
             told = hedge.returns(aid.source, proof, covariance, white)
@@ -272,7 +259,7 @@ class Isolation:
         elif offer is not None:
             hedge.late(aid.source, record.punctual, covariance)
         if hedge.wider:
-            hedge.answered(self._records, record, t_ns)
+            hedge.answered(self._records, record, aid.t_ns)
         if record.moved is not None:
             record.moved = hedge.moved(aid.source, self._records, record, covariance)
         return NONE
@@ -304,19 +291,30 @@ class Isolation:
         tilting = self._tilting
         if not too_far(tilting.sums, t_ns, tilting.before, nav, covariance, turned):
             return NONE
+        return self._tilted(t_ns)
+
+    def _tilted(self, t_ns: int) -> Action:
         self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
-    def _own(self, aid: Aid, known: Series | None) -> Series:
-        """The series of an aid, which may be changed: none was known, or a checkpoint has it."""
-        if known is None:
-            record = Series(aid.device, aid.locates, aid.moves, aid.t_ns, aid.no_slip)
-            record.means = Means.begun(aid.white)
-        else:
-            self._shared.discard(aid.source)
-            record = known.copied()
-        self._records[aid.source] = record
-        return record
+    def take(
+        self, aid: Aid, one: Ordinary, filter_: Plain, state: State
+    ) -> tuple[Taken, Action] | None:
+        """Fold an aid into the `filter_` of that `state` and take in how it ended, what `update`
+        and all of the above do, if it is an ordinary one; else nothing has changed."""
+        t_ns, record = aid.t_ns, self._records.get(aid.source)
+        if record is None or not may_be(one, t_ns, record) or (one.tilts and self.unsettled(t_ns)):
+            return None
+        if aid.source in self._shared:
+            record = self._own(aid, record)
+        taken = take(one, t_ns, record, filter_, self._tilting)
+        if taken is None:
+            return None
+        self.shown, self._comes, action, shown = (), returns.NOTHING, NONE, taken.shown
+        if shown & (BIAS | UNUSUAL | STRAYS) or self.hedge.wider:
+            biased = shown & BIAS > 0
+            action = self._fused(aid, record, one.says, biased, state.nav, state.covariance, state)
+        return taken, self._tilted(t_ns) if shown & TILTED else action
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:

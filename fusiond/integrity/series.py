@@ -103,6 +103,11 @@ class Series:
             self.refused, self.jumped = 0, False
 
     @property
+    def quiet(self) -> bool:
+        """Whether it is believed, and nothing is open of it."""
+        return not (self.excluded or self.refused or self.proof or self.punctual or self.moved)
+
+    @property
     def drifted(self) -> bool:
         """While excluded: whether it was for a drift that may be as slow as any."""
         return self.excluded == DRIFTS and not self.ran
