@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.offers import Offer
 from fusiond.aiding.packed import Packed
 from fusiond.models.model import Model
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
@@ -38,6 +39,12 @@ def immutable(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
     """A dataclass with slots that is frozen for the type checker alone: at run time a frozen one
     costs four times as much to make, and each fix makes three aids of some ten fields."""
     return dataclass(slots=True, eq=eq)
+
+
+@compiled("f8(f8[::1])")
+def speed_of(nav: Array) -> float:
+    """Horizontal speed (m/s) of a state (10,)."""
+    return math.hypot(nav[VN], nav[VE])
 
 
 class Innovation(NamedTuple):
@@ -92,7 +99,7 @@ class State(NamedTuple):
     @property
     def speed(self) -> float:
         """Horizontal speed, m/s."""
-        return math.hypot(self.nav[VN], self.nav[VE])
+        return speed_of(self.nav)
 
 
 class NotApplicable(NamedTuple):

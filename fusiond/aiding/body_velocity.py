@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import SpeedOffer
-from fusiond.aiding.packed import SPEED, Packed, slots_of
+from fusiond.aiding.packed import NO_SLIP, SPEED, Packed, slots_of
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -216,6 +216,56 @@ def speed_rows(
             r[0] -= (step_m_s * initial[share]) ** 2
 
 
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8[::1],"
+    "f8[:, ::1], f8[::1])"
+)
+def no_slip_rows(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    sd: float,
+    sd_down: float,
+    z: Array,
+    h: Array,
+    r: Array,
+) -> None:
+    """Write z (m,), H (m, n) and r (m,) of no velocity to the right, and down."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, RIGHT, z, h)
+    r[0] = sd * sd
+    if r.shape[0] > 1:
+        r[1] = sd_down * sd_down
+
+
+@compiled("f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8[::1], f8[:, ::1])")
+def across_of(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    z: Array,
+    h: Array,
+) -> float:
+    """See `Aid.across`: the velocity. z (1,) and H (1, n) are used up."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, RIGHT, z, h)
+    c = dcm_elements(nav[Q0:])
+    # Backward, a heading that has turned goes across to the other side.
+    way = math.copysign(1.0, c[0] * nav[VN] + c[3] * nav[VN + 1] + c[6] * nav[VN + 2])
+    across: float = way * (z[0] + _estimate(xi, slot[DRIFT]))
+    return across
+
+
 def _body_velocity(
     state: State, lever: Vector3, first: int, count: int, slots: Indices
 ) -> Innovation:
@@ -245,23 +295,30 @@ class NonHolonomicAid(Aid):
         return self.sd_m_s
 
     def across(self, state: State) -> tuple[float, float]:
-        slots = _slots(state.model, SIDE_DRIFT)
-        z, _, _ = _body_velocity(state, self.lever, RIGHT, 1, slots)
-        # Backward, a heading that has turned goes across to the other side.
-        way = math.copysign(1.0, float(state.dcm[:, 0] @ state.nav[VN : VN + 3]))
-        drift = slots[DRIFT]
-        if drift < 0:
-            return way * float(z[0]), 0.0
-        return way * float(z[0] + state.xi[drift]), float(state.model.initial[drift])
+        model, slots = state.model, _slots(state.model, SIDE_DRIFT)
+        at = state.nav, state.step, state.xi, model.column_of, model.hold_height
+        z, h, _ = state.rows(1)
+        across, drift = across_of(*at, *self.lever, slots, z, h), slots[DRIFT]
+        return across, float(model.initial[drift]) if drift >= 0 else 0.0
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
-        count = 1 if state.model.hold_height else 2  # right, down
-        rows = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model, SIDE_DRIFT))
-        sds = (self.sd_m_s, self.sd_down_m_s)[:count]
-        rows.r[:] = [sd * sd for sd in sds]
+        model, slots = state.model, _slots(state.model, SIDE_DRIFT)
+        at = state.nav, state.step, state.xi, model.column_of, model.hold_height
+        rows = state.rows(1 if model.hold_height else 2)  # right, down
+        no_slip_rows(*at, *self.lever, slots, self.sd_m_s, self.sd_down_m_s, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        if self.robust:
+            return None
+        slots = model.packed_slots.get((NO_SLIP,))
+        if slots is None:
+            rows, own = 1 if model.hold_height else 2, _slots(model, SIDE_DRIFT)
+            slots = model.packed_slots[NO_SLIP,] = slots_of(NO_SLIP, rows, own)
+        holds = self.sd_m_s, self.sd_down_m_s, self.min_speed_m_s, self.across_sd_m_s**2
+        return Packed(slots, np.array((*self.lever, *holds)))
 
 
 @immutable()

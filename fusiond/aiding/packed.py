@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-POSITION, VELOCITY, SPEED = range(3)
+POSITION, VELOCITY, SPEED, NO_SLIP = range(4)
 """Kinds."""
 KIND, ROWS, COUNTS, LISTS = 0, 1, 2, 4
 """Where `Packed.slots` has the kind, the number of rows m, how many slots there are in each of the

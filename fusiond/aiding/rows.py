@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.body_velocity import speed_rows
-from fusiond.aiding.packed import COUNTS, KIND, POSITION, SLOTS, VELOCITY
+from fusiond.aiding.body_velocity import no_slip_rows, speed_rows
+from fusiond.aiding.packed import COUNTS, KIND, NO_SLIP, POSITION, SLOTS, VELOCITY
 from fusiond.aiding.position import position_rows
 from fusiond.aiding.velocity import velocity_rows
 from fusiond.navigation.compiled import compiled
@@ -89,6 +89,23 @@ def write_rows(
             x[7],
             x[8],
             x[9],
+            z,
+            h,
+            r,
+        )
+    elif slots[KIND] == NO_SLIP:
+        no_slip_rows(
+            nav,
+            step,
+            xi,
+            column_of,
+            hold_height,
+            x[0],
+            x[1],
+            x[2],
+            first,
+            x[3],
+            x[4],
             z,
             h,
             r,

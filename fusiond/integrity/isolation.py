@@ -54,6 +54,7 @@ from fusiond.integrity.jumps import jumps
 from fusiond.integrity.kept import Kept
 from fusiond.integrity.moved import back
 from fusiond.integrity.ordinary import (
+    ACROSS,
     BIAS,
     STRAYS,
     TILTED,
@@ -311,6 +312,8 @@ class Isolation(Kept):
         if taken is None:
             return None
         self.shown, self._comes, action, shown = (), returns.NOTHING, NONE, taken.shown
+        if record.no_slip and (shown & ACROSS or self.hedge.wider):
+            self.hedge.went_across(aid, record, state)
         if shown & (BIAS | UNUSUAL | STRAYS) or self.hedge.wider:
             biased = shown & BIAS > 0
             action = self._fused(aid, record, one.says, biased, state.nav, state.covariance, state)

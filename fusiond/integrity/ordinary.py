@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import LENT_ROWS, Aid
-from fusiond.aiding.packed import COUNTS, KIND, POSITION, ROWS, SLOTS, VELOCITY
+from fusiond.aiding.base import LENT_ROWS, Aid, speed_of
+from fusiond.aiding.body_velocity import DRIFT, PITCH, YAW, across_of
+from fusiond.aiding.packed import COUNTS, KIND, NO_SLIP, POSITION, ROWS, SLOTS, VELOCITY
 from fusiond.aiding.rows import write_rows
 from fusiond.estimators.base import THRESHOLDS, Outcome
 from fusiond.estimators.tilt_axes import (
@@ -24,11 +25,12 @@ from fusiond.estimators.tilt_axes import (
     remember_estimate,
 )
 from fusiond.estimators.update import Plain, fuse
-from fusiond.integrity.hedge import any_beyond_prior
+from fusiond.integrity.hedge import any_beyond_prior, beyond_chance
 from fusiond.integrity.means import BIASED, UNLIKELY, lasting_of, take_few
 from fusiond.integrity.proof import residual_of
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import Said, Series, said
+from fusiond.integrity.slip import Slip, take_slip
 from fusiond.integrity.support import FINE_M, FORGET_NS, OTHERS_NS
 from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.models.model import Model
@@ -42,15 +44,16 @@ WHITENED = [slice(2 * LENT_ROWS, 2 * LENT_ROWS + m) for m in range(LENT_ROWS + 1
 """Where `Plain.room` has y, by the number of rows."""
 OTHERWISE = -1
 """Not taken in: nothing has changed."""
-BIAS, UNUSUAL, STRAYS, TILTED, ASSUMED = 1, 2, 4, 8, 16
-"""What taking in has shown, added up: a mean is beyond chance, or not likely; what fixes share is
-beyond chance; so are the corrections of the tilt; the sigma that counted is assumed."""
+BIAS, UNUSUAL, STRAYS, ACROSS, TILTED, SITS, ASSUMED = 1, 2, 4, 8, 16, 32, 64
+"""What taking in has shown, added up: a mean is beyond chance, or not likely; beyond chance is what
+fixes share, what goes across of a vehicle that does not slip, what the tilt was corrected by, where
+the unit sits; the sigma that counted is assumed."""
 
 
 @compiled(
     "Tuple((i8, f8, f8, f8))(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], f8[::1], b1,"
     "i8[:, ::1], i8[::1], i8[::1], i8[::1], f8[::1], i8[::1], f8[::1], i8, i8, f8, b1, f8[::1], f8,"
-    "f8[::1], f8[::1])"
+    "f8[::1], f8[::1], f8[::1])"
 )
 def _take(
     nav: Array,
@@ -74,12 +77,15 @@ def _take(
     tilts: bool,
     means: Array,
     limit: float,
+    slip: Array,
     sums: Array,
     before: Array,
 ) -> tuple[int, float, float, float]:
     """Take an aid in at `t_ns`, `every_ns` after the one before it of its series. What it has
     shown, or `OTHERWISE`; the NIS; how far the filter is from a position, north and east (m).
     `room` has the whitened innovation then."""
+    if slots[KIND] == NO_SLIP and speed_of(nav) < numbers[5]:
+        return OTHERWISE, 0.0, 0.0, 0.0
     m, n, width = slots[ROWS], dx.shape[0], cov.shape[0]
     p = cov[:n, :n]
     z, r, y = room[:m], room[LENT_ROWS : LENT_ROWS + m], room[2 * LENT_ROWS : 2 * LENT_ROWS + m]
@@ -110,6 +116,29 @@ def _take(
         north, east = residual_of(nav, xi, slots[a:b], slots[b:c], x[0], x[1], x[3], x[4], x[5])
         if any_beyond_prior(xi, p, slots[c:]):
             shown |= STRAYS
+    elif slots[KIND] == NO_SLIP and numbers[6] > 0.0:
+        x, of = numbers, slots[SLOTS : SLOTS + slots[COUNTS]]
+        row = room[at : at + n].reshape((1, n))
+        across = across_of(
+            nav,
+            step,
+            xi,
+            column_of,
+            hold_height,
+            x[0],
+            x[1],
+            x[2],
+            of,
+            z[:1],
+            row,
+        )
+        drift_sd = initial[of[DRIFT]] if of[DRIFT] >= 0 else 0.0
+        if take_slip(slip, t_ns, across, drift_sd, speed_of(nav), x[6]) > 0.0:
+            shown |= ACROSS
+        if of[PITCH] >= 0:
+            sd = max(initial[of[PITCH]], initial[of[YAW]])
+            if beyond_chance(xi[of[PITCH]], sd) + beyond_chance(xi[of[YAW]], sd) > 0.0:
+                shown |= SITS
     found = take_few(means, t_ns, limit, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0)
     if found == BIASED:
         shown |= BIAS
@@ -177,6 +206,9 @@ def take(
     if (packed := means.ready(one.degrees)) is None:
         return None
     position, velocity, value = one.says
+    slip = record.slip.packed
+    if record.no_slip:
+        slip = slip.copy()
     shown, nis, north, east = _take(
         *filter_,
         one.slots,
@@ -187,6 +219,7 @@ def take(
         one.tilts,
         packed,
         one.limit,
+        slip,
         tilting.sums,
         tilting.before,
     )
@@ -194,6 +227,8 @@ def take(
         return None
     record.every_ns, record.heard_ns, record.fused_ns = every_ns, t_ns, t_ns
     means.unlikely = shown & UNUSUAL > 0
+    if record.no_slip:
+        record.slip = Slip(slip)
     if position is not None:
         record.sd_m, record.away_m = max(position.sd[:2]), math.hypot(north, east)
     elif velocity is not None:

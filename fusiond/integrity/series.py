@@ -31,7 +31,6 @@ REPEATED = 2
 # Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
 # repeats the one before, as this series has shown it (average of so many).
 CHANCE, REPEATS_KEPT = 1e-9, 100.0
-NO_SLIP = Slip()
 # Before any instant that a clock can say.
 NEVER_NS = -(2**62)
 
@@ -86,7 +85,7 @@ class Series:
     """Of a position that is believed again, while it may be off still."""
     every_ns: int = 0
     """From the one before to the last that was heard."""
-    slip: Slip = NO_SLIP
+    slip: Slip = field(default_factory=Slip)
     """Of what is said not to slip."""
 
     def copied(self) -> Series:

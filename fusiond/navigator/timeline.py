@@ -26,7 +26,7 @@ from fusiond.integrity.action import MEASURED, MOTION, NONE, Action
 from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.kept import Memory
 from fusiond.integrity.moved import Moved
-from fusiond.integrity.ordinary import ASSUMED, Ordinary
+from fusiond.integrity.ordinary import ASSUMED, SITS, Ordinary
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.integrity.series import Said, said
 from fusiond.models.vehicle import MOUNTING
@@ -253,7 +253,7 @@ class Timeline:
                 entry.raw = raw
                 if not entry.judged:
                     entry.assumed = shown & ASSUMED > 0
-                self._act(aid, action)
+                self._act(aid, action, shown & SITS > 0 or bool(isolation.hedge.wider))
                 return outcome
         if entry.feedback == "release":
             estimator.release()
@@ -290,17 +290,17 @@ class Timeline:
             action = isolation.judge(aid, outcome, nav, p, state, says)
             if action is NONE and entry.tilts and outcome.name == "fused":
                 action = isolation.corrected(aid.t_ns, nav, p, estimator.turned)
-            if aid.constraint and self._mounting:
-                angle = estimator.xi.item
-                isolation.hedge.sits([angle(slot) for slot in self._mounting], self._mounting_sd)
             self._act(aid, action)
         return outcome
 
-    def _act(self, aid: Aid, action: Action) -> None:
-        """Do what came of an aid."""
+    def _act(self, aid: Aid, action: Action, sits: bool = True) -> None:
+        """Do what came of an aid, of which the mounting is known as well where it `sits`."""
         if action is not NONE:
             apart = self.isolation.shown
             self.estimator.doubt(aid, action in MEASURED, action in MOTION, apart)
+        if sits and aid.constraint and self._mounting:
+            angle = self.estimator.xi.item
+            self.isolation.hedge.sits([angle(slot) for slot in self._mounting], self._mounting_sd)
         if self.isolation.hedge.wider is not self._wider:
             self._hedge()
 

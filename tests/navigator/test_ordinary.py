@@ -26,6 +26,7 @@ from tests import runs
 from tests.navigator.vehicle import CONFIG, RATE_HZ, START_NS, outcomes_of, state_bytes
 
 SECONDS, FIRST_S = 96.0, 8.013
+KINDS = "gnss", "gnss_velocity", "wheel", "non_holonomic"
 LEGS = [
     Leg(10),
     Leg(6, speed_m_s=12.0),
@@ -136,7 +137,7 @@ def test_one_call_is_all_steps(seed: int, raw: bool, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(Isolation, "take", counted)
     at_once = _drive(estimator_of, seed, raw)
-    assert all(taken[source] > 150 for source in ("gnss", "gnss_velocity", "wheel"))
+    assert all(taken[source] > 150 for source in KINDS)
     before = taken.copy()
     stepwise = _drive(_stepwise, seed, raw)
     assert taken == before
