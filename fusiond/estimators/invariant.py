@@ -243,13 +243,12 @@ class InvariantFilter(TiltAxesFilter):
         super().doubt(aid, measured, motion, apart)
         self._doubted |= motion
 
-    @property
     def _turns_again(self) -> bool:
         return self._doubted and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
-        if self._turns_again:
+        if self._turns_again():
             self.turns = True
         if not self.turns or self._holding:
             return super().update(aid)
@@ -261,7 +260,7 @@ class InvariantFilter(TiltAxesFilter):
 
     def plain(self) -> Plain | None:
         """For kernels that do what `update` does; None where it does something else."""
-        return None if self.turns or self._turns_again else super().plain()
+        return None if self.turns or self._turns_again() else super().plain()
 
     def _update(self, aid: Linearised) -> Outcome:
         before = self.of_vehicle(self.nav, self.xi, -1.0)

@@ -47,24 +47,13 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.update import Plain
-from fusiond.integrity import returns, support
+from fusiond.integrity import ordinary, returns, support
 from fusiond.integrity.action import MOTION, NONE, Action
 from fusiond.integrity.hedge import differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.kept import Kept
 from fusiond.integrity.moved import back
-from fusiond.integrity.ordinary import (
-    ACROSS,
-    BIAS,
-    STRAYS,
-    TILTED,
-    UNUSUAL,
-    Ordinary,
-    Taken,
-    may_be,
-    ordinary,
-    take,
-)
+from fusiond.integrity.ordinary import Ordinary
 from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, said, velocity_away
@@ -157,7 +146,7 @@ class Isolation(Kept):
 
     def ordinary(self, aid: Aid, model: Model, tilts: bool) -> Ordinary | None:
         """What `take` wants of an aid for filters of a model; None where it is never ordinary."""
-        return ordinary(aid, model, tilts, self._pass)
+        return ordinary.made(aid, model, tilts, self._pass)
 
     # ------------------------------------------------------------------ judgement
 
@@ -300,24 +289,28 @@ class Isolation(Kept):
 
     def take(
         self, aid: Aid, one: Ordinary, filter_: Plain, state: State
-    ) -> tuple[Taken, Action] | None:
+    ) -> tuple[Outcome, int, Action] | None:
         """Fold an aid into the `filter_` of that `state` and take in how it ended, what `update`
-        and all of the above do, if it is an ordinary one; else nothing has changed."""
+        and all of the above do, if it is an ordinary one; else nothing has changed. With what that
+        has shown (fusiond.integrity.ordinary)."""
         t_ns, record = aid.t_ns, self._records.get(aid.source)
-        if record is None or not may_be(one, t_ns, record) or (one.tilts and self.unsettled(t_ns)):
+        if record is None or not ordinary.may_be(one, t_ns, record):
+            return None
+        if one.tilts and self.unsettled(t_ns):
             return None
         if aid.source in self._shared:
             record = self._own(aid, record)
-        taken = take(one, t_ns, record, filter_, self._tilting)
+        taken = ordinary.take(one, t_ns, record, filter_, self._tilting)
         if taken is None:
             return None
-        self.shown, self._comes, action, shown = (), returns.NOTHING, NONE, taken.shown
-        if record.no_slip and (shown & ACROSS or self.hedge.wider):
-            self.hedge.went_across(aid, record, state)
-        if shown & (BIAS | UNUSUAL | STRAYS) or self.hedge.wider:
-            biased = shown & BIAS > 0
+        outcome, shown = taken
+        self.shown, self._comes, action, hedge = (), returns.NOTHING, NONE, self.hedge
+        if record.no_slip and (shown & ordinary.ACROSS or hedge.wider):
+            hedge.went_across(aid, record, state)
+        if shown & (ordinary.BIAS | ordinary.UNUSUAL | ordinary.STRAYS) or hedge.wider:
+            biased = shown & ordinary.BIAS > 0
             action = self._fused(aid, record, one.says, biased, state.nav, state.covariance, state)
-        return taken, self._tilted(t_ns) if shown & TILTED else action
+        return outcome, shown, self._tilted(t_ns) if shown & ordinary.TILTED else action
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:

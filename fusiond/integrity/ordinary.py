@@ -153,7 +153,8 @@ def _take(
 
 class Ordinary(NamedTuple):
     """What of an aid is the same each time it is applied: as `Packed`, rows, chi-square of its gate
-    and of the test of its means, what it says, and whether its corrections of the tilt add up."""
+    and of the test of its means, what it says, the larger horizontal sigma of a position or
+    velocity (m, m/s; else 0), and whether its corrections of the tilt add up."""
 
     slots: Indices
     numbers: Array
@@ -161,17 +162,11 @@ class Ordinary(NamedTuple):
     threshold: float
     limit: float
     says: Said
+    sd: float
     tilts: bool
 
 
-class Taken(NamedTuple):
-    """An aid that was taken in: how it ended, and what that has `shown` beside."""
-
-    outcome: Outcome
-    shown: int
-
-
-def ordinary(aid: Aid, model: Model, tilts: bool, probability: float) -> Ordinary | None:
+def made(aid: Aid, model: Model, tilts: bool, probability: float) -> Ordinary | None:
     """An aid for filters of a model, whose means are tested with that `probability`; None where it
     is never ordinary."""
     packed = aid.packed(model)
@@ -179,7 +174,10 @@ def ordinary(aid: Aid, model: Model, tilts: bool, probability: float) -> Ordinar
         return None
     degrees = int(packed.slots[ROWS])
     limits = THRESHOLDS[aid.gate, degrees], THRESHOLDS[probability, degrees]
-    return Ordinary(*packed, degrees, *limits, said(aid.offers()), tilts)
+    says = said(aid.offers())
+    measured = says[0] or says[1]
+    sd = 0.0 if measured is None else max(measured.sd[:2])
+    return Ordinary(*packed, degrees, *limits, says, sd, tilts)
 
 
 def may_be(one: Ordinary, t_ns: int, record: Series) -> bool:
@@ -189,7 +187,7 @@ def may_be(one: Ordinary, t_ns: int, record: Series) -> bool:
         return False
     if position is not None and not (
         0.0 < record.sd_m <= FINE_M
-        and max(position.sd[:2]) <= FINE_M
+        and one.sd <= FINE_M
         and t_ns - record.fused_ns <= OTHERS_NS
         and not record.alike
     ):
@@ -200,29 +198,19 @@ def may_be(one: Ordinary, t_ns: int, record: Series) -> bool:
 
 def take(
     one: Ordinary, t_ns: int, record: Series, filter_: Plain, tilting: Tilting
-) -> Taken | None:
-    """Take one in that `may_be` ordinary; None where it is not, and nothing has changed."""
+) -> tuple[Outcome, int] | None:
+    """Take one in that `may_be` ordinary: how it ended, and what that has shown beside. None where
+    it is not, and nothing has changed."""
+    slots, numbers, degrees, threshold, limit, (position, velocity, value), sd, tilts = one
     every_ns, means = t_ns - record.heard_ns, record.means
-    if (packed := means.ready(one.degrees)) is None:
+    if (packed := means.ready(degrees)) is None:
         return None
-    position, velocity, value = one.says
     slip = record.slip.packed
     if record.no_slip:
         slip = slip.copy()
-    shown, nis, north, east = _take(
-        *filter_,
-        one.slots,
-        one.numbers,
-        t_ns,
-        every_ns,
-        one.threshold,
-        one.tilts,
-        packed,
-        one.limit,
-        slip,
-        tilting.sums,
-        tilting.before,
-    )
+    of_aid = slots, numbers, t_ns, every_ns, threshold, tilts
+    of_series = packed, limit, slip, tilting.sums, tilting.before
+    shown, nis, north, east = _take(*filter_, *of_aid, *of_series)
     if shown == OTHERWISE:
         return None
     record.every_ns, record.heard_ns, record.fused_ns = every_ns, t_ns, t_ns
@@ -230,11 +218,11 @@ def take(
     if record.no_slip:
         record.slip = Slip(slip)
     if position is not None:
-        record.sd_m, record.away_m = max(position.sd[:2]), math.hypot(north, east)
+        record.sd_m, record.away_m = sd, math.hypot(north, east)
     elif velocity is not None:
-        record.sd_m_s, means.assuming = max(velocity.sd[:2]), shown & ASSUMED > 0
+        record.sd_m_s, means.assuming = sd, shown & ASSUMED > 0
     if value is not None:
         nav = filter_.nav
         record.repeats_itself(value, math.hypot(nav.item(VN), nav.item(VE)) > MOVING_M_S)
-    y = tuple(filter_.room[WHITENED[one.degrees]].tolist())
-    return Taken(Outcome("fused", nis, one.degrees, y), shown)
+    y = tuple(filter_.room[WHITENED[degrees]].tolist())
+    return Outcome("fused", nis, degrees, y), shown

@@ -249,7 +249,7 @@ class Timeline:
         if one is not None and (plain := estimator.plain()) is not None:
             raw = raw_innovation(aid, estimator) if self.keeps_raw else None
             if (found := isolation.take(aid, one, plain, estimator.state)) is not None:
-                (outcome, shown), action = found
+                outcome, shown, action = found
                 entry.raw = raw
                 if not entry.judged:
                     entry.assumed = shown & ASSUMED > 0
