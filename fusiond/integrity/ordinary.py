@@ -192,8 +192,9 @@ def may_be(one: Ordinary, t_ns: int, record: Series) -> bool:
         and not record.alike
     ):
         return False
-    # A speed is printed coarsely: once the same says nothing yet.
-    return value != record.value or not (record.locates or record.moves or record.repeats)
+    if value is None or value != record.value:
+        return True
+    return not (record.locates or record.moves) and record.may_repeat
 
 
 def take(

@@ -138,6 +138,11 @@ class Series:
             self.repeating += (same - self.repeating) / REPEATS_KEPT
         return False
 
+    @property
+    def may_repeat(self) -> bool:
+        """Of a speed, which is printed coarsely: whether one more of the same is no fault."""
+        return self.repeats + 1 < self._most_repeats()
+
     def _most_repeats(self) -> float:
         return math.log(CHANCE) / math.log(min(max(self.repeating, 0.01), 1.0 - 1e-12))
 

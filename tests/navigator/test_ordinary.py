@@ -74,7 +74,7 @@ def _measurements(truth: Truth, seed: int) -> list[tuple[float, Measurement]]:
         fix = replace(fix, v_ned_m_s=(n, e, d), sd_v_ned_m_s=(0.1, 0.1, 0.1))
         if not 30.0 < t_s < 44.0:
             found.append((t_s + delay_s, fix))
-        speed = round(math.hypot(*v[:2]) + 0.03 * float(rng.standard_normal()), 2)
+        speed = round(math.hypot(*v[:2]) + 0.03 * float(rng.standard_normal()), 1)
         found.append((t_s + 0.05, WheelSpeed("wheel", at, stamp, speed)))
         if k % 15 == 0:
             lat, lon, up = (p + rng.standard_normal(3) * 2.0 / runs.metres(p[0], p[2])).tolist()
