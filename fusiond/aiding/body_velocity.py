@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import SpeedOffer
-from fusiond.aiding.packed import NO_SLIP, SPEED, Packed, slots_of
+from fusiond.aiding.packed import AMOUNT, NO_SLIP, SPEED, Packed, slots_of
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -59,6 +59,7 @@ Indices = NDArray[np.int64]
 FORWARD, RIGHT = 0, 1
 # Where the kernel finds the slot of each parameter; -1 for one that the model has not.
 PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
+_UNKNOWN = np.zeros((0, 0))
 SIGN_SIGMAS = 3.0
 """A velocity beyond as many of its sigmas has the other sign once in 740."""
 
@@ -217,6 +218,36 @@ def speed_rows(
 
 
 @compiled(
+    "f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8[:, :], f8[::1],f8[:, ::1])"
+)
+def direction_of(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    p: Array,
+    z: Array,
+    h: Array,
+) -> float:
+    """Sign of the forward velocity of a filter with P (n, n), or (0, 0) where none is known; 0
+    where it is not beyond `SIGN_SIGMAS` of its sigma. z (1,) and H (1, n) are used up."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, FORWARD, z, h)
+    variance = 0.0
+    for i in range(p.shape[0]):
+        if h[0, i] != 0.0:
+            for j in range(p.shape[0]):
+                variance += h[0, i] * p[i, j] * h[0, j]
+    if abs(z[0]) <= SIGN_SIGMAS * math.sqrt(max(variance, 0.0)):
+        return 0.0
+    return math.copysign(1.0, z[0])
+
+
+@compiled(
     "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8[::1],"
     "f8[:, ::1], f8[::1])"
 )
@@ -264,17 +295,6 @@ def across_of(
     way = math.copysign(1.0, c[0] * nav[VN] + c[3] * nav[VN + 1] + c[6] * nav[VN + 2])
     across: float = way * (z[0] + _estimate(xi, slot[DRIFT]))
     return across
-
-
-def _body_velocity(
-    state: State, lever: Vector3, first: int, count: int, slots: Indices
-) -> Innovation:
-    """h(x^) (m,), H (m, n) along `count` of the vehicle's axes from `first` on; r is left."""
-    model, rows = state.model, state.rows(count)
-    z, h, _ = rows
-    hold = model.hold_height
-    _rows(state.nav, state.step, state.xi, model.column_of, hold, *lever, slots, first, z, h)
-    return rows
 
 
 @immutable()
@@ -346,28 +366,28 @@ class WheelSpeedAid(Aid):
         nav, xi, step, model, p, _ = state
         slots = _slots(model, self.drift, self.scale, self.latency)
         speed = self.speed_m_s
-        if not self.signed:
-            z, h, _ = _body_velocity(state, self.lever, FORWARD, 1, slots)
-            forward = float(z[0])
-            sd = 0.0 if p is None else math.sqrt(max(float(h[0] @ p @ h[0]), 0.0))
-            if abs(forward) <= SIGN_SIGMAS * sd:
-                return NotApplicable("direction_unknown")
-            speed = math.copysign(speed, forward)
         at = nav, step, xi, model.column_of, model.hold_height, *self.lever, slots
-        rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
         rows = state.rows(1)
+        if not self.signed:
+            z, h, _ = rows
+            direction = direction_of(*at, _UNKNOWN if p is None else p, z, h)
+            if direction == 0.0:
+                return NotApplicable("direction_unknown")
+            speed = math.copysign(speed, direction)
+        rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
         speed_rows(*at, speed, self.sd_m_s**2, *rounding, *rows)
         return rows
 
     def packed(self, model: Model) -> Packed | None:
-        if self.robust or not self.signed:
+        if self.robust:
             return None
         kept = model.packed_slots
-        key = SPEED, self.drift, self.scale, self.latency, self.rounding
+        kind = SPEED if self.signed else AMOUNT
+        key = kind, self.drift, self.scale, self.latency, self.rounding
         slots = kept.get(key)
         if slots is None:
             own = _slots(model, self.drift, self.scale, self.latency)
-            slots = kept[key] = slots_of(SPEED, 1, own, model.indices[self.rounding])
+            slots = kept[key] = slots_of(kind, 1, own, model.indices[self.rounding])
         measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
         return Packed(slots, np.array((*self.lever, *measured)))
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-POSITION, VELOCITY, SPEED, NO_SLIP = range(4)
-"""Kinds."""
+POSITION, VELOCITY, SPEED, AMOUNT, NO_SLIP = range(5)
+"""Kinds; `AMOUNT` is a speed of which the sign is not measured."""
 KIND, ROWS, COUNTS, LISTS = 0, 1, 2, 4
 """Where `Packed.slots` has the kind, the number of rows m, how many slots there are in each of the
 `LISTS`, and from `SLOTS` on one list after another."""

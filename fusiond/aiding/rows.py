@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.body_velocity import no_slip_rows, speed_rows
-from fusiond.aiding.packed import COUNTS, KIND, NO_SLIP, POSITION, SLOTS, VELOCITY
+from fusiond.aiding.base import speed_of
+from fusiond.aiding.body_velocity import direction_of, no_slip_rows, speed_rows
+from fusiond.aiding.packed import AMOUNT, COUNTS, KIND, NO_SLIP, POSITION, SLOTS, VELOCITY
 from fusiond.aiding.position import position_rows
 from fusiond.aiding.velocity import velocity_rows
 from fusiond.navigation.compiled import compiled
@@ -16,7 +19,7 @@ Indices = NDArray[np.int64]
 
 
 @compiled(
-    "void(i8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], b1, f8[:, :],"
+    "b1(i8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], b1, f8[:, :],"
     "f8[::1], f8[:, ::1], f8[::1])"
 )
 def write_rows(
@@ -33,14 +36,17 @@ def write_rows(
     z: Array,
     h: Array,
     r: Array,
-) -> None:
+) -> bool:
     """Write z (m,), H (m, n) and r (m,) of an aid, with `coarse` times the sigma that it states,
-    at a state of a filter with P (n, n) and a model with these columns and sigmas (n,)."""
+    at a state of a filter with P (n, n) and a model with these columns and sigmas (n,). Whether it
+    holds there."""
     x = numbers
     a = SLOTS + slots[COUNTS]
     b = a + slots[COUNTS + 1]
     c = b + slots[COUNTS + 2]
     first, second, third, fourth = slots[SLOTS:a], slots[a:b], slots[b:c], slots[c:]
+    if slots[KIND] == NO_SLIP and speed_of(nav) < x[5]:
+        return False
     if slots[KIND] == POSITION:
         position_rows(
             nav,
@@ -111,6 +117,25 @@ def write_rows(
             r,
         )
     else:
+        speed = x[3]
+        if slots[KIND] == AMOUNT:
+            direction = direction_of(
+                nav,
+                step,
+                xi,
+                column_of,
+                hold_height,
+                x[0],
+                x[1],
+                x[2],
+                first,
+                p,
+                z,
+                h,
+            )
+            if direction == 0.0:
+                return False
+            speed = math.copysign(speed, direction)
         speed_rows(
             nav,
             step,
@@ -121,7 +146,7 @@ def write_rows(
             x[1],
             x[2],
             first,
-            x[3],
+            speed,
             x[4],
             x[5],
             second,
@@ -130,3 +155,4 @@ def write_rows(
             h,
             r,
         )
+    return True

@@ -84,8 +84,6 @@ def _take(
     """Take an aid in at `t_ns`, `every_ns` after the one before it of its series. What it has
     shown, or `OTHERWISE`; the NIS; how far the filter is from a position, north and east (m).
     `room` has the whitened innovation then."""
-    if slots[KIND] == NO_SLIP and speed_of(nav) < numbers[5]:
-        return OTHERWISE, 0.0, 0.0, 0.0
     m, n, width = slots[ROWS], dx.shape[0], cov.shape[0]
     p = cov[:n, :n]
     z, r, y = room[:m], room[LENT_ROWS : LENT_ROWS + m], room[2 * LENT_ROWS : 2 * LENT_ROWS + m]
@@ -94,7 +92,10 @@ def _take(
     shown, coarse, assumes = 0, 1.0, False
     if slots[KIND] == VELOCITY:
         coarse, assumes = lasting_of(means, every_ns * 1e-9)
-    write_rows(slots, numbers, coarse, nav, xi, step, column_of, initial, hold_height, p, z, h, r)
+    if not write_rows(
+        slots, numbers, coarse, nav, xi, step, column_of, initial, hold_height, p, z, h, r
+    ):
+        return OTHERWISE, 0.0, 0.0, 0.0
     if tilts:
         remember(nav, p, before)
     carries = lever.size > 0 or may_part(p, biases[0])

@@ -52,7 +52,7 @@ class StepByStep(InvariantFilter):
 
 def _measurements(truth: Truth, seed: int) -> list[tuple[float, Measurement]]:
     """When each arrives (s), in that order: a receiver that is wrong in most ways, a wheel that
-    rounds, and another receiver's fixes that are two seconds late."""
+    rounds, and of odd seeds knows no direction, and another receiver's fixes two seconds late."""
     rng = np.random.default_rng(seed)
     found: list[tuple[float, Measurement]] = []
     t = np.arange(FIRST_S, SECONDS - 1.0, 0.2)
@@ -75,7 +75,8 @@ def _measurements(truth: Truth, seed: int) -> list[tuple[float, Measurement]]:
         if not 30.0 < t_s < 44.0:
             found.append((t_s + delay_s, fix))
         speed = round(math.hypot(*v[:2]) + 0.03 * float(rng.standard_normal()), 1)
-        found.append((t_s + 0.05, WheelSpeed("wheel", at, stamp, speed)))
+        wheel = WheelSpeed("wheel", at, stamp, speed, signed=seed % 2 == 0)
+        found.append((t_s + 0.05, wheel))
         if k % 15 == 0:
             lat, lon, up = (p + rng.standard_normal(3) * 2.0 / runs.metres(p[0], p[2])).tolist()
             late = PositionFix("other", at, stamp, lat, lon, up, sd_ned_m=(2.0, 2.0, 3.0))
