@@ -331,7 +331,7 @@ class NonHolonomicAid(Aid):
         return rows
 
     def packed(self, model: Model) -> Packed | None:
-        if self.robust:
+        if self.robust or self.across_sd_m_s <= 0.0:
             return None
         slots = model.packed_slots.get((NO_SLIP,))
         if slots is None:

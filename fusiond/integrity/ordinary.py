@@ -117,7 +117,7 @@ def _take(
         north, east = residual_of(nav, xi, slots[a:b], slots[b:c], x[0], x[1], x[3], x[4], x[5])
         if any_beyond_prior(xi, p, slots[c:]):
             shown |= STRAYS
-    elif slots[KIND] == NO_SLIP and numbers[6] > 0.0:
+    elif slots[KIND] == NO_SLIP:
         x, of = numbers, slots[SLOTS : SLOTS + slots[COUNTS]]
         row = room[at : at + n].reshape((1, n))
         across = across_of(
