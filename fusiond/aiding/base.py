@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import Offer
+from fusiond.aiding.packed import Packed
 from fusiond.models.model import Model
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
@@ -37,6 +39,12 @@ def immutable(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
     """A dataclass with slots that is frozen for the type checker alone: at run time a frozen one
     costs four times as much to make, and each fix makes three aids of some ten fields."""
     return dataclass(slots=True, eq=eq)
+
+
+@compiled("f8(f8[::1])")
+def speed_of(nav: Array) -> float:
+    """Horizontal speed (m/s) of a state (10,)."""
+    return math.hypot(nav[VN], nav[VE])
 
 
 class Innovation(NamedTuple):
@@ -91,7 +99,7 @@ class State(NamedTuple):
     @property
     def speed(self) -> float:
         """Horizontal speed, m/s."""
-        return math.hypot(self.nav[VN], self.nav[VE])
+        return speed_of(self.nav)
 
 
 class NotApplicable(NamedTuple):
@@ -184,6 +192,11 @@ class Aid:
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
         raise NotImplementedError
+
+    def packed(self, model: Model) -> Packed | None:
+        """What it is to a kernel that writes its innovation (fusiond.aiding.rows); None where there
+        is none for it, or where its innovation is not always all that it says."""
+        return None
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         """How it ended, for a receiver that keeps count of its rows (fusiond.estimators.screening);

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import SpeedOffer
+from fusiond.aiding.packed import AMOUNT, NO_SLIP, SPEED, Packed, slots_of
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -58,6 +59,7 @@ Indices = NDArray[np.int64]
 FORWARD, RIGHT = 0, 1
 # Where the kernel finds the slot of each parameter; -1 for one that the model has not.
 PITCH, YAW, LEVER, DRIFT, SCALE, LATENCY = range(6)
+_UNKNOWN = np.zeros((0, 0))
 SIGN_SIGMAS = 3.0
 """A velocity beyond as many of its sigmas has the other sign once in 740."""
 
@@ -182,7 +184,7 @@ def _rows(
     "f8[::1], f8[::1], f8[:, ::1], f8[::1])",
     allocates=True,
 )
-def _speed(
+def speed_rows(
     nav: Array,
     step: Array,
     xi: Array,
@@ -215,15 +217,84 @@ def _speed(
             r[0] -= (step_m_s * initial[share]) ** 2
 
 
-def _body_velocity(
-    state: State, lever: Vector3, first: int, count: int, slots: Indices
-) -> Innovation:
-    """h(x^) (m,), H (m, n) along `count` of the vehicle's axes from `first` on; r is left."""
-    model, rows = state.model, state.rows(count)
-    z, h, _ = rows
-    hold = model.hold_height
-    _rows(state.nav, state.step, state.xi, model.column_of, hold, *lever, slots, first, z, h)
-    return rows
+@compiled(
+    "f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8[:, :], f8[::1],f8[:, ::1])"
+)
+def direction_of(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    p: Array,
+    z: Array,
+    h: Array,
+) -> float:
+    """Sign of the forward velocity of a filter with P (n, n), or (0, 0) where none is known; 0
+    where it is not beyond `SIGN_SIGMAS` of its sigma. z (1,) and H (1, n) are used up."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, FORWARD, z, h)
+    variance = 0.0
+    for i in range(p.shape[0]):
+        if h[0, i] != 0.0:
+            for j in range(p.shape[0]):
+                variance += h[0, i] * p[i, j] * h[0, j]
+    if abs(z[0]) <= SIGN_SIGMAS * math.sqrt(max(variance, 0.0)):
+        return 0.0
+    return math.copysign(1.0, z[0])
+
+
+@compiled(
+    "void(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8, f8, f8[::1],"
+    "f8[:, ::1], f8[::1])"
+)
+def no_slip_rows(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    sd: float,
+    sd_down: float,
+    z: Array,
+    h: Array,
+    r: Array,
+) -> None:
+    """Write z (m,), H (m, n) and r (m,) of no velocity to the right, and down."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, RIGHT, z, h)
+    r[0] = sd * sd
+    if r.shape[0] > 1:
+        r[1] = sd_down * sd_down
+
+
+@compiled("f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8[::1], f8[:, ::1])")
+def across_of(
+    nav: Array,
+    step: Array,
+    xi: Array,
+    column_of: Indices,
+    hold_height: bool,
+    l0: float,
+    l1: float,
+    l2: float,
+    slot: Indices,
+    z: Array,
+    h: Array,
+) -> float:
+    """See `Aid.across`: the velocity. z (1,) and H (1, n) are used up."""
+    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, RIGHT, z, h)
+    c = dcm_elements(nav[Q0:])
+    # Backward, a heading that has turned goes across to the other side.
+    way = math.copysign(1.0, c[0] * nav[VN] + c[3] * nav[VN + 1] + c[6] * nav[VN + 2])
+    across: float = way * (z[0] + _estimate(xi, slot[DRIFT]))
+    return across
 
 
 @immutable()
@@ -244,23 +315,30 @@ class NonHolonomicAid(Aid):
         return self.sd_m_s
 
     def across(self, state: State) -> tuple[float, float]:
-        slots = _slots(state.model, SIDE_DRIFT)
-        z, _, _ = _body_velocity(state, self.lever, RIGHT, 1, slots)
-        # Backward, a heading that has turned goes across to the other side.
-        way = math.copysign(1.0, float(state.dcm[:, 0] @ state.nav[VN : VN + 3]))
-        drift = slots[DRIFT]
-        if drift < 0:
-            return way * float(z[0]), 0.0
-        return way * float(z[0] + state.xi[drift]), float(state.model.initial[drift])
+        model, slots = state.model, _slots(state.model, SIDE_DRIFT)
+        at = state.nav, state.step, state.xi, model.column_of, model.hold_height
+        z, h, _ = state.rows(1)
+        across, drift = across_of(*at, *self.lever, slots, z, h), slots[DRIFT]
+        return across, float(model.initial[drift]) if drift >= 0 else 0.0
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
-        count = 1 if state.model.hold_height else 2  # right, down
-        rows = _body_velocity(state, self.lever, RIGHT, count, _slots(state.model, SIDE_DRIFT))
-        sds = (self.sd_m_s, self.sd_down_m_s)[:count]
-        rows.r[:] = [sd * sd for sd in sds]
+        model, slots = state.model, _slots(state.model, SIDE_DRIFT)
+        at = state.nav, state.step, state.xi, model.column_of, model.hold_height
+        rows = state.rows(1 if model.hold_height else 2)  # right, down
+        no_slip_rows(*at, *self.lever, slots, self.sd_m_s, self.sd_down_m_s, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        if self.robust or self.across_sd_m_s <= 0.0:
+            return None
+        slots = model.packed_slots.get((NO_SLIP,))
+        if slots is None:
+            rows, own = 1 if model.hold_height else 2, _slots(model, SIDE_DRIFT)
+            slots = model.packed_slots[NO_SLIP,] = slots_of(NO_SLIP, rows, own)
+        holds = self.sd_m_s, self.sd_down_m_s, self.min_speed_m_s, self.across_sd_m_s**2
+        return Packed(slots, np.array((*self.lever, *holds)))
 
 
 @immutable()
@@ -288,18 +366,30 @@ class WheelSpeedAid(Aid):
         nav, xi, step, model, p, _ = state
         slots = _slots(model, self.drift, self.scale, self.latency)
         speed = self.speed_m_s
-        if not self.signed:
-            z, h, _ = _body_velocity(state, self.lever, FORWARD, 1, slots)
-            forward = float(z[0])
-            sd = 0.0 if p is None else math.sqrt(max(float(h[0] @ p @ h[0]), 0.0))
-            if abs(forward) <= SIGN_SIGMAS * sd:
-                return NotApplicable("direction_unknown")
-            speed = math.copysign(speed, forward)
         at = nav, step, xi, model.column_of, model.hold_height, *self.lever, slots
-        rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
         rows = state.rows(1)
-        _speed(*at, speed, self.sd_m_s**2, *rounding, *rows)
+        if not self.signed:
+            z, h, _ = rows
+            direction = direction_of(*at, _UNKNOWN if p is None else p, z, h)
+            if direction == 0.0:
+                return NotApplicable("direction_unknown")
+            speed = math.copysign(speed, direction)
+        rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
+        speed_rows(*at, speed, self.sd_m_s**2, *rounding, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        if self.robust:
+            return None
+        kept = model.packed_slots
+        kind = SPEED if self.signed else AMOUNT
+        key = kind, self.drift, self.scale, self.latency, self.rounding
+        slots = kept.get(key)
+        if slots is None:
+            own = _slots(model, self.drift, self.scale, self.latency)
+            slots = kept[key] = slots_of(kind, 1, own, model.indices[self.rounding])
+        measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
+        return Packed(slots, np.array((*self.lever, *measured)))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
         return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)

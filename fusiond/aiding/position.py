@@ -46,6 +46,8 @@ from fusiond.aiding.antenna import Matrix, antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
+from fusiond.aiding.packed import POSITION, Packed, slots_of
+from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
@@ -88,7 +90,7 @@ def _add_of_turned_lever(c: Matrix, rest: Indices, p: Array, r: Array) -> None:
     "f8, f8, f8, f8, f8, f8, f8, f8, f8, f8, f8[:, :], f8[::1], f8[:, ::1], f8[::1])",
     allocates=True,
 )
-def _position(
+def position_rows(
     nav: Array,
     xi: Array,
     step: Array,
@@ -233,8 +235,22 @@ class PositionAid(Aid):
         slots = model.column_of, at[self.bias], at[self.time], at[self.rest], at[self.wander]
         fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
         where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
-        _position(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
+        position_rows(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        if self.robust:
+            return None
+        height, at, kept = self.height_m, model.indices, model.packed_slots
+        rows = 2 if height is None or model.hold_height else 3
+        key = POSITION, rows, self.bias, self.time, self.rest, self.wander
+        slots = kept.get(key)
+        if slots is None:
+            lists = at[self.bias], at[self.time], at[self.rest], at[self.wander]
+            slots = kept[key] = slots_of(POSITION, rows, *lists)
+        fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
+        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
+        return Packed(slots, np.array((*fix, *where)))
 
     def coarser(self, factor: float) -> PositionAid:
         north, east, down = self.sd

@@ -24,6 +24,8 @@ from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import VelocityOffer
+from fusiond.aiding.packed import VELOCITY, Packed, slots_of
+from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_elements
@@ -40,7 +42,7 @@ Indices = NDArray[np.int64]
     "void(f8[::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8, f8, f8, f8,"
     "f8, f8, f8[::1], f8[:, ::1], f8[::1])"
 )
-def _velocity(
+def velocity_rows(
     nav: Array,
     xi: Array,
     step: Array,
@@ -118,16 +120,31 @@ class VelocityAid(Aid):
     def device(self) -> str:
         return self.source.removesuffix(SUFFIX)
 
+    @property
+    def _measured(self) -> tuple[float, float, float, float, float, float]:
+        """Velocity and sigmas, 0 where there is none down."""
+        north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
+        sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
+        return north, east, down, sd_n, sd_e, sd_d
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, _, _ = state
         at = model.indices
         rows = state.rows(2 if model.hold_height else len(self.v_ned))
         slots = model.column_of, at[self.time], at[self.rest]
-        north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
-        sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
-        measured = north, east, down, sd_n, sd_e, sd_d
-        _velocity(nav, xi, step, *slots, *measured, *self.lever, self.sd_time_s, *rows)
+        velocity_rows(nav, xi, step, *slots, *self._measured, *self.lever, self.sd_time_s, *rows)
         return rows
+
+    def packed(self, model: Model) -> Packed | None:
+        if self.robust:
+            return None
+        at, kept = model.indices, model.packed_slots
+        rows = 2 if model.hold_height else len(self.v_ned)
+        key = VELOCITY, rows, self.time, self.rest
+        slots = kept.get(key)
+        if slots is None:
+            slots = kept[key] = slots_of(VELOCITY, rows, at[self.time], at[self.rest])
+        return Packed(slots, np.array((*self._measured, *self.lever, self.sd_time_s)))
 
     def coarser(self, factor: float) -> VelocityAid:
         sd = tuple(map(factor.__mul__, self.sd))

@@ -65,7 +65,7 @@ from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.tilt_axes import TiltAxesFilter
-from fusiond.estimators.update import feed_back
+from fusiond.estimators.update import Plain, feed_back
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -243,9 +243,12 @@ class InvariantFilter(TiltAxesFilter):
         super().doubt(aid, measured, motion, apart)
         self._doubted |= motion
 
+    def _turns_again(self) -> bool:
+        return self._doubted and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
+
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
-        if self._doubted and self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2:
+        if self._turns_again():
             self.turns = True
         if not self.turns or self._holding:
             return super().update(aid)
@@ -254,6 +257,10 @@ class InvariantFilter(TiltAxesFilter):
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = self._doubted = False
         return outcome
+
+    def plain(self) -> Plain | None:
+        """For kernels that do what `update` does; None where it does something else."""
+        return None if self.turns or self._turns_again() else super().plain()
 
     def _update(self, aid: Linearised) -> Outcome:
         before = self.of_vehicle(self.nav, self.xi, -1.0)

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import fuse, work
+from fusiond.estimators.update import Plain, fuse, work
 from fusiond.models.model import Model
 
 
@@ -23,10 +25,21 @@ class KalmanEstimator(ErrorStateFilter):
     def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
         super().__init__(model, gap_s, shares)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
+        none = np.empty(0, dtype=np.int64)
+        self._plain = Plain(
+            *(self.nav, self.xi, self.step, self._cov, self._dx),
+            *(model.column_of, model.initial, model.hold_height),
+            *(none.reshape(2, 0), none, none, none),
+            np.empty(LENT_ROWS * (3 + model.size + model.width)),
+        )
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
         return self._fold_in(aid)
+
+    def plain(self) -> Plain | None:
+        """For kernels that do what `update` does; None where it does something else."""
+        return None if self._holding else self._plain
 
     def _fold_in(self, aid: Linearised) -> Outcome:
         innovation = self._linearise(aid)

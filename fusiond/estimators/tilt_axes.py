@@ -60,6 +60,7 @@ from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT, UPRIGHT
 from fusiond.estimators.turn_rate import gyro_slots, keep_turn
+from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
@@ -133,6 +134,65 @@ def carry_over(p: Array, before: Array, after: Array, biases: Indices) -> float:
     return heading_turn(before, after)
 
 
+# An estimate before an update: nav, the gyros' biases, what is left of a lever arm; behind it what
+# the update has told of the biases, and the lever then.
+_GYROS, _ARM, _TOLD, _ARM_AFTER, ESTIMATE_SIZE = NAV_SIZE, 13, 16, 19, 22
+
+
+@compiled("void(f8[::1], f8[::1], i8[::1], i8[::1], f8[::1])")
+def remember_estimate(nav: Array, xi: Array, gyros: Indices, lever: Indices, before: Array) -> None:
+    """Write `before` (22,) of nav (10,) and of the slots (0 or 3,) in xi (n,)."""
+    for j in range(NAV_SIZE):
+        before[j] = nav[j]
+    for j in range(gyros.size):
+        before[_GYROS + j] = xi[gyros[j]]
+    for j in range(lever.size):
+        before[_ARM + j] = xi[lever[j]]
+
+
+@compiled("void(f8[:, :], f8[::1], f8[::1], f8[::1], f8, i8[::1], i8[::1], i8[::1])")
+def keep_rows(
+    m: Array,
+    before: Array,
+    nav: Array,
+    xi: Array,
+    turned: float,
+    gyros: Indices,
+    lever: Indices,
+    late: Indices,
+) -> None:
+    """M (n, k) <- T M after an update of an estimate `before`, which has `turned` the axes (rad):
+    what is known of the gyros, and of the antenna's place."""
+    if gyros.size:
+        told = before[_TOLD:_ARM_AFTER]
+        for j in range(3):
+            told[j] = xi[gyros[j]] - before[_GYROS + j]
+        keep_turn(m, before[Q0:NAV_SIZE], nav[Q0:], turned, told, gyros)
+    if lever.size:
+        after = before[_ARM_AFTER:ESTIMATE_SIZE]
+        for j in range(3):
+            after[j] = xi[lever[j]]
+        keep_antenna(m, before[:NAV_SIZE], nav, before[_ARM:_TOLD], after, lever, late)
+
+
+@compiled("f8(f8[:, :], f8[::1], f8[::1], f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1])")
+def carry_over_all(
+    p: Array,
+    before: Array,
+    nav: Array,
+    xi: Array,
+    biases: Indices,
+    gyros: Indices,
+    lever: Indices,
+    late: Indices,
+) -> float:
+    """`carry_over` of P (n, n), and `keep_rows` of it."""
+    turned = carry_over(p, before[Q0:NAV_SIZE], nav[Q0:], biases)
+    keep_rows(p, before, nav, xi, turned, gyros, lever, late)
+    keep_rows(p.T, before, nav, xi, turned, gyros, lever, late)
+    return turned
+
+
 class TiltAxesFilter(KalmanEstimator):
     """The centralised filter, in whose P the axes of a tilt turn with the heading, what is known of
     the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
@@ -150,6 +210,14 @@ class TiltAxesFilter(KalmanEstimator):
         self._gyros = gyro_slots(model) if known else self._slots
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
+        self._plain = self._plain._replace(
+            biases=self._biases,
+            gyros=self._gyros,
+            lever=self._lever,
+            late=self._late,
+            room=np.empty(self._plain.room.size + ESTIMATE_SIZE),
+        )
+        self._plain_doubted = self._plain._replace(gyros=self._gyros[:0])
         self.undoubted = True
         """Whether what gyros are wrong by is what they were wrong by when the filter started."""
         if known:
@@ -178,6 +246,12 @@ class TiltAxesFilter(KalmanEstimator):
             self._carry_over(before)
         return outcome
 
+    def plain(self) -> Plain | None:
+        """For kernels that do what `update` does; None where it does something else."""
+        if self._holding:
+            return None
+        return self._plain if self.undoubted else self._plain_doubted
+
     def release(self) -> None:
         """Feed back what was carried."""
         before = self._estimate()
@@ -187,23 +261,21 @@ class TiltAxesFilter(KalmanEstimator):
             self._carry_over(before)
 
     def _estimate(self) -> Array:
-        """Nav (10,), the gyros' biases (0 or 3,), what is left of the lever arm (0 or 3,)."""
-        return np.concatenate([self.nav, self.xi[self._gyros], self.xi[self._lever]])
+        """As `remember_estimate` writes it."""
+        before = np.empty(ESTIMATE_SIZE)
+        remember_estimate(self.nav, self.xi, self._gyros, self._lever, before)
+        return before
 
     def _carry_over(self, before: Array) -> None:
         """P after an update of an `_estimate` `before`."""
-        p = self._covariance
-        self.turned = carry_over(p, before[Q0:NAV_SIZE], self.nav[Q0:], self._biases)
-        for rows in (p, p.T):
-            self._keep(rows, before)
+        slots = self._biases, *self._kept
+        self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
+
+    @property
+    def _kept(self) -> tuple[Indices, Indices, Indices]:
+        gyros = self._gyros if self.undoubted else self._gyros[:0]
+        return gyros, self._lever, self._late
 
     def _keep(self, rows: Array, before: Array) -> None:
         """M (n, k) <- T M: what is known of the gyros, and of the antenna's place."""
-        end = NAV_SIZE + self._gyros.size
-        if self._gyros.size and self.undoubted:
-            told = self.xi[self._gyros] - before[NAV_SIZE:end]
-            turned = before[Q0:NAV_SIZE], self.nav[Q0:], self.turned
-            keep_turn(rows, *turned, told, self._gyros)
-        if self._astray:
-            arms = before[end:], self.xi[self._lever]
-            keep_antenna(rows, before[:NAV_SIZE], self.nav, *arms, self._lever, self._late)
+        keep_rows(rows, before, self.nav, self.xi, self.turned, *self._kept)

@@ -184,6 +184,10 @@ class Hedge:
         """An aid that does not slip was fused; the `state` after it."""
         across, variance = aid.across(state), aid.across_sd_m_s**2
         record.slip = record.slip.with_one(aid.t_ns, across, state.speed, variance)
+        self.went_across(aid, record, state)
+
+    def went_across(self, aid: Aid, record: Series, state: State) -> None:
+        """What the slip leaves open of one that was."""
         self._heading(aid.source + ACROSS, record.slip.opened)
         if AT_REST in self.wider:
             kept, p = FADES * float(self.wider[AT_REST][8]), state.covariance
@@ -239,7 +243,7 @@ class Hedge:
         wider = None
         if state is not None and (p := state.covariance) is not None:
             slots = state.model.indices[wander]
-            if _any_beyond_prior(state.xi, p, slots):
+            if any_beyond_prior(state.xi, p, slots):
                 wider = _beyond_prior(state.xi, p, slots.tolist())
         if wider is not None or self.wider:
             self._put(source + STRAYS, wider)
@@ -293,8 +297,7 @@ class Hedge:
     def sits(self, angles: Sequence[float], sd: float) -> None:
         """The mounting's pitch and yaw (rad) as found so far, beyond what was configured with one
         sigma `sd` (rad)."""
-        chance = SELDOM * sd * sd
-        pitch, yaw = (max(0.0, angle * angle - chance) for angle in angles)
+        pitch, yaw = (beyond_chance(angle, sd) for angle in angles)
         wider = None
         if pitch or yaw:
             wider = np.zeros(9)
@@ -315,8 +318,14 @@ def _series_of(name: str) -> str:
     return name
 
 
+@compiled("f8(f8, f8)")
+def beyond_chance(angle: float, sd: float) -> float:
+    """What the square of an angle has beyond what chance does with that sigma."""
+    return max(0.0, angle * angle - SELDOM * sd * sd)
+
+
 @compiled("b1(f8[::1], f8[:, :], i8[::1])")
-def _any_beyond_prior(xi: Array, covariance: Array, slots: Indices) -> bool:
+def any_beyond_prior(xi: Array, covariance: Array, slots: Indices) -> bool:
     """Whether `_beyond_prior` has anything: asked of every fix."""
     for slot in slots:
         shown = 1.0 - covariance[slot, slot]

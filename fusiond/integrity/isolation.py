@@ -40,26 +40,26 @@ Srinath, IEEE Trans. AC 32 (1987), 1133.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
 from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.integrity import returns, support
+from fusiond.estimators.update import Plain
+from fusiond.integrity import ordinary, returns, support
 from fusiond.integrity.action import MOTION, NONE, Action
-from fusiond.integrity.hedge import NOTHING, Hedge, differ
+from fusiond.integrity.hedge import differ
 from fusiond.integrity.jumps import jumps
-from fusiond.integrity.means import Means
-from fusiond.integrity.moved import Moved, Parted, back
+from fusiond.integrity.kept import Kept
+from fusiond.integrity.moved import Parted, back
+from fusiond.integrity.ordinary import Ordinary
 from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
-from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, parts_by, said
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting, remember, too_far
+from fusiond.models.model import Model
 from fusiond.navigation.strapdown import LAT, LON, VE, VN
 
 Array = NDArray[np.float64]
@@ -75,20 +75,8 @@ FALSE_ALARM = 1e-6
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
 # its constraint is refused. A corner taken too fast is over by then.
 SLIDING_NS, SLIDING_COUNT = 1_000_000_000, 10
-# A step of a velocity is known by its mean when that shows all of it or, of one that the gate just
-# lets pass, a third: so many times what it shows is in the middle.
-SHOWN_OF_STEP = 2.0
 # So many doubts of the filter are remembered.
 DOUBTS = 8
-
-
-class Memory(NamedTuple):
-    """All that a later restore needs."""
-
-    records: dict[str, Series]
-    doubts: tuple[int, ...]
-    tilting: Tilting
-    wider: Mapping[str, Array]
 
 
 def _passed(aid: Aid, outcome: Outcome) -> bool:
@@ -96,19 +84,13 @@ def _passed(aid: Aid, outcome: Outcome) -> bool:
     return outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
 
 
-class Isolation:
+class Isolation(Kept):
     """Judges each aid once it has been looked at; a function of the aids in order alone."""
 
     def __init__(self, false_alarm: float = FALSE_ALARM) -> None:
-        self._records: dict[str, Series] = {}
-        self._shared: set[str] = set()
-        """Series whose record a checkpoint has too: copied before it is changed."""
-        self._doubts: tuple[int, ...] = ()
-        self._tilting = Tilting()
-        self.hedge = Hedge()
+        super().__init__()
         self.shown: tuple[float, ...] = ()
         """By how much (m, m/s) the series that was judged last was off, if it had a bias."""
-        self._begun, self._comes = Begun(), returns.NOTHING
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
@@ -162,32 +144,9 @@ class Isolation:
         """Whether a velocity that comes is not believed."""
         return support.velocity_left_out(self._records, t_ns)
 
-    @property
-    def doubts(self) -> tuple[int, ...]:
-        """Instants (ns) at which the filter was in doubt, the last `DOUBTS` of them."""
-        return self._doubts
-
-    def snapshot(self) -> Memory:
-        """A copy of everything."""
-        self._shared = set(self._records)
-        mine = self._records.copy(), self._doubts, self._tilting.copied(), self.hedge.wider
-        return Memory(*mine)
-
-    def restore(self, memory: Memory) -> None:
-        """Back to a snapshot."""
-        self._records, self._shared = memory.records.copy(), set(memory.records)
-        self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
-        self.hedge.wider = memory.wider
-
-    def reset(
-        self, contradicted: bool = False, failed: bool = False, moved: Moved | None = None
-    ) -> None:
-        """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
-        their velocities are to prove themselves, as after an outage; and where one before it has
-        `failed`, that they are on time, or is open what they have `moved` by."""
-        self._begun, self._comes = Begun(contradicted, failed, moved), returns.NOTHING
-        self._records, self._shared = {}, set()
-        self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
+    def ordinary(self, aid: Aid, model: Model, tilts: bool) -> Ordinary | None:
+        """What `take` wants of an aid for filters of a model; None where it is never ordinary."""
+        return ordinary.made(aid, model, tilts, self._pass)
 
     # ------------------------------------------------------------------ judgement
 
@@ -212,7 +171,8 @@ class Isolation:
         record.every_ns, record.heard_ns = t_ns - record.heard_ns, t_ns
         if record.every_ns > FORGET_NS:
             record.forget()
-        offer, velocity, value = says or said(aid.offers())
+        says = says or said(aid.offers())
+        offer, velocity, value = says
         offset, self.shown, repeats = None, (), False
         if offer is not None:
             if state is not None:
@@ -234,8 +194,8 @@ class Isolation:
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
             passed = _passed(aid, outcome) and not repeats
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
-            if record.parted is not None and not record.excluded:
-                self._followed(record, record.parted, t_ns)
+            if not record.excluded:
+                self._followed(record, t_ns)
             if offset is not None and not record.excluded and covariance is not None:
                 record.moved = back(record, t_ns, covariance)
             return NONE
@@ -267,16 +227,30 @@ class Isolation:
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
         if record.no_slip and state is not None and aid.across_sd_m_s > 0.0:
             self.hedge.goes_across(aid, record, state)
-        hedge, proof = self.hedge, record.proof
-        if record.means.tested(outcome.whitened, t_ns, self._pass):
+        biased = record.means.tested(outcome.whitened, t_ns, self._pass)
+        return self._fused(aid, record, says, biased, nav, covariance, state)
+
+    def _fused(
+        self,
+        aid: Aid,
+        record: Series,
+        says: Said,
+        biased: bool,
+        nav: Array,
+        covariance: Array | None,
+        state: State | None,
+    ) -> Action:
+        """Of an aid that was fused: what its series leaves open, whose means may be `biased`."""
+        (offer, velocity, _), hedge, proof = says, self.hedge, record.proof
+        if biased:
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
             action = self._blame(record, aid)
             if record.moves and action in MOTION and self.shown:
-                record.parted = Parted(t_ns, *(SHOWN_OF_STEP * by for by in self.shown[:2]))
+                record.parted = Parted.shown(aid.t_ns, self.shown)
                 if not record.excluded:
-                    self._followed(record, record.parted, t_ns)
-            return self._doubted(action, t_ns)
+                    self._followed(record, aid.t_ns)
+            return self._doubted(action, aid.t_ns)
         told, white = False, proof is not None and aid.white
         if proof is not None and (white or aid.wanders):
             told = hedge.returns(aid.source, proof, covariance, white)
@@ -288,7 +262,7 @@ class Isolation:
         elif offer is not None:
             hedge.late(aid.source, record.punctual, covariance)
         if hedge.wider:
-            hedge.answered(self._records, record, t_ns)
+            hedge.answered(self._records, record, aid.t_ns)
         if record.moved is not None:
             record.moved = hedge.moved(aid.source, self._records, record, nav, covariance)
         return NONE
@@ -320,19 +294,36 @@ class Isolation:
         tilting = self._tilting
         if not too_far(tilting.sums, t_ns, tilting.before, nav, covariance, turned):
             return NONE
+        return self._tilted(t_ns)
+
+    def _tilted(self, t_ns: int) -> Action:
         self._tilting = Tilting()
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
-    def _own(self, aid: Aid, known: Series | None) -> Series:
-        """The series of an aid, which may be changed: none was known, or a checkpoint has it."""
-        if known is None:
-            record = Series(aid.device, aid.locates, aid.moves, aid.t_ns, aid.no_slip)
-            record.means = Means.begun(aid.white)
-        else:
-            self._shared.discard(aid.source)
-            record = known.copied()
-        self._records[aid.source] = record
-        return record
+    def take(
+        self, aid: Aid, one: Ordinary, filter_: Plain, state: State
+    ) -> tuple[Outcome, int, Action] | None:
+        """Fold an aid into the `filter_` of that `state` and take in how it ended, what `update`
+        and all of the above do, if it is an ordinary one; else nothing has changed. With what that
+        has shown (fusiond.integrity.ordinary)."""
+        t_ns, record = aid.t_ns, self._records.get(aid.source)
+        if record is None or not ordinary.may_be(one, t_ns, record):
+            return None
+        if one.tilts and self.unsettled(t_ns):
+            return None
+        if aid.source in self._shared:
+            record = self._own(aid, record)
+        taken = ordinary.take(one, t_ns, record, filter_, self._tilting)
+        if taken is None:
+            return None
+        outcome, shown = taken
+        self.shown, self._comes, action, hedge = (), returns.NOTHING, NONE, self.hedge
+        if record.no_slip and (shown & ordinary.ACROSS or hedge.wider):
+            hedge.went_across(aid, record, state)
+        if shown & (ordinary.BIAS | ordinary.UNUSUAL | ordinary.STRAYS) or hedge.wider:
+            biased = shown & ordinary.BIAS > 0
+            action = self._fused(aid, record, one.says, biased, state.nav, state.covariance, state)
+        return outcome, shown, self._tilted(t_ns) if shown & ordinary.TILTED else action
 
     def _doubted(self, action: Action, t_ns: int) -> Action:
         if action in MOTION:
@@ -406,17 +397,6 @@ class Isolation:
             record.excluded, record.fused_ns, record.back_ns = "", t_ns, t_ns
             record.refused, record.jumped, record.proof = 0, False, None
             record.means.restart()
-
-    def _followed(self, record: Series, parted: Parted, t_ns: int) -> None:
-        """A velocity that had parted from the filter is believed again, or still: what it may take
-        the position of its device along by is open."""
-        what, record.parted = parted.followed(record.device, t_ns), None
-        for name, other in self._records.items():
-            if other.locates and other.device == record.device:
-                if name in self._shared:
-                    self._shared.discard(name)
-                    self._records[name] = other = other.copied()
-                other.moved = what.joined(other.moved)
 
     def _blame(self, record: Series, aid: Aid) -> Action:
         """A bias inside the gate: the series', where something else supports the filter."""

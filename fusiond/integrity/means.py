@@ -128,7 +128,7 @@ def _believe(packed: Array) -> None:
 # What an innovation of fewer components has for the others.
 _NO_MORE = (0.0, 0.0, 0.0)
 # What a look at the means has shown.
-_NOTHING, _UNLIKELY, _BIASED, _TOO_FEW = 0, 1, 2, 3
+_NOTHING, UNLIKELY, BIASED, _TOO_FEW = 0, 1, 2, 3
 
 
 @compiled("i8(f8[::1], i8, f8, f8)")
@@ -149,7 +149,7 @@ def _look(packed: Array, t_ns: int, limit: float, own: float) -> int:
         for k in range(_SHOWN, _HEAD):
             packed[k] = 0.0
         packed[:1].view(np.int64)[0] = _LONG_AGO_NS
-        return _BIASED
+        return BIASED
     if own > 0.0:
         return _NOTHING
     unlikely = most_fast > LIKELY * packed[_SPREAD] or most_slow > LIKELY * packed[_SPREAD + 1]
@@ -163,7 +163,7 @@ def _look(packed: Array, t_ns: int, limit: float, own: float) -> int:
     packed[_SHOWN + 1] += max(slow / d, WHITE_SLOW)
     packed[_SHOWN + 2] += packed[_COARSE] * slow / d
     packed[_SHOWN + 3] += 1.0
-    return _UNLIKELY if unlikely else _NOTHING
+    return UNLIKELY if unlikely else _NOTHING
 
 
 @compiled("f8(f8[::1], f8[:, :], i8, f8, f8, f8)")
@@ -219,7 +219,7 @@ def _take(packed: Array, y: Array, t_ns: int, limit: float) -> int:
 
 
 @compiled("i8(f8[::1], i8, f8, f8, f8, f8)")
-def _take_few(packed: Array, t_ns: int, limit: float, x: float, y: float, z: float) -> int:
+def take_few(packed: Array, t_ns: int, limit: float, x: float, y: float, z: float) -> int:
     """`_take` of an innovation of up to three components: a third of the time of an array that is
     made for it."""
     d = (packed.shape[0] - _HEAD) // 2
@@ -233,7 +233,7 @@ def _take_few(packed: Array, t_ns: int, limit: float, x: float, y: float, z: flo
 
 
 @compiled("Tuple((f8, b1))(f8[::1], f8)")
-def _lasting(packed: Array, every_s: float) -> tuple[float, bool]:
+def lasting_of(packed: Array, every_s: float) -> tuple[float, bool]:
     """c of a receiver's velocity that comes next, `every_s` after the one before, and whether more
     of c^2 is assumed than `ASSUMING`. Of velocities that nothing is known of half of their variance
     is white.
@@ -308,11 +308,16 @@ class Means:
             packed = self._ready(degrees)
         limit = THRESHOLDS[probability, degrees]
         if degrees <= 3:
-            found = _take_few(packed, t_ns, limit, *whitened, *_NO_MORE[degrees:])
+            found = take_few(packed, t_ns, limit, *whitened, *_NO_MORE[degrees:])
         else:
             found = _take(packed, np.array(whitened), t_ns, limit)
-        self.unlikely = found == _UNLIKELY
-        return found == _BIASED
+        self.unlikely = found == UNLIKELY
+        return found == BIASED
+
+    def ready(self, degrees: int) -> Array | None:
+        """What the kernels read; None where an innovation of that dimension begins the means."""
+        packed = self._packed
+        return packed if packed.shape[0] == _HEAD + 2 * degrees else None
 
     def _ready(self, degrees: int) -> Array:
         """What the kernels read, for an innovation of that dimension."""
@@ -333,8 +338,8 @@ class Means:
         of chi-square of `degrees`, `own` the part (1) of each innovation's variance that is the
         filter's and common to all. If not, what it shows of the series is learned from."""
         found = _look(self._packed, t_ns, limit, own)
-        self.unlikely = found == _UNLIKELY
-        return found == _BIASED
+        self.unlikely = found == UNLIKELY
+        return found == BIASED
 
     def leaves_open(self, covariance: Array, first: int, sd: tuple[float, ...]) -> Array:
         """Variances (9,) of what is published, position, velocity (n, e, d) and attitude, that the
@@ -381,5 +386,5 @@ class Means:
         """c: by how much (1, at least) a sigma is too small for errors that last, as the series has
         shown; the measurement that comes next counts with it. What is assumed of measurements
         `every_s` weighs as `LIKELY_COUNT` of them, and fades with each that is heard."""
-        coarse, self.assuming = _lasting(self._packed, every_s)
+        coarse, self.assuming = lasting_of(self._packed, every_s)
         return coarse

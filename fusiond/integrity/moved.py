@@ -33,7 +33,7 @@ Nature 363 (1993), 315 (a duration of which no more is known than for how long i
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -51,6 +51,9 @@ TELLS = 5.0
 LEAST = 0.01
 # What goes on in fewer cases than one in twenty is not likely, as everywhere (means.LIKELY).
 UNLIKELY = 0.05
+# A step of a velocity is known by its mean when that shows all of it or, of one that the gate just
+# lets pass, a third: so many times what it shows is in the middle.
+SHOWN_OF_STEP = 2.0
 # Once the motion was in doubt nothing is vouched for for so long (ns).
 VOUCHED_NS = 10_000_000_000
 
@@ -148,6 +151,11 @@ class Parted(NamedTuple):
     since_ns: int
     north: float
     east: float
+
+    @staticmethod
+    def shown(t_ns: int, by: Sequence[float]) -> Parted:
+        """As a mean that is beyond chance shows it (m/s)."""
+        return Parted(t_ns, SHOWN_OF_STEP * by[0], SHOWN_OF_STEP * by[1])
 
     def followed(self, device: str, t_ns: int) -> Moved:
         """It is believed again, or still, at `t_ns`."""

@@ -260,7 +260,7 @@ def residual(offer: PositionOffer, state: State) -> Offset:
     """From the body's origin, as the `settled` offer has it, to where the filter is, at once: asked
     of every fix."""
     at, place = state.model.indices, (offer.lat_rad, offer.lon_rad, *offer.lever)
-    north, east = _residual(state.nav, state.xi, at[offer.time], at[offer.rest], *place)
+    north, east = residual_of(state.nav, state.xi, at[offer.time], at[offer.rest], *place)
     sd_n, sd_e, _ = offer.sd
     return Offset(north, east, sd_n if sd_n > sd_e else sd_e)
 
@@ -314,7 +314,7 @@ def _settled(
 
 
 @compiled("UniTuple(f8, 2)(f8[::1], f8[::1], i8[::1], i8[::1], f8, f8, f8, f8, f8)")
-def _residual(
+def residual_of(
     nav: Array,
     xi: Array,
     time: Indices,

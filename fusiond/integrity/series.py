@@ -31,7 +31,6 @@ REPEATED = 2
 # Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
 # repeats the one before, as this series has shown it (average of so many).
 CHANCE, REPEATS_KEPT = 1e-9, 100.0
-NO_SLIP = Slip()
 # Before any instant that a clock can say.
 NEVER_NS = -(2**62)
 
@@ -88,7 +87,7 @@ class Series:
     """Of a velocity that is left out, where the motion was doubted for it."""
     every_ns: int = 0
     """From the one before to the last that was heard."""
-    slip: Slip = NO_SLIP
+    slip: Slip = field(default_factory=Slip)
     """Of what is said not to slip."""
 
     def copied(self) -> Series:
@@ -103,6 +102,11 @@ class Series:
         self.means.restart()
         if not self.excluded:
             self.refused, self.jumped = 0, False
+
+    @property
+    def quiet(self) -> bool:
+        """Whether it is believed, and nothing is open of it."""
+        return not (self.excluded or self.refused or self.proof or self.punctual or self.moved)
 
     @property
     def drifted(self) -> bool:
@@ -135,6 +139,11 @@ class Series:
         if moving:
             self.repeating += (same - self.repeating) / REPEATS_KEPT
         return False
+
+    @property
+    def may_repeat(self) -> bool:
+        """Of a speed, which is printed coarsely: whether one more of the same is no fault."""
+        return self.repeats + 1 < self._most_repeats()
 
     def _most_repeats(self) -> float:
         return math.log(CHANCE) / math.log(min(max(self.repeating, 0.01), 1.0 - 1e-12))

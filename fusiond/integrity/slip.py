@@ -20,7 +20,8 @@ squares).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import numpy as np
+from numpy.typing import NDArray
 
 from fusiond.integrity.means import (
     DOUBTED_COUNT,
@@ -32,70 +33,81 @@ from fusiond.integrity.means import (
     WHITE_FAST,
     WHITE_SLOW,
 )
+from fusiond.navigation.compiled import compiled
 
-PACES = (FAST, WHITE_FAST), (SLOW, WHITE_SLOW)
+Array = NDArray[np.float64]
+
+# Of the array that the kernel reads: the means of u v and v^2, at the fast pace and at the slow
+# one, what is opened of the heading; sum of slips' squares (m^2/s^2) and their number lately, in
+# the period before, and of those that are believed; since when (ns, an integer) lately is.
+_OPENED, _LATELY, _WAITING, _BELIEVED, _SINCE, _SIZE = 4, 5, 7, 9, 11, 12
 
 
-class Shown(NamedTuple):
-    """Sum of slips' squares (m^2/s^2) and their number."""
+@compiled("f8(f8[::1], i8, f8, f8, f8, f8)")
+def take_slip(
+    packed: Array, t_ns: int, across: float, drift_sd: float, speed: float, variance: float
+) -> float:
+    """See `Slip.with_one`; what is opened then."""
+    square = speed * speed
+    number = DOUBTED_COUNT + packed[_BELIEVED + 1]
+    lasting = (DOUBTED_COUNT * (drift_sd * drift_sd) + packed[_BELIEVED]) / number
+    opened = shown = 0.0
+    for k in range(2):
+        most, white = (FAST, WHITE_FAST) if k == 0 else (SLOW, WHITE_SLOW)
+        uv, vv = packed[2 * k], packed[2 * k + 1]
+        pace = most * min(1.0, square / vv) if vv > 0.0 else most
+        uv, vv = uv + pace * (across * speed - uv), vv + pace * (square - vv)
+        packed[2 * k], packed[2 * k + 1] = uv, vv
+        if vv > 0.0:
+            shown = uv * uv / vv
+            opened = max(opened, (shown - LIKELY * (lasting + variance * white)) / vv)
+    packed[_OPENED] = opened
+    since_ns = packed[_SINCE:].view(np.int64)
+    if t_ns - since_ns[0] >= LEARN_NS:
+        since_ns[0] = t_ns
+        # Of no more than `LASTING_COUNT`.
+        number = packed[_BELIEVED + 1] + packed[_WAITING + 1]
+        share = min(1.0, LASTING_COUNT / number) if number > 0.0 else 1.0
+        packed[_BELIEVED] = share * (packed[_BELIEVED] + packed[_WAITING])
+        packed[_BELIEVED + 1] = share * number
+        for k in range(2):
+            packed[_WAITING + k] = packed[_LATELY + k]
+            packed[_LATELY + k] = 0.0
+    packed[_LATELY] += shown
+    packed[_LATELY + 1] += 1.0
+    return opened
 
-    squares: float = 0.0
-    number: float = 0.0
 
+class Slip:
+    """What goes across as a series has shown it; never changed."""
 
-class Slip(NamedTuple):
-    """What goes across as a series has shown it; `opened` of the heading's variance (rad^2)."""
+    __slots__ = ("packed",)
 
-    means: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    """Of u v and v^2, at the fast pace and at the slow one."""
-    opened: float = 0.0
-    since_ns: int = 0
-    lately: Shown = Shown()
-    waiting: Shown = Shown()
-    """Of the period before."""
-    believed: Shown = Shown()
+    def __init__(self, packed: Array | None = None) -> None:
+        self.packed = np.zeros(_SIZE) if packed is None else packed
+        """What `take_slip` changes a copy of."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Slip) and self.packed.tobytes() == other.packed.tobytes()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def opened(self) -> float:
+        """Of the heading's variance (rad^2)."""
+        return float(self.packed[_OPENED])
 
     def with_one(
         self, t_ns: int, across: tuple[float, float], speed: float, variance: float
     ) -> Slip:
         """One more: the velocity across and the sigma of slips that is configured (m/s), the speed,
         and the aid's own variance (m^2/s^2)."""
-        u, drift_sd = across
-        square = speed * speed
-        lasting = self._lasting(drift_sd * drift_sd)
-        means: list[float] = []
-        opened = shown = 0.0
-        for k, (most, white) in enumerate(PACES):
-            uv, vv = self.means[2 * k : 2 * k + 2]
-            pace = most * min(1.0, square / vv) if vv > 0.0 else most
-            uv, vv = uv + pace * (u * speed - uv), vv + pace * (square - vv)
-            means += [uv, vv]
-            if vv > 0.0:
-                shown = uv * uv / vv
-                opened = max(opened, (shown - LIKELY * (lasting + variance * white)) / vv)
-        s = self
-        if t_ns - s.since_ns >= LEARN_NS:
-            s = s._replace(
-                since_ns=t_ns,
-                lately=Shown(),
-                waiting=s.lately,
-                believed=_sum(s.believed, s.waiting),
-            )
-        lately = Shown(s.lately.squares + shown, s.lately.number + 1.0)
-        return s._replace(means=tuple(means), opened=opened, lately=lately)
-
-    def _lasting(self, configured: float) -> float:
-        """Variance of a slip that lasts."""
-        told = self.believed
-        return (DOUBTED_COUNT * configured + told.squares) / (DOUBTED_COUNT + told.number)
+        packed = self.packed.copy()
+        take_slip(packed, t_ns, *across, speed, variance)
+        return Slip(packed)
 
     def without_lately(self) -> Slip:
         """Its series is left out: what it has shown lately is a fault's."""
-        return Slip(believed=self.believed)
-
-
-def _sum(one: Shown, other: Shown) -> Shown:
-    """Both, of no more than `LASTING_COUNT`."""
-    number = one.number + other.number
-    share = min(1.0, LASTING_COUNT / number) if number else 1.0
-    return Shown(share * (one.squares + other.squares), share * number)
+        packed = np.zeros(_SIZE)
+        packed[_BELIEVED : _BELIEVED + 2] = self.packed[_BELIEVED : _BELIEVED + 2]
+        return Slip(packed)

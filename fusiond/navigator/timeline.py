@@ -22,9 +22,11 @@ from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.offers import Offer
 from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.integrity.action import MEASURED, MOTION, NONE
-from fusiond.integrity.isolation import Isolation, Memory
+from fusiond.integrity.action import MEASURED, MOTION, NONE, Action
+from fusiond.integrity.isolation import Isolation
+from fusiond.integrity.kept import Memory
 from fusiond.integrity.moved import Moved
+from fusiond.integrity.ordinary import ASSUMED, SITS, Ordinary
 from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.integrity.series import Said, said
 from fusiond.models.vehicle import MOUNTING
@@ -48,12 +50,14 @@ class Entry:
     that what it corrects the tilt by is added up (fusiond.integrity.tilt), `judged` that its
     innovation has been looked at: a rewind applies it again, and then what it `says` is known.
     `assumed`: it counts as coarser than it says, and its own errors have not shown that. `error` is
-    what made it `failed`; `raw` is kept where the timeline `keeps_raw`."""
+    what made it `failed`; `raw` is kept where the timeline `keeps_raw`; `ordinary` is what of it is
+    the same each time that it is applied as nearly all are (fusiond.integrity.ordinary)."""
 
     key: Key
     aid: Aid
     feedback: Feedback = "at_once"
     tilts: bool = False
+    ordinary: Ordinary | None = None
     says: Said | None = None
     outcome: Outcome | None = None
     judged: bool = False
@@ -174,6 +178,7 @@ class Timeline:
         if at < last and self._keys[at] == key:
             self._count(entry, Outcome("duplicate"))
             return entry
+        entry.ordinary = self.isolation.ordinary(aid, self.estimator.model, tilts)
         self._keys.insert(at, key)
         self._entries.insert(at, entry)
         if self._checkpoints and (
@@ -240,6 +245,16 @@ class Timeline:
 
     def _apply(self, entry: Entry) -> Outcome:
         estimator, isolation, aid = self.estimator, self.isolation, entry.aid
+        one = entry.ordinary
+        if one is not None and (plain := estimator.plain()) is not None:
+            raw = raw_innovation(aid, estimator) if self.keeps_raw else None
+            if (found := isolation.take(aid, one, plain, estimator.state)) is not None:
+                outcome, shown, action = found
+                entry.raw = raw
+                if not entry.judged:
+                    entry.assumed = shown & ASSUMED > 0
+                self._act(aid, action, shown & SITS > 0 or bool(isolation.hedge.wider))
+                return outcome
         if entry.feedback == "release":
             estimator.release()
         elif entry.feedback == "hold":
@@ -275,14 +290,19 @@ class Timeline:
             action = isolation.judge(aid, outcome, nav, p, state, says)
             if action is NONE and entry.tilts and outcome.name == "fused":
                 action = isolation.corrected(aid.t_ns, nav, p, estimator.turned)
-            if action is not NONE:
-                estimator.doubt(aid, action in MEASURED, action in MOTION, isolation.shown)
-            if aid.constraint and self._mounting:
-                angle = estimator.xi.item
-                isolation.hedge.sits([angle(slot) for slot in self._mounting], self._mounting_sd)
-            if isolation.hedge.wider is not self._wider:
-                self._hedge()
+            self._act(aid, action)
         return outcome
+
+    def _act(self, aid: Aid, action: Action, sits: bool = True) -> None:
+        """Do what came of an aid, of which the mounting is known as well where it `sits`."""
+        if action is not NONE:
+            apart = self.isolation.shown
+            self.estimator.doubt(aid, action in MEASURED, action in MOTION, apart)
+        if sits and aid.constraint and self._mounting:
+            angle = self.estimator.xi.item
+            self.isolation.hedge.sits([angle(slot) for slot in self._mounting], self._mounting_sd)
+        if self.isolation.hedge.wider is not self._wider:
+            self._hedge()
 
     def _hedge(self) -> None:
         """What the estimator publishes is as wide as the isolation has it now."""

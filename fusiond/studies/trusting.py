@@ -10,6 +10,7 @@ from fusiond.estimators.base import Outcome
 from fusiond.integrity.action import Action
 from fusiond.integrity.isolation import Isolation
 from fusiond.integrity.series import Said
+from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
 
@@ -32,3 +33,7 @@ class Trusting(Isolation):
     def corrected(self, t_ns: int, nav: Array, covariance: Array, turned: float = 0.0) -> Action:
         """Nor is the IMU."""
         return Action.NONE
+
+    def ordinary(self, aid: Aid, model: Model, tilts: bool) -> None:
+        """None is judged as it is folded in."""
+        return None

@@ -30,6 +30,7 @@ from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
+from fusiond.models.model import Model
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     AXLE_LEVER,
@@ -107,6 +108,10 @@ class SlippingAid(NonHolonomicAid):
         if isinstance(found, NotApplicable):
             return found
         return found._replace(z=found.z + np.array(self.slip))
+
+    def packed(self, model: Model) -> None:
+        """A kernel knows nothing of the slip."""
+        return None
 
 
 @dataclass(frozen=True, slots=True)

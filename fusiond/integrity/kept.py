@@ -1,0 +1,97 @@
+"""What is kept of all series of innovations, and copied for checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.integrity import returns
+from fusiond.integrity.hedge import NOTHING, Hedge
+from fusiond.integrity.means import Means
+from fusiond.integrity.moved import Moved
+from fusiond.integrity.returns import Begun
+from fusiond.integrity.series import Series
+from fusiond.integrity.tilt import Tilting
+
+Array = NDArray[np.float64]
+
+
+class Memory(NamedTuple):
+    """All that a later restore needs."""
+
+    records: dict[str, Series]
+    doubts: tuple[int, ...]
+    tilting: Tilting
+    wider: Mapping[str, Array]
+
+
+class Kept:
+    """Series by name, doubts of the filter, sums of its tilt's corrections, and what is open."""
+
+    def __init__(self) -> None:
+        self._records: dict[str, Series] = {}
+        self._shared: set[str] = set()
+        """Series whose record a checkpoint has too: copied before it is changed."""
+        self._doubts: tuple[int, ...] = ()
+        self._tilting = Tilting()
+        self.hedge = Hedge()
+        self._begun, self._comes = Begun(), returns.NOTHING
+
+    @property
+    def doubts(self) -> tuple[int, ...]:
+        """Instants (ns) at which the filter was in doubt, the last few of them."""
+        return self._doubts
+
+    def snapshot(self) -> Memory:
+        """A copy of everything."""
+        self._shared = set(self._records)
+        mine = self._records.copy(), self._doubts, self._tilting.copied(), self.hedge.wider
+        return Memory(*mine)
+
+    def restore(self, memory: Memory) -> None:
+        """Back to a snapshot."""
+        self._records, self._shared = memory.records.copy(), set(memory.records)
+        self._doubts, self._tilting = memory.doubts, memory.tilting.copied()
+        self.hedge.wider = memory.wider
+
+    def reset(
+        self, contradicted: bool = False, failed: bool = False, moved: Moved | None = None
+    ) -> None:
+        """The filter starts anew: nobody is suspected. But positions that were `contradicted` by
+        their velocities are to prove themselves, as after an outage; and where one before it has
+        `failed`, that they are on time, or is open what they have `moved` by."""
+        self._begun, self._comes = Begun(contradicted, failed, moved), returns.NOTHING
+        self._records, self._shared = {}, set()
+        self._doubts, self._tilting, self.hedge.wider = (), Tilting(), NOTHING
+
+    def _own(self, aid: Aid, known: Series | None) -> Series:
+        """The series of an aid, which may be changed: none was known, or a checkpoint has it."""
+        if known is None:
+            record = Series(aid.device, aid.locates, aid.moves, aid.t_ns, aid.no_slip)
+            record.means = Means.begun(aid.white)
+        else:
+            self._shared.discard(aid.source)
+            record = known.copied()
+        self._records[aid.source] = record
+        return record
+
+    def _followed(self, record: Series, t_ns: int) -> None:
+        """A velocity is believed again, or still: where it had parted from the filter, what it may
+        carry the position of its device off by is open."""
+        if record.parted is None:
+            return
+        what, record.parted = record.parted.followed(record.device, t_ns), None
+        of_device = [
+            (name, r)
+            for name, r in self._records.items()
+            if r.locates and r.device == record.device
+        ]
+        for name, position in of_device:
+            mine = position.copied() if name in self._shared else position
+            mine.moved = what.joined(mine.moved)
+            self._shared.discard(name)
+            self._records[name] = mine
