@@ -15,8 +15,8 @@ from fusiond.integrity.returns import Begun, Coming, prove
 from fusiond.integrity.series import Series
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults.hours import around_town
-from fusiond.studies.faults.library import Alter, Fault
-from fusiond.studies.faults.recording import Drive, Recording
+from fusiond.studies.faults.library import Fault
+from fusiond.studies.faults.recording import Alter, Drive, Recording
 from fusiond.studies.faults.runs import run
 from tests.integrity.journey import Journey
 from tests.integrity.series_bench import Bench, S

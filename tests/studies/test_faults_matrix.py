@@ -22,6 +22,8 @@ ROWS = [
     ("velocity_reversed", "navigating", "isolated", 5.0),
     ("drift_0.5_m_s", "coasting", "isolated", 10.0),
     ("carried_off_0.5_m_s", "navigating", "isolated", None),
+    ("two_step_500m", "navigating", "isolated", 10.0),
+    ("two_carried_off_0.5_m_s", "navigating", "isolated", None),
     ("wheels_frozen", "coasting", "isolated", 5.0),
     ("gyro_bias_1_deg_s", "navigating", "isolated", None),
     ("gyro_spike_in_range", "navigating", "imu_spike", 3.0),

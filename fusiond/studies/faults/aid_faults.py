@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.measurements import DelayedFix, Measurement, MonotonicStamp, PositionFix, WheelSpeed
 from fusiond.simulation.imu_truth import metres_to_geodetic
-from fusiond.studies.faults.recording import Received, Recording
+from fusiond.studies.faults.recording import Alter, Received, Recording
 
 STEP_M = 500.0
 DRIFT_M_S = 0.5
@@ -52,6 +52,21 @@ def _fixes(r: Recording, begin_s: float, end_s: float) -> list[Received]:
         for item in r.received
         if isinstance(item.measurement, PositionFix) and begin_s * 1e9 <= item.t_ns < end_s * 1e9
     ]
+
+
+def sparing(alter: Alter, source: str) -> Alter:
+    """What alters a recording, but for what that source says."""
+
+    def altered(r: Recording, begin_s: float, length_s: float) -> Recording:
+        turns = list(dict.fromkeys(item.measurement.source for item in r.received))
+        spared = [item for item in r.received if item.measurement.source == source]
+        others = [item for item in r.received if item.measurement.source != source]
+        part = alter(replace(r, received=tuple(others)), begin_s, length_s)
+        # Of what comes at the same time the order is as before.
+        received = [*part.received, *spared]
+        return part.with_received(sorted(received, key=lambda i: turns.index(i.measurement.source)))
+
+    return altered
 
 
 def _north_of(lat_rad: float, height_m: float | None, north_m: float) -> float:

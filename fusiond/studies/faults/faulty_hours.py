@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults.aid_faults import sparing
 from fusiond.studies.faults.hours import (
     HOUR_S,
     KINDS,
@@ -45,7 +46,7 @@ from fusiond.studies.faults.judge import (
 from fusiond.studies.faults.library import TO_THE_END
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import largest
-from fusiond.studies.faults.recording import Recording, town
+from fusiond.studies.faults.recording import GNSS, SECOND, Recording, town
 from fusiond.studies.faults.runs import navigate
 
 APART_S = (180.0, 480.0)
@@ -56,7 +57,7 @@ SETTLED_S = 60.0
 """What is told so long after a fault's end is of the fault."""
 JUDGED_S = 100.0
 """A hundred fixes of one a second."""
-RECEIVERS = ("gnss", "second")
+RECEIVERS = (GNSS, SECOND)
 NOTHING_WRONG = (*USUAL, "verdict_cannot_tell")
 
 
@@ -73,11 +74,9 @@ class Happening:
         """The recording with it."""
         alter = EVERY[self.fault].alter
         assert alter is not None
-        spared = [r for r in whole.received if r.measurement.source == self.spares]
-        others = [r for r in whole.received if r.measurement.source != self.spares]
-        part = replace(whole, received=tuple(others))
-        altered = alter(part, self.begin_s, self.end_s - self.begin_s)
-        return altered.with_received([*altered.received, *spared])
+        if self.spares is not None:
+            alter = sparing(alter, self.spares)
+        return alter(whole, self.begin_s, self.end_s - self.begin_s)
 
 
 def faults_of(kind: Kind) -> tuple[str, ...]:
@@ -86,7 +85,7 @@ def faults_of(kind: Kind) -> tuple[str, ...]:
         name
         for name, fault in EVERY.items()
         if fault.alter is not None and fault.configure is None and fault.begin_s is None
-        if fault.drive.path is town and not fault.drive.spare
+        if fault.drive.path is town and not (fault.drive.spare or fault.drive.second)
         if kind.drive.wheels or not fault.drive.wheels
     )
 
@@ -101,7 +100,7 @@ def happenings(kind: Kind, seed: int, duration_s: float) -> list[Happening]:
         fault, drawn_s = EVERY[name], round(rng.uniform(*LASTS_S))
         spares = (None, *RECEIVERS)[rng.integers(3)]
         length_s = drawn_s if fault.length_s == TO_THE_END else fault.length_s
-        of_two = kind.twice and not fault.of_imu
+        of_two = kind.drive.second and not fault.of_imu
         found.append(Happening(name, begin_s, begin_s + length_s, spares if of_two else None))
     return found
 
@@ -157,7 +156,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "judged": tests_of(
             r for r in recording.received if quiet(r.seen_ns * 1e-9, SETTLED_S + JUDGED_S)
         ),
-        "limits": kind.twice,
+        "limits": kind.drive.second,
         "not_navigating_s": sum(s.mode not in ("", NAVIGATING) for s in samples),
         "beyond_s": beyond_s(vouched),
         "longest_lie_s": longest_lie_s(samples),

@@ -35,13 +35,11 @@ from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.integrity.isolation import FALSE_ALARM
 from fusiond.navigator.navigator import Navigator
-from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
-from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults.judge import MOST_SIGMA, NAVIGATING, QUANTITIES, longest_lie_s
-from fusiond.studies.faults.library import with_wheels
+from fusiond.studies.faults.library import with_second, with_wheels
 from fusiond.studies.faults.recording import (
     REST_S,
     TOWN_LEGS,
@@ -49,7 +47,6 @@ from fusiond.studies.faults.recording import (
     Drive,
     Received,
     Recording,
-    gnss_fixes,
 )
 from fusiond.studies.faults.runs import VEHICLE, navigate
 
@@ -105,22 +102,21 @@ def parked(duration_s: float) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A vehicle and what it does for an hour; `twice`: two receivers and alert limits."""
+    """A vehicle and what it does for an hour; one of two receivers has alert limits, too."""
 
     drive: Drive
-    twice: bool = False
 
     def config(self) -> Config:
         """What the navigator gets."""
         settings = VEHICLE.model_dump(exclude_unset=True)
         settings["imu"]["rate_hz"] = RATE_HZ
-        if self.twice:
-            settings["aiding"]["second"] = {**settings["aiding"]["gnss"], "kind": "gnss"}
+        if self.drive.second:
             settings["integrity"] = {
                 "horizontal_alert_limit_m": LIMITS_M[0],
                 "vertical_alert_limit_m": LIMITS_M[1],
             }
         config = Config.model_validate(settings)
+        config = with_second(config) if self.drive.second else config
         return with_wheels(config) if self.drive.wheels else config
 
     def recorded(self, config: Config, seed: int, duration_s: float) -> tuple[Truth, Recording]:
@@ -128,15 +124,7 @@ class Kind:
         truth, recording = replace(self.drive, duration_s=duration_s).recorded(config, seed)
         if self.drive.wheels:
             return truth, _drifting(recording, config, np.random.default_rng([seed, 2]))
-        if not self.twice:
-            return truth, recording
-        options = replace(SCENARIOS["drive"].fitted(config).gnss, rate_hz=GNSS_HZ)
-        second = GnssReceiver(truth, options, np.random.default_rng([seed, 1]))
-        received = [
-            replace(item, measurement=replace(item.measurement, source="second"))
-            for item in gnss_fixes(second)
-        ]
-        return truth, recording.with_received([*recording.received, *received])
+        return truth, recording
 
 
 def _drifting(recording: Recording, config: Config, rng: np.random.Generator) -> Recording:
@@ -164,7 +152,7 @@ KINDS = {
     "wheels": Kind(Drive(around_town, wheels=True, gnss_rate_hz=GNSS_HZ)),
     "motorway": Kind(Drive(on_motorway, gnss_rate_hz=GNSS_HZ)),
     "parked": Kind(Drive(parked, gnss_rate_hz=GNSS_HZ)),
-    "two receivers": Kind(Drive(around_town, gnss_rate_hz=GNSS_HZ), twice=True),
+    "two receivers": Kind(Drive(around_town, second=True, gnss_rate_hz=GNSS_HZ)),
 }
 
 
@@ -194,7 +182,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
         "told": dict(told),
         "doubts": len(doubts),
         "tests": tests_of(recording.received),
-        "limits": kind.twice,
+        "limits": kind.drive.second,
         "not_navigating_s": len(after) - len(vouched),
         "beyond_s": beyond_s(vouched),
         "rms": np.sqrt(np.mean(np.square(vouched), axis=0)).round(3).tolist() if vouched else [],

@@ -17,10 +17,17 @@ from fusiond.configuration.schema import Config, SpareImu
 from fusiond.simulation.trajectories import Leg, Path, follow
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
-from fusiond.studies.faults.recording import BEND_S, DURATION_S, REST_S, Drive, Recording
+from fusiond.studies.faults.recording import (
+    BEND_S,
+    DURATION_S,
+    GNSS,
+    REST_S,
+    SECOND,
+    Alter,
+    Drive,
+)
 
 PhaseName = Literal["aligning", "navigating", "coasting"]
-Alter = Callable[[Recording, float, float], Recording]
 Configure = Callable[[Config], Config]
 
 
@@ -133,6 +140,12 @@ def with_wheels(config: Config) -> Config:
     return config.model_copy(update={"aiding": {**config.aiding, "wheel": section}})
 
 
+def with_second(config: Config) -> Config:
+    """With a second receiver, as the first."""
+    aiding = {**config.aiding, SECOND: config.aiding[GNSS]}
+    return config.model_copy(update={"aiding": aiding})
+
+
 def with_spare(config: Config) -> Config:
     """With a second inertial unit, turned by a quarter."""
     spare = SpareImu(source="spare", axes=("+y", "+x", "-z"))
@@ -143,6 +156,7 @@ _of_imu = partial(Fault, of_imu=True)
 _in_bend = partial(_of_imu, imu.silent, phases=("navigating",), begin_s=BEND_S)
 _of_wheels = partial(_of_imu, length_s=30.0, phases=UNDER_WAY, drive=Drive(wheels=True))
 _with_spare = partial(_of_imu, drive=Drive(spare=True))
+_of_two = partial(Fault, drive=Drive(second=True))
 _from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
 _under_way = partial(Fault, phases=("navigating",))
 
@@ -176,6 +190,11 @@ FAULTS: dict[str, Fault] = {
     "fixes_from_future": Fault(aid.from_future, 20.0),
     "multipath_tunnel_jump": _under_way(aid.multipath_tunnel_jump, 60.6),
     "first_fixes_at_90s": _from_start(aid.no_fix_yet, 90.0, drive=Drive(_smooth)),
+    # fixes of two receivers
+    "one_of_two_drifts_0.5_m_s": _of_two(aid.sparing(aid.drift, SECOND), 60.0),
+    "two_step_500m": _of_two(aid.step, 20.0),
+    "two_frozen": _of_two(aid.frozen, 20.0),
+    "two_carried_off_0.5_m_s": _of_two(aid.carried_off, 60.0, phases=("navigating",)),
     # RDSS
     "rdss_step_500m": Fault(aid.rdss_step, 60.0),
     "rdss_latitude_nan": Fault(aid.rdss_nan, 30.0),

@@ -8,8 +8,8 @@ from drivers.measurements import DelayedFix, PositionFix, WheelSpeed
 from fusiond.configuration.settings import DEG
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
-from fusiond.studies.faults.library import FAULTS, UNDER_WAY, Alter, Fault, sideways
-from fusiond.studies.faults.recording import Drive, Recording
+from fusiond.studies.faults.library import FAULTS, UNDER_WAY, Fault, sideways
+from fusiond.studies.faults.recording import Alter, Drive, Recording
 
 KM_H = 3.6
 """km/h in a m/s: speeds of one unit, read as the other."""

@@ -20,8 +20,8 @@ from fusiond.configuration.settings import DEG
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
 from fusiond.studies.faults.judge import LIE_S
-from fusiond.studies.faults.library import PHASES, Alter, Fault
-from fusiond.studies.faults.recording import Drive
+from fusiond.studies.faults.library import PHASES, Fault
+from fusiond.studies.faults.recording import Alter, Drive
 from fusiond.studies.faults.runs import run
 
 LASTS_S = 60.0

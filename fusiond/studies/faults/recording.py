@@ -31,6 +31,8 @@ REST_S = 15.0
 BEND_S = 90.0
 """Start of the bend of 180 deg in `town`, which lasts 15 s at 20 m/s."""
 RDSS_EVERY_S = 11.0
+GNSS, SECOND = "gnss", "second"
+"""What the configuration calls the receivers."""
 """One second more than the service frequency of a 10 s card."""
 WHEEL_EVERY_S = 0.1
 WHEEL_SD_M_S = 0.1
@@ -90,6 +92,9 @@ class Recording:
         return replace(self, received=tuple(sorted(received, key=lambda r: r.seen_ns)))
 
 
+Alter = Callable[[Recording, float, float], Recording]
+"""What a fault does to a recording, from an instant (s) on, for so long (s)."""
+
 TOWN_LEGS = (
     Leg(8, speed_m_s=14.0),
     Leg(12),
@@ -122,6 +127,8 @@ class Drive:
     wheels: bool = False
     spare: bool = False
     """A second inertial unit, `[imu.spare]` of the configuration."""
+    second: bool = False
+    """A second receiver, `SECOND` of the configuration, as good as the first."""
     gnss_rate_hz: float = 5.0
     duration_s: float = DURATION_S
 
@@ -141,12 +148,18 @@ class Drive:
         received += _rdss(RdssCentre(truth, car.rdss, rdss_rng), self.duration_s)
         if self.wheels:
             received += _wheels(truth, wheel_rng)
+        spare_seed, second_seed = sequence.spawn(2)
+        if self.second:
+            twin = GnssReceiver(truth, receiver, np.random.default_rng(second_seed))
+            received += [
+                replace(r, measurement=replace(r.measurement, source=SECOND))
+                for r in gnss_fixes(twin)
+            ]
         samples = np.hstack((imu.gyro, imu.accel))
         recording = Recording(stamps, stamps, samples, ()).with_received(received)
         if self.spare:
-            [spare_seed] = sequence.spawn(1)
-            second = _spare(car, truth, np.random.default_rng(spare_seed))
-            recording = replace(recording, spare=replace(recording, samples=second, received=()))
+            said = _spare(car, truth, np.random.default_rng(spare_seed))
+            recording = replace(recording, spare=replace(recording, samples=said, received=()))
         return truth, recording
 
 
@@ -169,7 +182,7 @@ def gnss_fixes(receiver: GnssReceiver) -> list[Received]:
         lat, lon, height = receiver.position[k].tolist()
         north, east, down = receiver.v_ned[k].tolist()
         fix = PositionFix(
-            "gnss",
+            GNSS,
             seen_ns,
             MonotonicStamp(t_ns),
             lat,

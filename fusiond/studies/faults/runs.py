@@ -23,7 +23,15 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.judge import Course, Event, Sample, axis_ratio, judge
-from fusiond.studies.faults.library import FAULTS, PHASES, Fault, PhaseName, with_spare, with_wheels
+from fusiond.studies.faults.library import (
+    FAULTS,
+    PHASES,
+    Fault,
+    PhaseName,
+    with_second,
+    with_spare,
+    with_wheels,
+)
 from fusiond.studies.faults.recording import DURATION_S, Drive, Recording, town
 
 Array = NDArray[np.float64]
@@ -79,7 +87,8 @@ def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
     fault = FAULTS[row.fault]
     if drive is not None and fault.drive.path is town:
         found = drawn(drive)
-        found = replace(found, wheels=fault.drive.wheels, spare=fault.drive.spare)
+        own = fault.drive
+        found = replace(found, wheels=own.wheels, spare=own.spare, second=own.second)
         fault = replace(fault, drive=found)
     return {"fault": row.fault, "phase": row.phase, **run(fault, row.phase, seed)}
 
@@ -104,6 +113,8 @@ def _driven(fault: Fault, phase: PhaseName, seed: int) -> Course:
     vehicle = with_wheels(VEHICLE) if fault.drive.wheels else VEHICLE
     if fault.drive.spare:
         vehicle = with_spare(vehicle)
+    if fault.drive.second:
+        vehicle = with_second(vehicle)
     truth, recording = fault.drive.recorded(vehicle, seed)
     outage = PHASES[phase].outage_s
     if outage is not None:
