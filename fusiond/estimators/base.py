@@ -325,11 +325,15 @@ class ErrorStateFilter:
     def doubt(
         self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
     ) -> None:
-        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
+        """Widen P: by an aid's innovation what it measures, and its offset in time, which a drift
+        along the track has taught, by what it was at first; or attitude and sensor errors."""
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return
         used = len(rows.z) if measured else 0
+        if measured:
+            late = self.model.indices[getattr(aid, "time", "")]
+            self._covs[:, late, late] += self.model.initial[late] ** 2
         for row, least in enumerate(apart[:used]):
             rows.z[row] = math.copysign(max(abs(rows.z[row]), least), rows.z[row])
         self._doubt(Innovation(rows.z[:used], rows.h[:used], rows.r[:used]), motion)
