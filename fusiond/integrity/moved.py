@@ -59,7 +59,7 @@ VOUCHED_NS = 10_000_000_000
 
 
 class Witness(Protocol):
-    """What is known of another device's positions."""
+    """What is known of another device's positions or velocities."""
 
     device: str
     locates: bool
