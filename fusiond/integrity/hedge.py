@@ -28,7 +28,7 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
-A velocity that is refused, by chance one in ten thousand, is apart by u, and none was T before.
+A velocity that is refused, by chance one in ten thousand, is apart by u, and was not T before.
 Either it is wrong, or the unit has felt an acceleration that was none: until the next has told
 velocity, position and tilt are open by
 
@@ -249,10 +249,8 @@ class Hedge:
             self._put(source + STRAYS, wider)
 
     def refused(self, source: str, by: tuple[float, float], since_s: float) -> None:
-        """A velocity was refused that is apart `by` (m/s) from the filter's, north and east, after
-        `since_s` in which nothing of it was."""
-        if since_s <= 0.0:
-            return
+        """A velocity was refused that is apart `by` (m/s) from the filter's, north and east, and
+        was not `since_s` before."""
         north, east = by[0] ** 2, by[1] ** 2
         wider = np.zeros(9)
         wider[3:5] = north, east

@@ -211,8 +211,9 @@ class Isolation(Kept):
                 return NONE
             by = (0.0, 0.0) if velocity is None else parts_by(velocity, v_n, v_e)
             away = record.away_m if aid.locates else math.hypot(*by)
-            if record.moves and not aid.locates:
-                self.hedge.refused(aid.source, by, (t_ns - record.fused_ns) * 1e-9)
+            since_ns = t_ns - record.fused_ns
+            if velocity is not None and 0 < since_ns <= FORGET_NS:
+                self.hedge.refused(aid.source, by, since_ns * 1e-9)
             action = self._refuse(record, t_ns, outcome.nis, away)
             if record.moves and action in MOTION:
                 record.parted = Parted(record.refused_ns, *by)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusiond.aiding.body_velocity import NonHolonomicAid
+from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.estimators.base import Outcome
@@ -348,3 +348,29 @@ def test_a_velocity_that_is_refused_opens_what_it_says_until_the_next() -> None:
     assert opened == pytest.approx([0.0, 0.0625, 0.0, 0.0, 0.25, 0.0, tilt, tilt, 0.0])
     bench.velocity(61)
     assert "gnss_velocity" not in bench.isolation.hedge.wider
+
+
+def test_one_that_has_not_been_fused_lately_says_nothing_of_when_it_parted() -> None:
+    """Not the first after a start, nor after an outage of it: that may have been hours ago."""
+    bench = Bench()
+    bench.covariance = np.diag([1e-4] * 9)
+    bench.fix(0)
+    bench.velocity(0, bias=12.0, east_m_s=3.5)
+    assert "gnss_velocity" not in bench.isolation.hedge.wider
+    for t in range(1, 60):
+        bench.both(range(t, t + 1))
+    for t in range(60, 90):
+        bench.fix(t)
+    bench.velocity(90, bias=12.0, east_m_s=3.5)
+    assert "gnss_velocity" not in bench.isolation.hedge.wider
+
+
+def test_a_speed_that_is_refused_opens_no_velocity() -> None:
+    bench = Bench()
+    bench.covariance = np.diag([1e-4] * 9)
+    for t in range(20):
+        bench.both(range(t, t + 1))
+        bench.wheel(t, 8.0)
+    aid = WheelSpeedAid("wheel", 20 * S, GATE, 12.0, 0.1, LEVER)
+    bench.isolation.judge(aid, Outcome("gated", 1600.0, 1, (40.0,)), NAV, bench.covariance)
+    assert "wheel" not in bench.isolation.hedge.wider
