@@ -260,7 +260,9 @@ class InvariantFilter(TiltAxesFilter):
 
     def plain(self) -> Plain | None:
         """For kernels that do what `update` does; None where it does something else."""
-        return None if self.turns or self._turns_again() else super().plain()
+        if self.turns or (self._doubted and self._turns_again()):
+            return None
+        return super().plain()
 
     def _update(self, aid: Linearised) -> Outcome:
         before = self.of_vehicle(self.nav, self.xi, -1.0)

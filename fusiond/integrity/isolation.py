@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
-from fusiond.estimators.base import Outcome, gate_threshold
+from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.update import Plain
 from fusiond.integrity import ordinary, returns, support
 from fusiond.integrity.action import MOTION, NONE, Action
@@ -302,11 +302,11 @@ class Isolation(Kept):
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
     def take(
-        self, aid: Aid, one: Ordinary, filter_: Plain, state: State
+        self, aid: Aid, one: Ordinary, filter_: Plain, estimator: Estimator
     ) -> tuple[Outcome, int, Action] | None:
-        """Fold an aid into the `filter_` of that `state` and take in how it ended, what `update`
-        and all of the above do, if it is an ordinary one; else nothing has changed. With what that
-        has shown (fusiond.integrity.ordinary)."""
+        """Fold an aid into an estimator, whose `filter_` that is, and take in how it ended, what
+        `update` and all of the above do, if it is an ordinary one; else nothing has changed. With
+        what that has shown (fusiond.integrity.ordinary)."""
         t_ns, record = aid.t_ns, self._records.get(aid.source)
         if record is None or not ordinary.may_be(one, t_ns, record):
             return None
@@ -319,6 +319,9 @@ class Isolation(Kept):
             return None
         outcome, shown = taken
         self.shown, self._comes, action, hedge = (), returns.NOTHING, NONE, self.hedge
+        if not (shown or hedge.wider):
+            return outcome, shown, action
+        state = estimator.state
         if record.no_slip and (shown & ordinary.ACROSS or hedge.wider):
             hedge.went_across(aid, record, state)
         if shown & (ordinary.BIAS | ordinary.UNUSUAL | ordinary.STRAYS) or hedge.wider:

@@ -210,9 +210,20 @@ def take(
     slip = record.slip.packed
     if record.no_slip:
         slip = slip.copy()
-    of_aid = slots, numbers, t_ns, every_ns, threshold, tilts
-    of_series = packed, limit, slip, tilting.sums, tilting.before
-    shown, nis, north, east = _take(*filter_, *of_aid, *of_series)
+    shown, nis, north, east = _take(
+        *filter_,
+        slots,
+        numbers,
+        t_ns,
+        every_ns,
+        threshold,
+        tilts,
+        packed,
+        limit,
+        slip,
+        tilting.sums,
+        tilting.before,
+    )
     if shown == OTHERWISE:
         return None
     record.every_ns, record.heard_ns, record.fused_ns = every_ns, t_ns, t_ns

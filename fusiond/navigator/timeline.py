@@ -195,8 +195,9 @@ class Timeline:
         """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
         latest = self.imu.latest_ns
         estimator, entries = self.estimator, self._entries
-        while self._next < len(entries) and (t_ns := entries[self._next].key[0]) <= latest:
-            entry = entries[self._next]
+        for entry in entries[self._next :]:
+            if (t_ns := entry.key[0]) > latest:
+                break
             if t_ns > estimator.t_ns:
                 estimator.propagate(self.imu, t_ns, record)
                 self._checkpoint()
@@ -248,12 +249,14 @@ class Timeline:
         one = entry.ordinary
         if one is not None and (plain := estimator.plain()) is not None:
             raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            if (found := isolation.take(aid, one, plain, estimator.state)) is not None:
+            if (found := isolation.take(aid, one, plain, estimator)) is not None:
                 outcome, shown, action = found
                 entry.raw = raw
                 if not entry.judged:
                     entry.assumed = shown & ASSUMED > 0
-                self._act(aid, action, shown & SITS > 0 or bool(isolation.hedge.wider))
+                wider = isolation.hedge.wider
+                if shown or wider or wider is not self._wider:
+                    self._act(aid, action, shown & SITS > 0 or bool(wider))
                 return outcome
         if entry.feedback == "release":
             estimator.release()
