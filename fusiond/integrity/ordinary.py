@@ -40,8 +40,6 @@ from fusiond.navigation.strapdown import VE, VN
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-WHITENED = [slice(2 * LENT_ROWS, 2 * LENT_ROWS + m) for m in range(LENT_ROWS + 1)]
-"""Where `Plain.room` has y, by the number of rows."""
 OTHERWISE = -1
 """Not taken in: nothing has changed."""
 BIAS, UNUSUAL, STRAYS, ACROSS, TILTED, SITS, ASSUMED = 1, 2, 4, 8, 16, 32, 64
@@ -51,9 +49,9 @@ the unit sits; the sigma that counted is assumed."""
 
 
 @compiled(
-    "Tuple((i8, f8, f8, f8))(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], f8[::1], b1,"
-    "i8[:, ::1], i8[::1], i8[::1], i8[::1], f8[::1], i8[::1], f8[::1], i8, i8, f8, b1, f8[::1], f8,"
-    "f8[::1], f8[::1], f8[::1])"
+    "Tuple((i8, f8, f8, f8, UniTuple(f8, 3)))(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1],"
+    "i8[::1], f8[::1], b1, i8[:, ::1], i8[::1], i8[::1], i8[::1], f8[::1], i8[::1], f8[::1], i8,"
+    "i8, f8, b1, f8[::1], f8, f8[::1], f8[::1], f8[::1])"
 )
 def _take(
     nav: Array,
@@ -80,10 +78,10 @@ def _take(
     slip: Array,
     sums: Array,
     before: Array,
-) -> tuple[int, float, float, float]:
+) -> tuple[int, float, float, float, tuple[float, float, float]]:
     """Take an aid in at `t_ns`, `every_ns` after the one before it of its series. What it has
-    shown, or `OTHERWISE`; the NIS; how far the filter is from a position, north and east (m).
-    `room` has the whitened innovation then."""
+    shown, or `OTHERWISE`; the NIS; how far the filter is from a position, north and east (m); the
+    whitened innovation, 0 behind it."""
     m, n, width = slots[ROWS], dx.shape[0], cov.shape[0]
     p = cov[:n, :n]
     z, r, y = room[:m], room[LENT_ROWS : LENT_ROWS + m], room[2 * LENT_ROWS : 2 * LENT_ROWS + m]
@@ -95,7 +93,7 @@ def _take(
     if not write_rows(
         slots, numbers, coarse, nav, xi, step, column_of, initial, hold_height, p, z, h, r
     ):
-        return OTHERWISE, 0.0, 0.0, 0.0
+        return OTHERWISE, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0)
     if tilts:
         remember(nav, p, before)
     carries = lever.size > 0 or may_part(p, biases[0])
@@ -104,7 +102,7 @@ def _take(
         remember_estimate(nav, xi, gyros, lever, estimate)
     nis = fuse(nav, xi, cov, dx, z, h, r, threshold, False, y, g)
     if not nis <= threshold:
-        return OTHERWISE, nis, 0.0, 0.0
+        return OTHERWISE, nis, 0.0, 0.0, (0.0, 0.0, 0.0)
     turned = 0.0
     if carries:
         turned = carry_over_all(p, estimate, nav, xi, biases, gyros, lever, late)
@@ -140,7 +138,8 @@ def _take(
             sd = max(initial[of[PITCH]], initial[of[YAW]])
             if beyond_chance(xi[of[PITCH]], sd) + beyond_chance(xi[of[YAW]], sd) > 0.0:
                 shown |= SITS
-    found = take_few(means, t_ns, limit, y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0)
+    whitened = y[0], y[1] if m > 1 else 0.0, y[2] if m > 2 else 0.0
+    found = take_few(means, t_ns, limit, whitened[0], whitened[1], whitened[2])
     if found == BIASED:
         shown |= BIAS
     elif found == UNLIKELY:
@@ -149,7 +148,7 @@ def _take(
         shown |= TILTED
     if assumes:
         shown |= ASSUMED
-    return shown, nis, north, east
+    return shown, nis, north, east, whitened
 
 
 class Ordinary(NamedTuple):
@@ -210,7 +209,7 @@ def take(
     slip = record.slip.packed
     if record.no_slip:
         slip = slip.copy()
-    shown, nis, north, east = _take(
+    shown, nis, north, east, whitened = _take(
         *filter_,
         slots,
         numbers,
@@ -237,5 +236,4 @@ def take(
     if value is not None:
         nav = filter_.nav
         record.repeats_itself(value, math.hypot(nav.item(VN), nav.item(VE)) > MOVING_M_S)
-    y = tuple(filter_.room[WHITENED[degrees]].tolist())
-    return Outcome("fused", nis, degrees, y), shown
+    return Outcome("fused", nis, degrees, whitened[:degrees]), shown

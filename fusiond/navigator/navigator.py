@@ -369,11 +369,12 @@ class Navigator:
         if self.warm is not None and aid.locates:
             self.warm.judge(source, name)
         if name == "fused":
-            if outcome.whitened and not (entry.judged or entry.assumed):
+            if not (entry.judged or entry.assumed) and outcome.whitened:
                 entry.judged = True
                 self.verdicts.judge(aid, outcome)
             t_ns = entry.key[0]
-            self.last_fused_ns[source] = max(t_ns, self.last_fused_ns.get(source, 0))
+            if t_ns > self.last_fused_ns.get(source, -1):
+                self.last_fused_ns[source] = t_ns
             if aid.locates and t_ns > self._last_position_ns:
                 self._last_position_ns = t_ns
         elif name == TURNS_AT_REST:
