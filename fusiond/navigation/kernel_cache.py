@@ -28,16 +28,16 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from llvmlite.binding import parse_bitcode
+from llvmlite.binding import add_symbol, parse_bitcode
 from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
 from numba.core.environment import Environment, lookup_environment
-from numba.core.runtime.nrt import rtsys
+from numba.core.runtime._nrt_python import c_helpers
 from numba.core.serialize import dumps
 
 # numba's functions have no types.
@@ -45,6 +45,7 @@ _dumps: Any = dumps
 _result: Any = CompileResult
 _Library: Any = JITCodeLibrary
 _parse_bitcode: Any = parse_bitcode
+_add_symbol: Any = add_symbol
 _Environment: Any = Environment
 _known_environment: Any = lookup_environment
 
@@ -79,7 +80,7 @@ class KernelCache(NullCache):
         return found
 
     def _load(self, signature: object, target: Any) -> Any:
-        rtsys.initialize(target)  # what kernels allocate arrays with
+        _name_runtime()
         path = self._path(signature, target.codegen())
         try:
             with path.open("rb") as file:
@@ -120,6 +121,15 @@ class KernelCache(NullCache):
         """Native code differs by signature, system, processor and its features."""
         made_for = hashlib.sha256(repr((str(signature), _processor(codegen))).encode())
         return self._folder / f"{self._name}-{made_for.hexdigest()[:16]}.kernel"
+
+
+@cache
+def _name_runtime() -> None:
+    """Tell the linker where the functions are that kernels make arrays with. What else numba's
+    runtime consists of lies in each kernel that needs it; numba compiles it for the first that is
+    compiled, which takes as long as linking twenty."""
+    for name, address in c_helpers.items():
+        _add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
 @lru_cache
