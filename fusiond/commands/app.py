@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections.abc import Callable, Iterable
 from typing import Annotated
 
 import typer
@@ -26,21 +27,53 @@ from fusiond.commands import (
 )
 from fusiond.commands.status import status
 
-app = typer.Typer(
-    help="Inertial navigation aided by BeiDou RDSS and GNSS.",
-    no_args_is_help=True,
-    # Asked for by the shell's script alone (docs/install.md): no option of it clutters `--help`.
-    add_completion="_FUSIOND_COMPLETE" in os.environ,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich" if sys.stdout.isatty() and sys.stderr.isatty() else None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
-
 # Imports make half a million objects that live for ever. At CPython's own threshold of 700 the
 # collector looks through them again and again: 0.2 s of the processor's time until a command begins
 # its work, which sets a lower one (`fusiond.commands.shared.loaded`).
 COLLECT_AFTER = 1_000_000
+
+
+def _root(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as installed  # noqa: PLC0415
+
+        typer.echo(f"fusiond {installed('fusiond')}")
+        raise typer.Exit
+
+
+# In the order of `--help`.
+COMMANDS = (
+    *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor, status),
+    *(recordings.replay, reporting.report),
+    *(offline.process, offline.calibrate, offline.simulate, offline.compare),
+    batch.batch,
+    *(research.schema, research.study, research.model, research.bench),
+)
+
+
+def command_line(commands: Iterable[Callable[..., None]]) -> typer.Typer:
+    """With these commands."""
+    made = typer.Typer(
+        help="Inertial navigation aided by BeiDou RDSS and GNSS.",
+        no_args_is_help=True,
+        # Asked for by the shell's script alone (docs/install.md): no option of it clutters
+        # `--help`.
+        add_completion="_FUSIOND_COMPLETE" in os.environ,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich" if sys.stdout.isatty() and sys.stderr.isatty() else None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    made.callback(invoke_without_command=True)(_root)
+    for command in commands:
+        made.command()(command)
+    return made
+
+
+app = command_line(COMMANDS)
+app.add_typer(configure.config, name="config")
+app.add_typer(recordings.log, name="log")
 
 
 def main() -> None:
@@ -53,34 +86,12 @@ def main() -> None:
     # installed package. (https://docs.pydantic.dev/latest/concepts/plugins)
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
-        app()
+        # Of a command the options of that one: those of all take 30 ms to make.
+        named = [command for command in COMMANDS if sys.argv[1:2] == [command.__name__]]
+        (command_line(named) if named else app)()
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
         # The interpreter's last two collections would look through all that was imported, a quarter
         # of a second for nothing: the process and its memory end.
         gc.freeze()
-
-
-@app.callback(invoke_without_command=True)
-def _root(
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
-) -> None:
-    if version:
-        from importlib.metadata import version as installed  # noqa: PLC0415
-
-        typer.echo(f"fusiond {installed('fusiond')}")
-        raise typer.Exit
-
-
-# In the order of `--help`.
-for command in (
-    *(live.run, live.demo, dashboard.dashboard, live.check, live.doctor, status),
-    *(recordings.replay, reporting.report),
-    *(offline.process, offline.calibrate, offline.simulate, offline.compare),
-    batch.batch,
-    *(research.schema, research.study, research.model, research.bench),
-):
-    app.command()(command)
-app.add_typer(configure.config, name="config")
-app.add_typer(recordings.log, name="log")
