@@ -64,7 +64,7 @@ from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_axes import TiltAxesFilter, keep_downward
 from fusiond.estimators.update import Plain, feed_back
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
@@ -290,6 +290,7 @@ class InvariantFilter(TiltAxesFilter):
         after = self.of_vehicle(nav, xi) @ self.jacobian(found.error, turning)
         p = after @ found.covariance @ after.T
         self.covariance[:] = 0.5 * (p + p.T)
+        keep_downward(self._estimate(), nav, xi, self._biases)
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
         self.step[:] = _turned(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)

@@ -99,7 +99,7 @@ def _take(
     carries = lever.size > 0 or may_part(p, biases[0])
     estimate = room[room.shape[0] - ESTIMATE_SIZE :]
     if carries:
-        remember_estimate(nav, xi, gyros, lever, estimate)
+        remember_estimate(nav, xi, biases, gyros, lever, estimate)
     nis = fuse(nav, xi, cov, dx, z, h, r, threshold, False, y, g)
     if not nis <= threshold:
         return OTHERWISE, nis, 0.0, 0.0, (0.0, 0.0, 0.0)

@@ -89,6 +89,21 @@ def test_a_corrected_tilt_leaves_what_the_biases_make_downward() -> None:
     assert np.sqrt(np.diag(known)) == pytest.approx(KNOWN_SD, rel=0.05)
 
 
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_corrected_tilt_does_not_move_the_vehicle_downward(turns: bool) -> None:
+    """What is felt at rest is taken for the same acceleration before and after tilt and force
+    biases have changed together; g (3 deg)^2 / 2 is 0.013 m/s^2."""
+    f = _straight_on(0.3, math.radians(1.0), DOUBTED_FORCE_M_S2)
+    f.turns = turns
+    level = math.radians(3.0)
+    aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
+    assert f.update(aid).name == "fused"
+    attitude = dcm_from_quaternion(f.nav[6:])
+    assert math.degrees(rpy_from_dcm(attitude)[0]) > 2.5
+    felt = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
+    assert abs(attitude[2] @ (felt - f.xi[12:15]) + STANDARD_GRAVITY_M_S2) < 1e-3
+
+
 def test_how_far_a_heading_was_turned() -> None:
     before = np.array(quaternion_from_rpy(0.1, -0.2, 3.0))
     for psi in (0.0, 1e-3, -0.4, 2.5):
