@@ -96,6 +96,16 @@ def test_nothing_else_is_taken_for_lateness(recording: Recording) -> None:
     assert not late.suspects
 
 
+def test_samples_that_were_lost_are_no_lateness() -> None:
+    """Of one fix a second one falls where nothing was felt, gravity neither: 0.7 s earlier none
+    would, on a straight at constant speed as well."""
+    _, seldom = Drive(duration_s=95.0, gnss_rate_hz=1.0).recorded(VEHICLE, seed=5)
+    recording = imu_faults.silent(seldom, 81.3, 1.0)
+    told, late, _ = looked(recording, (40.0, 76.0, 86.0, 87.0, 88.0, 89.0))
+    assert not told
+    assert not late.suspects
+
+
 def test_a_receiver_that_was_late_for_a_while_is_not_late_now() -> None:
     """A phone's inertial unit leaves so much open that one lateness fits what was late and what is
     on time again: 1.2 s for 0.8 and 0, and 33 m at 30 m/s."""

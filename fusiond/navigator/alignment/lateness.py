@@ -42,6 +42,8 @@ from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import NamedTuple
 
+import numpy as np
+
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.estimators.base import Estimator, gate_threshold
@@ -256,6 +258,11 @@ class Lateness:
         earliest_ns = round((MOST_LATE_S + NEAR_S[0]) * 1e9)
         first_ns = max(imu.oldest_ns + earliest_ns, t_ns - KEPT_NS)
         past = motion.span_since(imu, first_ns - earliest_ns)
+        # What was not felt, gravity neither, shows in a fix that falls there, and in none that
+        # would be earlier.
+        lost = np.flatnonzero(np.diff(past.times) > imu.hold_ns)
+        if lost.size:
+            first_ns = max(first_ns, int(past.times[lost[-1] + 1]) + earliest_ns)
         for source, receiver in tuple(self._receivers.items()):
             yield from self._weigh(receiver, past, first_ns, t_ns)
             late = receiver.settled(t_ns)
