@@ -39,15 +39,16 @@ an update that takes r out again leaves (C b)_D where that had put it,
 without which a straight road told a tilt by its vertical velocities. All are of the second order,
 psi b, dt b, r b.
 
-So is what an update makes of the estimate itself. With d the third row of C, the vehicle is moved
-downward by g + d f, of a force f = f_m - b^ of the accelerometers; a tilt that is corrected by dt
-and biases by db, as the sum of the two is known, change it by -g dt^2 / 2 beside what the update
-has told, each time in the same direction:
+So is what an update makes of the estimate itself. With d the third row of C, tilt and biases that
+hide each other move the vehicle downward by half of the tilt times the bias: a tilt that is
+corrected by dt, and biases by db = g dt, change that by g dt^2 / 2 beside what the update has told,
+each time in the same direction. A tilt alone, or a bias, changes nothing that was learned with it.
+So it is the biases' change along the mean of the axes before and after that has been told:
 
-    b^_z <- b^_z + (g |d+ - d|^2 / 2 - (d+ - d) db) / d+_z
+    b^_z <- b^_z - (d+ - d) db / (2 d+_z)
 
-leaves it where it was. After a doubt a roll known to 4 deg, corrected by one to three of them at
-each of ten fixes of a bend, had made 0.02 m/s^2 of it, and a vertical velocity eight sigma off.
+After a doubt a roll known to 4 deg, corrected by one to three of them at each of ten fixes of a
+bend, had made 0.02 m/s^2 of it, and a vertical velocity eight sigma off.
 
 Twelve cars with accelerometers of 50 mg and gyros of 3 deg/s, each
 tilt known by its sum with a bias, after a minute and its one bend: NEES a degree 169 of the tilt
@@ -194,20 +195,18 @@ def keep_rows(
 
 @compiled("void(f8[::1], f8[::1], f8[::1], i8[:, ::1])")
 def keep_downward(before: Array, nav: Array, xi: Array, biases: Indices) -> None:
-    """Leave what moves the vehicle downward as an update of an estimate `before` has told it: what
-    it has made of it beyond the first order goes into the vertical one of xi's force `biases`."""
+    """What an update of an estimate `before` has told of xi's force `biases` downward, it has told
+    along the mean of the axes before and after: the vertical bias takes the difference."""
     if biases.shape[1] == 0:
         return
     old, new = dcm_elements(before[Q0:NAV_SIZE]), dcm_elements(nav[Q0:])
     if abs(new[8]) < UPRIGHT:
         return
     beyond = 0.0
-    for axis in range(6, 9):
-        beyond += 0.5 * STANDARD_GRAVITY_M_S2 * (new[axis] - old[axis]) ** 2
     for j in range(biases.shape[1]):
         axis = 6 + biases[1, j]
-        beyond -= (new[axis] - old[axis]) * (xi[biases[0, j]] - before[_FORCES + j])
-    xi[biases[0, 0]] += beyond / new[8]
+        beyond += 0.5 * (new[axis] - old[axis]) * (xi[biases[0, j]] - before[_FORCES + j])
+    xi[biases[0, 0]] -= beyond / new[8]
 
 
 @compiled("f8(f8[:, :], f8[::1], f8[::1], f8[::1], i8[:, ::1], i8[::1], i8[::1], i8[::1])")

@@ -104,6 +104,19 @@ def test_a_corrected_tilt_does_not_move_the_vehicle_downward(turns: bool) -> Non
     assert abs(attitude[2] @ (felt - f.xi[12:15]) + STANDARD_GRAVITY_M_S2) < 1e-3
 
 
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_tilt_that_is_corrected_alone_leaves_the_biases(turns: bool) -> None:
+    """As after samples that were lost: what had been learned of the biases was with another."""
+    f = _straight_on(0.3, math.radians(1.0), KNOWN_SD)
+    f.covariance[PHI : PHI + 2, PHI : PHI + 2] += 0.03**2 * np.eye(2)
+    f.turns = turns
+    level = math.radians(3.0)
+    aid = AttitudeAid("attitude", 0, 0.9999, (level, -level, math.nan), (0.01, 0.01, 1.0))
+    assert f.update(aid).name == "fused"
+    assert math.degrees(rpy_from_dcm(dcm_from_quaternion(f.nav[6:]))[0]) > 2.5
+    assert np.abs(f.xi[12:15]).max() < 1e-3
+
+
 def test_how_far_a_heading_was_turned() -> None:
     before = np.array(quaternion_from_rpy(0.1, -0.2, 3.0))
     for psi in (0.0, 1e-3, -0.4, 2.5):
