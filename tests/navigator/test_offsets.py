@@ -76,6 +76,18 @@ def test_an_offset_of_many_small_steps_is_none() -> None:
     assert watch.changed is None
 
 
+def test_what_is_learned_anew_after_a_doubt_is_no_change() -> None:
+    """P was opened and is what it was: where the estimate goes is for what it has learned since."""
+    p, opened = 0.03**2, 0.03**2 + PRIOR_S**2
+    for late_s, told in ((0.04, False), (LATE_S, True)):
+        watch, one = OffsetWatch(MODEL), np.eye(MODEL.size)
+        for k in range(30):
+            watch.look((k + 1) * LOOK_NS, MOVING, np.zeros(MODEL.size), one * p)
+        watch.look(31 * LOOK_NS, MOVING, np.zeros(MODEL.size), one * opened)
+        watch.look(32 * LOOK_NS, MOVING, np.full(MODEL.size, -late_s), one * 0.999 * p)
+        assert (watch.changed is not None) == told
+
+
 @pytest.mark.parametrize("late_s", [0.0, LATE_S])
 def test_a_start_after_a_failure_is_not_vouched_for_before_it_excludes_late_fixes(
     late_s: float,

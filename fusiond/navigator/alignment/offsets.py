@@ -16,7 +16,8 @@ offset has changed where both
 
     |x - x_0| > k sqrt(P_0 - P + FIRM_S^2)    and    |c| >= LATE_S
 
-for a look at it in the last minute, the prior at the start among them: for k = 4 the mode says so
+for a look at it in the last minute, the prior at the start among them, and none before P was opened
+again by more than its walk (a doubt of the receiver does that): for k = 4 the mode says so
 and the lateness is looked for (fusiond.navigator.alignment.lateness), for k = 4.9, a chance of one
 in a million, the filter is given up.
 
@@ -54,6 +55,8 @@ FIRM_S = 0.005
 # A look each second, compared with those of the last minute: what is slower is a clock's walk.
 LOOK_NS, COMPARED_NS = 1_000_000_000, 60_000_000_000
 LOOKS = COMPARED_NS // LOOK_NS + 1
+# A doubt adds the prior's variance to P, which had come below that; a fix that is taken back less.
+OPENED = 1.5
 
 
 class OffsetWatch:
@@ -89,11 +92,18 @@ class OffsetWatch:
             self._unproven = failed
         self._looked_ns = t_ns
         x, p = xi[self._slots], covariance[self._slots, self._slots]
+        self._forget_opened(t_ns, p)
         self.suspects = self._compare(t_ns, x, p)
         self._keep(t_ns, x, p)
         self._unproven = self._unproven and not self._excluded(x, p)
         if self._unproven and not self.suspects and math.hypot(nav[VN], nav[VE]) > MOVING_M_S:
             self.suspects = "began anew after a failure, perhaps from fixes that are late"
+
+    def _forget_opened(self, t_ns: int, p: Array) -> None:
+        """The looks at an offset before a doubt of its receiver: it may have moved since."""
+        row = (self._row - 1) % LOOKS
+        walked = self._walk * (t_ns - self._t_ns[row]) * 1e-9
+        self._p[:, p > (self._p[row] + walked) * OPENED] = 0.0
 
     def _keep(self, t_ns: int, x: Array, p: Array) -> None:
         row = self._row % LOOKS
