@@ -14,7 +14,7 @@ from fusiond.integrity.hedge import NOTHING, Hedge
 from fusiond.integrity.means import Means
 from fusiond.integrity.moved import Moved
 from fusiond.integrity.returns import Begun
-from fusiond.integrity.series import Series
+from fusiond.integrity.series import NEVER_NS, Series
 from fusiond.integrity.tilt import Tilting
 
 Array = NDArray[np.float64]
@@ -45,6 +45,17 @@ class Kept:
     def doubts(self) -> tuple[int, ...]:
         """Instants (ns) at which the filter was in doubt, the last few of them."""
         return self._doubts
+
+    @property
+    def moved(self) -> Moved | None:
+        """What the position that may be off by most may be off by: a filter that starts anew knows
+        no more of it."""
+        positions = [r for r in self._records.values() if r.locates]
+        opened = [r.moved for r in positions if r.moved is not None]
+        begun = self._begun.moved
+        if begun and not any(r.device == begun.device and r.fused_ns > NEVER_NS for r in positions):
+            opened.append(begun)
+        return max(opened, key=lambda one: sum(one.leaves_open(one.since_ns)[:2]), default=None)
 
     def snapshot(self) -> Memory:
         """A copy of everything."""

@@ -164,11 +164,11 @@ class Parted(NamedTuple):
         return Moved(device, self.since_ns + lasted_ns, lasted_ns, (0.0, 0.0, 0.0), speeds)
 
 
-def left(device: str, t_ns: int, lasted_ns: int, away_m: float, before: Moved | None) -> Moved:
+def left(device: str, t_ns: int, lasted_ns: int, away_m: float) -> Moved:
     """Of a navigation that begins anew with a device that had left the one before it by `away_m`,
-    in which axes is not known any more; and what had been open `before`."""
+    in which axes is not known any more."""
     square = 0.5 * away_m * away_m
-    return Moved(device, t_ns, lasted_ns, (square, square, square)).joined(before)
+    return Moved(device, t_ns, lasted_ns, (square, square, square))
 
 
 def back(returned: Returned, t_ns: int, covariance: Array) -> Moved:

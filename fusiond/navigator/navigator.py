@@ -195,6 +195,8 @@ class Navigator:
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
         self._lateness.stop()
+        if self.started is not None:
+            self._standing.ended(self.timeline.isolation)
         self.timeline.clear()
         self._protection.restart()
         self.started, self._saved, self.warm = None, saved, None

@@ -83,8 +83,10 @@ class Standing:
         self._from = self._fastest = 0.0
         self._changed = 0.0
         self._left = ""
+        self._gone: Moved | None = None
         self.moved: Moved | None = None
-        """By what the source that `left` names had left the solution before the start."""
+        """By what a source may be off still that had left the solution before the start, or was
+        believed again in it."""
         self._shaken: tuple[int, str | None] | None = None
 
     def started(self, t_ns: int) -> None:
@@ -108,13 +110,20 @@ class Standing:
         longer_ns = TRIAL_NS if lasted else max(TRIAL_NS, 2 * self._trial_ns)
         self._trial_ns = min(longer_ns, LONGEST_TRIAL_NS)
 
+    def ended(self, isolation: Isolation) -> None:
+        """A navigation is over, for whatever reason; the next one starts from the same sources."""
+        gone, self._gone, still = self._gone, None, isolation.moved
+        if gone is not None:
+            still = gone.joined(still if still and still.device == gone.device else None)
+        self.moved = still
+
     def failure(self, t_ns: int, isolation: Isolation, nav: Array) -> str | None:
         """Why navigation must begin anew; None while it need not. To be asked whenever the filter
         has run.
 
         `nav` (10,) at `t_ns`, the filter's instant.
         """
-        self._shaken = None
+        self._shaken = self._gone = None
         v_n, v_e = nav[VN : VE + 1].tolist()
         speed, doubts = math.hypot(v_n, v_e), isolation.doubts
         self._watch(t_ns, isolation, speed)
@@ -133,7 +142,7 @@ class Standing:
         by_source = lost.cause == "source"
         self._left = lost.device if by_source else ""
         if by_source:
-            self.moved = left(lost.device, t_ns, waited_ns, lost.away_m, self.moved)
+            self._gone = left(lost.device, t_ns, waited_ns, lost.away_m)
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
     def _watch(self, t_ns: int, isolation: Isolation, speed: float) -> None:
