@@ -247,10 +247,8 @@ class Isolation(Kept):
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
             action = self._blame(record, aid)
-            if record.moves and action in MOTION and self.shown:
-                record.parted = Parted.shown(aid.t_ns, self.shown)
-                if not record.excluded:
-                    self._followed(record, aid.t_ns)
+            if action in MOTION and self.shown:
+                self._parts(record, aid.t_ns, self.shown)
             return self._doubted(action, aid.t_ns)
         told, white = False, proof is not None and aid.white
         if proof is not None and (white or aid.wanders):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.integrity import returns
 from fusiond.integrity.hedge import NOTHING, Hedge
-from fusiond.integrity.means import Means
-from fusiond.integrity.moved import Moved
+from fusiond.integrity.means import FAST_COUNT, Means
+from fusiond.integrity.moved import Moved, Parted
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import NEVER_NS, Series
 from fusiond.integrity.tilt import Tilting
@@ -89,6 +89,16 @@ class Kept:
             record = known.copied()
         self._records[aid.source] = record
         return record
+
+    def _parts(self, record: Series, t_ns: int, by: Sequence[float]) -> None:
+        """The motion is doubted for what a velocity or a position is off `by` (m/s or m)."""
+        if record.locates:
+            over_s = FAST_COUNT * record.every_ns * 1e-9
+            record.parted = Parted.shown(t_ns, [one / over_s for one in by])
+        elif record.moves:
+            record.parted = Parted.shown(t_ns, by)
+        if not record.excluded:
+            self._followed(record, t_ns)
 
     def _followed(self, record: Series, t_ns: int) -> None:
         """A velocity is believed again, or still: where it had parted from the filter, what it may

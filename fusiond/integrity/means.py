@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 
 # Paces of the mean: some 11 and some 59 innovations deep, (2 - a) / a.
 FAST, SLOW = 1.0 / 6.0, 1.0 / 30.0
+FAST_COUNT = (2.0 - FAST) / FAST
 # The variance of a mean at each pace, for white innovations of variance one; and what is assumed of
 # a series before it has shown its own: successive innovations share a fifth of their variance.
 WHITE_FAST, WHITE_SLOW = FAST / (2.0 - FAST), SLOW / (2.0 - SLOW)
