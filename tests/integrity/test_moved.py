@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fusiond.integrity.action import Action
 from fusiond.integrity.hedge import MOVED
 from fusiond.integrity.moved import VOUCHED_NS, Moved, Parted, left
 from fusiond.integrity.returns import Begun, Coming, prove
@@ -126,9 +127,9 @@ def test_what_ran_away_before_is_kept_where_it_had_got_to() -> None:
 
 
 def test_what_was_open_before_is_open_after_another_failure() -> None:
-    first = left("gnss", 100 * S, OUT_NS, 10.0, None)
+    first = left("gnss", 100 * S, OUT_NS, 10.0)
     assert first.squares == (50.0, 50.0, 50.0)
-    again = left("gnss", 120 * S, OUT_NS, 10.0, first)
+    again = left("gnss", 120 * S, OUT_NS, 10.0).joined(first)
     assert again.squares == (75.0, 75.0, 75.0)
 
 
@@ -175,6 +176,21 @@ def test_a_receiver_that_is_believed_again_leaves_open_what_it_may_be_off_by() -
         assert math.sqrt(wider[0] - 16.0) == pytest.approx(off_m, abs=0.75)
         assert wider[1:3] == pytest.approx(16.0, abs=0.6)
         assert not wider[3:].any()
+
+
+def test_a_filter_that_starts_anew_knows_no_more_of_it() -> None:
+    bench, out_s = returned(1.5)
+    moved = bench.isolation.moved
+    assert moved is not None
+    assert (moved.device, moved.lasted_ns) == ("gnss", out_s * S)
+    bench.isolation.reset(moved=moved)
+    assert bench.isolation.moved == moved
+    t = 60 + out_s + 2
+    bench.both(range(t, t + 1))
+    assert "gnss" + MOVED in bench.isolation.hedge.wider
+    bench.fix(t + 1, source="second", sd_m=0.5)
+    bench.both(range(t + 2, t + 3))
+    assert bench.isolation.moved is None
 
 
 def test_it_is_over_once_another_device_has_told() -> None:
@@ -234,6 +250,25 @@ def test_it_is_taken_back_by_a_rewind_to_before_its_return() -> None:
     bench.isolation.restore(memory)
     bench.fix(64)
     assert "gnss" + MOVED not in bench.isolation.hedge.wider
+
+
+def test_a_position_that_no_velocity_goes_with_leaves_open_how_fast_it_may_go() -> None:
+    """A mean of 2.5 m within eleven fixes is a quarter of a metre a second, or twice that."""
+    bench = Bench()
+    bench.covariance = np.diag([1e-4] * 9)
+    for t in range(60):
+        bench.fix(t)
+    t, acted = 60, Action.NONE
+    while bench.isolation.moved is None:
+        acted = bench.fix(t, north_m=2.5)
+        t += 1
+    assert acted is Action.DOUBT_FILTER
+    assert not bench.isolation.excluded
+    north, east = bench.isolation.moved.speeds
+    shown = bench.isolation.shown
+    assert north == pytest.approx((2.0 * shown[0] / 11.0) ** 2)
+    assert 0.15**2 < north < 0.5**2
+    assert east < 0.05**2
 
 
 def staying(alter: Alter, duration_s: float) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
@@ -210,15 +211,24 @@ def test_a_start_from_a_receiver_that_had_jumped_away_coasts_until_another_devic
 def test_what_a_start_may_be_off_by_outlasts_a_failure_of_the_filter() -> None:
     isolation, standing = Left(), Standing(150.0)
     still = np.zeros(10)
-    assert standing.moved is None
     assert standing.failure(61 * S, isolation, still) is not None
+    standing.ended(isolation)
     moved = standing.moved
     assert moved is not None
     assert (moved.device, moved.since_ns, moved.lasted_ns) == ("gnss", 61 * S, 61 * S)
     assert moved.squares == (1250.0, 1250.0, 1250.0)
+    isolation.reset(failed=True, moved=moved)
     isolation.cause = "filter"
     assert standing.failure(90 * S, isolation, still) is not None
-    assert standing.moved == moved
+    standing.ended(isolation)
+    assert standing.moved == moved  # nobody has told meanwhile
+    isolation.reset(failed=True, moved=moved)
+    isolation.cause = "source"
+    assert standing.failure(200 * S, isolation, still) is not None
+    standing.ended(isolation)
+    assert standing.moved is not None
+    faded = 1250.0 * 61.0 / 200.0
+    assert standing.moved.squares == pytest.approx((1250.0 + faded,) * 3)
 
 
 def test_what_is_on_its_way_back_is_waited_for() -> None:

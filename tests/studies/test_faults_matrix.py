@@ -22,6 +22,7 @@ ROWS = [
     ("velocity_reversed", "navigating", "isolated", 5.0),
     ("drift_0.5_m_s", "coasting", "isolated", 10.0),
     ("carried_off_0.5_m_s", "navigating", "isolated", None),
+    ("places_drift_0.5_m_s", "navigating", "isolated", None),
     ("two_step_500m", "navigating", "isolated", 10.0),
     ("two_carried_off_0.5_m_s", "navigating", "isolated", None),
     ("wheels_frozen", "coasting", "isolated", 5.0),

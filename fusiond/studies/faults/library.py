@@ -177,6 +177,9 @@ FAULTS: dict[str, Fault] = {
     "velocity_ramp_0.1_m_s2": Fault(aid.velocity_ramp, 60.0),
     # In an outage a velocity is not known as well as that: nobody can tell.
     "carried_off_0.5_m_s": Fault(aid.carried_off, 60.0, phases=("navigating",)),
+    # Of a receiver without velocities, which would tell.
+    "places_drift_0.5_m_s": _under_way(aid.places_alone(aid.drift), 60.0),
+    "places_drift_2_m_s": _under_way(aid.places_alone(partial(aid.drift, north_m_s=2.0)), 60.0),
     "fixes_late_0.8s": Fault(aid.late, phases=UNDER_WAY),
     "fixes_always_late_0.8s": _from_start(aid.late),
     "false_burst_1khz": Fault(aid.false_burst, 0.5),
