@@ -18,7 +18,8 @@ Repetition    what is the same to the bit while the filter moves, more often tha
 A series that fails the mean test is measured against the rest: where another position, or the
 velocity of the same device, is believed, the series is excluded; where nothing is left to compare
 with, the filter's own motion and sensor errors are doubted, which widens P. So they are when the
-aids that are fused correct its tilt more than its P allows (fusiond.integrity.tilt).
+aids that are fused correct its tilt more than its P allows (fusiond.integrity.tilt). Not so where
+wheels say that it is the receiver (fusiond.integrity.denied).
 
 An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
 over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
@@ -49,6 +50,7 @@ from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.update import Plain
 from fusiond.integrity import ordinary, returns, support
 from fusiond.integrity.action import MOTION, NONE, Action
+from fusiond.integrity.denied import denies, position_away, rolling
 from fusiond.integrity.hedge import differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.kept import Kept
@@ -192,7 +194,7 @@ class Isolation(Kept):
         if record.excluded:
             self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
-            passed = _passed(aid, outcome) and not repeats
+            passed = _passed(aid, outcome) and not (repeats or position_away(self._records, record))
             self._look(record, t_ns, passed, outcome.whitened, offset, own)
             if not record.excluded:
                 self._followed(record, t_ns)
@@ -214,7 +216,8 @@ class Isolation(Kept):
             since_ns = t_ns - record.fused_ns
             if velocity is not None and 0 < since_ns <= FORGET_NS:
                 self.hedge.refused(aid.source, by, since_ns * 1e-9)
-            action = self._refuse(record, t_ns, outcome.nis, away)
+            denied = denies(self._records, record, by, v_n, v_e)
+            action = self._refuse(record, t_ns, outcome.nis, away, denied)
             if record.moves and action in MOTION:
                 record.parted = Parted(record.refused_ns, *by)
             return self._doubted(action, t_ns)
@@ -246,7 +249,9 @@ class Isolation(Kept):
         if biased:
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
-            action = self._blame(record, aid)
+            by = self.shown or (0.0, 0.0)
+            denied = denies(self._records, record, by, nav.item(VN), nav.item(VE))
+            action = self._blame(record, aid, denied)
             if action in MOTION and self.shown:
                 self._parts(record, aid.t_ns, self.shown)
             return self._doubted(action, aid.t_ns)
@@ -297,6 +302,10 @@ class Isolation(Kept):
 
     def _tilted(self, t_ns: int) -> Action:
         self._tilting = Tilting()
+        if rolling(self._records, t_ns) and (wrong := self._denied_positions()):
+            for one in wrong:
+                self._exclude(one, t_ns, DRIFTS, jumped=True)
+            return Action.DOUBT_MEASURED
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
     def take(
@@ -341,8 +350,8 @@ class Isolation(Kept):
         if record.no_slip and record.refused >= SLIDING_COUNT and lasts_ns >= SLIDING_NS:
             self._exclude(record, record.refused_ns, "disagrees", jumped=False)
 
-    def _refuse(self, record: Series, t_ns: int, nis: float, away: float) -> Action:
-        """A measurement was refused that is `away` (m or m/s) from the filter."""
+    def _refuse(self, record: Series, t_ns: int, nis: float, away: float, denied: bool) -> Action:
+        """A measurement was refused that is `away` (m or m/s) from the filter, or `denied`."""
         record.refused += 1
         if record.refused == 1:
             record.refused_ns = t_ns
@@ -351,6 +360,7 @@ class Isolation(Kept):
         if record.refused < REFUSED_IN_A_ROW:
             return NONE
         reason = "jumped" if record.jumped else "disagrees"
+        record.jumped = record.jumped or denied
         self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
         # A jump is the source's. Else the motion may be what is wrong, and positions shall decide.
         # What is neither position nor velocity (a heading, a height) has nobody to decide: a doubt
@@ -400,14 +410,18 @@ class Isolation(Kept):
             record.refused, record.jumped, record.proof = 0, False, None
             record.means.restart()
 
-    def _blame(self, record: Series, aid: Aid) -> Action:
-        """A bias inside the gate: the series', where something else supports the filter."""
+    def _blame(self, record: Series, aid: Aid, denied: bool) -> Action:
+        """A bias inside the gate: the series', where something else supports the filter, or where
+        it is `denied`."""
         record.means.restart()
         sd_m = 0.5 * record.away_m if aid.locates else FINE_M
         source = support.others(self._records, record, aid.t_ns, sd_m)
         if not source and aid.locates:
             source = support.vouched(self._records, record.device, aid.t_ns)
-        if not source:
+        if not (source or denied):
             return Action.DOUBT_FILTER
-        self._exclude(record, aid.t_ns, DRIFTS, jumped=record.locates)
-        return Action.DOUBT_MEASURED if record.locates else Action.DOUBT_FILTER
+        its_own = record.locates or denied
+        wrong = self._denied_positions() if record.locates and denied else []
+        for one in (record, *wrong):
+            self._exclude(one, aid.t_ns, DRIFTS, jumped=its_own)
+        return Action.DOUBT_MEASURED if its_own else Action.DOUBT_FILTER

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
-from fusiond.integrity import returns
+from fusiond.integrity import denied, returns
 from fusiond.integrity.hedge import NOTHING, Hedge
 from fusiond.integrity.means import FAST_COUNT, Means
 from fusiond.integrity.moved import Moved, Parted
@@ -106,13 +106,20 @@ class Kept:
         if record.parted is None:
             return
         what, record.parted = record.parted.followed(record.device, t_ns), None
-        of_device = [
-            (name, r)
-            for name, r in self._records.items()
-            if r.locates and r.device == record.device
-        ]
-        for name, position in of_device:
-            mine = position.copied() if name in self._shared else position
-            mine.moved = what.joined(mine.moved)
-            self._shared.discard(name)
-            self._records[name] = mine
+        for position in self._positions_of({record.device}):
+            position.moved = what.joined(position.moved)
+
+    def _denied_positions(self) -> list[Series]:
+        """Positions that are believed of devices whose velocities are not, by what wheels say: they
+        are wrong together."""
+        wrong = denied.devices(self._records)
+        return [r for r in self._positions_of(wrong) if not r.excluded]
+
+    def _positions_of(self, devices: Set[str]) -> list[Series]:
+        """Series of positions, which may be changed."""
+        found = [n for n, r in self._records.items() if r.locates and r.device in devices]
+        for name in found:
+            if name in self._shared:
+                self._shared.discard(name)
+                self._records[name] = self._records[name].copied()
+        return [self._records[name] for name in found]

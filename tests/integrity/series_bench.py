@@ -48,12 +48,19 @@ class Bench:
         aid = PositionAid(source, round(t_s * S), GATE, lat, lon, 40.0, sd, LEVER)
         return self._judge(replace(aid, shares_nothing=self._white), y)
 
-    def velocity(self, t_s: float, bias: float = 0.0, east_m_s: float = 3.0) -> Action:
-        """A velocity of the receiver, `bias` sigma off, that says so or so much to the east."""
+    def velocity(
+        self,
+        t_s: float,
+        bias: float = 0.0,
+        east_m_s: float = 3.0,
+        north_m_s: float = 8.0,
+        source: str = "gnss",
+    ) -> Action:
+        """A velocity of the receiver, `bias` sigma off, that says so or so much."""
         y = self.rng.standard_normal(3)
         y[1] += bias
-        v = 8.0, east_m_s, 0.0
-        aid = VelocityAid("gnss_velocity", round(t_s * S), GATE, v, (0.05,) * 3, LEVER)
+        v = north_m_s, east_m_s, 0.0
+        aid = VelocityAid(f"{source}_velocity", round(t_s * S), GATE, v, (0.05,) * 3, LEVER)
         return self._judge(aid, y)
 
     def moved_fix(self, t_s: float, velocity: tuple[float, float]) -> Action:

@@ -25,6 +25,7 @@ ROWS = [
     ("places_drift_0.5_m_s", "navigating", "isolated", None),
     ("two_step_500m", "navigating", "isolated", 10.0),
     ("two_carried_off_0.5_m_s", "navigating", "isolated", None),
+    ("two_carried_off_1_m_s_wheels", "navigating", "isolated", 20.0),
     ("wheels_frozen", "coasting", "isolated", 5.0),
     ("gyro_bias_1_deg_s", "navigating", "isolated", None),
     ("gyro_spike_in_range", "navigating", "imu_spike", 3.0),

@@ -159,6 +159,7 @@ _with_spare = partial(_of_imu, drive=Drive(spare=True))
 _of_two = partial(Fault, drive=Drive(second=True))
 _from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
 _under_way = partial(Fault, phases=("navigating",))
+_carried_off = partial(aid.carried_off, north_m_s=1.0)
 
 FAULTS: dict[str, Fault] = {
     "none": Fault(),
@@ -198,6 +199,11 @@ FAULTS: dict[str, Fault] = {
     "two_step_500m": _of_two(aid.step, 20.0),
     "two_frozen": _of_two(aid.frozen, 20.0),
     "two_carried_off_0.5_m_s": _of_two(aid.carried_off, 60.0, phases=("navigating",)),
+    # The IMU and the wheels alone can say so.
+    "carried_off_1_m_s_wheels": _under_way(_carried_off, 60.0, drive=Drive(wheels=True)),
+    "two_carried_off_1_m_s_wheels": _under_way(
+        _carried_off, 60.0, drive=Drive(wheels=True, second=True)
+    ),
     # RDSS
     "rdss_step_500m": Fault(aid.rdss_step, 60.0),
     "rdss_latitude_nan": Fault(aid.rdss_nan, 30.0),

@@ -1,0 +1,89 @@
+"""Receivers that are wrong together: the filter, which wheels agree with, says so."""
+
+from __future__ import annotations
+
+import pytest
+
+from fusiond.integrity.action import Action
+from tests.integrity.series_bench import Bench, S
+
+OFF = 12.0
+"""Of a velocity that its gate refuses, in sigmas."""
+
+
+def bench_of(seconds: int, *, wheels: bool) -> Bench:
+    """Two receivers that agree, and wheels or none."""
+    bench = Bench()
+    for t in range(seconds):
+        for source in ("gnss", "second"):
+            bench.fix(t, source=source)
+            bench.velocity(t, source=source)
+        if wheels:
+            bench.wheel(t + 0.5, 8.5)
+    return bench
+
+
+@pytest.mark.parametrize(
+    ("north_m_s", "east_m_s", "wheels", "denied"),
+    [
+        (8.5, 3.0, True, True),  # of another length
+        (8.0, 3.5, True, False),  # turned, as by a heading that is wrong
+        (7.5, 4.2, True, False),  # the same the other way
+        (8.5, 3.0, False, False),
+    ],
+)
+def test_wheels_deny_a_velocity_of_another_length(
+    north_m_s: float, east_m_s: float, wheels: bool, denied: bool
+) -> None:
+    bench = bench_of(60, wheels=wheels)
+    acted = [bench.velocity(t, OFF, east_m_s, north_m_s) for t in (60, 60.2, 60.4)]
+    assert bench.isolation.excluded == {"gnss_velocity": "disagrees"}
+    assert acted[-1] is (Action.NONE if denied else Action.DOUBT_MOTION)
+
+
+def test_wheels_that_have_been_silent_or_refused_deny_nothing() -> None:
+    bench = bench_of(60, wheels=True)
+    acted = [bench.velocity(63 + t / 5, OFF, 3.0, 8.5) for t in range(3)]
+    assert acted[-1] is Action.DOUBT_MOTION
+
+
+def wrong_together() -> tuple[Bench, float]:
+    """Both velocities are denied, and the positions go along until one is told; when that is."""
+    bench, t = bench_of(60, wheels=True), 60.0
+    acted: set[Action] = set()
+    while Action.DOUBT_MEASURED not in acted and t < 90.0:
+        for source in ("gnss", "second"):
+            bench.velocity(t, OFF, 3.0, 8.5, source)
+            acted.add(bench.fix(t, source=source, north_m=2.0))
+        bench.wheel(t, 8.5)
+        t += 0.2
+    assert Action.DOUBT_MOTION not in acted
+    return bench, t
+
+
+def test_positions_of_devices_whose_velocities_are_denied_are_left_out_together() -> None:
+    bench, t = wrong_together()
+    assert bench.isolation.excluded == {
+        "gnss_velocity": "disagrees",
+        "second_velocity": "disagrees",
+        "gnss": "drifts",
+        "second": "drifts",
+    }
+    lost = bench.isolation.lost(round(t * S))
+    assert lost is not None
+    assert lost.cause == "source"
+
+
+def test_their_velocities_come_back_with_the_positions() -> None:
+    """In a bend a drift is across, where no wheel tells: they pass, and are not believed."""
+    bench, t = wrong_together()
+    for _ in range(30):
+        bench.fix(t, north_m=30.0)
+        bench.velocity(t)
+        t += 0.2
+    assert "gnss_velocity" in bench.isolation.excluded
+    for _ in range(40):
+        bench.fix(t)
+        bench.velocity(t)
+        t += 1.0
+    assert bench.isolation.excluded.keys() == {"second", "second_velocity"}
