@@ -47,6 +47,8 @@ thousand is not the one that was configured: pitch and yaw are open by what it h
 
     sigma^2 + max(0, m^2 - 10.83 sigma_m^2)          sigma_m as configured
 
+and by all of it after a failure, which a unit that has turned may have been.
+
 A position that is back after an outage may be late, and lie within the outage's sigma all the same:
 until that would have shown position and velocity are no surer than a lateness leaves them
 (fusiond.integrity.punctual), along the track and the acceleration. Fixes by code have errors that

@@ -111,6 +111,7 @@ class Timeline:
         self.isolation = Isolation()
         self._wider = self.isolation.hedge.wider
         self._isolates = estimator.isolates
+        self._failed = False
         self._mounting = estimator.model.slots_of(MOUNTING)
         self._mounting_sd = max(estimator.model.initial[self._mounting].tolist(), default=0.0)
 
@@ -125,7 +126,7 @@ class Timeline:
         it was made of, `used`, once more. `contradicted`: positions have moved otherwise than their
         velocities; `failed`: the navigation before this one was given up; `moved`: what is used had
         left it."""
-        self._next = 0
+        self._next, self._failed = 0, failed
         self.isolation.reset(contradicted, failed, moved)
         self._hedge()
         self._checkpoints = [
@@ -255,8 +256,8 @@ class Timeline:
                 if not entry.judged:
                     entry.assumed = shown & ASSUMED > 0
                 wider = isolation.hedge.wider
-                if shown or wider or wider is not self._wider:
-                    self._act(aid, action, shown & SITS > 0 or bool(wider))
+                if shown or wider or wider is not self._wider or self._failed:
+                    self._act(aid, action, shown & SITS > 0 or bool(wider) or self._failed)
                 return outcome
         if entry.feedback == "release":
             estimator.release()
@@ -303,7 +304,8 @@ class Timeline:
             self.estimator.doubt(aid, action in MEASURED, action in MOTION, apart)
         if sits and aid.constraint and self._mounting:
             angle = self.estimator.xi.item
-            self.isolation.hedge.sits([angle(slot) for slot in self._mounting], self._mounting_sd)
+            angles = [angle(slot) for slot in self._mounting]
+            self.isolation.hedge.sits(angles, 0.0 if self._failed else self._mounting_sd)
         if self.isolation.hedge.wider is not self._wider:
             self._hedge()
 
