@@ -21,8 +21,8 @@ with, the filter's own motion and sensor errors are doubted, which widens P. So 
 aids that are fused correct its tilt more than its P allows (fusiond.integrity.tilt). Not so where
 wheels say that it is the receiver (fusiond.integrity.denied).
 
-An excluded series is looked at, not fused. It comes back when `READMIT_COUNT` innovations in a row
-over `READMIT_NS` have passed the gate, without a bias and, of a position, without running away: the
+An excluded series is looked at, not fused. It comes back when five innovations in a row over three
+seconds have passed the gate, without a bias and, of a position, without running away: the
 filter's own bound, grown as the IMU's errors let it, or another source then supports it. Patience
 does not; what it may be off by still is open (fusiond.integrity.moved). The filter's error,
 P / (P + R) of a position's variance, is the same in all of them, and c no less: a filter that has
@@ -56,7 +56,7 @@ from fusiond.integrity.jumps import jumps
 from fusiond.integrity.kept import Kept
 from fusiond.integrity.moved import Parted, back
 from fusiond.integrity.ordinary import Ordinary
-from fusiond.integrity.proof import NO_TREND, Offset, above, apart, filters_own, residual
+from fusiond.integrity.proof import above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, parts_by, said
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
@@ -69,9 +69,6 @@ Array = NDArray[np.float64]
 # Three failures of a gate of 0.9999 in a row are 1e-12 by chance; of one multipath burst in a
 # street they are the rule.
 REFUSED_IN_A_ROW = 3
-# Five in a row that pass a gate of 0.9999 while a fault of four sigma lasts: one case in 1000; and
-# over three seconds, so that no burst of a wrong stream is let in by its number.
-READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 # Probability of a false alarm of one mean test.
 FALSE_ALARM = 1e-6
 # A vehicle that does not face the way it is taken to, or slides: so long (ns) and so often in a row
@@ -96,11 +93,6 @@ class Isolation(Kept):
         self._pass = 1.0 - false_alarm
 
     # ------------------------------------------------------------------ what others ask
-
-    def believes(self, series: str) -> bool:
-        """Whether an aid of this series may be fused."""
-        record = self._records.get(series)
-        return record is None or not record.excluded
 
     @property
     def excluded(self) -> dict[str, str]:
@@ -195,14 +187,14 @@ class Isolation(Kept):
             self.hedge.drop(aid.source)
             own = 0.0 if offer is None or covariance is None else filters_own(offer, covariance)
             passed = _passed(aid, outcome) and not (repeats or position_away(self._records, record))
-            self._look(record, t_ns, passed, outcome.whitened, offset, own)
+            record.look(t_ns, passed, outcome.whitened, offset, own, self._pass)
             if not record.excluded:
                 self._followed(record, t_ns)
             if offset is not None and not record.excluded and covariance is not None:
                 record.moved = back(record, t_ns, covariance)
             return NONE
         if repeats:
-            self._exclude(record, t_ns, REPEATS, jumped=True)
+            record.exclude(t_ns, REPEATS, jumped=True)
             passed = _passed(aid, outcome)
             return self._doubted(Action.DOUBT_MEASURED if passed else NONE, t_ns)
         if outcome.name != "fused":
@@ -227,7 +219,7 @@ class Isolation(Kept):
         )
         record.fused_ns, record.refused, record.jumped = t_ns, 0, False
         if runs:
-            self._exclude(record, t_ns, DRIFTS, jumped=True)
+            record.exclude(t_ns, DRIFTS, jumped=True)
             return self._doubted(Action.DOUBT_MEASURED, t_ns)
         if record.no_slip and state is not None and aid.across_sd_m_s > 0.0:
             self.hedge.goes_across(aid, record, state)
@@ -304,7 +296,7 @@ class Isolation(Kept):
         self._tilting = Tilting()
         if rolling(self._records, t_ns) and (wrong := self._denied_positions()):
             for one in wrong:
-                self._exclude(one, t_ns, DRIFTS, jumped=True)
+                one.exclude(t_ns, DRIFTS, jumped=True)
             return Action.DOUBT_MEASURED
         return self._doubted(Action.DOUBT_MOTION, t_ns)
 
@@ -348,7 +340,7 @@ class Isolation(Kept):
             record.refused_ns = t_ns
         lasts_ns = t_ns - record.refused_ns
         if record.no_slip and record.refused >= SLIDING_COUNT and lasts_ns >= SLIDING_NS:
-            self._exclude(record, record.refused_ns, "disagrees", jumped=False)
+            record.exclude(record.refused_ns, "disagrees", jumped=False)
 
     def _refuse(self, record: Series, t_ns: int, nis: float, away: float, denied: bool) -> Action:
         """A measurement was refused that is `away` (m or m/s) from the filter, or `denied`."""
@@ -361,54 +353,13 @@ class Isolation(Kept):
             return NONE
         reason = "jumped" if record.jumped else "disagrees"
         record.jumped = record.jumped or denied
-        self._exclude(record, record.refused_ns, reason, jumped=record.jumped)
+        record.exclude(record.refused_ns, reason, jumped=record.jumped)
         # A jump is the source's. Else the motion may be what is wrong, and positions shall decide.
         # What is neither position nor velocity (a heading, a height) has nobody to decide: a doubt
         # would open the filter until it passes, which is patience by another name.
         if record.jumped or not (record.locates or record.moves):
             return NONE
         return Action.DOUBT_MOTION
-
-    @staticmethod
-    def _exclude(record: Series, since_ns: int, reason: str, *, jumped: bool) -> None:
-        record.excluded, record.refused_ns, record.jumped = reason, since_ns, jumped
-        record.passes, record.ran, record.slip = 0, False, record.slip.without_lately()
-        record.means.restart()
-
-    def _look(
-        self,
-        record: Series,
-        t_ns: int,
-        passed: bool,
-        whitened: tuple[float, ...],
-        offset: Offset | None,
-        own: float,
-    ) -> None:
-        """An innovation of a series that is left out: what may bring it back. `own` of its variance
-        is the filter's."""
-        if not passed:
-            record.passes = 0
-            record.means.restart()
-            return
-        if not record.passes:
-            record.passing_ns, record.trend, record.rise_m = t_ns, NO_TREND, 0.0
-        record.passes += 1
-        record.rise_m += record.above_m
-        if whitened:
-            record.means.add(whitened)
-        if offset is not None:
-            record.trend = record.trend.with_one(offset, (t_ns - record.passing_ns) * 1e-9)
-            record.ran = record.ran or record.trend.runs_away
-        means, degrees = record.means, record.means.degrees
-        if (
-            record.passes >= READMIT_COUNT
-            and t_ns - record.passing_ns >= READMIT_NS
-            and (offset is None or record.steady)
-            and not (degrees and means.biased(t_ns, gate_threshold(self._pass, degrees), own))
-        ):
-            record.excluded, record.fused_ns, record.back_ns = "", t_ns, t_ns
-            record.refused, record.jumped, record.proof = 0, False, None
-            record.means.restart()
 
     def _blame(self, record: Series, aid: Aid, denied: bool) -> Action:
         """A bias inside the gate: the series', where something else supports the filter, or where
@@ -423,5 +374,5 @@ class Isolation(Kept):
         its_own = record.locates or denied
         wrong = self._denied_positions() if record.locates and denied else []
         for one in (record, *wrong):
-            self._exclude(one, aid.t_ns, DRIFTS, jumped=its_own)
+            one.exclude(aid.t_ns, DRIFTS, jumped=its_own)
         return Action.DOUBT_MEASURED if its_own else Action.DOUBT_FILTER

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
+from fusiond.estimators.base import gate_threshold
 from fusiond.integrity.means import Means
 from fusiond.integrity.moved import Moved, Parted
 from fusiond.integrity.proof import (
@@ -18,6 +19,7 @@ from fusiond.integrity.proof import (
     NO_TREND,
     SLOWEST_M_S,
     TREND_SD_M_S,
+    Offset,
     Proof,
     Trend,
 )
@@ -31,6 +33,9 @@ REPEATED = 2
 # Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
 # repeats the one before, as this series has shown it (average of so many).
 CHANCE, REPEATS_KEPT = 1e-9, 100.0
+# Five in a row that pass a gate of 0.9999 while a fault of four sigma lasts: one case in 1000; and
+# over three seconds, so that no burst of a wrong stream is let in by its number.
+READMIT_COUNT, READMIT_NS = 5, 3_000_000_000
 # Before any instant that a clock can say.
 NEVER_NS = -(2**62)
 
@@ -56,7 +61,7 @@ class Series:
     """Failures of the gate in a row, the first at `refused_ns`."""
     refused_ns: int = 0
     jumped: bool = False
-    """The first of them left the filter faster than the IMU can err."""
+    """The first of them left the filter faster than the IMU can err; or it is wrong for itself."""
     excluded: str = ""
     passes: int = 0
     """While excluded: innovations in a row that passed, the first at `passing_ns`."""
@@ -102,6 +107,47 @@ class Series:
         self.means.restart()
         if not self.excluded:
             self.refused, self.jumped = 0, False
+
+    def exclude(self, since_ns: int, reason: str, *, jumped: bool) -> None:
+        """It is left out from an instant on; `jumped`: for itself, and not for the motion."""
+        self.excluded, self.refused_ns, self.jumped = reason, since_ns, jumped
+        self.passes, self.ran, self.slip = 0, False, self.slip.without_lately()
+        self.means.restart()
+
+    def look(
+        self,
+        t_ns: int,
+        passed: bool,
+        whitened: tuple[float, ...],
+        offset: Offset | None,
+        own: float,
+        probability: float,
+    ) -> None:
+        """An innovation while it is left out: what may bring it back. `own` of its variance is the
+        filter's; means are tested with that `probability`."""
+        if not passed:
+            self.passes = 0
+            self.means.restart()
+            return
+        if not self.passes:
+            self.passing_ns, self.trend, self.rise_m = t_ns, NO_TREND, 0.0
+        self.passes += 1
+        self.rise_m += self.above_m
+        if whitened:
+            self.means.add(whitened)
+        if offset is not None:
+            self.trend = self.trend.with_one(offset, (t_ns - self.passing_ns) * 1e-9)
+            self.ran = self.ran or self.trend.runs_away
+        means, degrees = self.means, self.means.degrees
+        if (
+            self.passes >= READMIT_COUNT
+            and t_ns - self.passing_ns >= READMIT_NS
+            and (offset is None or self.steady)
+            and not (degrees and means.biased(t_ns, gate_threshold(probability, degrees), own))
+        ):
+            self.excluded, self.fused_ns, self.back_ns = "", t_ns, t_ns
+            self.refused, self.jumped, self.proof = 0, False, None
+            self.means.restart()
 
     @property
     def quiet(self) -> bool:

@@ -111,7 +111,7 @@ class Returned:
             # The filter is where it believes to be: its state is of no matter but for the way.
             nav[LAT], nav[LON] = offer.lat_rad, offer.lon_rad
             less = self.isolation.unproven("gnss", aid.t_ns)
-            name = "fused" if self.isolation.believes("gnss") else "isolated"
+            name = "fused" if "gnss" not in self.isolation.excluded else "isolated"
             outcome = Outcome(name, 1.0, 3, () if less else self._white(3))
             found.append((less, self.isolation.judge(aid, outcome, nav)))
             if self._velocities:

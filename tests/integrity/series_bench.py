@@ -88,9 +88,10 @@ class Bench:
 
     def _judge(self, aid: PositionAid | VelocityAid, y: NDArray[np.float64]) -> Action:
         nis = float(y @ y)
-        fused = nis <= gate_threshold(GATE, 3) and self.isolation.believes(aid.source)
+        believed = aid.source not in self.isolation.excluded
+        fused = nis <= gate_threshold(GATE, 3) and believed
         name = "fused" if fused else "isolated"
-        if not fused and self.isolation.believes(aid.source):
+        if not fused and believed:
             name = "gated"
         seen = Outcome(name, nis, 3, tuple(y.tolist()))
         if self.covariance is not None:

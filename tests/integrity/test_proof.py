@@ -191,7 +191,7 @@ def test_a_drift_does_not_hide_behind_an_offset_in_time(known: bool) -> None:
         state = state_of(model, nav, xi) if known else None
         biased = 10.0 <= t_s < 14.0
         y = (2.5, 0.0, 0.0) if biased else (0.01 * (-1) ** k, 0.0, 0.0)
-        name = "fused" if isolation.believes("gnss") else "isolated"
+        name = "fused" if "gnss" not in isolation.excluded else "isolated"
         outcome = Outcome(name, 1.0, 3, y)
         aid = replace(aid, time=FIX_TIME, shares_nothing=True)
         isolation.judge(aid, outcome, nav, None, state)

@@ -261,9 +261,9 @@ def test_one_whose_own_velocity_was_left_out_since_is_to_prove_itself_wholly() -
                     "gnss_velocity", t_ns, 0.9999, (9.0, 3.0), (SD_M_S,) * 2, (0.0,) * 3
                 )
                 returned.isolation.judge(v, Outcome("gated", 400.0, 2, (20.0, 0.0)), nav)
-            assert not returned.isolation.believes("gnss_velocity")
+            assert "gnss_velocity" in returned.isolation.excluded
         returned.fixes(BACK + 11, BACK + 60)
-        assert returned.isolation.believes("gnss_velocity")
+        assert "gnss_velocity" not in returned.isolation.excluded
         contested.append(returned.isolation.contested((BACK + 60) * S // RATE))
         returned.fixes(BACK + 60, BACK + 150)
         assert returned.isolation.contested((BACK + 150) * S // RATE) is None
@@ -310,7 +310,7 @@ def _drifting(drift_m_s: float, wander: str) -> list[tuple[float, float]]:
         aid = replace(aid, wander=wander)
         noise = rng.standard_normal(3) if t_s < 600 else np.zeros(3)
         isolation.judge(aid, Outcome("fused", 1.0, 3, tuple(noise.tolist())), nav, p)
-        if t_s >= 640 and isolation.believes("gnss"):
+        if t_s >= 640 and "gnss" not in isolation.excluded:
             wider = isolation.hedge.wider.get("gnss", np.zeros(9))
             found.append((error_m, float(wider[0])))
     return found
