@@ -20,7 +20,7 @@ import math
 from collections.abc import Sequence
 
 from fusiond.integrity.punctual import MOVING_M_S
-from fusiond.integrity.series import Series
+from fusiond.integrity.series import DENIED, Series
 from fusiond.integrity.support import SUPPORT_NS, Records
 
 # tan(a / 2): see above.
@@ -53,7 +53,7 @@ def rolling(records: Records, t_ns: int) -> bool:
 
 def denied(records: Records, device: str) -> bool:
     """Whether a velocity of the device is left out for itself."""
-    return any(r.moves and r.device == device and r.excluded and r.jumped for r in records.values())
+    return any(r.device == device and r.excluded == DENIED for r in records.values())
 
 
 def devices(records: Records) -> set[str]:
@@ -62,9 +62,9 @@ def devices(records: Records) -> set[str]:
 
 
 def position_away(records: Records, record: Series) -> bool:
-    """Whether a velocity that was left out would come back before the position of its device, which
+    """Whether a velocity that was denied would come back before the position of its device, which
     is left out as well and away."""
-    return record.moves and any(
+    return record.excluded == DENIED and any(
         r.locates and r.device == record.device and r.excluded and not r.passes
         for r in records.values()
     )

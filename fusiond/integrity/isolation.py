@@ -58,7 +58,7 @@ from fusiond.integrity.moved import Parted, back
 from fusiond.integrity.ordinary import Ordinary
 from fusiond.integrity.proof import above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
-from fusiond.integrity.series import DRIFTS, REPEATS, Said, Series, parts_by, said
+from fusiond.integrity.series import DENIED, DRIFTS, REPEATS, Said, Series, parts_by, said
 from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.models.model import Model
@@ -352,7 +352,8 @@ class Isolation(Kept):
         if record.refused < REFUSED_IN_A_ROW:
             return NONE
         reason = "jumped" if record.jumped else "disagrees"
-        record.jumped = record.jumped or denied
+        if denied:
+            reason, record.jumped = DENIED if record.moves else reason, True
         record.exclude(record.refused_ns, reason, jumped=record.jumped)
         # A jump is the source's. Else the motion may be what is wrong, and positions shall decide.
         # What is neither position nor velocity (a heading, a height) has nobody to decide: a doubt
@@ -374,5 +375,5 @@ class Isolation(Kept):
         its_own = record.locates or denied
         wrong = self._denied_positions() if record.locates and denied else []
         for one in (record, *wrong):
-            one.exclude(aid.t_ns, DRIFTS, jumped=its_own)
+            one.exclude(aid.t_ns, DENIED if denied and one.moves else DRIFTS, jumped=its_own)
         return Action.DOUBT_MEASURED if its_own else Action.DOUBT_FILTER

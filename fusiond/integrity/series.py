@@ -26,7 +26,7 @@ from fusiond.integrity.proof import (
 from fusiond.integrity.punctual import Punctual
 from fusiond.integrity.slip import Slip
 
-DRIFTS, REPEATS = "drifts", "repeats itself"
+DRIFTS, REPEATS, DENIED = "drifts", "repeats itself", "wheels deny it"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2

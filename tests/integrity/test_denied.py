@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fusiond.integrity.action import Action
+from fusiond.integrity.series import DENIED
 from tests.integrity.series_bench import Bench, S
 
 OFF = 12.0
@@ -37,7 +38,8 @@ def test_wheels_deny_a_velocity_of_another_length(
 ) -> None:
     bench = bench_of(60, wheels=wheels)
     acted = [bench.velocity(t, OFF, east_m_s, north_m_s) for t in (60, 60.2, 60.4)]
-    assert bench.isolation.excluded == {"gnss_velocity": "disagrees"}
+    reason = DENIED if denied else "disagrees"
+    assert bench.isolation.excluded == {"gnss_velocity": reason}
     assert acted[-1] is (Action.NONE if denied else Action.DOUBT_MOTION)
 
 
@@ -64,8 +66,8 @@ def wrong_together() -> tuple[Bench, float]:
 def test_positions_of_devices_whose_velocities_are_denied_are_left_out_together() -> None:
     bench, t = wrong_together()
     assert bench.isolation.excluded == {
-        "gnss_velocity": "disagrees",
-        "second_velocity": "disagrees",
+        "gnss_velocity": DENIED,
+        "second_velocity": DENIED,
         "gnss": "drifts",
         "second": "drifts",
     }
