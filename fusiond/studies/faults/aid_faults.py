@@ -120,18 +120,6 @@ def drift(r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIF
     )
 
 
-def places_alone(alter: Alter) -> Alter:
-    """What alters a recording of receivers that measure no velocity, or do not send it."""
-
-    def altered(r: Recording, begin_s: float, length_s: float) -> Recording:
-        without = _changed(
-            r, 0.0, math.inf, PositionFix, lambda fix, _: replace(fix, v_ned_m_s=None)
-        )
-        return alter(without, begin_s, length_s)
-
-    return altered
-
-
 def carried_off(
     r: Recording, begin_s: float, length_s: float, north_m_s: float = DRIFT_M_S
 ) -> Recording:

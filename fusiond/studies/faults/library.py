@@ -159,6 +159,7 @@ _with_spare = partial(_of_imu, drive=Drive(spare=True))
 _of_two = partial(Fault, drive=Drive(second=True))
 _from_start = partial(Fault, phases=("aligning",), begin_s=0.0)
 _under_way = partial(Fault, phases=("navigating",))
+_of_places = partial(_under_way, length_s=60.0, drive=Drive(places_alone=True))
 _carried_off = partial(aid.carried_off, north_m_s=1.0)
 
 FAULTS: dict[str, Fault] = {
@@ -179,8 +180,8 @@ FAULTS: dict[str, Fault] = {
     # In an outage a velocity is not known as well as that: nobody can tell.
     "carried_off_0.5_m_s": Fault(aid.carried_off, 60.0, phases=("navigating",)),
     # Of a receiver without velocities, which would tell.
-    "places_drift_0.5_m_s": _under_way(aid.places_alone(aid.drift), 60.0),
-    "places_drift_2_m_s": _under_way(aid.places_alone(partial(aid.drift, north_m_s=2.0)), 60.0),
+    "places_drift_0.5_m_s": _of_places(aid.drift),
+    "places_drift_2_m_s": _of_places(partial(aid.drift, north_m_s=2.0)),
     "fixes_late_0.8s": Fault(aid.late, phases=UNDER_WAY),
     "fixes_always_late_0.8s": _from_start(aid.late),
     "false_burst_1khz": Fault(aid.false_burst, 0.5),

@@ -129,6 +129,8 @@ class Drive:
     """A second inertial unit, `[imu.spare]` of the configuration."""
     second: bool = False
     """A second receiver, `SECOND` of the configuration, as good as the first."""
+    places_alone: bool = False
+    """Receivers measure no velocity, or do not send it."""
     gnss_rate_hz: float = 5.0
     duration_s: float = DURATION_S
 
@@ -145,6 +147,8 @@ class Drive:
         stamps = np.rint(truth.t_s[1:] * 1e9).astype(np.int64)
         receiver = replace(car.gnss, rate_hz=self.gnss_rate_hz)
         received = gnss_fixes(GnssReceiver(truth, receiver, gnss_rng))
+        if self.places_alone:
+            received = [_without_velocity(item) for item in received]
         received += _rdss(RdssCentre(truth, car.rdss, rdss_rng), self.duration_s)
         if self.wheels:
             received += _wheels(truth, wheel_rng)
@@ -195,6 +199,11 @@ def gnss_fixes(receiver: GnssReceiver) -> list[Received]:
         )
         found.append(Received(t_ns, seen_ns, fix))
     return found
+
+
+def _without_velocity(item: Received) -> Received:
+    assert isinstance(item.measurement, PositionFix)
+    return replace(item, measurement=replace(item.measurement, v_ned_m_s=None))
 
 
 def _rdss(centre: RdssCentre, duration_s: float) -> list[Received]:

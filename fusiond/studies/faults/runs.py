@@ -88,7 +88,13 @@ def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
     if drive is not None and fault.drive.path is town:
         found = drawn(drive)
         own = fault.drive
-        found = replace(found, wheels=own.wheels, spare=own.spare, second=own.second)
+        found = replace(
+            found,
+            wheels=own.wheels,
+            spare=own.spare,
+            second=own.second,
+            places_alone=own.places_alone,
+        )
         fault = replace(fault, drive=found)
     return {"fault": row.fault, "phase": row.phase, **run(fault, row.phase, seed)}
 
