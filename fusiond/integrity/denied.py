@@ -31,7 +31,7 @@ def denies(records: Records, record: Series, by: Sequence[float], v_n: float, v_
     """Whether what a series is off `by` (m/s, north and east, of a velocity) from a filter that
     moves by `v_n` and `v_e` is its own; of a position, whether its device's velocity is denied."""
     if record.locates:
-        return denied(records, record.device)
+        return record.device in devices(records)
     if not record.moves or math.hypot(v_n, v_e) <= MOVING_M_S:
         return False
     along, across = by[0] * v_n + by[1] * v_e, by[1] * v_n - by[0] * v_e
@@ -51,14 +51,9 @@ def rolling(records: Records, t_ns: int) -> bool:
     )
 
 
-def denied(records: Records, device: str) -> bool:
-    """Whether a velocity of the device is left out for itself."""
-    return any(r.device == device and r.excluded == DENIED for r in records.values())
-
-
 def devices(records: Records) -> set[str]:
-    """Those that are denied."""
-    return {r.device for r in records.values() if denied(records, r.device)}
+    """Those of which a velocity is left out for itself."""
+    return {r.device for r in records.values() if r.excluded == DENIED}
 
 
 def position_away(records: Records, record: Series) -> bool:

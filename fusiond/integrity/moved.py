@@ -26,6 +26,9 @@ and a vehicle's heading, which follows a velocity across, by the angle that u ma
 drift may go on for ever and take the position anywhere: what is left after 19 T is one case in
 twenty, and is left out.
 
+A position that no velocity goes with, and that is believed still though the filter was put in doubt
+by a mean d of its innovations, has gone that far while the mean looks back: u is d by that time.
+
 Source: Jeffreys, Theory of Probability, 3rd ed. (1961), section 3.1 (the prior of a scale); Gott,
 Nature 363 (1993), 315 (a duration of which no more is known than for how long it has lasted).
 """

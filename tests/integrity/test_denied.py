@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from fusiond.integrity.action import Action
 from fusiond.integrity.series import DENIED
-from tests.integrity.series_bench import Bench, S
+from fusiond.navigation.strapdown import Q0
+from tests.integrity.series_bench import NAV, TOLD, Bench, S
 
 OFF = 12.0
 """Of a velocity that its gate refuses, in sigmas."""
@@ -74,6 +76,21 @@ def test_positions_of_devices_whose_velocities_are_denied_are_left_out_together(
     lost = bench.isolation.lost(round(t * S))
     assert lost is not None
     assert lost.cause == "source"
+
+
+def test_a_tilt_that_is_corrected_too_far_is_of_receivers_that_are_denied() -> None:
+    """Before any mean of their positions tells: what these do to the tilt is not the IMU's."""
+    p = np.diag([1e-4] * 9)
+    turned = NAV.copy()
+    turned[Q0 + 1] = 0.01
+    for off_north_m_s, action in ((0.5, Action.DOUBT_MEASURED), (0.0, Action.DOUBT_MOTION)):
+        bench = bench_of(60, wheels=True)
+        for t in (60, 60.2, 60.4):
+            bench.velocity(t, OFF if off_north_m_s else 0.0, 3.0, 8.0 + off_north_m_s)
+        bench.isolation.correcting(NAV, TOLD * p)
+        assert bench.isolation.corrected(round(60.6 * S), turned, p) is action
+        assert ("gnss" in bench.isolation.excluded) == (off_north_m_s > 0.0)
+        assert "second" not in bench.isolation.excluded
 
 
 def test_their_velocities_come_back_with_the_positions() -> None:
