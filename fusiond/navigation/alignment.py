@@ -59,15 +59,15 @@ def levelling_jacobian(dcm: Array, lat: float, height: float) -> Array:
 def integrate_felt(
     times: NDArray[np.int64],
     samples: Array,
-    bias: Array,
-    at: NDArray[np.int64],
+    biases: Array,
+    counts: NDArray[np.int64],
     gained: Array,
     turned: Array,
     slopes: Array,
 ) -> None:
-    """Integrate samples (m, 6) less a rate bias (3,) in the axes of their begin; write what they
-    come to after `at` (k,) of them, in order of size: the velocity gained (k, 3), the attitude
-    (k, 3, 3), the slopes of that velocity by force bias and rate bias (k, 3, 6).
+    """Integrate samples (m, 6) of rate and force less biases (6,) of force and rate in the axes of
+    their begin; write what they come to after `counts` (k,) of them, in order of size: the velocity
+    gained (k, 3), the attitude (k, 3, 3), the slopes of that velocity by the biases (k, 3, 6).
 
     `times` (m + 1,) ns holds the begin before the first sample. Over tens of seconds: Earth rate,
     transport and Coriolis are left out, and so is gravity. With C' = C [w - b_w]x the attitude's
@@ -80,18 +80,18 @@ def integrate_felt(
     v, d, s = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     f, mid = np.empty(3), np.empty((3, 3))
     done = 0
-    for k in range(at.shape[0]):
-        for i in range(done, at[k]):
+    for k in range(counts.shape[0]):
+        for i in range(done, counts[k]):
             h = (times[i + 1] - times[i]) * 1e-9
-            x = 0.5 * h * (samples[i, 0] - bias[0])
-            y = 0.5 * h * (samples[i, 1] - bias[1])
-            z = 0.5 * h * (samples[i, 2] - bias[2])
+            x = 0.5 * h * (samples[i, 0] - biases[3])
+            y = 0.5 * h * (samples[i, 1] - biases[4])
+            z = 0.5 * h * (samples[i, 2] - biases[5])
             rotate_quaternion(q, x, y, z, False)
             quaternion_to_dcm(q, dcm)
             for r in range(3):
                 f[r] = 0.0
                 for j in range(3):
-                    f[r] += dcm[r, j] * samples[i, 3 + j]
+                    f[r] += dcm[r, j] * (samples[i, 3 + j] - biases[j])
                     mid[r, j] = d[r, j] - 0.5 * h * dcm[r, j]
                     d[r, j] -= h * dcm[r, j]
                 v[r] += h * f[r]
@@ -100,9 +100,94 @@ def integrate_felt(
                 s[1, j] -= h * (f[2] * mid[0, j] - f[0] * mid[2, j])
                 s[2, j] -= h * (f[0] * mid[1, j] - f[1] * mid[0, j])
             rotate_quaternion(q, x, y, z, False)
-        done = max(done, at[k])
+        done = max(done, counts[k])
         quaternion_to_dcm(q, dcm)
         gained[k] = v
         turned[k] = dcm
         slopes[k, :, :3] = d
         slopes[k, :, 3:] = s
+
+
+@compiled(
+    "void(f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1],"
+    " f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8, f8, f8, f8, f8,"
+    " f8[:, ::1], f8[:, :, ::1])",
+    allocates=True,
+)
+def judge_felt(
+    t_s: Array,
+    means: Array,
+    gained: Array,
+    turned: Array,
+    slopes: Array,
+    felt_biases: Array,
+    velocity: Array,
+    sd: Array,
+    levers: Array,
+    dcm: Array,
+    first: Array,
+    biases: Array,
+    dcm_turns: Array,
+    force_variance: float,
+    rate_variance: float,
+    g: float,
+    late: float,
+    sd_late_s: float,
+    left: Array,
+    rows: Array,
+) -> None:
+    """What a guess leaves of k velocities, in sigmas (k, 3), and the slopes (k, 3, 13) of what it
+    says by phi, biases (6,) of force and rate, offset in time and first velocity
+    (`fusiond.navigator.alignment.motion_fit`).
+
+    Of a stretch of samples: seconds (k,), rate and force (k, 6) as sensed at the fixes; the
+    integrals over it (`integrate_felt`), with the biases that were taken off; of the fixes
+    velocity, sigma and lever (k, 3). Of the guess: C_0 (3, 3), the velocity (3,) at the first fix,
+    biases, C_0 D (3, 3) of the last fix, the offset `late` in its sigmas, `sd_late_s`. A velocity
+    gained has the white noise of `force_variance` t + `rate_variance` t^3 beside its own.
+    """
+    more = biases - felt_biases
+    there, acceleration, arm, body = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    turn, weight = np.empty((3, 3)), np.empty(3)
+    for k in range(t_s.shape[0]):
+        t, lever = t_s[k], levers[k]
+        x, y, z = means[k, 0] - biases[3], means[k, 1] - biases[4], means[k, 2] - biases[5]
+        arm[0] = y * lever[2] - z * lever[1]
+        arm[1] = z * lever[0] - x * lever[2]
+        arm[2] = x * lever[1] - y * lever[0]
+        for i in range(3):
+            body[i] = gained[k, i]
+            for j in range(6):
+                body[i] += slopes[k, i, j] * more[j]
+            for j in range(3):
+                body[i] += turned[k, i, j] * arm[j]
+                turn[i, j] = 0.0
+                for n in range(3):
+                    turn[i, j] += dcm[i, n] * turned[k, n, j]
+        white = force_variance * t + rate_variance * t * t * t
+        for i in range(3):
+            down = g if i == 2 else 0.0
+            there[i], acceleration[i] = 0.0, down
+            for j in range(3):
+                there[i] += dcm[i, j] * body[j]
+                acceleration[i] += turn[i, j] * (means[k, 3 + j] - biases[j])
+            weight[i] = 1.0 / np.sqrt(sd[k, i] * sd[k, i] + white)
+            said = first[i] + down * t + there[i] + late * sd_late_s * acceleration[i]
+            left[k, i] = (velocity[k, i] - said) * weight[i]
+        for i in range(3):
+            row, one, two = rows[k, i], (i + 1) % 3, (i + 2) % 3
+            # exp(phi) u moves by phi x u; a lever's velocity by a rate less b_w is -[l]x of it.
+            row[i], row[one], row[two] = 0.0, there[two], -there[one]
+            for j in range(6):
+                row[3 + j] = 0.0
+                for n in range(3):
+                    row[3 + j] += dcm[i, n] * slopes[k, n, j]
+            for j in range(3):
+                ahead, behind = (j + 1) % 3, (j + 2) % 3
+                row[6 + j] -= there[two] * dcm_turns[one, j] - there[one] * dcm_turns[two, j]
+                row[6 + j] += turn[i, ahead] * lever[behind] - turn[i, behind] * lever[ahead]
+            row[9] = sd_late_s * acceleration[i]
+            row[10], row[11], row[12] = 0.0, 0.0, 0.0
+            row[10 + i] = 1.0
+            for j in range(13):
+                row[j] *= weight[i]

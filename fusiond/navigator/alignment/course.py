@@ -129,14 +129,14 @@ def _moved_off(
     g = gravity(lat, height)
     f = motion.felt(imu, np.array([standing.end_ns, velocity.t_ns]), standing.mean_rate)
     rested = dcm_from_rpy(*level(standing.mean_force), 0.0)
-    gained = rested @ f.gained[1] + [0.0, 0.0, g * f.t_s[1]]
+    gained = rested @ f.gained[1] + [0.0, 0.0, g * f.of.t_s[1]]
     dcm = rested @ f.turned[1]
     roll, pitch, turned = rpy_from_dcm(dcm)
     rate = f.rates[1]
     antenna = gained + dcm @ np.cross(rate, velocity.lever)
     felt_m_s, speed = math.hypot(*antenna[:2]), math.hypot(*velocity.v_ned[:2])
     sd_felt = _felt_sd(by, g, (velocity.t_ns - standing.end_ns) * 1e-9, turned, speed)
-    acceleration = dcm @ f.forces[1] + [0.0, 0.0, g]
+    acceleration = dcm @ f.of.means[1, 3:] + [0.0, 0.0, g]
     late = math.hypot(*acceleration[:2]) * _sd_late_s(by, velocity)
     sd_speed = math.hypot(max(velocity.sd[:2]), late)
     if abs(felt_m_s - speed) > AGREEMENT_SIGMAS * math.hypot(sd_felt, sd_speed):

@@ -37,7 +37,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import NamedTuple
@@ -113,11 +113,28 @@ class Found(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Receiver:
-    """The last aids of a receiver as they were stamped, how late they are taken to be (ns), and
-    what speaks for another lateness since when (ns)."""
+class _Heard:
+    """The aids of a measurement as they were stamped, and its velocities once they were asked
+    for."""
 
-    heard: deque[tuple[Aid, ...]] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
+    aids: tuple[Aid, ...]
+    found: list[Epoch] | None = None
+
+    def epochs(self) -> list[Epoch]:
+        """Its velocities, each with its position."""
+        if self.found is None:
+            offers = [offer for aid in self.aids for offer in aid.offers()]
+            position = next((o for o in offers if isinstance(o, PositionOffer)), None)
+            self.found = [Epoch(o, position) for o in offers if isinstance(o, VelocityOffer)]
+        return self.found
+
+
+@dataclass(slots=True)
+class _Receiver:
+    """The last measurements of a receiver, how late they are taken to be (ns), and what speaks for
+    another lateness since when (ns)."""
+
+    heard: deque[_Heard] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
     late_ns: int = 0
     suspected: Late | None = None
     since_ns: int = 0
@@ -174,7 +191,7 @@ class Lateness:
             if not any(aid.moves and not aid.screened for aid in aids):
                 return aids
             receiver = self._receivers[source] = _Receiver()
-        receiver.heard.append(tuple(aids))
+        receiver.heard.append(_Heard(tuple(aids)))
         late_ns = receiver.late_ns
         return [_earlier(aid, late_ns) for aid in aids] if late_ns else aids
 
@@ -183,8 +200,8 @@ class Lateness:
         return [
             _earlier(aid, receiver.late_ns)
             for receiver in self._receivers.values()
-            for aids in tuple(receiver.heard)[-HANDED_ON:]
-            for aid in aids
+            for heard in tuple(receiver.heard)[-HANDED_ON:]
+            for aid in heard.aids
         ]
 
     def due(self, t_ns: int) -> bool:
@@ -281,7 +298,8 @@ class Lateness:
     ) -> Generator[None, None, None]:
         """What the fixes of a span say of a receiver's lateness; the best that they have said
         counts."""
-        epochs = _epochs(receiver.heard)
+        of_each = (epoch for heard in receiver.heard for epoch in heard.epochs())
+        epochs = sorted(of_each, key=lambda epoch: epoch.velocity.t_ns)
         fixes, place = _fixes([e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns])
         # The last must have a course.
         while fixes and math.hypot(*fixes[-1].v_ned[:2]) < self._options.course_speed_m_s:
@@ -329,17 +347,6 @@ class Lateness:
             return
         self._due_ns = t_ns + EVERY_NS
         receiver.suspect(Late(max(0.0, late.seconds), late.sd), t_ns)
-
-
-def _epochs(heard: Iterable[Sequence[Aid]]) -> list[Epoch]:
-    """Measurements that have a velocity, in order of its instant."""
-    found = []
-    for aids in heard:
-        offers = [offer for aid in aids for offer in aid.offers()]
-        position = next((o for o in offers if isinstance(o, PositionOffer)), None)
-        found += [Epoch(o, position) for o in offers if isinstance(o, VelocityOffer)]
-    found.sort(key=lambda epoch: epoch.velocity.t_ns)
-    return found
 
 
 def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityOffer], PositionOffer | None]:

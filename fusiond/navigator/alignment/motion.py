@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 
 # A rate or a force at an instant is the mean of so much (ns) to each side.
 AROUND_NS = 100_000_000
-UNBIASED = np.zeros(3)
 # A velocity below so many of its sigmas is none.
 STILL_SIGMAS = 3.0
 MOST_FIXES = 20
@@ -65,19 +64,41 @@ class Measured(NamedTuple):
     levers: Array
 
 
-class Felt(NamedTuple):
-    """Integrals from the first fix to each of k, with biases (6,) of force and rate taken off:
-    times (k,) s, gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of
-    the velocity by the biases (k, 3, 6), at the fixes rates (k, 3) less theirs and forces (k, 3) as
-    they were sensed."""
+class Stretch(NamedTuple):
+    """What the IMU sensed from the first of k fixes to the last: times (m + 1,) ns, of the first
+    fix and of samples (m, 6), how many of them (k,) there are until each fix, seconds (k,) from the
+    first to each, and means (k, 6) of the samples around each."""
 
+    times: NDArray[np.int64]
+    samples: Array
+    counts: NDArray[np.int64]
     t_s: Array
+    means: Array
+
+    def felt(self, biases: Array) -> Felt:
+        """Less biases (6,) of force and rate."""
+        k = len(self.counts)
+        gained, turned, slopes = np.empty((k, 3)), np.empty((k, 3, 3)), np.empty((k, 3, 6))
+        integrate_felt(self.times, self.samples, biases, self.counts, gained, turned, slopes)
+        return Felt(self, gained, turned, slopes, biases)
+
+
+class Felt(NamedTuple):
+    """Integrals over a stretch from its first fix to each of k, with biases (6,) of force and rate
+    taken off: gained velocity (k, 3) and attitude (k, 3, 3) in the axes of the first, slopes of the
+    velocity by the biases (k, 3, 6)."""
+
+    of: Stretch
     gained: Array
     turned: Array
     slopes: Array
-    rates: Array
-    forces: Array
     biases: Array
+
+    @property
+    def rates(self) -> Array:
+        """At the fixes (k, 3), less their biases."""
+        rates: Array = self.of.means[:, :3] - self.biases[3:]
+        return rates
 
     @property
     def turns(self) -> Array:
@@ -126,19 +147,18 @@ def samples_at(past: Past, t_ns: int) -> Array:
     return mean
 
 
-def felt(past: Past, instants: NDArray[np.int64], rate: Array, force: Array = UNBIASED) -> Felt:
-    """What the IMU felt from the first of instants (k,) to each, less biases (3,)."""
+def stretch(past: Past, instants: NDArray[np.int64]) -> Stretch:
+    """What was sensed from the first of instants (k,) to the last."""
     first, end = past.index_after(int(instants[0])), past.index_after(int(instants[-1]))
     times = np.concatenate((instants[:1], past.times[first:end]))
-    at = np.searchsorted(times[1:], instants, side="right")
-    gained, turned = np.empty((len(at), 3)), np.empty((len(at), 3, 3))
-    slopes = np.empty((len(at), 3, 6))
-    samples = past.samples[first:end] - np.concatenate([np.zeros(3), force])
-    integrate_felt(times, samples, rate, at, gained, turned, slopes)
+    counts = np.searchsorted(times[1:], instants, side="right")
     t_s = (instants - instants[0]) * 1e-9
-    means = _samples_at(past, instants)
-    biases = np.concatenate([force, rate])
-    return Felt(t_s, gained, turned, slopes, means[:, :3] - rate, means[:, 3:], biases)
+    return Stretch(times, past.samples[first:end], counts, t_s, _samples_at(past, instants))
+
+
+def felt(past: Past, instants: NDArray[np.int64], rate: Array) -> Felt:
+    """What the IMU felt from the first of instants (k,) to each, less a rate bias (3,)."""
+    return stretch(past, instants).felt(np.concatenate((np.zeros(3), rate)))
 
 
 def _samples_at(past: Past, instants: NDArray[np.int64]) -> Array:

@@ -41,6 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.models.blocks import ImuNoise
+from fusiond.navigation.alignment import judge_felt
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.rotation import (
     dcm_from_quaternion,
@@ -48,7 +49,7 @@ from fusiond.navigation.rotation import (
     rotation_vector_to_quaternion,
     wrap_angle,
 )
-from fusiond.navigator.alignment.motion import Felt, Measured, Past, felt
+from fusiond.navigator.alignment.motion import Felt, Measured, Past, stretch
 
 Array = NDArray[np.float64]
 
@@ -65,10 +66,6 @@ FIRST_RAD = 0.5
 # those that they were made with: half its square is left out, a cm/s of what gravity gains in 20 s,
 # and what the slopes by the rate bias have of the force bias (a twelfth for 5 deg).
 BENT_RAD = 0.01
-# (a x b)_i = CROSS_ijk a_j b_k.
-CROSS = np.zeros((3, 3, 3))
-CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
-CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
 
 
 class Fit(NamedTuple):
@@ -104,9 +101,9 @@ def fit(
     asked = Asked(noise, g, yaw, prior, sd_late_s)
     here = Guess(dcm_from_rpy(0.0, 0.0, yaw), f.biases, 0.0, m.velocity[0])
     for part in _parts(m, rate):
-        begun = felt(past, part.instants, here.biases[3:], here.biases[:3])
-        here = _descend(past, begun, part, asked, here.since(part)).here
-    found = _descend(past, f, m, asked, here.since(m))
+        begun = stretch(past, part.instants).felt(here.biases)
+        here = _descend(begun, part, asked, here.since(part)).here
+    found = _descend(f, m, asked, here.since(m))
     here, scale = found.here, np.array([1.0] * 9 + [sd_late_s])
     known = np.asarray(np.linalg.inv(found.rows.T @ found.rows), np.float64)[:10, :10]
     return Fit(
@@ -155,22 +152,20 @@ def _parts(m: Measured, rate_sd: float) -> list[Measured]:
     return found
 
 
-def _descend(past: Past, f: Felt, m: Measured, asked: Asked, here: Guess) -> Descent:
+def _descend(f: Felt, m: Measured, asked: Asked, here: Guess) -> Descent:
     """By Gauss-Newton from a guess, begun at `f`; a step that makes the fit worse is halved."""
-    f = _about(past, f, m, here)
-    z = _left(f, m, asked, here)
-    rows, converged = np.empty((z.size, 13)), False
+    f, converged = _about(f, here), False
+    z, rows = _judged(f, m, asked, here)
     for _ in range(ITERATIONS):
-        rows = _slopes(f, m, asked, here)
-        step = np.asarray(np.linalg.lstsq(rows, z, rcond=None)[0], np.float64)
+        step = _step(rows, z)
         size = float(np.linalg.norm(rows @ step))
         converged = size < CONVERGED
         for _ in range(HALVINGS):
             there = here.moved(step)
-            about = _about(past, f, m, there)
-            left = _left(about, m, asked, there)
+            about = _about(f, there)
+            left, slopes = _judged(about, m, asked, there)
             if converged or left @ left < z @ z:
-                here, f, z = there, about, left
+                here, f, z, rows = there, about, left, slopes
                 break
             step = 0.5 * step
         else:
@@ -181,45 +176,42 @@ def _descend(past: Past, f: Felt, m: Measured, asked: Asked, here: Guess) -> Des
     return Descent(here, rows, z, converged)
 
 
-def _about(past: Past, f: Felt, m: Measured, here: Guess) -> Felt:
+def _step(rows: Array, z: Array) -> Array:
+    """The least squares (13,) of rows @ step = z, in sigmas of each alone."""
+    normal = rows.T @ rows
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    step: Array = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * (rows.T @ z))
+    return step
+
+
+def _about(f: Felt, here: Guess) -> Felt:
     """The integrals, made anew where the biases are others by now."""
     force, rate = np.abs(here.biases - f.biases).reshape(2, 3).max(axis=1).tolist()
-    if max(rate * f.t_s[-1], force / STANDARD_GRAVITY_M_S2) > BENT_RAD:
-        return felt(past, m.instants, here.biases[3:], here.biases[:3])
+    if max(rate * f.of.t_s[-1], force / STANDARD_GRAVITY_M_S2) > BENT_RAD:
+        return f.of.felt(here.biases)
     return f
 
 
-def _weights(f: Felt, m: Measured, asked: Asked) -> Array:
-    """One over the sigmas (k, 3) of the velocities, with the white noise of what was felt."""
-    n = asked.noise
-    white = n.force_noise**2 * f.t_s
-    white += (STANDARD_GRAVITY_M_S2 * n.rate_noise) ** 2 * f.t_s**3 / 3.0
-    weights: Array = 1.0 / np.sqrt(m.sd**2 + white[:, None])
-    return weights
-
-
-def _left(f: Felt, m: Measured, asked: Asked, here: Guess) -> Array:
-    """What a guess leaves (3 k + 10,), in sigmas."""
-    dcm, there = _since_first(f, m, here)
-    while_late = asked.sd_late_s * _accelerations(f, dcm, here, asked.g)
-    gained = m.velocity - np.outer(f.t_s, [0.0, 0.0, asked.g])
-    z = (gained - here.first - there - here.late * while_late) * _weights(f, m, asked)
-    return np.concatenate([z.ravel(), here.apart(asked.yaw) / asked.prior])
-
-
-def _slopes(f: Felt, m: Measured, asked: Asked, here: Guess) -> Array:
-    """Slopes (3 k + 10, 13) of what a guess says by its steps, in sigmas."""
-    dcm, there = _since_first(f, m, here)
-    h = np.zeros((len(there), 3, 13))
-    h[:, :, :3] = np.einsum("ijk,mk->mij", CROSS, there)  # d(exp(phi) u) = dphi x u
-    h[:, :, 3:9] = dcm @ f.slopes
-    h[:, :, 6:9] -= h[:, :, :3] @ (dcm @ f.turns)
-    h[:, :, 6:9] += dcm @ f.turned @ np.einsum("ijk,mj->mik", CROSS, m.levers)
-    h[:, :, 9] = asked.sd_late_s * _accelerations(f, dcm, here, asked.g)
-    h[:, :, 10:] = np.eye(3)
-    h *= _weights(f, m, asked)[:, :, None]
-    of_priors = np.hstack([np.diag(1.0 / asked.prior), np.zeros((10, 3))])
-    return np.vstack([h.reshape(-1, 13), of_priors])
+def _judged(f: Felt, m: Measured, asked: Asked, here: Guess) -> tuple[Array, Array]:
+    """What a guess leaves (3 k + 10,) and the slopes (3 k + 10, 13) of what it says by its steps,
+    in sigmas."""
+    k = 3 * len(m.velocity)
+    z, rows = np.empty(k + 10), np.zeros((k + 10, 13))
+    # C_0, since which the axes have turned to C_T.
+    turned = _turn(f.turns @ (here.biases - f.biases)[3:]) @ f.turned[-1]
+    dcm = here.last @ turned.T
+    n, of = asked.noise, f.of
+    judge_felt(
+        *(of.t_s, of.means, f.gained, f.turned, f.slopes, f.biases),
+        *(m.velocity, m.sd, m.levers),
+        *(dcm, here.first, here.biases, dcm @ f.turns),
+        *(n.force_noise**2, (STANDARD_GRAVITY_M_S2 * n.rate_noise) ** 2 / 3.0, asked.g),
+        *(here.late, asked.sd_late_s),
+        *(z[:k].reshape(-1, 3), rows[:k].reshape(-1, 3, 13)),
+    )
+    z[k:] = here.apart(asked.yaw) / asked.prior
+    rows[range(k, k + 10), range(10)] = 1.0 / asked.prior
+    return z, rows
 
 
 class Guess(NamedTuple):
@@ -246,23 +238,6 @@ class Guess(NamedTuple):
         c = self.last
         apart = wrap_angle(yaw - math.atan2(c[1, 0], c[0, 0]))
         return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases, [-self.late]])
-
-
-def _since_first(f: Felt, m: Measured, here: Guess) -> tuple[Array, Array]:
-    """C_0 (3, 3), and the velocity (k, 3) gained since the first fix but for gravity's, with the
-    antenna's about the IMU."""
-    more = here.biases - f.biases
-    dcm = here.last @ (_turn(f.turns @ more[3:]) @ f.turned[-1]).T
-    levers = np.einsum("ijk,mj,mk->mi", CROSS, f.rates - more[3:], m.levers)
-    arms = (f.turned @ levers[:, :, None])[:, :, 0]
-    return dcm, (f.gained + f.slopes @ more + arms) @ dcm.T
-
-
-def _accelerations(f: Felt, dcm: Array, here: Guess, g: float) -> Array:
-    """Of the body, NED (k, 3) at the fixes, with C_0 (3, 3)."""
-    forces = (dcm @ f.turned) @ (f.forces - here.biases[:3])[:, :, None]
-    accelerations: Array = forces[:, :, 0] + [0.0, 0.0, g]
-    return accelerations
 
 
 def _turn(phi: Array) -> Array:
