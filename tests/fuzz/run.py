@@ -29,6 +29,9 @@ LONGEST = 9000
 """Bytes of a long input: the longest frame of all, UBX, with something on either side."""
 SHORT_PER_LONG = 1000
 HUNG_S = 60
+RUNS_A_PROCESS = 1_000_000
+"""atheris keeps 0.6 kB of each run of `csv`, which alone keeps nothing: 2 GB, the fuzzer's limit,
+after three million."""
 _EXECUTED = re.compile(r"stat::number_of_executed_units:\s+(\d+)")
 _HEADINGS = ("parser", "runs", "long", "seconds", "runs/s", "found", "kept", "corpus", "crashes")
 
@@ -47,7 +50,11 @@ class Fuzzing:
 
     def run(self) -> None:
         began = time.monotonic()
-        self.done = self._fuzz(self._runs, [f"-max_len={PARSERS[self.name].length}"])
+        while (runs := min(self._runs - self.done, RUNS_A_PROCESS)) > 0:
+            done = self._fuzz(runs, [f"-max_len={PARSERS[self.name].length}"])
+            self.done += done
+            if self._stopped or done < runs:  # by a crash
+                break
         if not (self._stopped or self.crashes):
             long = [f"-max_len={LONGEST}", "-len_control=0"]
             self.done_long = self._fuzz(max(1, self._runs // SHORT_PER_LONG), long)
