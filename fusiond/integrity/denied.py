@@ -9,9 +9,10 @@ a turns the velocity v, which is then off
 
 so that what is off along the track by more than half of what it is across (a beyond 53 deg) is no
 heading: the receiver is left out for itself, the motion is not doubted, and neither has it anybody
-who speaks for its position. Once one position of a device so denied is found to drift, all are left
-out: they are wrong together. Such a velocity comes back with the position, not before: where the
-vehicle has turned a drift is across, and no wheel tells.
+who speaks for its position. Receivers that part by the same, within their sigmas, are judged by
+their mean, and what one is denied all are. Once one position of a device so denied is found to
+drift, all are left out: they are wrong together. Such a velocity comes back with the position, not
+before: where the vehicle has turned a drift is across, and no wheel tells.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from fusiond.integrity.support import SUPPORT_NS, Records
 
 # tan(a / 2): see above.
 MOST_TURN = 0.5
+# What two part by is the same within so many sigmas of both: chi-square of two, one in 3000.
+SAME = 4.0
 
 
 def denies(records: Records, record: Series, by: Sequence[float], v_n: float, v_e: float) -> bool:
@@ -34,8 +37,22 @@ def denies(records: Records, record: Series, by: Sequence[float], v_n: float, v_
         return record.device in devices(records)
     if not record.moves or math.hypot(v_n, v_e) <= MOVING_M_S:
         return False
-    along, across = by[0] * v_n + by[1] * v_e, by[1] * v_n - by[0] * v_e
-    return abs(along) > MOST_TURN * abs(across) and rolling(records, record.heard_ns)
+    if not rolling(records, record.heard_ns):
+        return False
+    others = [r for r in records.values() if r is not record and _same(r, record, by)]
+    if any(r.excluded == DENIED for r in others):
+        return True
+    north, east = (sum(one) for one in zip(by, *(r.off for r in others), strict=True))
+    own: bool = abs(north * v_n + east * v_e) > MOST_TURN * abs(east * v_n - north * v_e)
+    return own
+
+
+def _same(other: Series, record: Series, by: Sequence[float]) -> bool:
+    """Whether another velocity is refused for the same offset."""
+    if not (other.moves and (other.refused or other.excluded)):
+        return False
+    apart = math.hypot(by[0] - other.off[0], by[1] - other.off[1])
+    return apart <= SAME * math.hypot(record.sd_m_s, other.sd_m_s)
 
 
 def rolling(records: Records, t_ns: int) -> bool:

@@ -206,9 +206,11 @@ class Isolation(Kept):
             by = (0.0, 0.0) if velocity is None else parts_by(velocity, v_n, v_e)
             away = record.away_m if aid.locates else math.hypot(*by)
             since_ns = t_ns - record.fused_ns
-            if velocity is not None and 0 < since_ns <= FORGET_NS:
-                self.hedge.refused(aid.source, by, since_ns * 1e-9)
-            denied = denies(self._records, record, by, v_n, v_e)
+            if velocity is not None:
+                record.parts(by)
+                if 0 < since_ns <= FORGET_NS:
+                    self.hedge.refused(aid.source, by, since_ns * 1e-9)
+            denied = denies(self._records, record, record.off, v_n, v_e)
             action = self._refuse(record, t_ns, outcome.nis, away, denied)
             if record.moves and action in MOTION:
                 record.parted = Parted(record.refused_ns, *by)
@@ -242,6 +244,7 @@ class Isolation(Kept):
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
             by = self.shown or (0.0, 0.0)
+            record.off = by[0], by[1]
             denied = denies(self._records, record, by, nav.item(VN), nav.item(VE))
             action = self._blame(record, aid, denied)
             if action in MOTION and self.shown:

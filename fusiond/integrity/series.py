@@ -60,6 +60,8 @@ class Series:
     refused: int = 0
     """Failures of the gate in a row, the first at `refused_ns`."""
     refused_ns: int = 0
+    off: tuple[float, float] = (0.0, 0.0)
+    """North and east (m/s): what a velocity was off by in their mean."""
     jumped: bool = False
     """The first of them left the filter faster than the IMU can err; or it is wrong for itself."""
     excluded: str = ""
@@ -107,6 +109,11 @@ class Series:
         self.means.restart()
         if not self.excluded:
             self.refused, self.jumped = 0, False
+
+    def parts(self, by: tuple[float, float]) -> None:
+        """A velocity is refused that is off `by` (m/s, north and east)."""
+        (north, east), share = self.off if self.refused else by, 1.0 / (self.refused + 1)
+        self.off = north + share * (by[0] - north), east + share * (by[1] - east)
 
     def exclude(self, since_ns: int, reason: str, *, jumped: bool) -> None:
         """It is left out from an instant on; `jumped`: for itself, and not for the motion."""

@@ -7,7 +7,7 @@ import pytest
 
 from fusiond.integrity.action import Action
 from fusiond.integrity.series import DENIED
-from fusiond.navigation.strapdown import Q0
+from fusiond.navigation.strapdown import Q0, VE, VN
 from tests.integrity.series_bench import NAV, TOLD, Bench, S
 
 OFF = 12.0
@@ -43,6 +43,35 @@ def test_wheels_deny_a_velocity_of_another_length(
     reason = DENIED if denied else "disagrees"
     assert bench.isolation.excluded == {"gnss_velocity": reason}
     assert acted[-1] is (Action.NONE if denied else Action.DOUBT_MOTION)
+
+
+def off(along_m_s: float, across_m_s: float) -> tuple[float, float]:
+    """East and north, of a velocity that is off by so much of where the filter goes."""
+    north, east = NAV[VN : VE + 1] / np.hypot(NAV[VN], NAV[VE])
+    by = along_m_s * np.array([east, north]) + across_m_s * np.array([north, -east])
+    return float(NAV[VE] + by[0]), float(NAV[VN] + by[1])
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_receivers_that_part_by_the_same_are_judged_by_their_mean(order: int) -> None:
+    bench = bench_of(60, wheels=True)
+    alongs = [("gnss", 0.56), ("second", 0.46)][::order]
+    for t in (60, 60.2, 60.4):
+        for source, along_m_s in alongs:
+            assert bench.velocity(t, OFF, *off(along_m_s, 1.0), source) is Action.NONE
+    assert bench.isolation.excluded == {"gnss_velocity": DENIED, "second_velocity": DENIED}
+
+
+@pytest.mark.parametrize(("along_m_s", "denied"), [(0.4, True), (0.2, False)])
+def test_what_one_is_denied_is_denied_to_another(along_m_s: float, denied: bool) -> None:
+    """Within four sigmas, of 0.05 m/s each."""
+    bench = bench_of(60, wheels=True)
+    for t in (60, 60.2, 60.4):
+        bench.velocity(t, OFF, *off(0.55, 1.0))
+    for t in (60.6, 60.8, 61.0):
+        acted = bench.velocity(t, OFF, *off(along_m_s, 1.0), "second")
+    assert bench.isolation.excluded["second_velocity"] == (DENIED if denied else "disagrees")
+    assert acted is (Action.NONE if denied else Action.DOUBT_MOTION)
 
 
 def test_wheels_that_have_been_silent_or_refused_deny_nothing() -> None:
