@@ -117,11 +117,14 @@ def sigmas(change: dict[str, Any], section: GnssAiding | None = None) -> tuple[A
     return position.sd, velocity.sd
 
 
-@pytest.mark.parametrize(("quality", "floor"), [(1, 0.3), (2, 0.3), (4, 0.02), (5, 0.05)])
-def test_no_fix_is_better_than_its_quality(quality: int, floor: float) -> None:
-    tight = {"sd_ned_m": (0.002, 0.01, 0.7), "quality": quality}
+@pytest.mark.parametrize(
+    ("quality", "floor", "height"), [(1, 0.3, 0.5), (2, 0.3, 0.5), (4, 0.02, 0.02), (5, 0.05, 0.05)]
+)
+def test_no_fix_is_better_than_its_quality(quality: int, floor: float, height: float) -> None:
+    tight: dict[str, Any] = {"sd_ned_m": (0.002, 0.01, 0.7), "quality": quality}
     assert sigmas(tight)[0] == (floor, floor, 0.7)
     assert sigmas(tight, GnssAiding(min_position_sd_m=0.005))[0] == (0.005, 0.01, 0.7)
+    assert sigmas(tight | {"sd_ned_m": (2.0, 2.0, 0.01)})[0] == (2.0, 2.0, height)
 
 
 def test_a_sigma_that_nobody_can_measure_is_not_stated() -> None:

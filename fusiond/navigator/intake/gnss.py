@@ -33,10 +33,10 @@ ASSUMED_HDOP, ASSUMED_VDOP = 2.0, 3.0
 RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
 # One sigma an axis that a fix may have where the section says no other, by quality: no receiver is
 # better, and one that claims it counts noise alone, not what successive fixes share. By code:
-# differentially 0.4 to 0.5 m horizontally (data sheets of Trimble 5700 and Septentrio mosaic-X5),
-# 0.3 m an axis. By phase with ambiguities in doubt: a fraction of the wavelength of 0.19 m. Fixed:
+# differentially 0.4 to 0.5 m horizontally and 0.5 to 0.7 m in height (data sheets of Trimble 5700
+# and Septentrio mosaic-X5), 0.3 m an axis and 0.5 m. By phase with ambiguities in doubt: a fraction of the wavelength of 0.19 m. Fixed:
 # 1 cm + 1 ppm (both sheets and u-blox ZED-F9P's), 2 cm at a base 10 km away.
-CODE_FLOOR_M = 0.3
+CODE_FLOOR_M, CODE_HEIGHT_FLOOR_M = 0.3, 0.5
 FLOOR_M = {4: 0.02, 5: 0.05}
 RTK = (4, 5)
 """Quality of fixes by carrier phase against a base station."""
@@ -94,13 +94,17 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     if stated is not None and min(stated) <= 0.0:
         return "no_sigma"
     least = o.min_position_sd_m
-    if least is None:
-        least = FLOOR_M.get(m.quality, CODE_FLOOR_M)
+    if least is not None:
+        least_d = least
+    elif m.quality in FLOOR_M:
+        least = least_d = FLOOR_M[m.quality]
+    else:
+        least, least_d = CODE_FLOOR_M, CODE_HEIGHT_FLOOR_M
     (n, e, d), rounding, scale = _position_sd(m, o), m.rounding_sd_ned_m, o.sigma_scale
     sd = (
         math.hypot(max(n * scale, least), rounding[0]),
         math.hypot(max(e * scale, least), rounding[1]),
-        math.hypot(max(d * scale, least), rounding[2]),
+        math.hypot(max(d * scale, least_d), rounding[2]),
     )
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
     by_phase = _by_phase(m, sections)
