@@ -34,8 +34,9 @@ RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
 # One sigma an axis that a fix may have where the section says no other, by quality: no receiver is
 # better, and one that claims it counts noise alone, not what successive fixes share. By code:
 # differentially 0.4 to 0.5 m horizontally and 0.5 to 0.7 m in height (data sheets of Trimble 5700
-# and Septentrio mosaic-X5), 0.3 m an axis and 0.5 m. By phase with ambiguities in doubt: a fraction of the wavelength of 0.19 m. Fixed:
-# 1 cm + 1 ppm (both sheets and u-blox ZED-F9P's), 2 cm at a base 10 km away.
+# and Septentrio mosaic-X5), 0.3 m an axis and 0.5 m. By phase with ambiguities in doubt: a fraction
+# of the wavelength of 0.19 m. Fixed: 1 cm + 1 ppm (both sheets and u-blox ZED-F9P's), 2 cm at a
+# base 10 km away.
 CODE_FLOOR_M, CODE_HEIGHT_FLOOR_M = 0.3, 0.5
 FLOOR_M = {4: 0.02, 5: 0.05}
 RTK = (4, 5)
