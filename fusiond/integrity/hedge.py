@@ -28,6 +28,8 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
+So do the last velocities, before any mean does (fusiond.integrity.lately).
+
 A velocity that is refused, by chance one in ten thousand, is apart by u, and was not T before.
 Either it is wrong, or the unit has felt an acceleration that was none: until the next has told
 velocity, position and tilt are open by
@@ -86,6 +88,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.integrity.lately import SELDOM
 from fusiond.integrity.means import SLOW
 from fusiond.integrity.moved import LEAST, Moved
 from fusiond.integrity.proof import Proof
@@ -102,8 +105,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Said = PositionOffer | VelocityOffer | None
 
-# Of a chi-square of one, by chance once in a thousand.
-SELDOM = 10.83
 # What a turn at rest has left open fades by this with each innovation, as the slow mean's square;
 # below a hundredth of P's variance, half a percent of sigma, it is nothing, and so is what is left
 # open of a tilt, which is kept under its own name.
@@ -112,6 +113,8 @@ FADES, TILT = (1.0 - SLOW) ** 2, " tilt"
 LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
 # So is what fixes share beyond chance, and what one that is believed again may be off by.
 STRAYS, MOVED = " strays", " moved"
+# And what the last velocities leave open until the next.
+LATELY = " lately"
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -127,7 +130,7 @@ class Hedge:
 
     def holds(self, source: str) -> bool:
         """Whether a series has left anything open."""
-        return source in self.wider or source + TILT in self.wider
+        return any(source + of in self.wider for of in ("", TILT, LATELY))
 
     def look(
         self,
@@ -154,6 +157,13 @@ class Hedge:
                 self._put(source + TILT, self._tilts(source + TILT, record, said, covariance, left))
         elif aid.across_sd_m_s > 0.0:
             self._put(source, _turns(aid, record, nav, covariance) if unlikely else None)
+
+    def lately(self, source: str, record: Series, sd: Sequence[float], p: Array | None) -> None:
+        """A velocity with `sd` (d,) was fused; P (n, n) of the filter."""
+        wider = None
+        if p is not None and record.lately.seldom:
+            wider = record.lately.leaves_open(p, sd, record.means.coarse)
+        self._put(source + LATELY, wider)
 
     def _tilts(
         self,
@@ -307,13 +317,13 @@ class Hedge:
     def drop(self, source: str) -> None:
         """Nothing of a series is beyond chance, or P holds it; what it may have moved by stays."""
         if self.wider:
-            for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS))):
+            for name in (source, *(source + of for of in (TILT, LATE, ACROSS, STRAYS, LATELY))):
                 self._put(name, None)
 
 
 def _series_of(name: str) -> str:
     """Whose answer is awaited of what is kept under a name."""
-    for what in (TILT, LATE, STRAYS, MOVED):
+    for what in (TILT, LATE, STRAYS, MOVED, LATELY):
         name = name.removesuffix(what)
     return name
 

@@ -226,6 +226,8 @@ class Isolation(Kept):
         if record.no_slip and state is not None and aid.across_sd_m_s > 0.0:
             self.hedge.goes_across(aid, record, state)
         biased = record.means.tested(outcome.whitened, t_ns, self._pass)
+        if velocity is not None:
+            record.lately = record.lately.and_then(outcome.whitened)
         return self._fused(aid, record, says, biased, nav, covariance, state)
 
     def _fused(
@@ -256,6 +258,8 @@ class Isolation(Kept):
         if not told and (record.means.unlikely or (hedge.wider and hedge.holds(aid.source))):
             left = self._tilting.left(covariance)
             hedge.look(aid, record, offer or velocity, nav, covariance, left)
+        if velocity is not None:
+            hedge.lately(aid.source, record, velocity.sd, covariance)
         if offer is not None and aid.wanders:
             hedge.strays(aid.source, offer.wander, state)
         elif offer is not None:
@@ -326,7 +330,7 @@ class Isolation(Kept):
         state = estimator.state
         if record.no_slip and (shown & ordinary.ACROSS or hedge.wider):
             hedge.went_across(aid, record, state)
-        if shown & (ordinary.BIAS | ordinary.UNUSUAL | ordinary.STRAYS) or hedge.wider:
+        if shown & ordinary.LEAVES_OPEN or hedge.wider:
             biased = shown & ordinary.BIAS > 0
             action = self._fused(aid, record, one.says, biased, state.nav, state.covariance, state)
         return outcome, shown, self._tilted(t_ns) if shown & ordinary.TILTED else action

@@ -181,6 +181,25 @@ def _follows(packed: Array, p: Array, first: int, chance: float, sd_0: float, sd
     return changes
 
 
+@compiled("void(f8, f8[:, :], i8, f8, f8[::1])")
+def open_by(excess: float, p: Array, at: int, variance: float, out: Array) -> None:
+    """Add to `out` (9,) what is left open of the state `at` by the `excess` of an innovation's
+    variance (1), and by what P (n, n) has in common with it; measured with that `variance`."""
+    own = p[at, at]
+    if excess <= 0.0 or own <= 0.0:
+        return
+    share = excess * (own + variance) / (own * own)
+    for j in range(3):
+        with_position, with_velocity = p[DR + j, at], p[DV + j, at]
+        out[j] += share * with_position * with_position
+        out[3 + j] += share * with_velocity * with_velocity
+    north, east, yaw = p[PHI, at], p[PHI + 1, at], p[PHI + 2, at]
+    tilt = share * (north * north + east * east)  # of whichever axis roll and pitch are about
+    out[6] += tilt
+    out[7] += tilt
+    out[8] += share * yaw * yaw
+
+
 @compiled("void(f8[::1], f8[:, :], i8, f8, f8, f8, i8, f8[::1])")
 def _open(
     packed: Array,
@@ -195,21 +214,10 @@ def _open(
     """Add to `out` (9,) what the excess of each component leaves open."""
     d, sd = (packed.shape[0] - _HEAD) // 2, (sd_0, sd_1, sd_2)
     for i in range(min(d, axes)):
-        fast, slow, own = packed[_HEAD + i], packed[_HEAD + d + i], p[first + i, first + i]
+        fast, slow = packed[_HEAD + i], packed[_HEAD + d + i]
         excess = fast * fast - LIKELY * packed[_SPREAD]
         excess = max(excess, slow * slow - LIKELY * packed[_SPREAD + 1])
-        if excess <= 0.0 or own <= 0.0:
-            continue
-        share = excess * (own + packed[_COARSE] * sd[i] * sd[i]) / (own * own)
-        for j in range(3):
-            with_position, with_velocity = p[DR + j, first + i], p[DV + j, first + i]
-            out[j] += share * with_position * with_position
-            out[3 + j] += share * with_velocity * with_velocity
-        north, east, yaw = p[PHI, first + i], p[PHI + 1, first + i], p[PHI + 2, first + i]
-        tilt = share * (north * north + east * east)  # of whichever axis roll and pitch are about
-        out[6] += tilt
-        out[7] += tilt
-        out[8] += share * yaw * yaw
+        open_by(excess, p, first + i, packed[_COARSE] * sd[i] * sd[i], out)
 
 
 @compiled("i8(f8[::1], f8[::1], i8, f8)")

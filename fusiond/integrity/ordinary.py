@@ -42,10 +42,12 @@ Indices = NDArray[np.int64]
 
 OTHERWISE = -1
 """Not taken in: nothing has changed."""
-BIAS, UNUSUAL, STRAYS, ACROSS, TILTED, SITS, ASSUMED = 1, 2, 4, 8, 16, 32, 64
+BIAS, UNUSUAL, STRAYS, ACROSS, TILTED, SITS, ASSUMED, LATELY = 1, 2, 4, 8, 16, 32, 64, 128
 """What taking in has shown, added up: a mean is beyond chance, or not likely; beyond chance is what
 fixes share, what goes across of a vehicle that does not slip, what the tilt was corrected by, where
-the unit sits; the sigma that counted is assumed."""
+the unit sits; the sigma that counted is assumed; the last velocities are not likely."""
+LEAVES_OPEN = BIAS | UNUSUAL | STRAYS | LATELY
+"""What the solution may be less sure for than P is."""
 
 
 @compiled(
@@ -233,6 +235,9 @@ def take(
         record.sd_m, record.away_m = sd, math.hypot(north, east)
     elif velocity is not None:
         record.sd_m_s, means.assuming = sd, shown & ASSUMED > 0
+        record.lately = record.lately.and_then(whitened)
+        if record.lately.seldom:
+            shown |= LATELY
     if value is not None:
         nav = filter_.nav
         record.repeats_itself(value, math.hypot(nav.item(VN), nav.item(VE)) > MOVING_M_S)

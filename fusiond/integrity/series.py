@@ -12,6 +12,7 @@ from operator import attrgetter
 
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.estimators.base import gate_threshold
+from fusiond.integrity.lately import NOT_YET, Lately
 from fusiond.integrity.means import Means
 from fusiond.integrity.moved import Moved, Parted
 from fusiond.integrity.proof import (
@@ -77,6 +78,8 @@ class Series:
     """When it was believed again last."""
     means: Means = field(default_factory=Means)
     """Of its innovations that were fused, or passed while it is left out."""
+    lately: Lately = NOT_YET
+    """Of a velocity that is fused: the last innovations."""
     value: tuple[float, ...] | None = None
     alike: int = 0
     """How many before the last value were the same, moving or not."""
@@ -107,12 +110,14 @@ class Series:
         """It has not been heard of for long: it is judged anew, though not believed again."""
         self.repeats = self.passes = 0
         self.means.restart()
+        self.lately = NOT_YET
         if not self.excluded:
             self.refused, self.jumped = 0, False
 
     def parts(self, by: tuple[float, float]) -> None:
         """A velocity is refused that is off `by` (m/s, north and east)."""
         (north, east), share = self.off if self.refused else by, 1.0 / (self.refused + 1)
+        self.lately = NOT_YET
         self.off = north + share * (by[0] - north), east + share * (by[1] - east)
 
     def exclude(self, since_ns: int, reason: str, *, jumped: bool) -> None:

@@ -1,0 +1,87 @@
+"""What the last two innovations of a velocity leave open before any mean of them does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusiond.integrity.hedge import LATELY
+from fusiond.integrity.lately import NOT_YET, SELDOM, Lately
+from fusiond.integrity.means import LIKELY
+from fusiond.navigation.error_model import DR, DV
+from tests.integrity.series_bench import Bench
+
+ONE, TWO = SELDOM**0.5, (0.5 * SELDOM) ** 0.5
+SD = (0.05, 0.05, 0.08)
+
+
+@pytest.mark.parametrize(
+    ("before", "last", "seldom"),
+    [
+        (0.0, 0.99 * ONE, False),
+        (0.0, 1.01 * ONE, True),
+        (0.99 * TWO, 0.99 * TWO, False),
+        (1.01 * TWO, 1.01 * TWO, True),
+        (-1.2 * TWO, 1.2 * TWO, False),  # the two speak against each other
+    ],
+)
+@pytest.mark.parametrize("axis", range(3))
+def test_seldom_is_one_or_two_beyond_chance(
+    before: float, last: float, seldom: bool, axis: int
+) -> None:
+    y = np.zeros((2, 3))
+    y[:, axis] = before, last
+    lately = NOT_YET.and_then(tuple(y[0])).and_then(tuple(y[1]))
+    assert lately.seldom is seldom
+
+
+def test_what_chance_does_once_in_a_thousand() -> None:
+    """Of three components of the last and of the last two: six in a thousand at most."""
+    lately, found = NOT_YET, 0
+    drawn = np.random.default_rng(4).standard_normal((40_000, 3))
+    for y in drawn.tolist():
+        lately = lately.and_then(tuple(y))
+        found += lately.seldom
+    assert 4e-3 < found / len(drawn) < 6.5e-3
+
+
+def test_both_horizontal_axes_are_open_by_the_larger_and_what_goes_with_them() -> None:
+    p = np.diag([1e-6] * 3 + [0.03**2] * 3 + [0.2**2] * 3)
+    p[DR, DV] = p[DV, DR] = 0.5 * 0.03 * 0.2
+    lately = Lately((4.0, 0.5, 0.2), (0.0, 0.0, 0.0))
+    opened = lately.leaves_open(p, SD, 2.0)
+    variance = 0.03**2 + (2.0 * 0.05) ** 2
+    assert opened[3:5] == pytest.approx([(16.0 - LIKELY) * variance] * 2)
+    assert opened[5] == 0.0
+    regression = p[DR, DV] / p[DV, DV]
+    assert opened[0] == pytest.approx(opened[3] * regression**2)
+    # Of the mean of two, half the variance that chance gives it.
+    of_two = Lately((3.0, 0.0, 0.0), (3.0, 0.0, 0.0)).leaves_open(p, SD, 1.0)
+    assert of_two[3] == pytest.approx((9.0 - 0.5 * LIKELY) * (0.03**2 + 0.05**2))
+
+
+def test_a_velocity_leaves_it_open_until_the_next_that_fits() -> None:
+    bench = Bench()
+    bench.covariance = np.diag([1e-6] * 3 + [0.03**2] * 3 + [0.2**2] * 3)
+    for t in range(30):
+        bench.velocity(t)
+    assert f"gnss_velocity{LATELY}" not in bench.isolation.hedge.wider
+    kept = bench.isolation.snapshot()
+    bench.velocity(30, 4.2)
+    wider = bench.isolation.hedge.wider[f"gnss_velocity{LATELY}"]
+    assert wider[3] == wider[4] > 0.1**2
+    bench.isolation.restore(kept)
+    assert f"gnss_velocity{LATELY}" not in bench.isolation.hedge.wider
+    bench.velocity(30, 4.2)
+    bench.velocity(31, -2.0)
+    assert f"gnss_velocity{LATELY}" not in bench.isolation.hedge.wider
+
+
+def test_one_that_is_refused_begins_anew() -> None:
+    bench = Bench()
+    bench.covariance = np.diag([1e-6] * 3 + [0.03**2] * 3 + [0.2**2] * 3)
+    for t in range(30):
+        bench.velocity(t)
+    bench.velocity(30, 2.5)
+    bench.velocity(31, 20.0)
+    assert bench.isolation._records["gnss_velocity"].lately == NOT_YET
