@@ -12,7 +12,7 @@ from fusiond.aiding.base import Aid
 from fusiond.integrity import denied, returns
 from fusiond.integrity.hedge import NOTHING, Hedge
 from fusiond.integrity.means import FAST_COUNT, Means
-from fusiond.integrity.moved import Moved, Parted
+from fusiond.integrity.moved import Moved, Parted, left
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import NEVER_NS, Series
 from fusiond.integrity.tilt import Tilting
@@ -56,6 +56,15 @@ class Kept:
         if begun and not any(r.device == begun.device and r.fused_ns > NEVER_NS for r in positions):
             opened.append(begun)
         return max(opened, key=lambda one: sum(one.leaves_open(one.since_ns)[:2]), default=None)
+
+    def handed_on(self, t_ns: int) -> Moved | None:
+        """What a navigation must know that goes on from this one and remembers nothing else of its
+        sources: what one may be off by, or one that is left out is apart by at `t_ns`."""
+        out = [r for r in self._records.values() if r.locates and r.excluded]
+        opened = [left(r.device, t_ns, max(0, t_ns - r.refused_ns), r.away_m) for r in out]
+        if self.moved is not None:
+            opened.append(self.moved)
+        return max(opened, key=lambda one: sum(one.leaves_open(t_ns)[:2]), default=None)
 
     def snapshot(self) -> Memory:
         """A copy of everything."""

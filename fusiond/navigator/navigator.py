@@ -306,7 +306,9 @@ class Navigator:
         if self.warm is None or not self.imu.end:
             return None
         try:
-            return self.warm.start(self.imu.oldest_ns)
+            start = self.warm.start(self.imu.oldest_ns)
+            self._standing.moved = self.warm.moved
+            return start
         except RefusedStateError as error:
             self._event("warm_state_refused", str(error))
             self.warm = None

@@ -193,6 +193,23 @@ def test_a_filter_that_starts_anew_knows_no_more_of_it() -> None:
     assert bench.isolation.moved is None
 
 
+def test_what_goes_on_after_the_process_knows_of_one_that_is_left_out() -> None:
+    bench = Bench()
+    bench.both(range(60))
+    assert bench.isolation.handed_on(60 * S) is None
+    for t in range(60, 70):
+        bench.fix(t, north_m=40.0)
+        bench.fix(t, source="second")
+    handed = bench.isolation.handed_on(70 * S)
+    assert handed is not None
+    assert handed.device == "gnss"
+    assert handed.lasted_ns == 10 * S
+    assert handed.squares[0] == pytest.approx(0.5 * 40.0**2, rel=0.3)
+    # It is what the next one begins with.
+    bench.isolation.reset(moved=handed)
+    assert bench.isolation.handed_on(75 * S) == handed
+
+
 def test_it_is_over_once_another_device_has_told() -> None:
     bench, out_s = returned(0.0)
     t = 60 + out_s + 2
