@@ -12,8 +12,10 @@ for which it had been left out, what is published of the position is wider than 
 in each axis, t after the return. How long a fault lasts has no scale: what has lasted for T goes on
 for t more in T / (T + t) of the cases (the prior 1 / T of a duration that nothing is known of).
 Of a first fix after an outage of T, which nothing has contradicted, it is what d^2 is beyond 3.84 S
-(fusiond.integrity.returns). What ends it sooner is another device's position that could tell:
-`TELLS` times as fine as what is open, and within half of it.
+(fusiond.integrity.returns); and of the tilt what the filter makes of that, by its regression on the
+position, P_ix / P_xx: ten metres that were the receiver's tilted it by 0.2 deg at a stated 0.03.
+What ends it sooner is another device's position that could tell: `TELLS` times as fine as what is
+open, and within half of it.
 
 A velocity that had parted from the filter, and is believed again because the filter has followed
 the receiver, is no different: the filter was wrong, or position and velocity drift away together.
@@ -91,20 +93,22 @@ class Returned(Protocol):
 
 class Moved(NamedTuple):
     """A `device` that is back since `since_ns` after `lasted_ns` without it, and what it may be off
-    by (m^2): north, east, down; and may go on to run away with (m^2/s^2): north, east."""
+    by (m^2): north, east, down; may go on to run away with (m^2/s^2): north, east; and has tilted
+    the filter by (rad^2)."""
 
     device: str
     since_ns: int
     lasted_ns: int
     squares: tuple[float, float, float]
     speeds: tuple[float, float] = (0.0, 0.0)
+    tilt: float = 0.0
 
     def leaves_open(self, t_ns: int, speed: float = math.inf) -> Array:
         """Variances (9,) that what is published is wider by, at that speed (m/s)."""
         elapsed_ns = self.lasted_ns + max(0, t_ns - self.since_ns)
         share = self.lasted_ns / elapsed_ns
         wider = np.zeros(9)
-        wider[:3] = self.squares
+        wider[:3], wider[6:8] = self.squares, self.tilt
         if share >= UNLIKELY:
             wider[3:5] = self.speeds
             wider[:2] += wider[3:5] * (elapsed_ns * 1e-9) ** 2
@@ -121,9 +125,11 @@ class Moved(NamedTuple):
         opened = before.leaves_open(self.since_ns)
         north, east, down = (np.array(self.squares) + opened[:3]).tolist()
         runs_n, runs_e = np.maximum(self.speeds, opened[3:5]).tolist()
-        lasted_ns = max(self.lasted_ns, before.lasted_ns)
         return self._replace(
-            lasted_ns=lasted_ns, squares=(north, east, down), speeds=(runs_n, runs_e)
+            lasted_ns=max(self.lasted_ns, before.lasted_ns),
+            squares=(north, east, down),
+            speeds=(runs_n, runs_e),
+            tilt=self.tilt + float(opened[6]),
         )
 
     def told(self, series: Collection[Witness]) -> bool:

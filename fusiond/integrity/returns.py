@@ -56,12 +56,14 @@ class Begun(NamedTuple):
 class Coming(NamedTuple):
     """Of a position that is about to be fused: whether it lies `behind` by more than is likely,
     the `gain` that the filter follows it with, the horizontal axes' mean, what is known `before`
-    it, and what it is off by (m^2), north, east, down, beyond what is likely."""
+    it, what it is off by (m^2), north, east, down, beyond what is likely, and what of that the
+    filter takes for a tilt (rad^2)."""
 
     behind: bool = False
     gain: float = 0.0
     before: Before = Before()
     beyond: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tilt: float = 0.0
 
 
 NOTHING = Coming()
@@ -82,14 +84,16 @@ def coming(aid: Aid, state: State, covariance: Array) -> Coming:
     s = np.einsum("ij,jk,ik->i", rows.h, covariance, rows.h) + rows.r
     north, east, *down = np.maximum(rows.z**2 - LIKELY * s, 0.0).tolist()
     beyond = (north, east, down[0] if down else 0.0)
+    follows = covariance[PHI : PHI + 2, DR : DR + 2] / np.diag(covariance)[DR : DR + 2]
+    tilted = float((follows**2 @ beyond[:2]).sum())  # of whichever axis roll and pitch are about
     v_n, v_e = float(state.nav[VN]), float(state.nav[VE])
     speed = math.hypot(v_n, v_e)
     if speed <= MOVING_M_S:
-        return Coming(gain=followed, before=before, beyond=beyond)
+        return Coming(gain=followed, before=before, beyond=beyond, tilt=tilted)
     along = np.array([v_n, v_e]) / speed
     sd = math.sqrt(float(along @ (own + r) @ along))
     behind = float(along @ rows.z[:2]) > SURPRISE * sd
-    return Coming(behind, followed, before._replace(late_s=sd / speed), beyond)
+    return Coming(behind, followed, before._replace(late_s=sd / speed), beyond, tilted)
 
 
 def prove(
@@ -117,7 +121,7 @@ def prove(
         record.punctual = came if record.sd_m <= FINE_M else None
         if any(comes.beyond):
             out_ns = max(record.every_ns, support.OTHERS_NS)
-            moved = Moved(record.device, offer.t_ns, out_ns, comes.beyond)
+            moved = Moved(record.device, offer.t_ns, out_ns, comes.beyond, tilt=comes.tilt)
             record.moved = moved.joined(record.moved)
     if record.punctual is not None:
         v_n, v_e, sd = float(nav[VN]), float(nav[VE]), record.sd_m * record.means.colour

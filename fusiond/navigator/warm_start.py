@@ -98,6 +98,7 @@ class WarmMoved:
     lasted_ns: Nanoseconds
     squares: tuple[Way, Way, Way]
     speeds: tuple[Running, Running]
+    tilt: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
 
 
 @dataclass(frozen=True, slots=True, config=STRICT)
@@ -158,7 +159,7 @@ class WarmStart:
         if known is None:
             return None
         lasts = known.since_ns, known.lasted_ns
-        return Moved(known.device, *lasts, known.squares, known.speeds)
+        return Moved(known.device, *lasts, known.squares, known.speeds, known.tilt)
 
     def judge(self, source: str, outcome: str) -> None:
         """A position aid of `source` has been applied: the first to be fused or gated decides."""

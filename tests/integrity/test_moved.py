@@ -147,9 +147,12 @@ def test_nor_does_a_first_fix_after_an_outage() -> None:
     record = Series("gnss", locates=True, moves=False, heard_ns=offer.t_ns)
     record.fused_ns, record.every_ns, record.sd_m = offer.t_ns - OUT_NS, OUT_NS, 0.8
     record.moved = Moved("gnss", record.fused_ns, OUT_NS, SQUARES)
-    comes = Coming(beyond=(1.0, 0.0, 0.0))
+    comes = Coming(beyond=(1.0, 0.0, 0.0), tilt=1e-6)
     prove({"gnss": record}, record, offer, nav, None, Begun(), comes, 1.0 - 1e-6)
-    assert record.moved.leaves_open(offer.t_ns)[:3].tolist() == [9.0, 4.5, 0.5]
+    opened = record.moved.leaves_open(offer.t_ns).tolist()
+    assert opened == [9.0, 4.5, 0.5, 0.0, 0.0, 0.0, 1e-6, 1e-6, 0.0]
+    again = Moved("gnss", offer.t_ns, OUT_NS, (1.0, 0.0, 0.0), tilt=2e-6).joined(record.moved)
+    assert again.leaves_open(offer.t_ns)[6:8].tolist() == pytest.approx([3e-6] * 2)
 
 
 def returned(off_m: float) -> tuple[Bench, int]:

@@ -116,6 +116,20 @@ def test_a_filter_that_knows_its_place_hardly_follows() -> None:
     assert coming(aid, state, p).gain == pytest.approx(100.0 / (100.0 + r))
 
 
+def test_a_fix_that_is_off_tilts_the_filter_that_follows() -> None:
+    """By the regression of the tilt on the position, of what is beyond chance."""
+    north_m, own = 12.0, 3.0
+    place = float(START[LAT]) + north_m / metres_a_radian(START)[0], START[LON], 40.0
+    aid = PositionAid("gnss", 0, 0.9999, *place, (SD_M,) * 3, (0.0,) * 3)
+    p = np.zeros((MODEL.size, MODEL.size))
+    p[:2, :2], p[6:8, 6:8] = 0.01**2 * np.eye(2), own**2 * np.eye(2)
+    p[1, 6] = p[6, 1] = 0.5 * 0.01 * own
+    comes = coming(aid, state_at(START), p)
+    beyond = north_m**2 - 3.84 * (own**2 + SD_M**2)
+    assert comes.beyond[0] == pytest.approx(beyond, rel=1e-3)
+    assert comes.tilt == pytest.approx((0.5 * 0.01 / own) ** 2 * beyond, rel=1e-3)
+
+
 def _back(wander: str, seconds: float) -> list[tuple[Array, Array]]:
     """Of a receiver that is back, for so long, after 40 s without, on a straight and then braking
     and turning: what is open, and the velocity."""
