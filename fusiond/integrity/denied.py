@@ -18,7 +18,6 @@ before: where the vehicle has turned a drift is across, and no wheel tells.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import DENIED, Series
@@ -30,28 +29,28 @@ MOST_TURN = 0.5
 SAME = 4.0
 
 
-def denies(records: Records, record: Series, by: Sequence[float], v_n: float, v_e: float) -> bool:
-    """Whether what a series is off `by` (m/s, north and east, of a velocity) from a filter that
-    moves by `v_n` and `v_e` is its own; of a position, whether its device's velocity is denied."""
+def denies(records: Records, record: Series, v_n: float, v_e: float) -> bool:
+    """Whether what a velocity is `off` from a filter that moves by `v_n` and `v_e` (m/s) is its
+    own; of a position, whether its device's velocity is denied."""
     if record.locates:
         return record.device in devices(records)
     if not record.moves or math.hypot(v_n, v_e) <= MOVING_M_S:
         return False
     if not rolling(records, record.heard_ns):
         return False
-    others = [r for r in records.values() if r is not record and _same(r, record, by)]
+    others = [r for r in records.values() if r is not record and _same(r, record)]
     if any(r.excluded == DENIED for r in others):
         return True
-    north, east = (sum(one) for one in zip(by, *(r.off for r in others), strict=True))
+    north, east = (sum(one) for one in zip(record.off, *(r.off for r in others), strict=True))
     own: bool = abs(north * v_n + east * v_e) > MOST_TURN * abs(east * v_n - north * v_e)
     return own
 
 
-def _same(other: Series, record: Series, by: Sequence[float]) -> bool:
+def _same(other: Series, record: Series) -> bool:
     """Whether another velocity is refused for the same offset."""
     if not (other.moves and (other.refused or other.excluded)):
         return False
-    apart = math.hypot(by[0] - other.off[0], by[1] - other.off[1])
+    apart = math.dist(record.off, other.off)
     return apart <= SAME * math.hypot(record.sd_m_s, other.sd_m_s)
 
 

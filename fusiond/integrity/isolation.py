@@ -210,7 +210,7 @@ class Isolation(Kept):
                 record.parts(by)
                 if 0 < since_ns <= FORGET_NS:
                     self.hedge.refused(aid.source, by, since_ns * 1e-9)
-            denied = denies(self._records, record, record.off, v_n, v_e)
+            denied = denies(self._records, record, v_n, v_e)
             action = self._refuse(record, t_ns, outcome.nis, away, denied)
             if record.moves and action in MOTION:
                 record.parted = Parted(record.refused_ns, *by)
@@ -245,9 +245,8 @@ class Isolation(Kept):
         if biased:
             self.shown = differ(record, offer or velocity, covariance)
             hedge.drop(aid.source)
-            by = self.shown or (0.0, 0.0)
-            record.off = by[0], by[1]
-            denied = denies(self._records, record, by, nav.item(VN), nav.item(VE))
+            record.off = (self.shown[0], self.shown[1]) if self.shown[1:] else (0.0, 0.0)
+            denied = denies(self._records, record, nav.item(VN), nav.item(VE))
             action = self._blame(record, aid, denied)
             if action in MOTION and self.shown:
                 self._parts(record, aid.t_ns, self.shown)

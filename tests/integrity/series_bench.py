@@ -35,6 +35,7 @@ class Bench:
         self.rng = np.random.default_rng(3)
         self._white = white
         self.covariance: NDArray[np.float64] | None = None
+        self.nav = NAV
 
     def fix(
         self, t_s: float, north_m: float = 0.0, source: str = "gnss", sd_m: float = SD_M
@@ -95,8 +96,8 @@ class Bench:
             name = "gated"
         seen = Outcome(name, nis, 3, tuple(y.tolist()))
         if self.covariance is not None:
-            self.isolation.correcting(NAV, TOLD * self.covariance)
-        return self.isolation.judge(aid, seen, NAV, self.covariance)
+            self.isolation.correcting(self.nav, TOLD * self.covariance)
+        return self.isolation.judge(aid, seen, self.nav, self.covariance)
 
     def both(self, seconds: range, north_m: float = 0.0) -> set[Action]:
         """Fix and velocity each second."""

@@ -74,6 +74,22 @@ def test_what_one_is_denied_is_denied_to_another(along_m_s: float, denied: bool)
     assert acted is (Action.NONE if denied else Action.DOUBT_MOTION)
 
 
+@pytest.mark.parametrize(("course_e", "denied"), [(8.0, True), (0.5, False)])
+def test_a_mean_that_wheels_deny_is_the_receivers(course_e: float, denied: bool) -> None:
+    """A bias inside the gate, to the east, of a vehicle that goes there or across."""
+    bench = bench_of(60, wheels=True)
+    bench.nav = NAV.copy()
+    bench.nav[VN : VE + 1] = 8.5 - course_e, course_e
+    bench.covariance = np.diag([1e-6] * 3 + [0.02**2] * 3 + [0.3**2] * 3)
+    t, acted = 60.0, set[Action]()
+    while not bench.isolation.excluded and t < 90.0:
+        acted.add(bench.velocity(t, 2.5))
+        bench.wheel(t, 8.5)
+        t += 0.2
+    assert bench.isolation.excluded == {"gnss_velocity": DENIED if denied else "drifts"}
+    assert (Action.DOUBT_MEASURED in acted) == denied
+
+
 def test_wheels_that_have_been_silent_or_refused_deny_nothing() -> None:
     bench = bench_of(60, wheels=True)
     acted = [bench.velocity(63 + t / 5, OFF, 3.0, 8.5) for t in range(3)]
