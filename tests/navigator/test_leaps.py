@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
-from fusiond.navigator.alignment.leaps import LOOKED_NS, Epoch, since_leap, unchanged
+from fusiond.navigator.alignment.leaps import (
+    LOOKED_NS,
+    Epoch,
+    since_leap,
+    unchanged,
+    velocities_alone,
+)
 
 SD, NO_LEVER = (1.0, 1.0, 2.0), (0.0, 0.0, 0.0)
 RADIUS_M = 6_371_000.0
@@ -61,6 +67,23 @@ def test_only_what_came_after_the_last_change_of_lateness_is_left(
 ) -> None:
     left = since_leap(epochs(late_s, lon_rad=lon_rad))
     assert left[0].velocity.t_ns == round(since_s * 1e9)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0])
+@pytest.mark.parametrize("late_s", [0.4, 1.0])
+def test_velocities_that_are_late_alone_have_positions_that_go_before(
+    late_s: float, rate_hz: float
+) -> None:
+    """A bend of 86 deg in 15 s; or all of it late, of which positions know nothing."""
+    places = epochs(noise_m=1.0, rate_hz=rate_hz)[: round(15.0 * rate_hz)]
+    said = epochs((late_s,) * 3, noise_m=1.0, rate_hz=rate_hz)[: len(places)]
+    alone = [e._replace(position=on_time.position) for e, on_time in zip(said, places, strict=True)]
+    assert velocities_alone(alone, late_s)
+    assert not velocities_alone(said, late_s)
+    assert not velocities_alone([e._replace(position=None) for e in alone], late_s)
+    # Where nothing changes a velocity, nothing says which of them is late.
+    straight = [e._replace(velocity=e.velocity._replace(v_ned=(9.0, 0.0, 0.0))) for e in alone]
+    assert not velocities_alone(straight, late_s)
 
 
 def test_a_change_that_is_within_what_is_told_of_a_lateness_is_none() -> None:

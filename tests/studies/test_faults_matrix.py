@@ -23,6 +23,7 @@ ROWS = [
     ("step_500m", "navigating", "isolated", 10.0),
     ("fix_frozen", "navigating", "isolated", 10.0),
     ("velocity_reversed", "navigating", "isolated", 5.0),
+    ("velocity_1s_old", "navigating", "isolated", None),
     ("drift_0.5_m_s", "coasting", "isolated", 10.0),
     ("carried_off_0.5_m_s", "navigating", "isolated", None),
     ("places_drift_0.5_m_s", "navigating", "isolated", None),

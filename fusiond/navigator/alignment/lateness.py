@@ -54,7 +54,13 @@ from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment import motion
 from fusiond.navigator.alignment.course import ways
-from fusiond.navigator.alignment.leaps import LOOKED_NS, Epoch, since_leap, unchanged
+from fusiond.navigator.alignment.leaps import (
+    LOOKED_NS,
+    Epoch,
+    since_leap,
+    unchanged,
+    velocities_alone,
+)
 from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.offsets import OffsetWatch
 from fusiond.navigator.alignment.options import AlignmentOptions
@@ -300,7 +306,8 @@ class Lateness:
         counts."""
         of_each = (epoch for heard in receiver.heard for epoch in heard.epochs())
         epochs = sorted(of_each, key=lambda epoch: epoch.velocity.t_ns)
-        fixes, place = _fixes([e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns])
+        looked = [e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns]
+        fixes, place = _fixes(looked)
         # The last must have a course.
         while fixes and math.hypot(*fixes[-1].v_ned[:2]) < self._options.course_speed_m_s:
             fixes.pop()
@@ -343,6 +350,7 @@ class Lateness:
             or now - least <= EVIDENCE
             or abs(late.seconds - now_s) <= PRIOR_SIGMAS * prior
             or unchanged(epochs, abs(late.seconds - now_s), self._doubted_ns(t_ns))
+            or velocities_alone(since_leap(looked), late.seconds - now_s)
         ):
             return
         self._due_ns = t_ns + EVERY_NS

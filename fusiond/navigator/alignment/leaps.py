@@ -8,6 +8,13 @@ s sqrt(2 ln 2), which a few leaps do not move.
 
 And where the sum of r along the track, which telescopes to two positions' noise, stays below v tau,
 none has become late by tau: an inertial unit that was turned for some seconds may fit one as well.
+
+Velocities alone that are late by tau have positions that go before them,
+
+    d_k = sum r = tau (v_k - v_0)
+
+and tau is the slope of the one by the other: what the IMU has felt says how late the velocities
+are, and this whether the positions are as well.
 """
 
 from __future__ import annotations
@@ -76,6 +83,17 @@ def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool
         return False
     v = np.array([e.velocity.v_ned[:2] for e in epochs[first:]])[before]
     return math.hypot(*np.ptp(v, axis=0)) >= SHOWING_M_S
+
+
+def velocities_alone(epochs: Sequence[Epoch], by_s: float) -> bool:
+    """Whether of fixes whose velocities are late `by_s` the positions are nearer to be on time."""
+    steps = _steps(epochs)
+    if steps is None or (steps.dt_s > LONGEST_S).any():
+        return False
+    off = np.vstack((np.zeros(2), np.cumsum(steps.off_m, axis=0)))
+    v = np.array([e.velocity.v_ned[:2] for e in epochs])
+    off, v = off - off.mean(axis=0), v - v.mean(axis=0)
+    return float(np.sum(off * v)) > 0.5 * by_s * float(np.sum(v * v))
 
 
 class _Steps(NamedTuple):

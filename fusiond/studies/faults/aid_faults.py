@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
@@ -29,6 +30,7 @@ AHEAD_NS = 5_000_000_000
 WHEEL_SCALE = 1.2
 
 M = TypeVar("M", bound=Measurement)
+Velocity = tuple[float, float, float | None]
 
 
 def _changed(
@@ -138,6 +140,21 @@ def velocity_bias(r: Recording, begin_s: float, length_s: float, north_m_s: floa
         return replace(fix, v_ned_m_s=(north + north_m_s, east, down))
 
     return _changed(r, begin_s, length_s, PositionFix, faster)
+
+
+def velocity_old(r: Recording, begin_s: float, length_s: float, age_s: float = 1.0) -> Recording:
+    """Positions on time, with the velocity of an epoch `age_s` before, or of the first."""
+    said: dict[str, deque[tuple[float, Velocity]]] = {}
+
+    def older(fix: PositionFix, since_s: float) -> PositionFix:
+        assert fix.v_ned_m_s is not None
+        kept = said.setdefault(fix.source, deque())
+        kept.append((since_s, fix.v_ned_m_s))
+        while len(kept) > 1 and kept[1][0] <= since_s - age_s:
+            kept.popleft()
+        return replace(fix, v_ned_m_s=kept[0][1])
+
+    return _changed(r, begin_s, length_s, PositionFix, older)
 
 
 def velocity_ramp(r: Recording, begin_s: float, length_s: float) -> Recording:

@@ -169,6 +169,7 @@ FAULTS: dict[str, Fault] = {
     "position_0n_0e": Fault(aid.null_island, 20.0),
     "fix_frozen": Fault(aid.frozen, 20.0),
     "velocity_reversed": Fault(aid.velocity_reversed, 20.0),
+    "velocity_1s_old": Fault(aid.velocity_old, 60.0),
     "drift_0.1_m_s": Fault(partial(aid.drift, north_m_s=0.1), 60.0, phases=UNDER_WAY),
     "drift_0.2_m_s": Fault(partial(aid.drift, north_m_s=0.2), 60.0, phases=UNDER_WAY),
     "drift_0.5_m_s": Fault(aid.drift, 60.0),
