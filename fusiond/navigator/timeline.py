@@ -246,6 +246,14 @@ class Timeline:
         del self._entries[rows], self._keys[rows]
 
     def _apply(self, entry: Entry) -> Outcome:
+        """An exception, wherever it comes from, costs the aid."""
+        try:
+            return self._applied(entry)
+        except RAISED_BY_NUMBERS as error:
+            entry.error = repr(error)
+            return Outcome("failed")
+
+    def _applied(self, entry: Entry) -> Outcome:
         estimator, isolation, aid = self.estimator, self.isolation, entry.aid
         one = entry.ordinary
         if one is not None and (plain := estimator.plain()) is not None:
@@ -267,21 +275,17 @@ class Timeline:
             if (share := isolation.unsettled(aid.t_ns)) and not self._isolates:
                 estimator.unsettle(share)
             isolation.correcting(estimator.nav, estimator.covariance)
-        try:
-            aid = aid.at(estimator.nav)
-            entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            coarse = isolation.coarseness(aid)
-            if coarse == math.inf:
-                outcome = estimator.look(aid)
-            elif aid.locates and isolation.unproven(aid.source, aid.t_ns):
-                outcome = self._unproven(aid)
-            else:
-                outcome = estimator.update(aid if coarse == 1.0 else aid.coarser(coarse))
-            if not entry.judged:
-                entry.assumed = isolation.assumes(aid)
-        except RAISED_BY_NUMBERS as error:
-            entry.error = repr(error)
-            return Outcome("failed")
+        aid = aid.at(estimator.nav)
+        entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
+        coarse = isolation.coarseness(aid)
+        if coarse == math.inf:
+            outcome = estimator.look(aid)
+        elif aid.locates and isolation.unproven(aid.source, aid.t_ns):
+            outcome = self._unproven(aid)
+        else:
+            outcome = estimator.update(aid if coarse == 1.0 else aid.coarser(coarse))
+        if not entry.judged:
+            entry.assumed = isolation.assumes(aid)
         if outcome.name in TURNS:
             isolation.turns_at_rest(aid.felt_turn(estimator.state))
             self._hedge()

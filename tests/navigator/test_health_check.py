@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,30 @@ def test_an_aid_that_raises_costs_itself(error: Exception) -> None:
     assert outcomes_of(navigator)["odd"] == {"failed": 3}
     assert outcomes_of(navigator)["gnss"]["fused"] == 34
     assert told.count(("aid_failed", f"odd could not be used: {error!r}")) == 1
+    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
+
+
+@pytest.mark.parametrize("where", ["take", "judge"])
+def test_so_does_one_whose_judgement_raises(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the velocity alone, of which every tenth raises."""
+    told: list[str] = []
+    navigator, row = started(on_event=lambda code, text: told.append(code))
+    isolation, count = navigator.timeline.isolation, iter(range(10**6))
+    judged = getattr(isolation, where)
+
+    def raising(aid: Aid, *given: Any) -> Any:
+        if aid.source == "gnss_velocity" and next(count) % 10 == 9:
+            raise ValueError("too many values to unpack")
+        return judged(aid, *given)
+
+    monkeypatch.setattr(isolation, where, raising)
+    if where == "judge":
+        monkeypatch.setattr(isolation, "take", lambda *_: None)
+    rest_of_the_drive(navigator, row)
+    found = outcomes_of(navigator)["gnss_velocity"]
+    assert found["failed"] > 0
+    assert found["fused"] > found["failed"]
+    assert told.count("aid_failed") == 1
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
