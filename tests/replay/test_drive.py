@@ -160,7 +160,9 @@ def test_a_cut_goes_on_from_a_state_before_it(recorded: Recorded, tmp_path: Path
     solutions = {tick.solution.t_ns: tick.solution for tick in run.ticks()}
     assert (run.exact, run.began) == (False, "a state on the way")
     same = [(solutions[s.t_ns], s) for s in recorded.solutions if s.t_ns in solutions]
-    assert len(same) > 50
+    # Of the 50 ticks of the cut, and those before it: a state is written as a file begins, which a
+    # busy host's writing thread may do just before the cut, and a restart waits for its first fix.
+    assert len(same) > 25
     again, before = same[-1]
     assert again.mode in (Mode.NAVIGATING, Mode.COASTING)
     # Two filters on the same input from states a few ms apart: below what either is sure of.
