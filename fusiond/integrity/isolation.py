@@ -227,7 +227,7 @@ class Isolation(Kept):
             self.hedge.goes_across(aid, record, state)
         biased = record.means.tested(outcome.whitened, t_ns, self._pass)
         if velocity is not None:
-            record.lately = record.lately.and_then(outcome.whitened)
+            record.lately = record.lately.and_then(outcome.whitened, outcome.nis)
         return self._fused(aid, record, says, biased, nav, covariance, state)
 
     def _fused(

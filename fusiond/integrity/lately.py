@@ -31,18 +31,23 @@ _NONE = (0.0, 0.0, 0.0)
 
 
 class Lately(NamedTuple):
-    """The last innovation of a velocity, whitened, and the one before it, 0 where there is none."""
+    """The last innovation of a velocity, whitened, and the one before it, 0 where there is none,
+    with the sum of the squares of each."""
 
     last: tuple[float, ...] = _NONE
+    square: float = 0.0
     before: tuple[float, ...] = _NONE
+    square_before: float = 0.0
 
-    def and_then(self, whitened: tuple[float, ...]) -> Lately:
+    def and_then(self, whitened: tuple[float, ...], square: float) -> Lately:
         """With one more."""
-        return Lately(whitened, self.last)
+        return Lately(whitened, square, self.last, self.square)
 
     @property
     def seldom(self) -> bool:
         """Whether chance does so once in a thousand, of each component and either of the two."""
+        if self.square + self.square_before <= SELDOM:  # (a + b)^2 <= 2 (a^2 + b^2)
+            return False
         for a, b in zip(self.last, self.before, strict=False):
             if a * a > SELDOM or (a + b) * (a + b) > 2.0 * SELDOM:
                 return True

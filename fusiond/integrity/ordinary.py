@@ -235,8 +235,8 @@ def take(
         record.sd_m, record.away_m = sd, math.hypot(north, east)
     elif velocity is not None:
         record.sd_m_s, means.assuming = sd, shown & ASSUMED > 0
-        record.lately = record.lately.and_then(whitened)
-        if record.lately.seldom:
+        record.lately = lately = record.lately.and_then(whitened, nis)
+        if lately.seldom:
             shown |= LATELY
     if value is not None:
         nav = filter_.nav

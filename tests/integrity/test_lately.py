@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fusiond.integrity.hedge import LATELY
 from fusiond.integrity.lately import NOT_YET, SELDOM, Lately
@@ -13,6 +14,10 @@ from tests.integrity.series_bench import Bench
 
 ONE, TWO = SELDOM**0.5, (0.5 * SELDOM) ** 0.5
 SD = (0.05, 0.05, 0.08)
+
+
+def after(lately: Lately, y: NDArray[np.float64]) -> Lately:
+    return lately.and_then(tuple(y.tolist()), float(y @ y))
 
 
 @pytest.mark.parametrize(
@@ -31,7 +36,8 @@ def test_seldom_is_one_or_two_beyond_chance(
 ) -> None:
     y = np.zeros((2, 3))
     y[:, axis] = before, last
-    lately = NOT_YET.and_then(tuple(y[0])).and_then(tuple(y[1]))
+    lately = after(NOT_YET, y[0])
+    lately = after(lately, y[1])
     assert lately.seldom is seldom
 
 
@@ -39,8 +45,8 @@ def test_what_chance_does_once_in_a_thousand() -> None:
     """Of three components of the last and of the last two: six in a thousand at most."""
     lately, found = NOT_YET, 0
     drawn = np.random.default_rng(4).standard_normal((40_000, 3))
-    for y in drawn.tolist():
-        lately = lately.and_then(tuple(y))
+    for y in drawn:
+        lately = after(lately, y)
         found += lately.seldom
     assert 4e-3 < found / len(drawn) < 6.5e-3
 
@@ -48,15 +54,16 @@ def test_what_chance_does_once_in_a_thousand() -> None:
 def test_both_horizontal_axes_are_open_by_the_larger_and_what_goes_with_them() -> None:
     p = np.diag([1e-6] * 3 + [0.03**2] * 3 + [0.2**2] * 3)
     p[DR, DV] = p[DV, DR] = 0.5 * 0.03 * 0.2
-    lately = Lately((4.0, 0.5, 0.2), (0.0, 0.0, 0.0))
+    lately = after(NOT_YET, np.array([4.0, 0.5, 0.2]))
     opened = lately.leaves_open(p, SD, 2.0)
     variance = 0.03**2 + (2.0 * 0.05) ** 2
     assert opened[3:5] == pytest.approx([(16.0 - LIKELY) * variance] * 2)
     assert opened[5] == 0.0
     regression = p[DR, DV] / p[DV, DV]
     assert opened[0] == pytest.approx(opened[3] * regression**2)
+    y = np.array([3.0, 0.0, 0.0])
     # Of the mean of two, half the variance that chance gives it.
-    of_two = Lately((3.0, 0.0, 0.0), (3.0, 0.0, 0.0)).leaves_open(p, SD, 1.0)
+    of_two = after(after(NOT_YET, y), y).leaves_open(p, SD, 1.0)
     assert of_two[3] == pytest.approx((9.0 - 0.5 * LIKELY) * (0.03**2 + 0.05**2))
 
 
