@@ -28,7 +28,7 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
-So do the last velocities, before any mean does (fusiond.integrity.lately).
+What the last velocities leave open before any mean does has fusiond.integrity.lately.
 
 A velocity that is refused, by chance one in ten thousand, is apart by u, and was not T before.
 Either it is wrong, or the unit has felt an acceleration that was none: until the next has told

@@ -80,6 +80,10 @@ def test_velocities_that_are_late_alone_have_positions_that_go_before(
     alone = [e._replace(position=on_time.position) for e, on_time in zip(said, places, strict=True)]
     assert velocities_alone(alone, late_s)
     assert not velocities_alone(said, late_s)
+    # What was late and is on time again, all of it or its velocities alone.
+    assert not velocities_alone(places, -late_s)
+    back = [e._replace(position=late.position) for e, late in zip(places, said, strict=True)]
+    assert velocities_alone(back, -late_s)
     assert not velocities_alone([e._replace(position=None) for e in alone], late_s)
     # Where nothing changes a velocity, nothing says which of them is late.
     straight = [e._replace(velocity=e.velocity._replace(v_ned=(9.0, 0.0, 0.0))) for e in alone]

@@ -86,14 +86,15 @@ def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool
 
 
 def velocities_alone(epochs: Sequence[Epoch], by_s: float) -> bool:
-    """Whether of fixes whose velocities are late `by_s` the positions are nearer to be on time."""
+    """Whether of fixes whose velocities are later by `by_s` than they were (earlier, below 0) the
+    positions are nearer to have stayed."""
     steps = _steps(epochs)
     if steps is None or (steps.dt_s > LONGEST_S).any():
         return False
     off = np.vstack((np.zeros(2), np.cumsum(steps.off_m, axis=0)))
     v = np.array([e.velocity.v_ned[:2] for e in epochs])
     off, v = off - off.mean(axis=0), v - v.mean(axis=0)
-    return float(np.sum(off * v)) > 0.5 * by_s * float(np.sum(v * v))
+    return float(np.sum(off * v)) / by_s > 0.5 * float(np.sum(v * v))
 
 
 class _Steps(NamedTuple):
