@@ -5,6 +5,7 @@ Every read, frame, timer and tick comes as it would live, in the order of that c
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder
 from tests.clock.host_time import MS, Host
+from tests.patience import PATIENCE_S
 
 TICK_NS = 20 * MS
 
@@ -113,6 +115,15 @@ class Rig:
         state = self._warm.state(solution, self.chain.navigator)
         if state is not None:
             self.recorder.keep_state(t_ns, KEPT_STATE.dump_json(state))
+
+    def until_file(self, number: int) -> None:
+        """Wait until the writing thread has begun so many files: a state is kept for each, and on a
+        busy host it would come at any later tick."""
+        begun, writer = time.monotonic(), self.recorder._writer
+        assert writer is not None
+        while writer.parts < number:
+            assert time.monotonic() - begun < PATIENCE_S
+            time.sleep(0.002)
 
     def close(self) -> list[Path]:
         """The daemon ends; the files."""
