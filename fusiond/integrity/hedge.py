@@ -88,7 +88,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
-from fusiond.integrity.lately import SELDOM
+from fusiond.integrity.lately import RARE, SELDOM, Shown, goes_on
 from fusiond.integrity.means import SLOW
 from fusiond.integrity.moved import LEAST, Moved
 from fusiond.integrity.proof import Proof
@@ -113,7 +113,7 @@ FADES, TILT = (1.0 - SLOW) ** 2, " tilt"
 LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
 # So is what fixes share beyond chance, and what one that is believed again may be off by.
 STRAYS, MOVED = " strays", " moved"
-# And what the last velocities leave open until the next.
+# And what the last velocities leave open.
 LATELY = " lately"
 
 NOTHING: Mapping[str, Array] = {}
@@ -158,12 +158,25 @@ class Hedge:
         elif aid.across_sd_m_s > 0.0:
             self._put(source, _turns(aid, record, nav, covariance) if unlikely else None)
 
-    def lately(self, source: str, record: Series, sd: Sequence[float], p: Array | None) -> None:
-        """A velocity with `sd` (d,) was fused; P (n, n) of the filter."""
-        wider = None
-        if p is not None and record.lately.seldom:
-            wider = record.lately.leaves_open(p, sd, record.means.coarse)
-        self._put(source + LATELY, wider)
+    def lately(self, source: str, record: Series, sd: tuple[float, ...], p: Array | None) -> None:
+        """A velocity with `sd` (d,) was fused, and `look` has seen its means; P (n, n) of the
+        filter."""
+        apart, t_ns, shown = record.apart, record.heard_ns, None
+        if p is not None:
+            shown = self._apart(source, record, sd, p)
+        if shown is not None or apart is not None:
+            record.apart = apart = goes_on(apart, t_ns, record.every_ns, shown)
+        self._put(source + LATELY, None if apart is None else apart.leaves_open(t_ns))
+
+    def _apart(self, source: str, record: Series, sd: tuple[float, ...], p: Array) -> Shown | None:
+        lately, means = record.lately, record.means
+        of_means = self.wider.get(source) if means.unlikely else None
+        rare = of_means is not None and means.follows(p, DV, sd, RARE) > 0.0
+        if not lately.seldom:
+            return None if of_means is None else Shown(of_means, mean=rare)
+        wider = lately.leaves_open(p, sd, means.coarse)
+        wider = wider if of_means is None else np.maximum(wider, of_means)
+        return Shown(wider, lately.last, rare)
 
     def _tilts(
         self,

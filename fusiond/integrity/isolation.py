@@ -207,7 +207,7 @@ class Isolation(Kept):
             away = record.away_m if aid.locates else math.hypot(*by)
             since_ns = t_ns - record.fused_ns
             if velocity is not None:
-                record.parts(by)
+                record.parts(by, outcome.nis)
                 if 0 < since_ns <= FORGET_NS:
                     self.hedge.refused(aid.source, by, since_ns * 1e-9)
             denied = denies(self._records, record, v_n, v_e)

@@ -10,10 +10,23 @@ one, the last alone and the mean of the last two,
 are each beyond what chance does once in a thousand if a component's square is beyond 10.83 and
 10.83 / 2. What such a one has beyond chance is left open until the next is there, as it is of a
 mean: horizontally whatever the direction, for a vehicle that turns takes the error along.
+
+A filter follows a velocity that is off by little, and innovations do not show it any more: either
+it was wrong, or the velocity is still. What some in a row have shown, or a mean of theirs, for T
+from the first to the last is open by the largest of it as what parts from the filter is
+(fusiond.integrity.moved),
+
+    sigma^2 T / (T + t)
+
+t after the last, for 19 T; if a mean was beyond what chance does once in ten thousand, or the sum
+of n innovations, one that was refused among them, once in a million, by chi-square of three:
+
+    m^2 > 15.14 s          |sum y|^2 > 30.66 n
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,12 +34,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.integrity.means import LIKELY, open_by
+from fusiond.integrity.moved import UNLIKELY
 from fusiond.navigation.error_model import DV
 
 Array = NDArray[np.float64]
 
 # Of a chi-square of one, by chance once in a thousand.
 SELDOM = 10.83
+# Of one once in ten thousand, of three once in a million.
+RARE, MILLIONTH = 15.14, 30.66
 _NONE = (0.0, 0.0, 0.0)
 
 
@@ -66,3 +82,65 @@ class Lately(NamedTuple):
 
 
 NOT_YET = Lately()
+
+
+class Apart(NamedTuple):
+    """The largest that innovations from `since_ns` to `until_ns` have left open (9,); of the `n` of
+    these that did by themselves the `sums` (3,), whitened; `mean`: one of theirs was no chance."""
+
+    since_ns: int
+    until_ns: int
+    largest: Array
+    n: int
+    sums: Array
+    mean: bool
+
+    def leaves_open(self, t_ns: int) -> Array | None:
+        """Variances (9,) of what is published; None where it is nothing any more."""
+        if t_ns <= self.until_ns:
+            return self.largest
+        share = (self.until_ns - self.since_ns) / (t_ns - self.since_ns)
+        sure = self.mean or float(self.sums @ self.sums) > MILLIONTH * self.n
+        return share * self.largest if sure and share >= UNLIKELY else None
+
+
+class Shown(NamedTuple):
+    """What an innovation leaves open (9,): by itself, where it is `whitened` (d,), or in a `mean`,
+    where that was no chance."""
+
+    wider: Array
+    whitened: Sequence[float] = ()
+    mean: bool = False
+
+
+def goes_on(before: Apart | None, t_ns: int, every_ns: int, shown: Shown | None) -> Apart | None:
+    """What is apart after an innovation at `t_ns`, `every_ns` after the last."""
+    kept = None if before is None else before.leaves_open(t_ns)
+    if shown is None:
+        return None if kept is None else before
+    sums = np.zeros(3)
+    sums[: len(shown.whitened)] = shown.whitened
+    new = Apart(t_ns, t_ns, shown.wider, int(any(sums)), sums, shown.mean)
+    if before is not None and before.until_ns >= t_ns - every_ns:
+        return Apart(
+            before.since_ns,
+            t_ns,
+            np.maximum(before.largest, new.largest),
+            before.n + new.n,
+            before.sums + sums,
+            before.mean or new.mean,
+        )
+    if before is None or kept is None:
+        return new
+    lasted_ns = before.until_ns - before.since_ns  # what is left of it goes on for as long
+    largest = np.maximum(kept, new.largest)
+    return before._replace(since_ns=t_ns - lasted_ns, until_ns=t_ns, largest=largest)
+
+
+def refused(by: tuple[float, float], nis: float) -> Shown:
+    """A velocity that is refused and off `by` (m/s, north and east), to which all of its innovation
+    is put down."""
+    off, wider = math.hypot(*by), np.zeros(9)
+    wider[3:5] = off * off
+    share = -math.sqrt(nis) / off if off > 0.0 else 0.0
+    return Shown(wider, (share * by[0], share * by[1]))

@@ -12,7 +12,7 @@ from operator import attrgetter
 
 from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
 from fusiond.estimators.base import gate_threshold
-from fusiond.integrity.lately import NOT_YET, Lately
+from fusiond.integrity.lately import NOT_YET, Apart, Lately, goes_on, refused
 from fusiond.integrity.means import Means
 from fusiond.integrity.moved import Moved, Parted
 from fusiond.integrity.proof import (
@@ -80,6 +80,8 @@ class Series:
     """Of its innovations that were fused, or passed while it is left out."""
     lately: Lately = NOT_YET
     """Of a velocity that is fused: the last innovations."""
+    apart: Apart | None = None
+    """What several of those have left open."""
     value: tuple[float, ...] | None = None
     alike: int = 0
     """How many before the last value were the same, moving or not."""
@@ -110,20 +112,22 @@ class Series:
         """It has not been heard of for long: it is judged anew, though not believed again."""
         self.repeats = self.passes = 0
         self.means.restart()
-        self.lately = NOT_YET
+        self.lately, self.apart = NOT_YET, None
         if not self.excluded:
             self.refused, self.jumped = 0, False
 
-    def parts(self, by: tuple[float, float]) -> None:
+    def parts(self, by: tuple[float, float], nis: float) -> None:
         """A velocity is refused that is off `by` (m/s, north and east)."""
         (north, east), share = self.off if self.refused else by, 1.0 / (self.refused + 1)
         self.lately = NOT_YET
+        self.apart = goes_on(self.apart, self.heard_ns, self.every_ns, refused(by, nis))
         self.off = north + share * (by[0] - north), east + share * (by[1] - east)
 
     def exclude(self, since_ns: int, reason: str, *, jumped: bool) -> None:
         """It is left out from an instant on; `jumped`: for itself, and not for the motion."""
         self.excluded, self.refused_ns, self.jumped = reason, since_ns, jumped
         self.passes, self.ran, self.slip = 0, False, self.slip.without_lately()
+        self.apart = None
         self.means.restart()
 
     def look(

@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.integrity.hedge import LATELY
-from fusiond.integrity.lately import NOT_YET, SELDOM, Lately
+from fusiond.integrity.lately import NOT_YET, SELDOM, Apart, Lately, Shown, goes_on, refused
 from fusiond.integrity.means import LIKELY
 from fusiond.navigation.error_model import DR, DV
-from tests.integrity.series_bench import Bench
+from tests.integrity.series_bench import Bench, S
 
 ONE, TWO = SELDOM**0.5, (0.5 * SELDOM) ** 0.5
 SD = (0.05, 0.05, 0.08)
@@ -92,3 +92,73 @@ def test_one_that_is_refused_begins_anew() -> None:
     bench.velocity(30, 2.5)
     bench.velocity(31, 20.0)
     assert bench.isolation._records["gnss_velocity"].lately == NOT_YET
+
+
+OPEN = np.full(9, 0.04)
+
+
+def shown_each_second(count: int, y: float, mean: bool = False) -> Apart | None:
+    """What so many innovations have left open, one a second from 1 s on."""
+    apart = None
+    for k in range(1, count + 1):
+        apart = goes_on(apart, k * S, S, Shown(OPEN / k, (y, 0.0), mean))
+    return apart
+
+
+def test_what_some_in_a_row_have_shown_fades_as_long_as_it_lasted() -> None:
+    apart = shown_each_second(3, 4.0)
+    for after_s, share in ((0, 1.0), (2, 0.5), (6, 0.25), (37, 2.0 / 39.0)):
+        apart = goes_on(apart, (3 + after_s) * S, S, None)
+        assert apart is not None
+        opened = apart.leaves_open((3 + after_s) * S)
+        assert opened == pytest.approx(share * OPEN), after_s
+    assert goes_on(apart, 42 * S, S, None) is None  # nineteen times two seconds
+
+
+@pytest.mark.parametrize(("count", "y", "mean"), [(1, 9.0, False), (3, 3.1, False), (1, 0.0, True)])
+def test_what_chance_does_and_a_single_one_are_over_with_the_next(
+    count: int, y: float, mean: bool
+) -> None:
+    apart = shown_each_second(count, y, mean)
+    assert apart is not None
+    assert goes_on(apart, (count + 1) * S, S, None) is None
+
+
+def test_a_mean_that_is_no_chance_fades_as_well() -> None:
+    assert goes_on(shown_each_second(3, 0.0, mean=True), 4 * S, S, None) is not None
+
+
+def test_what_comes_again_lasts_as_long_as_the_first() -> None:
+    first = goes_on(shown_each_second(3, 4.0), 5 * S, S, None)
+    apart = goes_on(first, 7 * S, S, Shown(OPEN, (3.5,)))
+    assert apart is not None
+    assert apart.leaves_open(9 * S) == pytest.approx(0.5 * OPEN)
+
+
+def test_one_that_is_refused_is_the_first_of_those_that_follow() -> None:
+    by = (0.3, -0.4)
+    shown = refused(by, 25.0)
+    assert shown.wider[3:5] == pytest.approx([0.25, 0.25])
+    assert shown.whitened == pytest.approx((-3.0, 4.0))  # as innovations: computed minus measured
+    apart = goes_on(goes_on(None, S, S, shown), 2 * S, S, Shown(OPEN, (-3.0, 2.0, 0.1)))
+    assert apart is not None
+    opened = apart.leaves_open(3 * S)
+    assert opened is not None
+    assert opened[3] == pytest.approx(0.5 * 0.25)
+
+
+def test_a_velocity_that_the_filter_follows_stays_open() -> None:
+    bench = Bench()
+    bench.covariance = np.diag([1e-6] * 3 + [0.03**2] * 3 + [0.2**2] * 3)
+    for t in range(30):
+        bench.velocity(t)
+    for t, bias in ((30, 3.8), (31, 4.2), (32, 2.6)):
+        bench.velocity(t, bias)
+    name = f"gnss_velocity{LATELY}"
+    then = bench.isolation.hedge.wider[name][3]
+    for t in range(33, 39):
+        bench.velocity(t, -0.5)
+    assert 0.2 * then < bench.isolation.hedge.wider[name][3] < 0.5 * then
+    for t in range(39, 100):
+        bench.velocity(t)
+    assert name not in bench.isolation.hedge.wider

@@ -6,14 +6,18 @@ The whole matrix is run by `make faults`; docs/faults.md has what it found.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from fusiond.studies.faults.aid_faults import velocity_bias
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.hours import hour_of, rates
+from fusiond.studies.faults.library import Fault
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
+from fusiond.studies.faults.recording import Drive
 from fusiond.studies.faults.runs import Row, run, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
 
@@ -67,6 +71,15 @@ def test_what_a_failure_leaves_open_is_open_in_the_navigation_after_it(
     found = run(replace(of, drive=replace(path, gnss_rate_hz=rate_hz)), "navigating", seed)
     assert "diverged" in {e["code"] for e in found["events"]} or drive is not None
     assert found["longest_lie_s"] <= 5.0, found
+
+
+def test_a_velocity_that_the_filter_follows_is_open() -> None:
+    """Off by 0.2 m/s, of a receiver that states 0.05, twice a second: soon no innovation shows it,
+    and positions good to a metre do not for many seconds. It was beyond five sigma for 6 s."""
+    off = Fault(partial(velocity_bias, north_m_s=0.2), 30.0, drive=Drive(gnss_rate_hz=2.0))
+    found = run(off, "navigating", 4)
+    assert found["longest_lie_s"] == 0.0, found
+    assert found["verdict"] == "degraded and said so"
 
 
 @pytest.mark.parametrize(
