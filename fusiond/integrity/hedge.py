@@ -90,11 +90,11 @@ from fusiond.aiding.base import Aid, State
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.integrity.lately import RARE, SELDOM, Shown, goes_on
 from fusiond.integrity.means import SLOW
-from fusiond.integrity.moved import LEAST, Moved
+from fusiond.integrity.moved import FINE_M, LEAST, Moved
 from fusiond.integrity.proof import Proof
 from fusiond.integrity.punctual import MOVING_M_S, Punctual
 from fusiond.integrity.series import Series
-from fusiond.integrity.support import COARSER, FINE_M, FORGET_NS
+from fusiond.integrity.support import COARSER, FORGET_NS
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2

@@ -54,12 +54,12 @@ from fusiond.integrity.denied import denies, position_away, rolling
 from fusiond.integrity.hedge import differ
 from fusiond.integrity.jumps import jumps
 from fusiond.integrity.kept import Kept
-from fusiond.integrity.moved import Parted, back
+from fusiond.integrity.moved import FINE_M, Parted, back
 from fusiond.integrity.ordinary import Ordinary
 from fusiond.integrity.proof import above, apart, filters_own, residual
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import DENIED, DRIFTS, REPEATS, Said, Series, parts_by, said
-from fusiond.integrity.support import FINE_M, FORGET_NS, Lost
+from fusiond.integrity.support import FORGET_NS, Lost
 from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.models.model import Model
 from fusiond.navigation.strapdown import LAT, LON, VE, VN
@@ -259,6 +259,8 @@ class Isolation(Kept):
             hedge.look(aid, record, offer or velocity, nav, covariance, left)
         if velocity is not None:
             hedge.lately(aid.source, record, velocity.sd, covariance)
+        elif offer is not None and record.means.unlikely and covariance is not None:
+            self._goes_alone(record, aid.t_ns, offer, covariance)
         if offer is not None and aid.wanders:
             hedge.strays(aid.source, offer.wander, state)
         elif offer is not None:

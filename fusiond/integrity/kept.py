@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
 
@@ -9,13 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import PositionOffer
 from fusiond.integrity import denied, returns
-from fusiond.integrity.hedge import NOTHING, Hedge
+from fusiond.integrity.hedge import NOTHING, Hedge, differ
+from fusiond.integrity.lately import SELDOM
 from fusiond.integrity.means import FAST_COUNT, Means
-from fusiond.integrity.moved import Moved, Parted, left
+from fusiond.integrity.moved import FINE_M, Moved, Parted, left
 from fusiond.integrity.returns import Begun
 from fusiond.integrity.series import NEVER_NS, Series
 from fusiond.integrity.tilt import Tilting
+from fusiond.navigation.error_model import DR
 
 Array = NDArray[np.float64]
 
@@ -102,12 +106,25 @@ class Kept:
     def _parts(self, record: Series, t_ns: int, by: Sequence[float]) -> None:
         """The motion is doubted for what a velocity or a position is off `by` (m/s or m)."""
         if record.locates:
-            over_s = FAST_COUNT * record.every_ns * 1e-9
-            record.parted = Parted.shown(t_ns, [one / over_s for one in by])
+            record.parted = _runs(record, t_ns, by)
         elif record.moves:
             record.parted = Parted.shown(t_ns, by)
         if not record.excluded:
             self._followed(record, t_ns)
+
+    def _goes_alone(self, record: Series, t_ns: int, said: PositionOffer, p: Array) -> None:
+        """A fine position is off in a mean that is no chance, P (n, n) of the filter: where its
+        device sends no velocity that would tell, the filter follows what may run away with it."""
+        series = self._records.values()
+        if record.sd_m > FINE_M or any(r.moves and r.device == record.device for r in series):
+            return
+        if not record.every_ns or not record.means.follows(p, DR, said.sd, SELDOM):
+            return
+        parted = _runs(record, t_ns, differ(record, said, p))
+        what, before = parted.followed(record.device, t_ns), record.moved
+        if before is None or sum(before.speeds) < sum(what.speeds):
+            known = None if before is None or not any(before.squares) else before
+            record.moved = what.joined(known)
 
     def _followed(self, record: Series, t_ns: int) -> None:
         """A velocity is believed again, or still: where it had parted from the filter, what it may
@@ -132,3 +149,11 @@ class Kept:
                 self._shared.discard(name)
                 self._records[name] = self._records[name].copied()
         return [self._records[name] for name in found]
+
+
+def _runs(record: Series, t_ns: int, by: Sequence[float]) -> Parted:
+    """How fast a position goes that is off `by` (m) in the mean, within the time that this looks
+    back. Of one that goes fast the mean lags behind the last of its fixes."""
+    over_s = FAST_COUNT * record.every_ns * 1e-9
+    lags = max(1.0, record.away_m / math.hypot(by[0], by[1]))
+    return Parted.shown(t_ns, [lags * one / over_s for one in by])

@@ -15,7 +15,7 @@ Of a first fix after an outage of T, which nothing has contradicted, it is what 
 (fusiond.integrity.returns); and of the tilt what the filter makes of that, by its regression on the
 position, P_ix / P_xx: ten metres that were the receiver's tilted it by 0.2 deg at a stated 0.03.
 What ends it sooner is another device's position that could tell: `TELLS` times as fine as what is
-open, and within half of it.
+open, and within half of it; a coarse one tells nothing of a drift, which its sigma may hide.
 
 A velocity that had parted from the filter, and is believed again because the filter has followed
 the receiver, is no different: the filter was wrong, or position and velocity drift away together.
@@ -29,7 +29,8 @@ drift may go on for ever and take the position anywhere: what is left after 19 T
 twenty, and is left out.
 
 A position that no velocity goes with, and that is believed still though the filter was put in doubt
-by a mean d of its innovations, has gone that far while the mean looks back: u is d by that time.
+by a mean d of its innovations, has gone that far while the mean looks back: u is d by that time. So
+it is of one whose mean is no chance (fusiond.integrity.lately) and is not told: the filter follows.
 
 Source: Jeffreys, Theory of Probability, 3rd ed. (1961), section 3.1 (the prior of a scale); Gott,
 Nature 363 (1993), 315 (a duration of which no more is known than for how long it has lasted).
@@ -52,6 +53,8 @@ Array = NDArray[np.float64]
 # A device says which of two places is the right one, if they are five of its sigmas apart: its fix
 # is then on the nearer side of the middle but for six cases in a thousand.
 TELLS = 5.0
+# A position of this sigma (m) sees within seconds what a wrong velocity does to the filter.
+FINE_M = 3.0
 # A hundredth of P's variance is half a percent of sigma.
 LEAST = 0.01
 # What goes on in fewer cases than one in twenty is not likely, as everywhere (means.LIKELY).
@@ -148,6 +151,8 @@ class Moved(NamedTuple):
         )
 
     def _told_by(self, position: Witness) -> bool:
+        if any(self.speeds) and position.sd_m > FINE_M:
+            return False  # how fast it goes is not known, and may be what its sigma hides
         way_s = (self.lasted_ns + max(0, position.fused_ns - self.since_ns)) * 1e-9
         apart = math.sqrt(sum(self.squares[:2]) + sum(self.speeds) * way_s * way_s)
         return 0.0 < position.sd_m * TELLS <= apart and position.away_m <= 0.5 * apart
@@ -173,11 +178,15 @@ class Parted(NamedTuple):
         return Moved(device, self.since_ns + lasted_ns, lasted_ns, (0.0, 0.0, 0.0), speeds)
 
 
-def left(device: str, t_ns: int, lasted_ns: int, away_m: float) -> Moved:
+def left(device: str, t_ns: int, lasted_ns: int, away_m: float, alone: bool = False) -> Moved:
     """Of a navigation that begins anew with a device that had left the one before it by `away_m`,
-    in which axes is not known any more."""
+    in which axes is not known any more. If it sends positions `alone`, it may go on as fast."""
     square = 0.5 * away_m * away_m
-    return Moved(device, t_ns, lasted_ns, (square, square, square))
+    squares = square, square, square
+    if not alone or not lasted_ns:
+        return Moved(device, t_ns, lasted_ns, squares)
+    runs = square / (lasted_ns * 1e-9) ** 2
+    return Moved(device, t_ns, max(lasted_ns, VOUCHED_NS), squares, (runs, runs))
 
 
 def back(returned: Returned, t_ns: int, covariance: Array) -> Moved:

@@ -27,11 +27,12 @@ from fusiond.estimators.tilt_axes import (
 from fusiond.estimators.update import Plain, fuse
 from fusiond.integrity.hedge import any_beyond_prior, beyond_chance
 from fusiond.integrity.means import BIASED, UNLIKELY, lasting_of, take_few
+from fusiond.integrity.moved import FINE_M
 from fusiond.integrity.proof import residual_of
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import Said, Series, said
 from fusiond.integrity.slip import Slip, take_slip
-from fusiond.integrity.support import FINE_M, FORGET_NS, OTHERS_NS
+from fusiond.integrity.support import FORGET_NS, OTHERS_NS
 from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled

@@ -29,11 +29,10 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import gate_threshold
 from fusiond.integrity import support
 from fusiond.integrity.means import LIKELY
-from fusiond.integrity.moved import Moved
+from fusiond.integrity.moved import FINE_M, Moved
 from fusiond.integrity.proof import UNPROVEN_SIGMAS, Proof, settled
 from fusiond.integrity.punctual import MOVING_M_S, Before, Punctual
 from fusiond.integrity.series import NEVER_NS, Series
-from fusiond.integrity.support import FINE_M
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import DR, PHI
 from fusiond.navigation.strapdown import VE, VN

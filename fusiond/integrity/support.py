@@ -11,14 +11,13 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
+from fusiond.integrity.moved import FINE_M
 from fusiond.integrity.series import NEVER_NS, REPEATED, Series, said
 
 # What is not heard of for so long is judged anew: the vehicle has left the place of the trouble.
 FORGET_NS = 5_000_000_000
 # Another position supports the filter for as long as `coasting` is not said.
 OTHERS_NS = 10_000_000_000
-# A position of this sigma (m) sees within seconds what a wrong velocity does to the filter.
-FINE_M = 3.0
 # A position says nothing of what is finer than it by more than this.
 COARSER = 3.0
 # While the velocity of the same device was fused this lately, the filter's motion is supported.
@@ -46,7 +45,7 @@ class Lost(NamedTuple):
     """No position is believed: since when, whether `source` or `filter` is to blame, and how the
     first of them ended (`jumped`, `drifts`, ...), and how far they are away (m). `disputed`: a
     coarse position that is believed says that the source is wrong. `returning`: one is on its way
-    back."""
+    back. `alone`: it sends no velocity."""
 
     since_ns: int
     cause: str
@@ -55,6 +54,7 @@ class Lost(NamedTuple):
     away_m: float
     disputed: bool
     returning: bool = False
+    alone: bool = False
 
 
 def lost(records: Records, t_ns: int) -> Lost | None:
@@ -80,7 +80,8 @@ def lost(records: Records, t_ns: int) -> Lost | None:
     reason = first.excluded or "refused"
     cause = "source" if source else "filter"
     returning = any(r.excluded and r.returning for r in heard)
-    return Lost(first.refused_ns, cause, first.device, reason, away_m, disputed, returning)
+    alone = not any(r.moves and r.device == first.device for r in records.values())
+    return Lost(first.refused_ns, cause, first.device, reason, away_m, disputed, returning, alone)
 
 
 def contested(records: Records, t_ns: int) -> str | None:

@@ -141,8 +141,8 @@ class Standing:
             return None
         by_source = lost.cause == "source"
         self._left = lost.device if by_source else ""
-        if by_source:
-            self._gone = left(lost.device, t_ns, waited_ns, lost.away_m)
+        if by_source or lost.alone:
+            self._gone = left(lost.device, t_ns, waited_ns, lost.away_m, lost.alone)
         return f"{_told(lost)} for {waited_ns * 1e-9:.0f} s"
 
     def _watch(self, t_ns: int, isolation: Isolation, speed: float) -> None:

@@ -161,4 +161,4 @@ def test_a_velocity_that_the_filter_follows_stays_open() -> None:
     assert 0.2 * then < bench.isolation.hedge.wider[name][3] < 0.5 * then
     for t in range(39, 100):
         bench.velocity(t)
-    assert name not in bench.isolation.hedge.wider
+    assert bench.isolation.hedge.wider[name][3] < 0.1 * then

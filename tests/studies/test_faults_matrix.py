@@ -73,6 +73,19 @@ def test_what_a_failure_leaves_open_is_open_in_the_navigation_after_it(
     assert found["longest_lie_s"] <= 5.0, found
 
 
+@pytest.mark.parametrize(
+    ("fault", "drive", "rate_hz"),
+    [("places_drift_0.5_m_s", 119, 5.0), ("places_drift_2_m_s", 116, 1.0)],
+)
+def test_positions_that_run_away_alone_are_open(fault: str, drive: int, rate_hz: float) -> None:
+    """Followed without a doubt, and what navigation begins anew with: 98 and 125 sigma, for 18 and
+    17 s and longer."""
+    of = EVERY[fault]
+    path = replace(drawn(drive), places_alone=True, gnss_rate_hz=rate_hz)
+    found = run(replace(of, drive=path), "navigating", 0)
+    assert found["longest_lie_s"] <= 2.0, found
+
+
 def test_a_velocity_that_the_filter_follows_is_open() -> None:
     """Off by 0.2 m/s, of a receiver that states 0.05, twice a second: soon no innovation shows it,
     and positions good to a metre do not for many seconds. It was beyond five sigma for 6 s."""
