@@ -27,6 +27,7 @@ of n innovations, one that was refused among them, once in a million, by chi-squ
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -90,18 +91,18 @@ class Apart(NamedTuple):
 
     since_ns: int
     until_ns: int
-    largest: Array
+    largest: tuple[float, ...]
     n: int
-    sums: Array
+    sums: tuple[float, ...]
     mean: bool
 
     def leaves_open(self, t_ns: int) -> Array | None:
         """Variances (9,) of what is published; None where it is nothing any more."""
         if t_ns <= self.until_ns:
-            return self.largest
+            return np.array(self.largest)
         share = (self.until_ns - self.since_ns) / (t_ns - self.since_ns)
-        sure = self.mean or float(self.sums @ self.sums) > MILLIONTH * self.n
-        return share * self.largest if sure and share >= UNLIKELY else None
+        sure = self.mean or sum(y * y for y in self.sums) > MILLIONTH * self.n
+        return share * np.array(self.largest) if sure and share >= UNLIKELY else None
 
 
 class Shown(NamedTuple):
@@ -118,23 +119,19 @@ def goes_on(before: Apart | None, t_ns: int, every_ns: int, shown: Shown | None)
     kept = None if before is None else before.leaves_open(t_ns)
     if shown is None:
         return None if kept is None else before
-    sums = np.zeros(3)
-    sums[: len(shown.whitened)] = shown.whitened
-    new = Apart(t_ns, t_ns, shown.wider, int(any(sums)), sums, shown.mean)
+    sums, largest = (*shown.whitened, 0.0, 0.0, 0.0)[:3], shown.wider
+    n, mean = int(any(sums)), shown.mean
     if before is not None and before.until_ns >= t_ns - every_ns:
-        return Apart(
-            before.since_ns,
-            t_ns,
-            np.maximum(before.largest, new.largest),
-            before.n + new.n,
-            before.sums + sums,
-            before.mean or new.mean,
-        )
-    if before is None or kept is None:
-        return new
-    lasted_ns = before.until_ns - before.since_ns  # what is left of it goes on for as long
-    largest = np.maximum(kept, new.largest)
-    return before._replace(since_ns=t_ns - lasted_ns, until_ns=t_ns, largest=largest)
+        since_ns, n, mean = before.since_ns, before.n + n, before.mean or mean
+        sums = tuple(map(operator.add, before.sums, sums))
+        largest = np.maximum(before.largest, largest)
+    elif before is not None and kept is not None:  # what is left of it goes on for as long
+        since_ns = t_ns - (before.until_ns - before.since_ns)
+        n, sums, mean = before.n, before.sums, before.mean
+        largest = np.maximum(kept, largest)
+    else:
+        since_ns = t_ns
+    return Apart(since_ns, t_ns, tuple(largest.tolist()), n, sums, mean)
 
 
 def refused(by: tuple[float, float], nis: float) -> Shown:
