@@ -138,6 +138,10 @@ async def _lose_broker(broker: Broker, before: dict[str, float]) -> None:
     assert status["ticks"] - before["ticks"] > 0.5 * periods
 
 
+STANDS_S = 20.0
+"""Of the vehicle's second stop."""
+
+
 async def _restart_at_rest(
     heard: Heard, daemon: DaemonProcess, vehicle: VehicleProcess, folder: Path
 ) -> None:
@@ -155,8 +159,12 @@ async def _restart_at_rest(
     await daemon.ready()
     await heard.online(b"online")
     status = await heard.until("status", lambda m: m["mode"] == "navigating")
-    seen = [(vehicle.t_s(m["t_ms"]), m["mode"], m["why"]) for m in heard.all("status")[-8:]]
-    assert status["why"] == "heading from saved state", seen
+    new = [m for m in heard.all("status") if m["uptime_s"] <= status["uptime_s"]]
+    seen = [(vehicle.t_s(m["t_ms"]), m["mode"], m["why"]) for m in new]
+    # On a busy host a process takes longer to begin than the vehicle stands: then the saved heading
+    # is of no use, and its course counts.
+    if seen[0][0] < vehicle.t_s(stands["t_ms"]) + STANDS_S - 2.0:
+        assert status["why"] == "heading from saved state", seen
     print(f"navigates {status['uptime_s']:.1f} s after the restart")
     await _check_against_truth(heard, vehicle)
 
