@@ -106,7 +106,7 @@ class Kept:
     def _parts(self, record: Series, t_ns: int, by: Sequence[float]) -> None:
         """The motion is doubted for what a velocity or a position is off `by` (m/s or m)."""
         if record.locates:
-            record.parted = _runs(record, t_ns, by)
+            record.parted = runs(record, t_ns, by)
         elif record.moves:
             record.parted = Parted.shown(t_ns, by)
         if not record.excluded:
@@ -120,7 +120,7 @@ class Kept:
             return
         if not record.every_ns or not record.means.follows(p, DR, said.sd, SELDOM):
             return
-        parted = _runs(record, t_ns, differ(record, said, p))
+        parted = runs(record, t_ns, differ(record, said, p))
         what, before = parted.followed(record.device, t_ns), record.moved
         if before is None or sum(before.speeds) < sum(what.speeds):
             known = None if before is None or not any(before.squares) else before
@@ -151,7 +151,7 @@ class Kept:
         return [self._records[name] for name in found]
 
 
-def _runs(record: Series, t_ns: int, by: Sequence[float]) -> Parted:
+def runs(record: Series, t_ns: int, by: Sequence[float]) -> Parted:
     """How fast a position goes that is off `by` (m) in the mean, within the time that this looks
     back. Of one that goes fast the mean lags behind the last of its fixes."""
     over_s = FAST_COUNT * record.every_ns * 1e-9

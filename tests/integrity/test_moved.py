@@ -11,6 +11,7 @@ import pytest
 
 from fusiond.integrity.action import Action
 from fusiond.integrity.hedge import MOVED
+from fusiond.integrity.kept import runs
 from fusiond.integrity.moved import VOUCHED_NS, Moved, Parted, left
 from fusiond.integrity.returns import Begun, Coming, prove
 from fusiond.integrity.series import Series
@@ -358,3 +359,15 @@ def test_a_coarse_position_does_not_tell_of_a_drift() -> None:
     assert not drift.told([coarse])
     coarse.sd_m = 2.0
     assert drift.told([coarse])
+
+
+@pytest.mark.parametrize(("away_m", "lags"), [(0.5, 1.0), (2.5, 1.0), (7.5, 3.0)])
+def test_how_fast_a_position_goes_is_what_the_mean_shows_or_the_last_fix(
+    away_m: float, lags: float
+) -> None:
+    """Twice 2.5 m within eleven seconds, and more where the mean lags behind."""
+    record = Series("gnss", True, False, 100 * S)
+    record.every_ns, record.away_m = S, away_m
+    parted = runs(record, 100 * S, (1.5, -2.0, 9.0))
+    expected = (2.0 * lags * 1.5 / 11.0, -2.0 * lags * 2.0 / 11.0)
+    assert (parted.north, parted.east) == pytest.approx(expected)
