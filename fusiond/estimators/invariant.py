@@ -36,7 +36,8 @@ P_xi = J_0^-1 P J_0^-T
     nu_i = z(x_i) + H_i J_i xi_i,   xi_(i+1) = K_i nu_i,   P = J_i P_xi J_i^T  after it
 
 the covariance transform of an error that is reset, without which tilt and velocity errors would,
-after a correction of 90 deg, be correlated with the sensor errors of the wrong axes. One start of
+after a correction of 90 deg, be correlated with the sensor errors of the wrong axes (nor does what
+the force biases make downward change: fusiond.estimators.tilt_axes). One start of
 Gauss-Newton finds a heading that is off by up to 150 deg; with a sigma that reaches beyond it is
 begun at four headings, and the likeliest counts.
 
@@ -64,7 +65,7 @@ from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.tilt_axes import TiltAxesFilter, keep_downward
+from fusiond.estimators.tilt_axes import TiltAxesFilter, keep_down_rows, keep_downward
 from fusiond.estimators.update import Plain, feed_back
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
@@ -289,8 +290,11 @@ class InvariantFilter(TiltAxesFilter):
         nav, xi = self.without(self.nav, self.xi, found.error, turning)
         after = self.of_vehicle(nav, xi) @ self.jacobian(found.error, turning)
         p = after @ found.covariance @ after.T
+        before = self._estimate()
+        keep_downward(before, nav, xi, self._biases)
+        for rows in (p, p.T):
+            keep_down_rows(rows, self.nav[Q0:], nav[Q0:], *self._biases)
         self.covariance[:] = 0.5 * (p + p.T)
-        keep_downward(self._estimate(), nav, xi, self._biases)
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
         self.step[:] = _turned(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)

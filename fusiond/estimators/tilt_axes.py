@@ -101,6 +101,21 @@ def heading_turn(before: Array, after: Array) -> float:
 
 
 @compiled("void(f8[:, :], f8[::1], f8[::1], i8[::1], i8[::1])")
+def keep_down_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indices) -> None:
+    """M (n, k) <- T M: (C b)_D stays as it was known of the attitude q_nb (4,) `before`, in those
+    of the one `after`; `slots` and `axes` as for `turn_rows`."""
+    old, new = dcm_elements(before), dcm_elements(after)
+    if slots.size == 0 or abs(new[8]) < UPRIGHT:
+        return
+    for k in range(m.shape[1]):
+        left = 0.0
+        for j in range(slots.size):
+            axis = 6 + axes[j]
+            left += (old[axis] - new[axis]) * m[slots[j], k]
+        m[slots[0], k] += left / new[8]
+
+
+@compiled("void(f8[:, :], f8[::1], f8[::1], i8[::1], i8[::1])")
 def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indices) -> None:
     """M (n, k) <- T M: as well as tilt and force biases together were known of the attitude q_nb
     (4,) `before`, they are of the one `after` with T P T^T.
@@ -110,18 +125,11 @@ def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indic
     """
     psi = heading_turn(before, after)
     c, s = math.cos(psi), math.sin(psi)
-    old, new = dcm_elements(before), dcm_elements(after)
-    upright = slots.size > 0 and abs(new[8]) >= UPRIGHT
     for k in range(m.shape[1]):
         north, east = m[PHI, k], m[PHI + 1, k]
         m[PHI, k] = c * north - s * east
         m[PHI + 1, k] = s * north + c * east
-        if upright:
-            left = 0.0
-            for j in range(slots.size):
-                axis = 6 + axes[j]
-                left += (old[axis] - new[axis]) * m[slots[j], k]
-            m[slots[0], k] += left / new[8]
+    keep_down_rows(m, before, after, slots, axes)
 
 
 @compiled("b1(f8[:, :], i8[::1])")
