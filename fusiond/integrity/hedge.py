@@ -28,7 +28,8 @@ a slip is one cause, a heading the other, for a mounting does not change,
 
     sigma_yaw^2 + S max(0, m^2 - 3.84 s) / v^2        S = R + v^2 P_yaw
 
-What the last velocities leave open before any mean does has fusiond.integrity.lately.
+What the last velocities leave open before any mean does has fusiond.integrity.lately, and what a
+filter has followed that is shown no more.
 
 A velocity that is refused, by chance one in ten thousand, is apart by u, and was not T before.
 Either it is wrong, or the unit has felt an acceleration that was none: until the next has told
@@ -113,8 +114,10 @@ FADES, TILT = (1.0 - SLOW) ** 2, " tilt"
 LATE, ACROSS, AT_REST = " late", " across", "turns at rest"
 # So is what fixes share beyond chance, and what one that is believed again may be off by.
 STRAYS, MOVED = " strays", " moved"
-# And what the last velocities leave open.
+# And what the last velocities leave open, or a filter has followed.
 LATELY = " lately"
+# A mean of a position counts for that horizontally alone.
+HORIZONTAL = np.array([1.0, 1.0, 0.0] * 2 + [1.0] * 3)
 
 NOTHING: Mapping[str, Array] = {}
 
@@ -166,6 +169,19 @@ class Hedge:
             shown = self._apart(source, record, sd, p)
         if shown is not None or apart is not None:
             record.apart = apart = goes_on(apart, t_ns, record.every_ns, shown)
+        self._put(source + LATELY, None if apart is None else apart.leaves_open(t_ns))
+
+    def stays(self, source: str, record: Series, sd: tuple[float, ...], p: Array) -> None:
+        """A position with `sd` (d,) was fused, and `look` has seen its means; P (n, n) of the
+        filter."""
+        of_means = self.wider.get(source) if record.means.unlikely else None
+        if of_means is None and record.apart is None:
+            return
+        t_ns, shown = record.heard_ns, None
+        if of_means is not None:
+            rare = record.means.follows(p, DR, sd, RARE) > 0.0
+            shown = Shown(of_means * HORIZONTAL, mean=rare)
+        record.apart = apart = goes_on(record.apart, t_ns, record.every_ns, shown)
         self._put(source + LATELY, None if apart is None else apart.leaves_open(t_ns))
 
     def _apart(self, source: str, record: Series, sd: tuple[float, ...], p: Array) -> Shown | None:

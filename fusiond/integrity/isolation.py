@@ -259,8 +259,10 @@ class Isolation(Kept):
             hedge.look(aid, record, offer or velocity, nav, covariance, left)
         if velocity is not None:
             hedge.lately(aid.source, record, velocity.sd, covariance)
-        elif offer is not None and record.means.unlikely and covariance is not None:
-            self._goes_alone(record, aid.t_ns, offer, covariance)
+        elif offer is not None and covariance is not None:
+            hedge.stays(aid.source, record, offer.sd, covariance)
+            if record.means.unlikely:
+                self._goes_alone(record, aid.t_ns, offer, covariance)
         if offer is not None and aid.wanders:
             hedge.strays(aid.source, offer.wander, state)
         elif offer is not None:

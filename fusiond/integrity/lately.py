@@ -22,6 +22,9 @@ t after the last, for 19 T; if a mean was beyond what chance does once in ten th
 of n innovations, one that was refused among them, once in a million, by chi-square of three:
 
     m^2 > 15.14 s          |sum y|^2 > 30.66 n
+
+So is a position that the filter follows, whose mean was: what a step has brought is there when the
+mean shows it no more.
 """
 
 from __future__ import annotations
@@ -125,6 +128,8 @@ def goes_on(before: Apart | None, t_ns: int, every_ns: int, shown: Shown | None)
         since_ns, n, mean = before.since_ns, before.n + n, before.mean or mean
         sums = tuple(map(operator.add, before.sums, sums))
         largest = np.maximum(before.largest, largest)
+    elif before is not None and kept is not None and not (n or mean):  # chance, once in twenty
+        return before
     elif before is not None and kept is not None:  # what is left of it goes on for as long
         since_ns = t_ns - (before.until_ns - before.since_ns)
         n, sums, mean = before.n, before.sums, before.mean

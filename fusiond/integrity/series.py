@@ -81,7 +81,7 @@ class Series:
     lately: Lately = NOT_YET
     """Of a velocity that is fused: the last innovations."""
     apart: Apart | None = None
-    """What several of those have left open."""
+    """What several of those, or a position's means, have left open."""
     value: tuple[float, ...] | None = None
     alike: int = 0
     """How many before the last value were the same, moving or not."""

@@ -32,20 +32,20 @@ def bench(white: bool = True) -> Bench:
 
 
 def test_of_a_sound_receiver_it_is_seldom_wider_and_little() -> None:
-    """Chance: a component of a mean is beyond the bound one time in twenty at each pace."""
+    """Chance: a component of a mean is beyond the bound one time in twenty at each pace, and once
+    in ten thousand beyond what stays open."""
     made = bench()
-    wider, grown = 0, np.zeros(9)
-    epochs = 6000
+    wider, sigma = 0, np.zeros(3)
+    epochs = 20_000
     for t in range(epochs):
         made.both(range(t, t + 1))
         found = made.isolation.hedge.wider
         wider += bool(found)
-        grown += sum(found.values(), np.zeros(9))
+        sigma += np.sqrt(1.0 + sum(found.values(), np.zeros(9))[:3] / OWN_M**2) / epochs
     assert not made.isolation.excluded
     assert wider < 0.45 * epochs  # six components, two paces
-    sigma = np.sqrt(1.0 + grown[:3] / epochs / OWN_M**2)
     print(f"sigma of a position is wider by {sigma} on average")
-    assert sigma.max() < 1.15
+    assert sigma.max() < 1.12
 
 
 @pytest.mark.parametrize("own", [0.0, 0.7])
