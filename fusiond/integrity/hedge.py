@@ -164,24 +164,21 @@ class Hedge:
     def lately(self, source: str, record: Series, sd: tuple[float, ...], p: Array | None) -> None:
         """A velocity with `sd` (d,) was fused, and `look` has seen its means; P (n, n) of the
         filter."""
-        apart, t_ns, shown = record.apart, record.heard_ns, None
-        if p is not None:
-            shown = self._apart(source, record, sd, p)
-        if shown is not None or apart is not None:
-            record.apart = apart = goes_on(apart, t_ns, record.every_ns, shown)
-        self._put(source + LATELY, None if apart is None else apart.leaves_open(t_ns))
+        self._keeps(source, record, None if p is None else self._apart(source, record, sd, p))
 
     def stays(self, source: str, record: Series, sd: tuple[float, ...], p: Array) -> None:
         """A position with `sd` (d,) was fused, and `look` has seen its means; P (n, n) of the
         filter."""
-        of_means = self.wider.get(source) if record.means.unlikely else None
-        if of_means is None and record.apart is None:
-            return
-        t_ns, shown = record.heard_ns, None
-        if of_means is not None:
+        shown, wider = None, self.wider.get(source) if record.means.unlikely else None
+        if wider is not None:
             rare = record.means.follows(p, DR, sd, RARE) > 0.0
-            shown = Shown(of_means * HORIZONTAL, mean=rare)
-        record.apart = apart = goes_on(record.apart, t_ns, record.every_ns, shown)
+            shown = Shown(wider * HORIZONTAL, mean=rare)
+        self._keeps(source, record, shown)
+
+    def _keeps(self, source: str, record: Series, shown: Shown | None) -> None:
+        apart, t_ns = record.apart, record.heard_ns
+        if shown is not None or apart is not None:
+            record.apart = apart = goes_on(apart, t_ns, record.every_ns, shown)
         self._put(source + LATELY, None if apart is None else apart.leaves_open(t_ns))
 
     def _apart(self, source: str, record: Series, sd: tuple[float, ...], p: Array) -> Shown | None:

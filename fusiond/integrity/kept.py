@@ -155,5 +155,6 @@ def runs(record: Series, t_ns: int, by: Sequence[float]) -> Parted:
     """How fast a position goes that is off `by` (m) in the mean, within the time that this looks
     back. Of one that goes fast the mean lags behind the last of its fixes."""
     over_s = FAST_COUNT * record.every_ns * 1e-9
-    lags = max(1.0, record.away_m / math.hypot(by[0], by[1]))
+    off = math.hypot(by[0], by[1])
+    lags = max(1.0, record.away_m / off) if off > 0.0 else 1.0
     return Parted.shown(t_ns, [lags * one / over_s for one in by])

@@ -165,10 +165,10 @@ def test_a_velocity_that_the_filter_follows_stays_open() -> None:
         bench.velocity(t, bias)
     name = f"gnss_velocity{LATELY}"
     then = bench.isolation.hedge.wider[name][3]
-    for t in range(33, 39):
+    for t in range(33, 40):
         bench.velocity(t, -0.5)
-    assert 0.2 * then < bench.isolation.hedge.wider[name][3] < 0.6 * then
-    for t in range(39, 100):
+    assert 0.2 * then < bench.isolation.hedge.wider[name][3] < 0.5 * then
+    for t in range(40, 100):
         bench.velocity(t)
     assert bench.isolation.hedge.wider[name][3] < 0.1 * then
 
@@ -188,3 +188,14 @@ def test_a_position_that_the_filter_follows_stays_open() -> None:
         opened[step] = bench.isolation.hedge.wider.get(f"gnss{LATELY}", np.zeros(9))[0]
     assert opened[3.0] > 0.3
     assert opened[1.0] < 0.1 * opened[3.0]
+
+
+def test_a_position_that_was_silent_is_judged_anew() -> None:
+    bench = Bench()
+    bench.covariance = np.diag([1e-6] * 3 + [0.03**2] * 3 + [0.2**2] * 3)
+    for t in range(60):
+        bench.fix(t, 5.0 * math.exp(-(t - 30) / 8.0) if t >= 30 else 0.0)
+        bench.velocity(t)
+    assert f"gnss{LATELY}" in bench.isolation.hedge.wider
+    bench.fix(70)
+    assert f"gnss{LATELY}" not in bench.isolation.hedge.wider
