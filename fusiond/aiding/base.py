@@ -61,7 +61,7 @@ class Innovation(NamedTuple):
 
 
 class State(NamedTuple):
-    """What an aid may look at: navigation state (10,), parameters (n,), last step (27,), model, and
+    """What an aid may look at: navigation state (10,), parameters (n,), last step (28,), model, and
     the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth).
     `lent` is what a filter lends aids to write their innovations to, by the number of rows."""
 
@@ -147,6 +147,11 @@ class Aid:
     @property
     def across_sd_m_s(self) -> float:
         """Sigma of what an aid without slip (`no_slip`) knows of the velocity across; else 0."""
+        return 0.0
+
+    @property
+    def rests_s(self) -> float:
+        """For how long (s) a vehicle of which it holds is taken to rest."""
         return 0.0
 
     def across(self, state: State) -> tuple[float, float]:

@@ -41,7 +41,7 @@ CLEAR = 3.0
 
 @compiled("f8(f8[::1], i8)", forceinline=True)
 def turning(step: Array, axis: int) -> float:
-    """Rate (rad/s) about an axis of the body, smoothed, that is no noise, of a `step` (27,)."""
+    """Rate (rad/s) about an axis of the body, smoothed, that is no noise, of a `step` (28,)."""
     rate: float = step[STEP_SMOOTH_RATE_B + axis]
     left = rate * rate - CLEAR * CLEAR * step[STEP_NOISE_B + axis]
     return left / rate if left > 0.0 else 0.0
@@ -51,7 +51,7 @@ def turning(step: Array, axis: int) -> float:
 def add_of_force(
     step: Array, column_of: Indices, c: Matrix, r0: float, r1: float, r2: float, h: Array
 ) -> None:
-    """Add to h (n,) the slopes by e of (r0, r1, r2) . f_body, by the force that `step` (27,) holds,
+    """Add to h (n,) the slopes by e of (r0, r1, r2) . f_body, by the force that `step` (28,) holds,
     smoothed; `c` C_nb by rows."""
     row = (r0, r1, r2)
     for slot in range(CORE_SIZE, column_of.shape[0]):

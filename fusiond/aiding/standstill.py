@@ -205,6 +205,11 @@ class ZeroVelocityAid(Aid):
     sd_m_s: float
     rest: Rest
 
+    @property
+    def rests_s(self) -> float:
+        """Until the next window has said as much, and is no more than half of one late."""
+        return 1.5 * self.rest.window_s
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         doubt = self.rest.doubt(state)
         if doubt is not None:

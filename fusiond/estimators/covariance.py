@@ -49,7 +49,7 @@ def kept_part(work: Array, width: int) -> Array:
 
 @compiled("void(f8[::1], i8[::1], f8[::1])", forceinline=True)
 def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
-    """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (27,)."""
+    """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (28,)."""
     for i in range(12):
         weight[i] = 0.0
         if sensor_terms[12 + i] == PLAIN:

@@ -374,7 +374,7 @@ def _way(a: Array, b: Array) -> Array:
 
 
 def _turned(step: Array, psi: float) -> Array:
-    """The last step (27,) of a vehicle that is turned by psi (rad)."""
+    """The last step (28,) of a vehicle that is turned by psi (rad)."""
     step, turn = step.copy(), _about_down(psi)
     for first in (STEP_FORCE_N, STEP_SMOOTH_N):
         step[first : first + 3] = turn @ step[first : first + 3]

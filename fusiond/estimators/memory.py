@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.covariance import work_size
 from fusiond.estimators.reading import WIDER, Published
+from fusiond.estimators.turned_axes import TURN_SIZE
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import COEFFICIENTS
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
@@ -35,13 +36,13 @@ SCRATCH_AT += -SCRATCH_AT % LINE
 
 def scratch_size(width: int) -> int:
     """Doubles of scratch for a row width, whole lines: what covariances need, then `propagate`."""
-    size = work_size(width) + COEFFICIENTS + 24
+    size = work_size(width) + COEFFICIENTS + 24 + TURN_SIZE
     return size + -size % LINE
 
 
 class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above, nav (10,),
-    the last step (27,), the variances (9,) that what is published is `wider` by, `Published` (3,),
+    the last step (28,), the variances (9,) that what is published is `wider` by, `Published` (3,),
     `work` for kernels that propagate a covariance, `covs` (k, width, width), `phi` (width, width)
     or (0, 0), `xi` (n,), `dxs` (k, n), `shares` (k,)."""
 

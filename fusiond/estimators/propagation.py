@@ -38,12 +38,20 @@ from fusiond.estimators.memory import (
     scratch_size,
 )
 from fusiond.estimators.reading import in_fix_time, sigmas, widen
+from fusiond.estimators.turned_axes import rest_axes, rest_rows, turn_at_rest, turn_down, turn_tilt
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
 from fusiond.navigation.imu_buffer import END, HEAD_SIZE, HOLD, ROW_SIZE, START
 from fusiond.navigation.rotation import rpy_from_quaternion
-from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_DCM, STEP_SIZE, strapdown_step
+from fusiond.navigation.strapdown import (
+    NAV_SIZE,
+    Q0,
+    STEP_DCM,
+    STEP_RESTS_S,
+    STEP_SIZE,
+    strapdown_step,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -58,8 +66,6 @@ GAP_FORCE_M_S2 = 1.0
 
 # What a propagation does beside the usual, added up.
 HOLD_HEIGHT, RECORD, CARRY, TURN_TILT = 1, 2, 4, 8
-# Cosine of the tilt beyond which no accelerometer is the vertical one.
-UPRIGHT = 0.5
 
 
 @compiled("void(f8[::1], i8[::1], i8[::1], f8[::1])")
@@ -152,52 +158,6 @@ def shake(
                     cov[(first + i) * width + first + j] += h * total
 
 
-@compiled("void(f8[::1], i8, f8)", forceinline=True)
-def turn_tilt(cov: Array, width: int, known: float) -> None:
-    """Add to `cov`, flat and of `width` rows, what a turn does to the axes of a tilt, if nobody
-    knows whether it was one: the heading's variance was `known` (rad^2) before it
-    (fusiond.estimators.tilt_axes)."""
-    grown = cov[2 * width + 2] - known
-    if grown > 0.0:
-        north, east, both = cov[0], cov[width + 1], cov[1]
-        cov[0] += grown * east
-        cov[width + 1] += grown * north
-        cov[1] -= grown * both
-        cov[width] = cov[1]
-
-
-@compiled("void(f8[::1], i8, f8[::1], i8[::1], i8[::1], f8, f8)", forceinline=True)
-def turn_down(
-    cov: Array,
-    width: int,
-    step: Array,
-    sensor_slot: Indices,
-    sensor_kind: Indices,
-    grown_north: float,
-    grown_east: float,
-) -> None:
-    """Add to `cov`, flat and of `width` rows, what a tilt that only the gyros' errors have made
-    does to the vertical force: variances (rad^2) that a tilt has `grown` by, times those of the
-    force biases across (fusiond.estimators.tilt_axes)."""
-    upright = step[STEP_DCM + 8]
-    north, east, vertical = 0.0, 0.0, -1
-    for i in range(6, 12):
-        if sensor_kind[i] != PLAIN:
-            continue
-        row = sensor_slot[i] * width
-        if i // 2 == 5:
-            vertical = sensor_slot[i]
-        for k in range(6, 12):
-            if sensor_kind[k] == PLAIN:
-                p = cov[row + sensor_slot[k]]
-                a, b = STEP_DCM + i // 2 - 3, STEP_DCM + k // 2 - 3
-                north += step[a] * step[b] * p
-                east += step[a + 3] * step[b + 3] * p
-    if vertical >= 0 and abs(upright) >= UPRIGHT:
-        more = max(grown_north, 0.0) * east + max(grown_east, 0.0) * north
-        cov[vertical * width + vertical] += more / (upright * upright)
-
-
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])", allocates=True
 )
@@ -283,6 +243,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         rate_slope = scratch[COEFFICIENTS + 6 : COEFFICIENTS + 9]
         force_slope = scratch[COEFFICIENTS + 9 : COEFFICIENTS + 12]
         estimate = scratch[COEFFICIENTS + 12 : COEFFICIENTS + 24]
+        turn = scratch[COEFFICIENTS + 24 : COEFFICIENTS + 29]
         decaying = rate_terms.shape[0] > 0
         for j in range(CORE_SIZE, n):
             decaying = decaying or noise[j] > 0.0
@@ -294,8 +255,12 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 h = (stop - now) * 1e-9
                 silent = slopes(times, samples, i, gap_ns, rate_slope, force_slope)
                 compensate(samples, i, estimate, rate, force)
+                rests = turning and step[STEP_RESTS_S] > 0.0
+                w, x, y, z = nav[Q0], nav[Q0 + 1], nav[Q0 + 2], nav[Q0 + 3]
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
                 coefficients(nav, step, h, c)
+                if rests:
+                    turn_at_rest(w, x, y, z, nav[Q0:], turn)
                 # The held sample of a gap is a guess: its error acts over the whole of it.
                 whole = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
                 for k in range(used):
@@ -317,7 +282,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                     shake(cov, width, active, step, densities, i, h / shares[k])
                     if silent:
                         widen_for_gap(cov, width, active, whole, h / shares[k])
-                    if turning:
+                    if rests:
+                        rest_axes(cov, width, n, turn, sensor_slot, sensor_kind)
+                    elif turning:
                         grown_north, grown_east = cov[0] - north, cov[width + 1] - east
                         turn_tilt(cov, width, known)
                         turn_down(
@@ -341,6 +308,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         noise,
                         work,
                     )
+                    if rests:
+                        rest_rows(phi, width, width, turn, sensor_slot, sensor_kind)
                 if carry:
                     for k in range(room):
                         propagate_error(
@@ -354,6 +323,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                             kept,
                             work,
                         )
+                        if rests:
+                            dx = dxs[k * n : (k + 1) * n]
+                            rest_rows(dx, 1, 1, turn, sensor_slot, sensor_kind)
                 if decaying:
                     propagate_parameters(xi, h, rate_terms, kept)
                     sensor_estimates(xi, sensor_slot, sensor_kind, estimate)

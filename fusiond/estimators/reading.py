@@ -120,7 +120,7 @@ def sigmas(
     """Write one sigma (9,): position n, e, d (m), velocity n, e, d (m/s), roll, pitch, yaw (rad).
 
     By the clock and the axes of `Published`. Roll, pitch and yaw follow from phi by Euler
-    kinematics, with C_nb as `step` (27,) holds it.
+    kinematics, with C_nb as `step` (28,) holds it.
     """
     t = time_slot
     tt = cov[t, t] if t >= 0 else clock_sd_s * clock_sd_s

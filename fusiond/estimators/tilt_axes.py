@@ -39,6 +39,13 @@ an update that takes r out again leaves (C b)_D where that had put it,
 without which a straight road told a tilt by its vertical velocities. All are of the second order,
 psi b, dt b, r b.
 
+At rest nothing turns but C^, by the gyros' noise, and back as updates take that out again. Both are
+turns of the estimate, and both are known: while it is known to rest (STEP_RESTS_S of
+fusiond.navigation.strapdown) each interval is followed by the T of an update that has turned C^ as
+it has, in place of the two variances (`rest_axes`). As a noise, what moved C^ was worth as much as
+what corrected it was taken to tell: each velocity told more of tilt and bias, which at rest nothing
+can tell apart. After a doubt a tilt known to 2.8 deg was known to 0.7 after twenty minutes.
+
 So is what an update makes of the estimate itself. With d the third row of C, tilt and biases that
 hide each other move the vehicle downward by half of the tilt times the bias: a tilt that is
 corrected by dt, and biases by db = g dt, change that by g dt^2 / 2 beside what the update has told,
@@ -71,15 +78,16 @@ from fusiond.aiding.base import Linearised
 from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.propagation import TURN_TILT, UPRIGHT
+from fusiond.estimators.propagation import TURN_TILT
 from fusiond.estimators.turn_rate import gyro_slots, keep_turn
+from fusiond.estimators.turned_axes import UPRIGHT
 from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, PHI
 from fusiond.navigation.rotation import dcm_elements
-from fusiond.navigation.strapdown import NAV_SIZE, Q0
+from fusiond.navigation.strapdown import NAV_SIZE, Q0, STEP_RESTS_S
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -293,7 +301,7 @@ class TiltAxesFilter(KalmanEstimator):
         """For kernels that do what `update` does; None where it does something else."""
         if self._holding:
             return None
-        return self._plain if self.undoubted else self._plain_doubted
+        return self._plain if self._keeps_turn else self._plain_doubted
 
     def release(self) -> None:
         """Feed back what was carried."""
@@ -315,8 +323,13 @@ class TiltAxesFilter(KalmanEstimator):
         self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
 
     @property
+    def _keeps_turn(self) -> bool:
+        """At rest a turn of C^ is a known one, of which updates need tell P nothing."""
+        return self.undoubted and self.step.item(STEP_RESTS_S) == 0.0
+
+    @property
     def _kept(self) -> tuple[Indices, Indices, Indices]:
-        gyros = self._gyros if self.undoubted else self._gyros[:0]
+        gyros = self._gyros if self._keeps_turn else self._gyros[:0]
         return gyros, self._lever, self._late
 
     def _keep(self, rows: Array, before: Array) -> None:

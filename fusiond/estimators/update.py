@@ -127,7 +127,7 @@ class Plain(NamedTuple):
     """What a kernel takes of a filter whose next update is `fuse`, and what carries its P over
     where one turns the axes (fusiond.estimators.tilt_axes).
 
-    nav (10,), xi (n,), step (27,), P (w, w), dx (n,), its model's columns and sigmas at the start
+    nav (10,), xi (n,), step (28,), P (w, w), dx (n,), its model's columns and sigmas at the start
     (n,), whether the height is held; slots of force biases with their axes (2, k), of the gyros'
     (0 or 3,), of what is left of a lever arm (0 or 3,) and of its offset in time (0 or 1,); and
     `room` for an innovation of `LENT_ROWS` rows at most, z, r, y, then H and L^-1 H P, and at its

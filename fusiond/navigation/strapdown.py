@@ -35,17 +35,20 @@ LAT, LON, HEIGHT, VN, VE, VD, Q0 = 0, 1, 2, 3, 4, 5, 6
 NAV_SIZE = 10
 # What a step leaves for the error model (STEP_SIZE,): mean specific force in NED (m/s^2), mean
 # compensated rate and specific force in body axes, C_nb in the middle of the interval by rows, the
-# specific force in NED and the rate in body axes, each smoothed over the steps, and the variance of
-# the noise that the latter has left.
+# specific force in NED and the rate in body axes, each smoothed over the steps, the variance of the
+# noise that the latter has left, and for how long (s) the vehicle is known to rest.
 STEP_FORCE_N, STEP_RATE_B, STEP_FORCE_B, STEP_DCM, STEP_SMOOTH_N = 0, 3, 6, 9, 18
-STEP_SMOOTH_RATE_B, STEP_NOISE_B = 21, 24
-STEP_SIZE = 27
+STEP_SMOOTH_RATE_B, STEP_NOISE_B, STEP_RESTS_S = 21, 24, 27
+STEP_SIZE = 28
 # Time constant (s) of both: a car's acceleration changes in a second, an engine shakes in 50 ms.
 SMOOTH_S = 0.25
 # Seconds that the variance looks back, as fusiond.navigation.vibration does. Samples that differ
 # from the smoothed rate before by d have d^2 (1 - g / 2) of noise each, if it is white, and what is
 # smoothed with gain g has g / (2 - g) of that; a rate that changes adds to it.
 NOISE_S = 10.0
+# A vehicle that accelerates by so much rests no more: one that does by less gains 0.15 m/s until
+# that is noticed otherwise. An engine that idles shakes by less once it is smoothed.
+PULLS_M_S2 = 0.1
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, b1, f8[::1])", forceinline=True)
@@ -59,7 +62,7 @@ def strapdown_step(
     hold_height: bool,
     step: Array,
 ) -> None:
-    """Advance `nav` (10,) in place by `h` seconds; write `step` (27,) for the error model.
+    """Advance `nav` (10,) in place by `h` seconds; write `step` (28,) for the error model.
 
     `rate` (rad/s) and `force` (m/s^2) are the interval's means in body axes after compensation,
     the slopes their time derivatives. `hold_height` keeps height and v_D = 0 (planar models).
@@ -159,6 +162,8 @@ def strapdown_step(
     step[STEP_DCM + 4], step[STEP_DCM + 5] = 0.5 * (c11 + n11), 0.5 * (c12 + n12)
     step[STEP_DCM + 6], step[STEP_DCM + 7] = 0.5 * (c20 + n20), 0.5 * (c21 + n21)
     step[STEP_DCM + 8] = 0.5 * (c22 + n22)
+    pulls = max(abs(step[STEP_SMOOTH_N]), abs(step[STEP_SMOOTH_N + 1]))
+    step[STEP_RESTS_S] = max(step[STEP_RESTS_S] - h, 0.0) if pulls < PULLS_M_S2 else 0.0
 
 
 def step_before(nav: Array) -> Array:

@@ -31,6 +31,7 @@ from fusiond.integrity.proof import UNPROVEN_SIGMAS
 from fusiond.integrity.series import Said, said
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.strapdown import STEP_RESTS_S
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
 from fusiond.navigator.raw_innovation import RawInnovation, raw_innovation
 
@@ -284,6 +285,8 @@ class Timeline:
             outcome = self._unproven(aid)
         else:
             outcome = estimator.update(aid if coarse == 1.0 else aid.coarser(coarse))
+            if aid.rests_s:
+                estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
         if not entry.judged:
             entry.assumed = isolation.assumes(aid)
         if outcome.name in TURNS:

@@ -16,16 +16,21 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.aiding.position import PositionAid
+from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.doubt import open_by
+from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
 from fusiond.navigation.error_model import DV, FORCE_ERROR, PHI, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import drive
 from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_error
@@ -158,3 +163,53 @@ def test_an_unknown_tilt_turns_what_the_biases_make_downward() -> None:
     more = grown[0] * plain[across[1], across[1]] + grown[1] * plain[across[0], across[0]]
     assert more > 1e-6
     assert tilts[vertical, vertical] - plain[vertical, vertical] == pytest.approx(more, rel=0.02)
+
+
+def _apart(f: TiltAxesFilter) -> Array:
+    """P (2, 2) of the tilt, given what tilt and force biases make of the acceleration."""
+    felt, c = np.zeros((2, f.model.size)), dcm_from_quaternion(f.nav[6:])
+    felt[:, :2] = G * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    felt[:, [f.model.parameters(FORCE_ERROR + axis)[0] for axis in range(3)]] = c[:2]
+    both = f.covariance @ felt.T
+    apart: Array = f.covariance - both @ np.linalg.solve(felt @ both + 1e-12 * np.eye(2), both.T)
+    return apart[:2, :2]
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_a_parked_vehicle_is_told_nothing_of_its_tilt(turns: bool) -> None:
+    """What tilt and force biases are apart stays as unknown as it was, however long it is looked
+    at: taken for noise, what moves C^ told a fifth of it in five minutes."""
+    seconds, noise = 300, imu_noise(IMU)
+    rng, model = np.random.default_rng(701), make_model("ins21", noise)
+    nav = runs.level_nav((0.03, -0.02, 0.7), REST)
+    c, (lat, _, height) = dcm_from_quaternion(nav[6:]), runs.ORIGIN
+    earth = EARTH_RATE_RAD_S * np.array([math.cos(lat), 0.0, -math.sin(lat)])
+    still = np.hstack([c.T @ earth, c.T @ [0.0, 0.0, -gravity(lat, height)]])
+    white = np.repeat([noise.rate_noise, noise.force_noise], 3) * math.sqrt(RATE_HZ)
+    samples = still + rng.standard_normal((round(RATE_HZ * seconds), 6)) * white
+    imu = ImuBuffer(RATE_HZ, seconds + 2.0, np.eye(3), 0.0, 0.5)
+    imu.append(np.rint(np.arange(1, len(samples) + 1) / RATE_HZ * 1e9).astype(np.int64), samples)
+    p = np.diag(model.initial**2)
+    p[:9, :9] = np.diag([0.01, 0.01, 0.03, 0.1, 0.1, 0.1, 1.0, 1.0, 1.0]) ** 2
+    open_by(p, model, np.empty(0), np.empty((0, model.size)), motion=True)
+    filter_ = InvariantFilter(model, 0.5, settles=False)
+    filter_.initialise(0, 0, nav, np.zeros(model.size), p)
+    filter_.turns = turns
+    sigmas = []
+
+    def look(entry: Entry) -> None:
+        assert entry.outcome is not None
+        assert entry.outcome.name == "fused"
+        sigmas.append(np.degrees(np.sqrt(np.linalg.eigvalsh(_apart(filter_)))))
+
+    timeline = Timeline(filter_, imu, 15.0, 0.5, look)
+    timeline.start()
+    for t_s in range(1, seconds):
+        rest = runs.rest(mean_rate=(still[0], still[1], still[2]), end_s=t_s)
+        t_ns, gyros = t_s * runs.SECOND, (still[0], still[1], still[2])
+        timeline.insert(ZeroRateAid("rate", t_ns, 0.9999, gyros, math.radians(0.1), rest))
+        timeline.insert(ZeroVelocityAid("velocity", t_ns, 0.9999, 0.05, rest))
+    timeline.run()
+    print(sigmas[59], sigmas[-1])
+    assert (sigmas[59] > 2.0).all()
+    assert (sigmas[-1] > 0.9 * sigmas[59]).all()

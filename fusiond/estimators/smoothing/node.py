@@ -91,7 +91,7 @@ def write_body(
     body: Array,
 ) -> None:
     """Write `body` of P and Phi (width, width), dx and what was fed back (n,), nav (10,),
-    parameters (n,), step (27,); Phi is then the identity again, and nothing was fed back."""
+    parameters (n,), step (28,); Phi is then the identity again, and nothing was fed back."""
     n = xi.shape[0]
     at = 0
     for i in range(PUBLISHED):

@@ -119,7 +119,7 @@ def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
 
 
 def level_step(nav: Array) -> Array:
-    """What a strapdown step (27,) leaves in level flight at a constant velocity, nearly."""
+    """What a strapdown step (28,) leaves in level flight at a constant velocity, nearly."""
     state = State(nav, np.zeros(0), np.zeros(0), flight.model("ins17"))
     step = np.zeros(STEP_SIZE)
     step[2] = step[8] = -9.8
