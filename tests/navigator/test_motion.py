@@ -6,6 +6,7 @@ import pytest
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.motion_descent import judge_guess, least_squares, moved
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment import motion, motion_fit
 
@@ -117,13 +118,33 @@ def test_what_a_guess_says_moves_by_its_slopes(imu: ImuBuffer) -> None:
     f = motion.felt(imu, at, np.array([0.01, -0.02, 0.03]))
     asked = motion_fit.Asked(imu_noise(Imu()), 9.8, 0.3, np.full(10, 0.1), 0.1)
     guess = motion_fit.Guess(dcm_from_rpy(0.02, -0.03, 0.4), f.biases, 0.0, v[0])
-    _, rows = motion_fit._judged(f, m, asked, guess)
+    packed = guess.packed()
+
+    def judged(guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        z, rows = np.empty(3 * len(at) + 10), np.empty((3 * len(at) + 10, 13))
+        made = (f.of.t_s, f.of.means, f.gained, f.turned, f.slopes, f.biases)
+        judge_guess(*made, v, m.sd, levers, asked.packed(), guess, z, rows)
+        return z, rows
+
+    _, rows = judged(packed)
     h = 1e-5
     for column, step in enumerate(h * np.eye(13)):
-        ahead, _ = motion_fit._judged(f, m, asked, guess.moved(step))
-        behind, _ = motion_fit._judged(f, m, asked, guess.moved(-step))
-        slope = (behind - ahead) / (2.0 * h)
+        ahead, behind = np.empty(19), np.empty(19)
+        moved(packed, step, ahead)
+        moved(packed, -step, behind)
+        slope = (judged(behind)[0] - judged(ahead)[0]) / (2.0 * h)
         assert rows[:, column] == pytest.approx(slope, abs=3e-3 * abs(slope).max())
+
+
+def test_least_squares_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(6)
+    rows, z, step = rng.standard_normal((40, 13)), rng.standard_normal(40), np.empty(13)
+    rows *= np.logspace(-4, 4, 13)
+    assert least_squares(rows, z, step)
+    expected = np.linalg.lstsq(rows / np.logspace(-4, 4, 13), z, rcond=None)[0]
+    assert step * np.logspace(-4, 4, 13) == pytest.approx(expected, rel=1e-9)
+    rows[:, 5] = 0.0
+    assert not least_squares(rows, z, step)
 
 
 def test_rate_before_motion() -> None:

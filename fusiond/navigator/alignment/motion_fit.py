@@ -41,14 +41,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.models.blocks import ImuNoise
-from fusiond.navigation.alignment import judge_felt
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
-from fusiond.navigation.rotation import (
-    dcm_from_quaternion,
-    dcm_from_rpy,
-    rotation_vector_to_quaternion,
-    wrap_angle,
-)
+from fusiond.navigation.motion_descent import BIASES, FIRST, LATE, PRIORS, SOUGHT, descend
+from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.motion import Felt, Measured, Past, stretch
 
 Array = NDArray[np.float64]
@@ -56,16 +51,9 @@ Array = NDArray[np.float64]
 # One sigma (rad) of how a road and a vehicle's body on it slope: 10 %, beyond which streets are
 # signposted.
 TILT_SD_RAD = 0.1
-# Steps of Gauss-Newton at most, and the one, in sigmas, that ends them; how often one is halved,
-# and the one that ends them where no part of it is any better, for the valley is bent.
-ITERATIONS, CONVERGED, HALVINGS, STALLED = 16, 0.1, 6, 1.0
 # Three sigma of a rate bias turn the axes by so much (rad) over the last fixes, which are fitted
 # first: half its square, a tenth, is what a linearisation about no bias leaves out.
 FIRST_RAD = 0.5
-# The integrals are made anew where the biases found would turn or tilt the axes by more (rad) than
-# those that they were made with: half its square is left out, a cm/s of what gravity gains in 20 s,
-# and what the slopes by the rate bias have of the force bias (a twelfth for 5 deg).
-BENT_RAD = 0.01
 
 
 class Fit(NamedTuple):
@@ -127,6 +115,12 @@ class Asked(NamedTuple):
     prior: Array
     sd_late_s: float
 
+    def packed(self) -> Array:
+        """(15,) for `descend`."""
+        n, rate = self.noise, STANDARD_GRAVITY_M_S2 * self.noise.rate_noise
+        white = [n.force_noise**2, rate**2 / 3.0]
+        return np.concatenate([self.prior, [self.yaw, self.g, self.sd_late_s], white])
+
 
 class Descent(NamedTuple):
     """Where Gauss-Newton has come to: the guess, its slopes (3 k + 10, 13) and what is left (3 k +
@@ -153,65 +147,16 @@ def _parts(m: Measured, rate_sd: float) -> list[Measured]:
 
 
 def _descend(f: Felt, m: Measured, asked: Asked, here: Guess) -> Descent:
-    """By Gauss-Newton from a guess, begun at `f`; a step that makes the fit worse is halved."""
-    f, converged = _about(f, here), False
-    z, rows = _judged(f, m, asked, here)
-    for _ in range(ITERATIONS):
-        step = _step(rows, z)
-        size = float(np.linalg.norm(rows @ step))
-        converged = size < CONVERGED
-        for _ in range(HALVINGS):
-            there = here.moved(step)
-            about = _about(f, there)
-            left, slopes = _judged(about, m, asked, there)
-            if converged or left @ left < z @ z:
-                here, f, z, rows = there, about, left, slopes
-                break
-            step = 0.5 * step
-        else:
-            converged = size < STALLED
-            break
-        if converged:
-            break
-    return Descent(here, rows, z, converged)
-
-
-def _step(rows: Array, z: Array) -> Array:
-    """The least squares (13,) of rows @ step = z, in sigmas of each alone."""
-    normal = rows.T @ rows
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    step: Array = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * (rows.T @ z))
-    return step
-
-
-def _about(f: Felt, here: Guess) -> Felt:
-    """The integrals, made anew where the biases are others by now."""
-    force, rate = np.abs(here.biases - f.biases).reshape(2, 3).max(axis=1).tolist()
-    if max(rate * f.of.t_s[-1], force / STANDARD_GRAVITY_M_S2) > BENT_RAD:
-        return f.of.felt(here.biases)
-    return f
-
-
-def _judged(f: Felt, m: Measured, asked: Asked, here: Guess) -> tuple[Array, Array]:
-    """What a guess leaves (3 k + 10,) and the slopes (3 k + 10, 13) of what it says by its steps,
-    in sigmas."""
-    k = 3 * len(m.velocity)
-    z, rows = np.empty(k + 10), np.zeros((k + 10, 13))
-    # C_0, since which the axes have turned to C_T.
-    turned = _turn(f.turns @ (here.biases - f.biases)[3:]) @ f.turned[-1]
-    dcm = here.last @ turned.T
-    n, of = asked.noise, f.of
-    judge_felt(
-        *(of.t_s, of.means, f.gained, f.turned, f.slopes, f.biases),
+    """By Gauss-Newton from a guess, begun at `f`."""
+    of, rows = f.of, 3 * len(m.velocity) + PRIORS
+    z, slopes, guess = np.empty(rows), np.empty((rows, SOUGHT)), here.packed()
+    converged = descend(
+        *(of.times, of.samples, of.counts, of.t_s, of.means),
+        *(f.gained, f.turned, f.slopes, f.biases),
         *(m.velocity, m.sd, m.levers),
-        *(dcm, here.first, here.biases, dcm @ f.turns),
-        *(n.force_noise**2, (STANDARD_GRAVITY_M_S2 * n.rate_noise) ** 2 / 3.0, asked.g),
-        *(here.late, asked.sd_late_s),
-        *(z[:k].reshape(-1, 3), rows[:k].reshape(-1, 3, 13)),
+        *(asked.packed(), guess, z, slopes),
     )
-    z[k:] = here.apart(asked.yaw) / asked.prior
-    rows[range(k, k + 10), range(10)] = 1.0 / asked.prior
-    return z, rows
+    return Descent(Guess.of(guess), slopes, z, converged)
 
 
 class Guess(NamedTuple):
@@ -227,19 +172,12 @@ class Guess(NamedTuple):
         """As a guess of what began with the first of `m`."""
         return self._replace(first=m.velocity[0])
 
-    def moved(self, step: Array) -> Guess:
-        """By a step (13,)."""
-        last = _turn(step[:3]) @ self.last
-        late = self.late + float(step[9])
-        return Guess(last, self.biases + step[3:9], late, self.first + step[10:])
+    def packed(self) -> Array:
+        """(19,) for `descend`."""
+        return np.concatenate([self.last.ravel(), self.biases, [self.late], self.first])
 
-    def apart(self, yaw: float) -> Array:
-        """How far the priors (10,) are: level, `yaw` (rad), no biases, no offset."""
-        c = self.last
-        apart = wrap_angle(yaw - math.atan2(c[1, 0], c[0, 0]))
-        return np.concatenate([[c[1, 2], -c[0, 2], apart], -self.biases, [-self.late]])
-
-
-def _turn(phi: Array) -> Array:
-    x, y, z = (float(v) for v in phi)
-    return dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z)))
+    @staticmethod
+    def of(packed: Array) -> Guess:
+        """Unpacked."""
+        late = float(packed[LATE])
+        return Guess(packed[:BIASES].reshape(3, 3), packed[BIASES:LATE], late, packed[FIRST:])
