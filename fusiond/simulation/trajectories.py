@@ -25,9 +25,37 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 
 Array = NDArray[np.float64]
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[:, ::1])")
+def _steps(knots: Array, values: Array, t_s: Array, out: Array) -> None:
+    """Write `out` (4, n), a profile and its derivatives at instants (n,); knots and values (k,)."""
+    last = knots.shape[0] - 1
+    for k in range(t_s.shape[0]):
+        low, high = 0, last + 1  # the first knot later than t lies in between
+        while low < high:
+            middle = (low + high) // 2
+            if t_s[k] < knots[middle]:
+                high = middle
+            else:
+                low = middle + 1
+        i = min(max(low - 1, 0), max(last - 1, 0))
+        j = min(i + 1, last)
+        length = knots[j] - knots[i] if j > i else 1.0
+        x = (t_s[k] - knots[i]) / length
+        inside = 0.0 <= x < 1.0
+        x = min(max(x, 0.0), 1.0)
+        rise = values[j] - values[i]
+        x2, y = x * x, 1.0 - x
+        out[0, k] = values[i] + rise * x2 * x * (10.0 - 15.0 * x + 6.0 * x2)
+        out[1, k] = rise / length * 30.0 * x2 * (y * y)
+        out[2, k] = rise / (length * length) * 60.0 * x * (1.0 - 3.0 * x + 2.0 * x2)
+        bent = rise / (length * length * length) * 60.0 * (1.0 - 6.0 * x + 6.0 * x2)
+        out[3, k] = bent if inside else 0.0
 
 
 class Profile:
@@ -44,20 +72,10 @@ class Profile:
 
         The third jumps at the knots, where it is that of the piece that begins.
         """
-        last = len(self._t) - 1
-        i = np.clip(np.searchsorted(self._t, t_s, side="right") - 1, 0, max(last - 1, 0))
-        j = np.minimum(i + 1, last)
-        length = np.where(j > i, self._t[j] - self._t[i], 1.0)
-        x = (t_s - self._t[i]) / length
-        inside = (x >= 0.0) & (x < 1.0)
-        x = np.clip(x, 0.0, 1.0)
-        rise = self._values[j] - self._values[i]
-        x2 = x * x
-        value = self._values[i] + rise * x2 * x * (10.0 - 15.0 * x + 6.0 * x2)
-        first = rise / length * 30.0 * x2 * (1.0 - x) ** 2
-        second = rise / length**2 * 60.0 * x * (1.0 - 3.0 * x + 2.0 * x2)
-        third = np.where(inside, rise / length**3 * 60.0 * (1.0 - 6.0 * x + 6.0 * x2), 0.0)
-        return value, first, second, third
+        at = np.asarray(t_s, dtype=np.float64)
+        out = np.empty((4, *at.shape))
+        _steps(self._t, self._values, np.ascontiguousarray(at).ravel(), out.reshape(4, -1))
+        return out[0], out[1], out[2], out[3]
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,8 +91,14 @@ class Bench:
 
     async def mode(self, mode: Mode) -> None:
         """Wait for a solution of that mode from now on."""
-        start = len(self.seen)
-        await until(lambda: any(s.mode is mode for s in self.seen[start:]))
+        looked_at = len(self.seen)
+
+        def came() -> bool:
+            nonlocal looked_at
+            first, looked_at = looked_at, len(self.seen)
+            return any(s.mode is mode for s in self.seen[first:])
+
+        await until(came)
 
 
 @asynccontextmanager

@@ -14,11 +14,12 @@ import pytest
 from fusiond.studies.faults.aid_faults import velocity_bias
 from fusiond.studies.faults.drawn import drawn
 from fusiond.studies.faults.hours import hour_of, rates
-from fusiond.studies.faults.library import Fault
+from fusiond.studies.faults.judge import LIE_S, longest_lie_s
+from fusiond.studies.faults.library import FAULTS, Fault
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import SWEEPS, jobs, power_run, powers
 from fusiond.studies.faults.recording import Drive
-from fusiond.studies.faults.runs import Row, run, run_row
+from fusiond.studies.faults.runs import Row, course_of, placed, run, run_row
 from fusiond.studies.faults.tables import TABLES, put_into
 
 # Fault and phase; the event that names it; within how many seconds of its end the mode is
@@ -68,9 +69,9 @@ def test_what_a_failure_leaves_open_is_open_in_the_navigation_after_it(
     That one fix a second shows the turned unit's tilt late is another matter, of seconds."""
     of = EVERY[fault]
     path = of.drive if drive is None else drawn(drive)
-    found = run(replace(of, drive=replace(path, gnss_rate_hz=rate_hz)), "navigating", seed)
-    assert "diverged" in {e["code"] for e in found["events"]} or drive is not None
-    assert found["longest_lie_s"] <= 5.0, found
+    found = course_of(replace(of, drive=replace(path, gnss_rate_hz=rate_hz)), "navigating", seed)
+    assert "diverged" in {e.code for e in found.events} or drive is not None
+    assert longest_lie_s(found.samples) <= 5.0
 
 
 @pytest.mark.parametrize(
@@ -82,8 +83,8 @@ def test_positions_that_run_away_alone_are_open(fault: str, drive: int, rate_hz:
     17 s and longer."""
     of = EVERY[fault]
     path = replace(drawn(drive), places_alone=True, gnss_rate_hz=rate_hz)
-    found = run(replace(of, drive=path), "navigating", 0)
-    assert found["longest_lie_s"] <= 2.0, found
+    found = course_of(replace(of, drive=path), "navigating", 0)
+    assert longest_lie_s(found.samples) <= 2.0
 
 
 def test_a_velocity_that_the_filter_follows_is_open() -> None:
@@ -127,8 +128,10 @@ def test_what_lied_on_drawn_drives_does_not(fault: str, phase: str, drive: int) 
     """A slow drift before it can be told, and one that came back while it went on; a fix that is
     the same to the bit at rest; a start of velocities of which two were reversed; a position that
     was blamed by a velocity that had just come back. Town has none of them."""
-    found = run_row(Row(fault, phase), seed=drive % 65, drive=drive)  # type: ignore[arg-type]
-    assert found["verdict"] in {"degraded and said so", "survived"}, found
+    of = placed(FAULTS[fault], drive)
+    found = course_of(of, phase, seed=drive % 65)  # type: ignore[arg-type]
+    assert found.crash is None
+    assert longest_lie_s(found.samples) <= LIE_S
 
 
 def test_a_drawn_drive_meets_the_same_fault_elsewhere() -> None:

@@ -82,21 +82,27 @@ def rows(only: str | None = None, phase: PhaseName | None = None) -> list[Row]:
 
 
 def run_row(row: Row, seed: int, drive: int | None = None) -> dict[str, Any]:
-    """The figures of a row; the same seed gives the same. `drive`: the number of a drawn one in
-    place of the town, for the faults that happen there."""
-    fault = FAULTS[row.fault]
-    if drive is not None and fault.drive.path is town:
-        found = drawn(drive)
-        own = fault.drive
-        found = replace(
-            found,
-            wheels=own.wheels,
-            spare=own.spare,
-            second=own.second,
-            places_alone=own.places_alone,
-        )
-        fault = replace(fault, drive=found)
-    return {"fault": row.fault, "phase": row.phase, **run(fault, row.phase, seed)}
+    """The figures of a row; the same seed gives the same. `drive` as of `placed`."""
+    return {
+        "fault": row.fault,
+        "phase": row.phase,
+        **run(placed(FAULTS[row.fault], drive), row.phase, seed),
+    }
+
+
+def placed(fault: Fault, drive: int | None) -> Fault:
+    """On the drawn drive of that number in place of the town, if it is one that happens there."""
+    if drive is None or fault.drive.path is not town:
+        return fault
+    own = fault.drive
+    found = replace(
+        drawn(drive),
+        wheels=own.wheels,
+        spare=own.spare,
+        second=own.second,
+        places_alone=own.places_alone,
+    )
+    return replace(fault, drive=found)
 
 
 def run(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
@@ -105,17 +111,18 @@ def run(fault: Fault, phase: PhaseName, seed: int) -> dict[str, Any]:
     harmless = fault.alter is None and fault.configure is None
     end_s = begin_s if harmless else min(begin_s + fault.length_s, DURATION_S)
     reference = _unharmed(fault.drive, phase, seed)
-    course = reference if harmless else _driven(fault, phase, seed)
+    course = reference if harmless else course_of(fault, phase, seed)
     return {"begin_s": begin_s, "end_s": end_s, **judge(course, reference, begin_s, end_s)}
 
 
 @lru_cache(maxsize=8)
 def _unharmed(drive: Drive, phase: PhaseName, seed: int) -> Course:
     """The same drive with nothing wrong."""
-    return _driven(Fault(drive=drive), phase, seed)
+    return course_of(Fault(drive=drive), phase, seed)
 
 
-def _driven(fault: Fault, phase: PhaseName, seed: int) -> Course:
+def course_of(fault: Fault, phase: PhaseName, seed: int) -> Course:
+    """What came of a fault in a phase."""
     vehicle = with_wheels(VEHICLE) if fault.drive.wheels else VEHICLE
     if fault.drive.spare:
         vehicle = with_spare(vehicle)
