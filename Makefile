@@ -55,7 +55,8 @@ demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 
 
 # One core compiles while the other installs the tools and lints; then two at a time, in this order.
 # Hardware in the loop waits for real time more than it computes: the others take what it leaves, and
-# are the first to yield.
+# are the first to yield. The unit's guest comes after those: while `unit` waits for `collected` make
+# would start it in its place, and one core would idle beside guests that wait.
 test: $(RUNTIME) ## everything that CI checks
 	$(MAKE) --jobs=2 --output-sync=line lint hil unit systemd YIELDING="nice -n 19"
 
@@ -94,7 +95,7 @@ fuzz: $(STAMP) ## every parser with atheris, side by side; RUNS=10000000 ARGS=nm
 hil: $(STAMP) kernels test-packages ## hardware in the loop; alone, since the daemon keeps real time
 	$(BIN)/pytest tests/hil/test_hil.py
 
-systemd: $(STAMP) kernels test-packages ## the unit as its README installs it, systemd as process 1 of a guest
+systemd: $(STAMP) kernels test-packages | $(if $(YIELDING),hil) ## the unit as its README installs it, systemd as process 1 of a guest
 	$(BIN)/python -m tests.hil.unit_guest
 
 test-packages:
