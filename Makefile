@@ -55,8 +55,8 @@ demo: $(RUNTIME) ## simulated vehicle, real daemon, dashboard; ARGS="--duration 
 
 # One core compiles while the other installs the tools and lints; then two at a time, in this order.
 # Hardware in the loop waits for real time more than it computes: the others take what it leaves, and
-# are the first to yield. The unit's guest comes after those: while `unit` waits for `collected` make
-# would start it in its place, and one core would idle beside guests that wait.
+# are the first to yield. The unit's guest comes after theirs, or make would start it while `unit`
+# waits for `collected`: as fast, but four guests at once.
 test: $(RUNTIME) ## everything that CI checks
 	$(MAKE) --jobs=2 --output-sync=line lint hil unit systemd YIELDING="nice -n 19"
 
