@@ -1,7 +1,8 @@
 """What an interval does to the axes in which a covariance has the tilt, as compiled kernels.
 
-The equations are in fusiond.estimators.tilt_axes. Covariances (width, width) are flat, and of P21
-nothing is read or written (fusiond.estimators.covariance).
+The equations are in fusiond.estimators.tilt_axes. Covariances (width, width) are flat, and nothing
+of P21 comes into what else they hold: it is made of P12 (fusiond.estimators.covariance). What
+`rest_axes` does to one is what `turn_rows` there does after an update, to one that is whole.
 """
 
 from __future__ import annotations

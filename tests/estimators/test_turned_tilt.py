@@ -20,16 +20,19 @@ from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.covariance import mirror
 from fusiond.estimators.doubt import open_by
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.estimators.tilt_axes import TiltAxesFilter
+from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
+from fusiond.estimators.turned_axes import TURN_SIZE, rest_axes, rest_rows, turn_at_rest
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
-from fusiond.navigation.error_model import DV, FORCE_ERROR, PHI, RATE_ERROR
+from fusiond.navigation.error_model import CORE_SIZE, DV, FORCE_ERROR, PHI, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.rotation import dcm_from_quaternion
+from fusiond.navigation.rotation import dcm_from_quaternion, quaternion_from_rpy
+from fusiond.navigation.strapdown import STEP_RESTS_S, STEP_SIZE, strapdown_step
 from fusiond.navigator.timeline import Entry, Timeline
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import drive
@@ -213,3 +216,59 @@ def test_a_parked_vehicle_is_told_nothing_of_its_tilt(turns: bool) -> None:
     print(sigmas[59], sigmas[-1])
     assert (sigmas[59] > 2.0).all()
     assert (sigmas[-1] > 0.9 * sigmas[59]).all()
+
+
+def test_a_turn_at_rest_is_that_of_an_update() -> None:
+    """Of P, whose P21 is made afterwards, of a transition and of an estimate that is carried."""
+    model, rng = make_model("ins21", imu_noise(IMU)), np.random.default_rng(702)
+    n, width, terms = model.size, model.width, model.sensor_terms
+    before = np.array(quaternion_from_rpy(0.1, -0.2, 0.7))
+    after = np.array(quaternion_from_rpy(0.13, -0.17, 0.75))
+    turn = np.empty(TURN_SIZE)
+    turn_at_rest(*before.tolist(), after, turn)
+    slots = np.array([model.parameters(FORCE_ERROR + axis)[0] for axis in (2, 0, 1)])
+    t = np.eye(n)
+    turn_rows(t, before, after, slots, np.array([2, 0, 1]))
+    half = rng.standard_normal((n, n))
+    p, phi, dx = half @ half.T, rng.standard_normal((n, n)), rng.standard_normal(n)
+    flat = np.zeros((width, width))
+    flat[:n, :n] = p
+    flat[CORE_SIZE:, :CORE_SIZE] = np.nan
+    rest_axes(flat.ravel(), width, n, turn, *terms)
+    mirror(flat.ravel(), width, n)
+    assert flat[:n, :n] == pytest.approx(t @ p @ t.T, abs=1e-12)
+    moved, carried = phi.copy(), dx.copy()
+    rest_rows(moved.ravel(), n, n, turn, *terms)
+    rest_rows(carried, 1, 1, turn, *terms)
+    assert moved == pytest.approx(t @ phi, abs=1e-12)
+    assert carried == pytest.approx(t @ dx, abs=1e-12)
+
+
+@pytest.mark.parametrize(("force", "rests_s"), [(0.05, 0.9), (0.2, 0.0)])
+def test_a_vehicle_that_pulls_away_rests_no_more(force: float, rests_s: float) -> None:
+    nav, step, none = runs.level_nav(REST, REST), np.zeros(STEP_SIZE), np.zeros(3)
+    step[STEP_RESTS_S] = 1.0
+    for _ in range(10):
+        strapdown_step(nav, none, np.array([force, 0.0, -G]), none, none, 0.01, False, step)
+    assert step[STEP_RESTS_S] == pytest.approx(rests_s)
+
+
+def test_rest_that_is_refused_ends_at_once() -> None:
+    model = make_model("ins21", imu_noise(IMU))
+    imu, n = ImuBuffer(RATE_HZ, 4.0, np.eye(3), 0.0, 0.5), round(2 * RATE_HZ)
+    samples = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -G], (n, 1))
+    imu.append(np.arange(1, n + 1) * round(1e9 / RATE_HZ), samples)
+    filter_ = TiltAxesFilter(model, 0.5)
+    p = np.diag(model.initial**2)
+    p[:9, :9] = 0.01 * np.eye(9)
+    filter_.initialise(0, 0, runs.level_nav(REST, REST), np.zeros(model.size), p)
+    left = []
+    timeline = Timeline(
+        filter_, imu, 15.0, 0.5, lambda _: left.append(filter_.step.item(STEP_RESTS_S))
+    )
+    timeline.start()
+    for t_s, most_m_s in ((1, 0.5), (2, -1.0)):
+        rest = runs.rest(max_speed_m_s=most_m_s, end_s=t_s)
+        timeline.insert(ZeroVelocityAid("rest", t_s * runs.SECOND, 0.9999, 0.05, rest))
+    timeline.run()
+    assert left == [1.5, 0.0]

@@ -96,7 +96,7 @@ def spread_states(
 ) -> None:
     """Write the true states that the errors dx, dx + s L_1, dx - s L_1, dx + s L_2 ... would mean.
 
-    navs (2m + 1, 10), xis (2m + 1, n), steps (2m + 1, 18): rates and forces with their own sensor
+    navs (2m + 1, 10), xis (2m + 1, n), steps (2m + 1, 28): rates and forces with their own sensor
     errors taken out.
     """
     n = xi.shape[0]
