@@ -345,7 +345,8 @@ class NonHolonomicAid(Aid):
 class WheelSpeedAid(Aid):
     """Forward speed (m/s) with `sd_m_s` at `lever`; `rounding_sd_m_s` is a part of that. `drift`,
     `scale`, `latency` and `rounding` name the blocks of the wheel's own errors; what the last says
-    of steps of `shared_step_m_s` is in `sd_m_s` where the model has it not.
+    of steps of `shared_step_m_s` is in `sd_m_s` where the model has it not. `drifts`: sigma (m/s)
+    and correlation time (s) of what the block `drift` estimates, for tests without a filter.
 
     Not `signed`, it is an amount: its sign is that of the filter's own forward velocity where that
     is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
@@ -361,6 +362,7 @@ class WheelSpeedAid(Aid):
     latency: str = ""
     rounding: str = ""
     shared_step_m_s: float = 0.0
+    drifts: tuple[float, float] = (0.0, 1.0)
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p, _ = state
@@ -392,4 +394,5 @@ class WheelSpeedAid(Aid):
         return Packed(slots, np.array((*self.lever, *measured)))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
-        return (SpeedOffer(self.t_ns, self.speed_m_s, self.sd_m_s, self.rounding_sd_m_s),)
+        own = self.sd_m_s, self.rounding_sd_m_s, self.drifts
+        return (SpeedOffer(self.t_ns, self.speed_m_s, *own),)

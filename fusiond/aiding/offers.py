@@ -45,12 +45,14 @@ class VelocityOffer(NamedTuple):
 
 class SpeedOffer(NamedTuple):
     """Speed (m/s) along the forward axis, or its amount, as a wheel says it. `rounding_sd_m_s` is
-    the part of `sd_m_s` that is the same as long as the speed is: no mean takes it away."""
+    the part of `sd_m_s` that is the same as long as the speed is: no mean takes it away. Beside
+    `sd_m_s` it drifts, as a process of first order of that sigma (m/s) and time (s)."""
 
     t_ns: int
     speed_m_s: float
     sd_m_s: float
     rounding_sd_m_s: float = 0.0
+    drifts: tuple[float, float] = (0.0, 1.0)
 
 
 class HeadingOffer(NamedTuple):

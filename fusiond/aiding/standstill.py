@@ -8,10 +8,12 @@ Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a 
 all that is known may refute (`Rest.doubt`):
 
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
-    the mean of measured speeds is not zero, in the run
-    of windows or in this one                             `moving`    (fusiond.aiding.witnesses)
+    the mean of measured speeds is surely not zero, in
+    the run of windows or in this one                     `moving`    (fusiond.aiding.witnesses)
     |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
     the same by seven sigma, and the speed is known to be zero        `turns_at_rest`
+    the mean of measured speeds is not zero, unless the
+    wheels have drifted                                   `moving`
     the ride is smooth, and neither sqrt(P_vv) nor the
     sigma of a mean of measured speeds is below s_v       `quiet_at_speed`
 
@@ -69,8 +71,6 @@ RATE_SIGMAS = 3.0
 # The same, where it is no chance: on wheels nothing turns on the spot.
 SURE_SIGMAS = 7.0
 TURNING, TURNS_AT_REST = "turning", "turns_at_rest"
-# How far back measured speeds are averaged: as many windows as a run has.
-WITNESSED_NS = 1_000_000_000
 # The least turning radius of a car (m), and how long (s) a rate of turn lasts in a car that creeps.
 LEAST_RADIUS_M = 5.0
 CREEP_LASTS_S = 3.0
@@ -137,31 +137,34 @@ class Rest:
         # A tenth of the sigma that the aid claims, beside P: a filter that is surer is not.
         least = (0.1 * self.velocity_sd_m_s) ** 2
         square = _normalised(v.tolist(), p_v.tolist(), least)
-        measured = self._measured()
+        measured = self._measured(w.run)
         # A vehicle that turns back has a mean of nothing; the last window alone has not.
-        lately = self.witnesses.measured(w.end_ns - WITNESSED_NS, w.end_ns)
-        contradicted = measured.contradicts or lately.contradicts
-        if square > quantile(rows, VELOCITY_PROBABILITY) or contradicted:
+        lately = self._measured(1)
+        surely = measured.surely or lately.surely
+        if square > quantile(rows, VELOCITY_PROBABILITY) or surely:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
         turns = self._turns(state, p)
         if any(square > RATE_SIGMAS**2 * variance for square, variance in turns):
             sure = known and any(square > SURE_SIGMAS**2 * variance for square, variance in turns)
             return TURNS_AT_REST if sure else TURNING
+        if measured.contradicts or lately.contradicts:
+            return "moving"
         if not known and self.witnesses.smooth_ride(w.end_ns):
             return "quiet_at_speed"
         return None
 
-    def _measured(self) -> Measured:
-        w = self.window
-        return self.witnesses.measured(w.end_ns - w.run * WITNESSED_NS, w.end_ns)
+    def _measured(self, windows: int) -> Measured:
+        """In the last of so many windows."""
+        end_ns = self.window.end_ns
+        return self.witnesses.measured(end_ns - round(windows * self.window_s * 1e9), end_ns)
 
     def creeps(self, state: State) -> Array:
         """Variances (3,), rad^2/s^2, of what may have turned though nothing has refuted rest."""
         p, w = state.covariance, self.window
         if p is None:
             return np.zeros(3)
-        sd = min(math.sqrt(max(p[3, 3], p[4, 4])), self._measured().sd)
+        sd = min(math.sqrt(max(p[3, 3], p[4, 4])), self._measured(w.run).sd)
         turns = (sd / LEAST_RADIUS_M) ** 2
         down = np.square(state.dcm[2])
         if w.run > 1:
@@ -176,7 +179,7 @@ class Rest:
         if p is None:
             return 0.0
         sd = math.sqrt(max(p[3, 3], p[4, 4]))
-        if min(sd, self._measured().sd) > self.velocity_sd_m_s:
+        if min(sd, self._measured(self.window.run).sd) > self.velocity_sd_m_s:
             return 0.0
         return abs(float(state.dcm[2] @ _rate_error(state, self.window.mean_rate))) * self.window_s
 

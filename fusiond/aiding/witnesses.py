@@ -4,9 +4,14 @@ r"""What speaks for or against rest beside a quiet sensor: measured speeds, and 
 
 over the velocities v_k (north, east, or a wheel's speed) of one kind in a span of time. n fixes
 average: 0.2 m/s is seen by five fixes of 0.1 m/s. s_0 is what does not average: multipath, and the
-rounding of a speed that stays the same.
+rounding of a speed that stays the same. A wheel's drift by sd_d, a process of first order of time
+T, averages by what fits into the span of x T: it is sure with
 
-Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity aids.
+    s = max(sqrt(sd^2 / n + a sd_d^2), s_0),   a = max(2 (x - 1 + exp(-x)) / x^2, 1 / n)
+
+Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity aids;
+Gelb, Applied Optimal Estimation, section 3.6, for the process; a is its mean's variance by double
+integration of exp(-|t - s| / T).
 """
 
 from __future__ import annotations
@@ -23,6 +28,8 @@ from fusiond.aiding.offers import SpeedOffer, VelocityOffer
 # What remains of an averaged velocity (m/s): multipath moves a receiver's Doppler by a centimetre
 # or two a second, for seconds alike.
 LEAST_SD_M_S = 0.02
+# What does not drift beside that.
+STEADY = (0.0, 1.0)
 # A test of rest refuses a vehicle at rest once in a thousand windows: it loses one aid of many.
 # Quantiles of chi-square of one and two degrees of freedom.
 CONTRADICTION = (10.83, 13.82)
@@ -40,19 +47,24 @@ SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
 
 class Measured(NamedTuple):
     """What the measured speeds of a span say: whether they contradict rest, and the sigma (m/s) of
-    the best of their means (infinite: none was measured)."""
+    the best of their means (infinite: none was measured); whether `surely`, beyond what they may
+    drift by. What is claimed of rest asks for the first, what is asked of the gyros for the last:
+    a wheel that has drifted is no reason to believe a gyro."""
 
     contradicts: bool
     sd: float
+    surely: bool
 
 
 class _Speed(NamedTuple):
-    """A velocity or speed (m/s) with its sigma, and the part of that which no mean takes away."""
+    """A velocity or speed (m/s) with its sigma, the part of that which no mean takes away, and what
+    it drifts by: sigma (m/s) and time (s)."""
 
     t_ns: int
     v: tuple[float, ...]
     sd: float
     rounding: float
+    drifts: tuple[float, float]
 
 
 class _Sum(NamedTuple):
@@ -73,6 +85,17 @@ class _Sum(NamedTuple):
             for axis in range(len(total)):
                 total[axis] += row.v[axis]
         return _Sum(self.number + len(rows), variance, tuple(total), rounding)
+
+
+def _drifted(first: _Speed, last: _Speed, number: int) -> float:
+    """Variance (m/s)^2 of the mean of what so many speeds from `first` to `last` drift by."""
+    sd, time_s = last.drifts
+    if not sd:
+        return 0.0
+    x = (last.t_ns - first.t_ns) * 1e-9 / time_s
+    # Below 1e-3 the series is 1 - x / 3, and the difference has no digits left.
+    alike = 2.0 * (x - 1.0 + math.exp(-x)) / (x * x) if x > 1e-3 else 1.0 - x / 3.0
+    return sd * sd * max(alike, 1.0 / number)
 
 
 class Witnesses:
@@ -98,19 +121,17 @@ class Witnesses:
             for offer in aid.offers():
                 match offer:
                     case VelocityOffer():
-                        self._keep(aid.source, offer.t_ns, offer.v_ned[:2], max(offer.sd[:2]))
+                        speed = _Speed(offer.t_ns, offer.v_ned[:2], max(offer.sd[:2]), 0.0, STEADY)
+                        self._keep(aid.source, speed)
                     case SpeedOffer():
-                        v, rounding = (offer.speed_m_s,), offer.rounding_sd_m_s
-                        self._keep(aid.source, offer.t_ns, v, offer.sd_m_s, rounding)
+                        own = offer.sd_m_s, offer.rounding_sd_m_s, offer.drifts
+                        self._keep(aid.source, _Speed(offer.t_ns, (offer.speed_m_s,), *own))
 
-    def _keep(
-        self, source: str, t_ns: int, v: tuple[float, ...], sd: float, rounding: float = 0.0
-    ) -> None:
-        if t_ns <= self._told_ns:
+    def _keep(self, source: str, speed: _Speed) -> None:
+        if speed.t_ns <= self._told_ns:
             self._told.clear()
             self._told_ns = 0
         speeds = self._speeds[source]
-        speed = _Speed(t_ns, v, sd, rounding)
         if speeds and speed < speeds[-1]:
             self._sums.clear()
             insort(speeds, speed)
@@ -133,22 +154,23 @@ class Witnesses:
         return found
 
     def _measured(self, begin_ns: int, end_ns: int) -> Measured:
-        contradicts, best = False, math.inf
+        contradicts, best, surely = False, math.inf, False
         for source, speeds in self._speeds.items():
-            found = self._sum(source, speeds, begin_ns, end_ns)
-            if found is None:
+            first, last = bisect_left(speeds, (begin_ns,)), bisect_left(speeds, (end_ns + 1,))
+            if first >= last:
                 continue
-            sd = max(math.sqrt(found.variance) / found.number, found.rounding)
+            found = self._sum(source, speeds, first, last, begin_ns)
+            least, variance = found.rounding**2, found.variance / found.number**2
             square = sum((total / found.number) ** 2 for total in found.v)
-            contradicts |= square > CONTRADICTION[len(found.v) - 1] * sd * sd
-            best = min(best, sd)
-        return Measured(contradicts, best)
+            square /= CONTRADICTION[len(found.v) - 1]
+            contradicts |= square > max(variance, least)
+            variance += _drifted(speeds[first], speeds[last - 1], found.number)
+            surely |= square > max(variance, least)
+            best = min(best, max(variance, least))
+        return Measured(contradicts, math.sqrt(best), surely)
 
-    def _sum(self, source: str, speeds: list[_Speed], begin_ns: int, end_ns: int) -> _Sum | None:
-        """Of a source's speeds in a span, begun where that of a shorter span ended."""
-        first, last = bisect_left(speeds, (begin_ns,)), bisect_left(speeds, (end_ns + 1,))
-        if first >= last:
-            return None
+    def _sum(self, source: str, speeds: list[_Speed], first: int, last: int, begin_ns: int) -> _Sum:
+        """Of a source's speeds `first` to `last`-1, begun where that of a shorter span ended."""
         known = self._sums.get((source, begin_ns))
         if known is None or known.number > last - first:
             known = _Sum(0, 0.0, (0.0,) * len(speeds[first].v), LEAST_SD_M_S)

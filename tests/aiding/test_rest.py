@@ -94,6 +94,22 @@ def test_a_wheel_that_turns_is_no_rest() -> None:
     assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) == "moving"
 
 
+def test_a_wheel_that_may_have_drifted_keeps_nobody_from_asking_the_gyros() -> None:
+    """Ten speeds of -0.12 m/s: no rest to claim, but a gyro that is off is told. A wheel without a
+    drift says that the vehicle moves."""
+    turned = (0.0, 0.0, 1.0 * DEG)
+    for sd, doubt in ((0.1, "turns_at_rest"), (0.0, "moving")):
+        witnesses = Witnesses()
+        for k in range(10):
+            aid = WheelSpeedAid(
+                "wheel", round((END_S - 0.1 * k) * 1e9), 0.999, -0.12, 0.1, (0.0,) * 3,
+                drifts=(sd, 1.0),
+            )  # fmt: skip
+            witnesses.hear([aid])
+        assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) == "moving"
+        assert runs.rest(mean_rate=turned, witnesses=witnesses).doubt(_state(0.0, 0.02)) == doubt
+
+
 def test_a_turn_is_no_bias() -> None:
     """0.6 deg/s are seen in one window, 0.2 deg/s in ten; what the bias's prior allows is none."""
     known, unknown = _state(0.0, 0.02), _state(0.0, 0.02, sd_bias_deg_s=0.3)

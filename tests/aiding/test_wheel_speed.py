@@ -73,7 +73,7 @@ def test_a_speed_that_reads_zero_long_is_no_rest_below_its_step() -> None:
         reading = WheelSpeedAid("wheel", k * SECOND // 4, 0.99, 0.0, sd, (0.0, 0.0, 0.0))
         fine.hear([reading])
         rounded.hear([replace(reading, rounding_sd_m_s=sd)])
-    assert rounded.measured(0, 10 * SECOND) == (False, pytest.approx(sd))
+    assert rounded.measured(0, 10 * SECOND) == (False, pytest.approx(sd), False)
     assert fine.measured(0, 10 * SECOND).sd == pytest.approx(sd / math.sqrt(40.0))
     # Two km/h contradict rest all the same, even one reading of them.
     moving = Witnesses()

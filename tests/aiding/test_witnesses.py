@@ -6,14 +6,21 @@ import random
 from types import SimpleNamespace
 from typing import Any
 
-from fusiond.aiding.offers import VelocityOffer
+import numpy as np
+import pytest
+
+from fusiond.aiding.offers import SpeedOffer, VelocityOffer
 from fusiond.aiding.witnesses import KEEP_NS, Measured, Witnesses
+from fusiond.simulation.markov import gauss_markov
 
 SECOND_NS = 1_000_000_000
 
 
 def _aid(source: str, t_ns: int, v: float, sd: float) -> Any:
-    offer = VelocityOffer(t_ns, (v, -v, 0.0), (sd, sd, sd))
+    return _of(source, VelocityOffer(t_ns, (v, -v, 0.0), (sd, sd, sd)))
+
+
+def _of(source: str, offer: VelocityOffer | SpeedOffer) -> Any:
     return SimpleNamespace(source=source, screened=False, locates=False, offers=lambda: (offer,))
 
 
@@ -62,3 +69,38 @@ def test_what_was_said_of_spans_holds_until_a_speed_comes_into_one() -> None:
     assert after == [_at_once([*heard, late], *span) for span in windows]
     changed = [k for k in range(len(windows)) if after[k] != before[k]]
     assert changed == [2, 3]
+
+
+@pytest.mark.parametrize("windows", [1, 10])
+def test_wheels_that_drift_as_they_may_are_no_motion(windows: int) -> None:
+    """A vehicle at rest whose wheels err by what the filter estimates of them: the mean of a span
+    has the sigma that is stated, and refutes rest once in a thousand spans."""
+    runs, each, drifts = 2000, 10, (0.1, 1.0)
+    rng = np.random.default_rng(windows)
+    count = windows * each
+    drift = gauss_markov(rng, (count, runs), step_s=0.1, correlation_s=drifts[1], sigma=drifts[0])
+    speeds = drift + 0.1 * rng.standard_normal((count, runs))
+    refuted, sd = 0, 0.0
+    for run in range(runs):
+        witnesses = Witnesses()
+        for k, v in enumerate(speeds[:, run].tolist()):
+            offer = SpeedOffer(k * SECOND_NS // each, v, 0.1, 0.0, drifts)
+            witnesses.hear([_of("wheel", offer)])
+        _, sd, surely = witnesses.measured(0, windows * SECOND_NS)
+        refuted += surely
+    # Chi-square of 2000 variances: 1 +- 3.3 sqrt(2 / 2000); more than 8 of Poisson's 2 once in
+    # four thousand.
+    assert np.var(speeds.mean(axis=0)) / sd**2 == pytest.approx(1.0, abs=0.105)
+    assert refuted <= 8
+
+
+def test_a_wheel_that_creeps_is_motion_whatever_may_drift() -> None:
+    """Ten seconds at 0.3 m/s; one speed alone says no more than its noise and its drift do."""
+    witnesses = Witnesses()
+    for k in range(100):
+        offer = SpeedOffer(k * SECOND_NS // 10, 0.3, 0.1, 0.0, (0.1, 1.0))
+        witnesses.hear([_of("wheel", offer)])
+    assert witnesses.measured(0, 10 * SECOND_NS).surely
+    _, sd, surely = witnesses.measured(0, 0)
+    assert not surely
+    assert sd == pytest.approx(np.hypot(0.1, 0.1))

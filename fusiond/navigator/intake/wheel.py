@@ -46,6 +46,7 @@ def aids(m: WheelSpeed, sections: Sections, when: Instants) -> list[Aid]:
             latency,
             rounding,
             m.shared_step_m_s,
+            (o.drift_sd_m_s, o.drift_s),
         )
     ]
 
