@@ -37,9 +37,12 @@ async def test_ranges_carry_the_daemon_through_a_canyon(tmp_path: Path, broker: 
             await heard.online(b"online")
             await vehicle.start()
             await heard.until("status", lambda m: m["mode"] == "navigating")
-            health = await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
+            await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
+            # Just after the start, and where the host has stood still, there may be fewer.
+            health = await heard.until(
+                "health", lambda m: len(m["sources"]["gnss"]["sky"]["used"]) >= 8
+            )
             sky = health["sources"]["gnss"]["sky"]
-            assert len(sky["used"]) >= 8
             assert {name[0] for name in sky["used"]} == {"G", "C"}
             assert 0.5 < sky["hdop"] < 3.0
             assert sky["innovation_rms"] < 3.0
