@@ -19,13 +19,13 @@ KEYS = {"position_std_m", "velocity_std_m_s", "attitude_std_deg", "nees_mean", "
 
 @cache
 def result() -> dict[str, Any]:
-    return multiscale.run(4)
+    return multiscale.run(2)
 
 
 def test_keys_are_those_promised() -> None:
     found = result()
     assert STUDIES["multiscale"] == multiscale.__name__
-    assert found["runs"] == 4
+    assert found["runs"] == 2
     assert "paper 001" in found["paper"]["source"]
     assert found["finding"].endswith(".")
     assert found["paper"]["federated"]["position_std_m"] == [6.0023, 5.2128]
@@ -88,4 +88,4 @@ def test_plot_and_tables(tmp_path: Path) -> None:
     assert path.stat().st_size > 10_000
     titles = [title for title, _, _ in multiscale.tables(result())]
     assert len(titles) == 3
-    assert "4 runs" in titles[0]
+    assert "2 runs" in titles[0]
