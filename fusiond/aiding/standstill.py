@@ -8,20 +8,20 @@ Quiet alone is not rest: a smooth ride is as quiet. Rest, v = 0 and w = 0, is a 
 all that is known may refute (`Rest.doubt`):
 
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
-    the mean of measured speeds is surely not zero, in
-    the run of windows or in this one                     `moving`    (fusiond.aiding.witnesses)
+    the mean of measured speeds is not zero, whatever
+    drifts, in the run of windows or in this one          `moving`    (fusiond.aiding.witnesses)
     |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
     the same by seven sigma, and the speed is known to be zero        `turns_at_rest`
-    the mean of measured speeds is not zero, unless the
-    wheels have drifted                                   `moving`
+    the same mean is not zero, if nothing drifts          `moving`
     the ride is smooth, and neither sqrt(P_vv) nor the
     sigma of a mean of measured speeds is below s_v       `quiet_at_speed`
 
-v_max is the largest speed of a vehicle that creeps, s_v the sigma of the zero velocity, s_r of the
-rate of a vehicle at rest, all configured; s_n the gyro's noise in a window, k the number of windows
-in a row (one, and up to ten). The bias's P is at the start that of the data sheet: a turn within
-it cannot be told from a bias. The last test asks for evidence as good as what the aid
-will claim, once quiet windows at speed have shown that quiet is none.
+The tests are in this order: a wheel that may have drifted leaves no rest to claim, and keeps nobody
+from asking the gyros. v_max is the largest speed of a vehicle that creeps, s_v the sigma of the
+zero velocity, s_r of the rate of a vehicle at rest, all configured; s_n the gyro's noise in a
+window, k the number of windows in a row (one, and up to ten). The bias's P is at the start that of
+the data sheet: a turn within it cannot be told from a bias. The last test asks for evidence as good
+as what the aid will claim, once quiet windows at speed have shown that quiet is none.
 
 What has stood the tests may creep still, at a speed of sigma s_v, and around a bend: it turns about
 its down axis with the sigma s_v / R at the most, R the least radius of a car. A creep is not even:

@@ -10,7 +10,7 @@ T, averages by what fits into the span of x T: it is sure with
     s = max(sqrt(sd^2 / n + a sd_d^2), s_0),   a = max(2 (x - 1 + exp(-x)) / x^2, 1 / n)
 
 Source: Groves, 2nd ed., section 9.4.3 for Doppler velocity, section 15.3 for zero-velocity aids;
-Gelb, Applied Optimal Estimation, section 3.6, for the process; a is its mean's variance by double
+Gelb, Applied Optimal Estimation, chapter 3, for the process; a is its mean's variance by double
 integration of exp(-|t - s| / T).
 """
 
