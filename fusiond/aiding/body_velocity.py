@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
 from fusiond.aiding.felt import add_of_force, turning
-from fusiond.aiding.offers import SpeedOffer
+from fusiond.aiding.offers import STEADY, SpeedOffer
 from fusiond.aiding.packed import AMOUNT, NO_SLIP, SPEED, Packed, slots_of
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
@@ -362,7 +362,7 @@ class WheelSpeedAid(Aid):
     latency: str = ""
     rounding: str = ""
     shared_step_m_s: float = 0.0
-    drifts: tuple[float, float] = (0.0, 1.0)
+    drifts: tuple[float, float] = STEADY
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p, _ = state

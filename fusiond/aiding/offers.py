@@ -12,6 +12,8 @@ import math
 from typing import NamedTuple
 
 Vector3 = tuple[float, float, float]
+# Sigma (m/s) and time (s) of a speed that does not drift.
+STEADY = (0.0, 1.0)
 
 
 class PositionOffer(NamedTuple):
@@ -52,7 +54,7 @@ class SpeedOffer(NamedTuple):
     speed_m_s: float
     sd_m_s: float
     rounding_sd_m_s: float = 0.0
-    drifts: tuple[float, float] = (0.0, 1.0)
+    drifts: tuple[float, float] = STEADY
 
 
 class HeadingOffer(NamedTuple):

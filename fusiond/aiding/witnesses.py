@@ -23,13 +23,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fusiond.aiding.base import Aid
-from fusiond.aiding.offers import SpeedOffer, VelocityOffer
+from fusiond.aiding.offers import STEADY, SpeedOffer, VelocityOffer
 
 # What remains of an averaged velocity (m/s): multipath moves a receiver's Doppler by a centimetre
 # or two a second, for seconds alike.
 LEAST_SD_M_S = 0.02
-# What does not drift beside that.
-STEADY = (0.0, 1.0)
 # A test of rest refuses a vehicle at rest once in a thousand windows: it loses one aid of many.
 # Quantiles of chi-square of one and two degrees of freedom.
 CONTRADICTION = (10.83, 13.82)

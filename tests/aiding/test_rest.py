@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -71,6 +72,17 @@ def test_a_fix_before_the_quiet_windows_says_nothing() -> None:
     witnesses.hear([aid])
     assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) is None
     assert runs.rest(witnesses=witnesses, run=2).doubt(_state(0.0, 0.02)) == "moving"
+
+
+def test_windows_of_half_a_second_look_at_their_own() -> None:
+    """What was measured 0.75 s before the end was measured before the window."""
+    witnesses, sd = Witnesses(), (0.1, 0.1, 0.1)
+    before_ns = round((END_S - 0.75) * 1e9)
+    aid = VelocityAid("gnss_velocity", before_ns, 0.999, (5.0, 0.0, 0.0), sd, (0.0, 0.0, 0.0))
+    witnesses.hear([aid])
+    rest = replace(runs.rest(witnesses=witnesses), window_s=0.5)
+    assert rest.doubt(_state(0.0, 0.02)) is None
+    assert replace(rest, window_s=1.0).doubt(_state(0.0, 0.02)) == "moving"
 
 
 def test_a_vehicle_that_turns_back_is_not_at_rest() -> None:

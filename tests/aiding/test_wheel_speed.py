@@ -15,7 +15,7 @@ from fusiond.aiding.height import BarometerAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.aiding.witnesses import Witnesses
-from fusiond.configuration.aiding import BarometerAiding, HeightAiding
+from fusiond.configuration.aiding import BarometerAiding, HeightAiding, WheelAiding
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.models.catalogue import make_model
@@ -95,6 +95,7 @@ def test_rounding_enters_the_noise_of_every_kind() -> None:
     (wheel,) = aids(WHEEL)
     assert isinstance(wheel, WheelSpeedAid)
     assert (wheel.sd_m_s, wheel.signed, wheel.rounding_sd_m_s) == (pytest.approx(0.5), False, 0.4)
+    assert wheel.offers()[0].drifts == (WheelAiding().drift_sd_m_s, WheelAiding().drift_s)
     fix = PositionFix("gnss", SECOND, STAMP, 0.9, 0.2, 50.0, sd_ned_m=(3.0, 3.0, 6.0))
     fix = replace(fix, v_ned_m_s=(5.0, 0.0, None), sd_v_ned_m_s=(0.3, 0.3, None))
     coarse = replace(fix, rounding_sd_ned_m=(4.0, 0.0, 8.0), rounding_sd_v_m_s=0.4)

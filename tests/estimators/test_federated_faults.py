@@ -37,7 +37,7 @@ OFF = Filter("unisolated", FederatedOptions(fault_detection=False))
 RESET = Filter("fusion_reset", FederatedOptions(mode="fusion_reset"))
 RESCALE = Filter("rescale", FederatedOptions(mode="rescale"))
 CENTRALISED = Filter("centralised", isolates=True)
-RUNS = 12
+RUNS = 24
 
 
 @lru_cache(maxsize=8)

@@ -1,6 +1,6 @@
 """What hostile bytes cost: `python -m tests.fuzz.hostile` tells each parser's time by length.
 
-The slope is that of log time over log length, by least squares over 1, 2 and 4 times a length: 1
+The slope is that of log time over log length, by least squares over 1, 2, 4 and 8 times a length: 1
 is a parser whose work a byte does not grow, 2 one that goes through all that came for each byte.
 The shortest length is beyond what a parser may hold back for a frame, so that a bound of its buffer
 does not pass for a slope; times are the processor's, the least of some.
@@ -29,13 +29,13 @@ from tests.drivers.raw.frames import lnav_words, measurement, rawx, rtcm, sfrbx,
 from tests.fuzz.documents import INPUT_FILE, STATES, TABLES
 from tests.fuzz.targets import DECODING, DEVICES, EARLIEST, Planned
 
-TIMES = (1, 2, 4)
+TIMES = (1, 2, 4, 8)
 STREAM = 16_384
 """Twice the longest frame that is waited for."""
 
 
 class Hostile(NamedTuple):
-    """`shortest`: bytes (CAN: of frames' data); `read(data)` takes that many times 1 to 4."""
+    """`shortest`: bytes (CAN: of frames' data); `read(data)` takes that many times 1 to 8."""
 
     parser: str
     pattern: str
@@ -158,7 +158,7 @@ def _table(head: bytes, rows: Callable[[int], Iterator[bytes]]) -> Callable[[byt
 
 # --------------------------------------------------------------------------- patterns
 
-_ANY = random.Random(1).randbytes(4 * STREAM)
+_ANY = random.Random(1).randbytes(8 * STREAM)
 _FALSE = {
     "UBX of 8192": b"\xb5\x62\x02\x15\x00\x20",
     "UBX of 32": b"\xb5\x62\x01\x07\x20\x00",

@@ -7,7 +7,7 @@ import pytest
 from tests.fuzz.hostile import HOSTILE, Hostile, slope
 
 MOST = 1.5
-"""Half-way from linear to quadratic: over four times the length a factor of two either way."""
+"""Half-way from linear to quadratic: over eight times the length a factor of three either way."""
 
 
 @pytest.mark.parametrize("each", HOSTILE, ids=lambda each: f"{each.parser}: {each.pattern}")

@@ -19,7 +19,7 @@ from fusiond.studies.reduced_order import flight
 from fusiond.studies.reduced_order.cost import costs
 from fusiond.studies.reduced_order.runs import fly
 
-RUNS, SECONDS = 3, 400.0
+RUNS, SECONDS = 6, 400.0
 AXES = range(3)
 
 
