@@ -37,6 +37,8 @@ _COLUMNS = (
 COLUMNS: tuple[str, ...] = (*(name for name, _ in _COLUMNS), "status")
 _DECIMALS = np.array([decimals for _, decimals in _COLUMNS], dtype=np.int64)
 _CHUNK_ROWS = 2048
+_BLOCK = 1 << 19
+"""Bytes that are handed to the system at once: of small pieces it makes small pages of its own."""
 _DEG = 180.0 / np.pi
 
 
@@ -76,7 +78,7 @@ class SolutionWriter:
         if not isinstance(target, Path | str):
             self._stream: BinaryIO = target
         elif self._owned:
-            self._stream = Path(target).open("wb")  # noqa: SIM115 - closed by close()
+            self._stream = Path(target).open("wb", buffering=_BLOCK)  # noqa: SIM115 - closed by close()
         else:
             self._stream = sys.stdout.buffer
         self._labels = _label_table(STATUS)

@@ -74,6 +74,19 @@ def test_longest_cell_fits() -> None:
     assert len(cell) + 1 <= MAX_CELL
 
 
+@pytest.mark.parametrize("decimals", range(MAX_DECIMALS + 1))
+def test_cells_of_any_length_touch_no_more_than_their_part(decimals: int) -> None:
+    # One unit below each power of ten, and the power: another digit before the point.
+    values = [sign * (10.0**k - below) for k in range(18) for below in (1, 0) for sign in (1, -1)]
+    for value in [*values, -9.999999999999999e17]:
+        out = np.full(MAX_CELL + 9, ord("#"), dtype=np.uint8)
+        table = np.full((1, 1), value), np.array([decimals]), np.zeros(1, dtype=np.int64)
+        size = format_rows(*table, NO_LABELS, out[: MAX_CELL + 1])
+        expected = f"{value or 0.0:.{decimals}f}\n"
+        assert out[:size].tobytes() == expected.encode()
+        assert (out[MAX_CELL:] == ord("#")).all()
+
+
 def rows(n: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(7)
     return {
