@@ -16,7 +16,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO, TextIOWrapper
+from io import DEFAULT_BUFFER_SIZE, BytesIO, TextIOWrapper
 from math import inf, isfinite, nan
 from pathlib import Path
 from typing import Any, TextIO
@@ -24,8 +24,8 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.files.dialect import DialectError, plain_csv
-from fusiond.files.fixed_decimal import parse_rows
+from fusiond.files.dialect import DialectError, Text, first_line, plain_csv
+from fusiond.files.fixed_decimal import newlines, parse_rows
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -130,14 +130,17 @@ def read_table(
     path = Path(path)
     try:
         data = plain_csv(path)
-        stream = _as_text(data)
-        header = [cell.strip() for cell in stream.readline().split(",")]
+        start = len(first_line(data)) + 1
+        header = _header(data[: start + DEFAULT_BUFFER_SIZE])
         _check_header(path, header, columns)
-        parsed = None if text else _read_plain(data, header)
+        rows = newlines(data) - 1 + (data[-1:].tobytes() != b"\n")
+        parsed = None
+        if rows and not text:
+            parsed = _read_plain(data, start, rows, header)
+        if rows and parsed is None:
+            parsed = _read_clean(data, rows, header, text)
         if parsed is None:
-            parsed = _read_clean(data, header, text)
-        if parsed is None:
-            parsed = _read_with_care(stream, header, columns, text)
+            parsed = _read_with_care(data, header, columns, text)
     except DialectError as error:
         raise TableError(f"{path}: {error}") from error
     except OSError as error:
@@ -178,28 +181,27 @@ def _check_header(path: Path, header: list[str], columns: Sequence[Column]) -> N
         raise TableError(f"{path}, line 1: lacks {', '.join(lacking)}; it has {', '.join(header)}")
 
 
-def _as_text(data: bytearray) -> TextIO:
-    return TextIOWrapper(BytesIO(data), encoding="utf-8-sig")
+def _as_text(data: Text) -> TextIO:
+    return TextIOWrapper(BytesIO(data.data), encoding="utf-8-sig")
 
 
-def _read_plain(data: bytearray, header: list[str]) -> _Parsed | None:
+def _header(data: Text) -> list[str]:
+    """The cells of the first line, of `data` that goes on by as much as is decoded at once."""
+    with _as_text(data) as stream:
+        return [cell.strip() for cell in stream.readline().split(",")]
+
+
+def _read_plain(data: Text, start: int, rows: int, header: list[str]) -> _Parsed | None:
     """A file of plain decimals, such as this project writes; None if there is anything else."""
-    start = data.find(b"\n") + 1
-    rows = data.count(b"\n", start) + (not data.endswith(b"\n"))
-    if not start or start == len(data):
-        return None
     values = np.empty((len(header), rows))
-    if not parse_rows(np.frombuffer(data, dtype=np.uint8), start, values):
+    if not parse_rows(data, start, values):
         return None
     lines = np.arange(2, rows + 2, dtype=np.int64)
     return dict(zip(header, values, strict=True)), {}, lines, []
 
 
-def _read_clean(data: bytearray, header: list[str], text: Sequence[str]) -> _Parsed | None:
+def _read_clean(data: Text, rows: int, header: list[str], text: Sequence[str]) -> _Parsed | None:
     """The whole file through numpy's C reader; None if anything in it asks for a closer look."""
-    rows = data.count(b"\n") - 1 + (not data.endswith(b"\n"))
-    if rows <= 0:
-        return None
     with _as_text(data) as stream:
         stream.readline()
         try:
@@ -228,7 +230,7 @@ def _number(cell: str) -> float:
 
 
 def _read_with_care(
-    stream: Iterable[str], header: list[str], columns: Sequence[Column], text: Sequence[str]
+    data: Text, header: list[str], columns: Sequence[Column], text: Sequence[str]
 ) -> _Parsed:
     """Row by row: what cannot be parsed is rejected, what is empty and may be so becomes NaN."""
     present = [(header.index(c.name), c) for c in columns if c.name in header]
@@ -237,6 +239,8 @@ def _read_with_care(
     rows: list[list[float]] = []
     words: dict[str, list[str]] = {name: [] for _, name in places}
     lines: list[int] = []
+    stream = _as_text(data)
+    stream.readline()
     for line, row in enumerate(stream, start=2):
         cells = row.strip().split(",")
         if cells == [""]:

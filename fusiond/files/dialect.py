@@ -7,14 +7,21 @@ What cannot be told for certain is refused, with its name.
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Text = NDArray[np.uint8]
 
 _GZIP = b"\x1f\x8b"
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _LOOKED_AT = 100
 """Rows that show how numbers are written. Columns of whole numbers show nothing."""
 _COMMA_NUMBER = re.compile(rb"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
+_FIRST_LINE = re.compile(rb"[^\n]*")
 _POINT_NUMBER = re.compile(rb"^[+-]?\d*\.\d+([eE][+-]?\d+)?$")
 
 
@@ -22,17 +29,36 @@ class DialectError(ValueError):
     """A way of writing a table that is not read; the text names it and says what would do."""
 
 
-def plain_csv(path: Path) -> bytearray:
-    """The file's bytes with commas between cells and points in numbers.
+def plain_csv(path: Path) -> Text:
+    """The file's bytes (n,) with commas between cells and points in numbers.
 
     Raises `DialectError`, and `OSError` for a file that cannot be read.
     """
-    data = path.read_bytes()
-    if data.startswith(_GZIP):
-        data = _unzipped(data)
-    if data.startswith(_UTF_16):
+    data = _contents(path)
+    if data[:2].tobytes() == _GZIP:
+        data = _text(_unzipped(data.tobytes()))
+    if data[:2].tobytes() in _UTF_16:
         raise DialectError("UTF-16 text: save it as CSV in UTF-8")
-    return _with_commas(bytearray(data))
+    return _with_commas(data)
+
+
+def first_line(data: Text) -> bytes:
+    """The bytes before the first newline."""
+    found = _FIRST_LINE.match(data.data)
+    return found[0] if found else b""
+
+
+def _contents(path: Path) -> Text:
+    """All bytes of a file: large arrays have large pages, a third of the time of `read_bytes`."""
+    with path.open("rb") as file:
+        data = np.empty(os.fstat(file.fileno()).st_size, dtype=np.uint8)
+        data = data[: file.readinto(data.data)]
+        rest = file.read()  # of what has no size, or has grown meanwhile
+    return np.concatenate((data, _text(rest))) if rest else data
+
+
+def _text(data: bytes) -> Text:
+    return np.frombuffer(data, dtype=np.uint8).copy()
 
 
 def _unzipped(data: bytes) -> bytes:
@@ -45,9 +71,8 @@ def _unzipped(data: bytes) -> bytes:
         raise DialectError(f"damaged .gz: {error}") from error
 
 
-def _with_commas(data: bytearray) -> bytearray:
-    header, _, _ = data.partition(b"\n")
-    header = header.strip()
+def _with_commas(data: Text) -> Text:
+    header = first_line(data).strip()
     if b"," in header:
         return data
     if header.lower().startswith(b"sep="):
@@ -57,13 +82,13 @@ def _with_commas(data: bytearray) -> bytearray:
         if len(header.split()) > 1:
             raise DialectError("blanks between the cells: write commas, semicolons or tabs")
         return data
-    decimal = _decimal(data, between)
-    if decimal == b",":
-        return data.translate(bytes.maketrans(between + b",", b",."))
-    return data.translate(bytes.maketrans(between, b","))
+    text = data.tobytes()
+    if _decimal(text, between) == b",":
+        return _text(text.translate(bytes.maketrans(between + b",", b",.")))
+    return _text(text.translate(bytes.maketrans(between, b",")))
 
 
-def _decimal(data: bytearray, between: bytes) -> bytes:
+def _decimal(data: bytes, between: bytes) -> bytes:
     """What stands before a number's decimals: a comma or a point."""
     points = commas = False
     for row in data.split(b"\n", _LOOKED_AT + 1)[1 : _LOOKED_AT + 1]:

@@ -146,53 +146,119 @@ def format_rows(
 
 
 _EXACT = 2**53
+_EXACT_FOUR, _EXACT_EIGHT = _EXACT // 10**4, _EXACT // 10**8
+"""Numbers that so many more digits leave exact, or beyond 2^53 and within 64 bits."""
 _POWERS = np.array([10.0**k for k in range(23)])
+_ZEROS, _OVER, _HIGH = (np.uint64(byte * 0x0101010101010101) for byte in (_ZERO, 0x76, 0x80))
+_NEWLINES, _LOW = (np.uint64(byte * 0x0101010101010101) for byte in (_NEWLINE, 0x7F))
+_ONES = np.uint64(0x0101010101010101)
+
+
+@compiled("i8(u8[::1])", nogil=True)
+def _newlines(words: NDArray[np.uint64]) -> int:
+    """Bytes that are newlines: those of which nothing is left."""
+    found = np.uint64(0)
+    for i in range(words.shape[0]):
+        rest = words[i] ^ _NEWLINES
+        something = ((rest & _LOW) + _LOW) | rest | _LOW
+        found += ((~something >> np.uint64(7)) * _ONES) >> np.uint64(56)
+    return int(found)
+
+
+def newlines(text: NDArray[np.uint8]) -> int:
+    """How many there are in a text (n,) that lies at the beginning of its memory."""
+    whole = len(text) // 8 * 8
+    words = _newlines(text[:whole].view(np.uint64))
+    return words + int(np.count_nonzero(text[whole:] == _NEWLINE))
+
+
+@compiled("u8(u1[::1], u8)", forceinline=True)
+def _eight(text: NDArray[np.uint8], at: np.uint64) -> np.uint64:
+    """Eight bytes, the first lowest, less '0' each where they are digits."""
+    word = np.uint64(0)
+    for k in range(8):
+        word |= np.uint64(text[at + np.uint64(k)]) << np.uint64(8 * k)
+    return word ^ _ZEROS
+
+
+@compiled("u8(u8)", forceinline=True)
+def _joined(digits: np.uint64) -> np.uint64:
+    """The number of eight digits, the first lowest: pairs, then fours, then all."""
+    pairs = np.uint64(10) * digits + (digits >> np.uint64(8))
+    odd, even = pairs & np.uint64(0xFF000000FF), (pairs >> np.uint64(16)) & np.uint64(0xFF000000FF)
+    odd *= np.uint64((1000000 << 32) + 100)
+    even *= np.uint64((10000 << 32) + 1)
+    return (odd + even) >> np.uint64(32)
+
+
+@compiled("UniTuple(u8, 2)(u1[::1], u8, u8)", forceinline=True)
+def _digits(
+    text: NDArray[np.uint8], at: np.uint64, number: np.uint64
+) -> tuple[np.uint64, np.uint64]:
+    """`number` with the digits from `at` on; and where they end, or it has become too large."""
+    while at < np.uint64(text.shape[0]) and number <= np.uint64(_EXACT):
+        digit = np.uint8(text[at] - np.uint8(_ZERO))
+        if digit > np.uint8(9):
+            break
+        number = np.uint64(10) * number + np.uint64(digit)
+        at += np.uint64(1)
+    return number, at
+
+
+@compiled("UniTuple(u8, 2)(u1[::1], u8, u8)", forceinline=True)
+def _many_digits(
+    text: NDArray[np.uint8], at: np.uint64, number: np.uint64
+) -> tuple[np.uint64, np.uint64]:
+    """As `_digits`; the first eight at once, or four."""
+    if at + np.uint64(8) <= np.uint64(text.shape[0]):
+        word = _eight(text, at)
+        # No carry comes of a digit, so that those before the first other byte are seen as such.
+        others = ((word + _OVER) | word) & _HIGH
+        if others == np.uint64(0) and number <= np.uint64(_EXACT_EIGHT):
+            number = np.uint64(10**8) * number + _joined(word)
+            at += np.uint64(8)
+        elif others << np.uint64(32) == np.uint64(0) and number <= np.uint64(_EXACT_FOUR):
+            number = np.uint64(10**4) * number + _joined(word << np.uint64(32))
+            at += np.uint64(4)
+    return _digits(text, at, number)
 
 
 @compiled("b1(u1[::1], i8, f8[:, ::1])", nogil=True)
-def parse_rows(text: NDArray[np.uint8], at: int, values: NDArray[np.float64]) -> bool:
-    """Read `values` (columns, rows) from `text[at:]`, rows of cells with a comma in between.
+def parse_rows(text: NDArray[np.uint8], begin: int, values: NDArray[np.float64]) -> bool:
+    """Read `values` (columns, rows) from `text[begin:]`, rows of cells with a comma in between.
 
     False, with `values` in part written, if a cell is anything but an optional sign, digits and an
     optional point (at most 2^53 without the point), or if there are more or fewer cells.
     """
     columns, rows = values.shape
-    end = text.shape[0]
+    at, end, one = np.uint64(begin), np.uint64(text.shape[0]), np.uint64(1)
     for row in range(rows):
         for column in range(columns):
             negative = at < end and text[at] == _MINUS
             if negative:
-                at += 1
-            number, digits, decimals = 0, 0, -1
-            while at < end:
-                byte = text[at]
-                if 48 <= byte <= 57:
-                    number = 10 * number + (byte - 48)
-                    if number > _EXACT:
-                        return False
-                    digits += 1
-                    decimals += decimals >= 0
-                elif byte == _POINT and decimals < 0:
-                    decimals = 0
-                else:
-                    break
-                at += 1
-            if digits == 0 or decimals >= _POWERS.shape[0]:
+                at += one
+            first = at
+            number, at = _digits(text, at, np.uint64(0))
+            digits, decimals = at - first, np.uint64(0)
+            if at < end and text[at] == _POINT:
+                first = at + one
+                number, at = _many_digits(text, first, number)
+                decimals = at - first
+                digits += decimals
+            if digits == 0 or number > np.uint64(_EXACT) or decimals >= _POWERS.shape[0]:
                 return False
-            value = float(number)
-            if decimals > 0:
-                value /= _POWERS[decimals]
+            value = float(np.int64(number)) / _POWERS[decimals]
             values[column, row] = -value if negative else value
             if column < columns - 1:
                 if at >= end or text[at] != _COMMA:
                     return False
-                at += 1
+                at += one
         if at < end and text[at] == 13:  # carriage return
-            at += 1
+            at += one
         if at < end:
             if text[at] != _NEWLINE:
                 return False
-            at += 1
+            at += one
         elif row < rows - 1:
             return False
     return bool(at == end)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fusiond.files.csv_tables import TableError, counts, file_report
-from fusiond.files.fixed_decimal import parse_rows
+from fusiond.files.fixed_decimal import newlines, parse_rows
 from fusiond.files.tables import (
     read_attitude,
     read_gnss,
@@ -287,3 +289,45 @@ def test_plain_decimals_are_read_to_the_last_bit_or_left_to_others(
 def test_what_is_no_plain_decimal_is_left_to_others(text: str) -> None:
     expected = [[1.0]] if text == "1\r" else None
     assert parse(text, 1, 1) == expected
+
+
+@pytest.mark.parametrize(
+    "cell", ["5", "-5.", "12.5", ".1234", "-0.1234567", "1.12345678", "00.123456789"]
+)
+def test_nothing_is_read_beyond_the_end(cell: str) -> None:
+    # The memory goes on with more digits: what looks at eight bytes at once must not take them.
+    for text in (cell, f"{cell}\n", f"1,{cell}"):
+        held = np.full(len(text) + 16, ord("7"), dtype=np.uint8)
+        held[: len(text)] = np.frombuffer(text.encode(), dtype=np.uint8)
+        values = np.full((1 + text.count(","), 1), np.nan)
+        assert parse_rows(held[: len(text)], 0, values)
+        assert values[-1, 0] == float(cell)
+
+
+@pytest.mark.parametrize("after", [",", "\n", ".", "e", "/", ":", "-", "\x80", "\xff"])
+@pytest.mark.parametrize("digits", range(1, 14))
+def test_eight_digits_at_once_are_digits(digits: int, after: str) -> None:
+    cell = "3." + "1415926535897"[:digits]
+    text = f"{cell}{after}99999999\n".encode("latin-1")
+    values = np.full((2 if after == "," else 1, 2 if after == "\n" else 1), np.nan)
+    read = parse_rows(np.frombuffer(text, dtype=np.uint8).copy(), 0, values)
+    assert read == (after in ",\n")
+    if read:
+        assert values.ravel().tolist() == [float(cell), 99999999.0]
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 8, 9, 16, 61])
+def test_newlines_are_counted(length: int) -> None:
+    rng = np.random.default_rng(length)
+    for text in rng.choice(np.frombuffer(b"\n\x0b\t\x8a1", dtype=np.uint8), (50, length)):
+        assert newlines(text) == text.tobytes().count(b"\n")
+
+
+def test_a_pipe_is_read_as_a_file_is(tmp_path: Path) -> None:
+    path, pipe = write(tmp_path, IMU, "0,0,0,0,0,0,9.8", "1,0,0,0,0,0,9.8"), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor() as pool:
+        writing = pool.submit(pipe.write_bytes, path.read_bytes())
+        table = read_imu(pipe)
+        writing.result()
+    np.testing.assert_array_equal(table.t_s, [0.0, 1.0])
