@@ -59,6 +59,9 @@ LEAST_RATE_RAD_S, LEAST_FORCE_M_S2 = 0.003, 0.05
 BACK = 0.25
 # Samples that the running mean of leaps and the running probability of repetition remember.
 LEAPS_KEPT, REPEATS_KEPT = 100.0, 500.0
+# The probability of repetition falls no further: after half an hour at 200 Hz it would be no normal
+# number, which takes the processor three times as long. A repetition makes the same of both.
+LEAST_P = 1e-30
 # A repetition as rare as this is none; and at least three times the longest seen.
 CHANCE = 1e-9
 FEWEST_REPEATS = 10
@@ -101,7 +104,7 @@ def _begin(memory: Array, samples: Array, i: int) -> None:
     memory[_P_ALL] = memory[_SEEN] = 1.0
 
 
-@compiled("void(f8[::1], f8[:, ::1], i8, f8)")
+@compiled("void(f8[::1], f8[:, ::1], i8, f8)", forceinline=True)
 def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> None:
     """Sample i against the one before it: which axes stand still, and for how long."""
     moved = 0
@@ -116,7 +119,7 @@ def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> Non
         if small:
             memory[_LONGEST_ALL] = max(memory[_LONGEST_ALL], memory[_RUN_ALL])
         memory[_RUN_ALL] = 0.0
-        memory[_P_ALL] -= memory[_P_ALL] / REPEATS_KEPT
+        memory[_P_ALL] = max(memory[_P_ALL] - memory[_P_ALL] / REPEATS_KEPT, LEAST_P)
     else:
         memory[_RUN_ALL] += 1.0
         if memory[_RUN_ALL] < _most(memory[_P_ALL], memory[_LONGEST_ALL]):
@@ -127,7 +130,8 @@ def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> Non
             if step <= SMALLEST_STEPS * memory[_STEP + j]:
                 memory[_LONGEST + j] = max(memory[_LONGEST + j], memory[_RUN + j])
             memory[_RUN + j] = memory[_OTHERS + j] = 0.0
-            memory[_REPEATS + j] -= memory[_REPEATS + j] / REPEATS_KEPT
+            p = memory[_REPEATS + j]
+            memory[_REPEATS + j] = max(p - p / REPEATS_KEPT, LEAST_P)
         elif moved:
             memory[_RUN + j] += 1.0
             memory[_OTHERS + j] += 1.0
@@ -138,7 +142,7 @@ def _count_repeats(memory: Array, samples: Array, i: int, rate_hz: float) -> Non
         memory[_RAW + j] = samples[i, j]
 
 
-@compiled("i8(f8[::1], f8[:, ::1], i8, f8, f8[::1])")
+@compiled("i8(f8[::1], f8[:, ::1], i8, f8, f8[::1])", forceinline=True)
 def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array) -> int:
     """Code of sample i, `since_s` after the one before it, repetitions counted."""
     rate_hz = limits[0]
@@ -169,7 +173,7 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
     return TAKEN
 
 
-@compiled("b1(f8[::1], f8[:, ::1], i8)")
+@compiled("b1(f8[::1], f8[:, ::1], i8)", forceinline=True)
 def _leaps(memory: Array, samples: Array, i: int) -> bool:
     """Whether sample i may be a spike, if the next one is back."""
     for j in range(6):
@@ -191,7 +195,7 @@ def _comes_back(memory: Array, samples: Array, i: int, k: int) -> bool:
     return False
 
 
-@compiled("void(f8[::1], f8[:, ::1], i8)")
+@compiled("void(f8[::1], f8[:, ::1], i8)", forceinline=True)
 def _take(memory: Array, samples: Array, i: int) -> None:
     """Sample i is the one that the next is compared with."""
     for j in range(6):

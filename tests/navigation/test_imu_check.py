@@ -129,6 +129,20 @@ def test_a_sensor_that_always_repeats_is_not_stuck() -> None:
     assert _names(_feed(_check(), times, np.tile(UP, (6000, 1)))) == {}
 
 
+def test_what_never_repeats_is_remembered_in_normal_numbers() -> None:
+    # After five minutes at 1 kHz, and no other than after one.
+    for count in (20_000, 350_000):
+        rng = np.random.default_rng(5)
+        times = 1_000_000 * np.arange(1, count + 41, dtype=np.int64)
+        samples = UP + 0.01 * rng.standard_normal((count + 40, 6))
+        samples[count:] = samples[count]
+        check = ImuCheck(1000.0, np.inf, np.inf)
+        codes = _feed(check, times, samples, chunk=5000).codes
+        assert np.flatnonzero(codes).tolist() == list(range(count + 10, count + 40))
+        memory = check._memory[np.isfinite(check._memory)]
+        assert (np.abs(memory[memory != 0.0]) >= np.finfo(np.float64).tiny).all()
+
+
 def test_quiet_rest_is_learned() -> None:
     """A coarse sensor that shows rest by one step less: refused once at most, then known."""
     times, samples = COARSE.samples(90.0)
