@@ -15,7 +15,7 @@ T-BME 57 (2010), the moving-variance and rate-energy detectors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,47 +61,65 @@ class Window:
     scatter: Array
 
 
-@compiled("void(f8[:, ::1], i8, i8, f8[::1], f8[::1])")
-def _moments(samples: Array, first: int, end: int, mean: Array, sd: Array) -> None:
+@compiled("void(f8[:, ::1], i8, i8, f8[:, ::1])")
+def _moments(samples: Array, first: int, end: int, found: Array) -> None:
+    """Write to `found` (4, 3) means of rate and force of rows first ... end-1, and their standard
+    deviations."""
     count = end - first
-    for j in range(6):
-        total = 0.0
+    for part in range(2):
+        j = 3 * part
+        x = y = z = 0.0  # three sums that do not wait for each other
         for i in range(first, end):
-            total += samples[i, j]
-        mean[j] = total / count
-        total = 0.0
+            x += samples[i, j]
+            y += samples[i, j + 1]
+            z += samples[i, j + 2]
+        x, y, z = x / count, y / count, z / count
+        found[part, 0], found[part, 1], found[part, 2] = x, y, z
+        xx = yy = zz = 0.0
         for i in range(first, end):
-            d = samples[i, j] - mean[j]
-            total += d * d
-        sd[j] = np.sqrt(total / count)
+            dx, dy, dz = samples[i, j] - x, samples[i, j + 1] - y, samples[i, j + 2] - z
+            xx += dx * dx
+            yy += dy * dy
+            zz += dz * dz
+        found[2 + part, 0] = np.sqrt(xx / count)
+        found[2 + part, 1] = np.sqrt(yy / count)
+        found[2 + part, 2] = np.sqrt(zz / count)
+
+
+@compiled("i8(f8[:, ::1], i8, f8[:], f8[:, ::1])")
+def _lengthen(rates: Array, run: int, rate: Array, found: Array) -> int:
+    """Put `rate` (3,) behind the first `run` of `rates` (LONGEST_RUN, 3), the oldest of which makes
+    room; returns how many there are. Write to `found` (2, 3) their mean and their variance, of two
+    or more."""
+    if run == rates.shape[0]:
+        for i in range(1, run):
+            for j in range(3):
+                rates[i - 1, j] = rates[i, j]
+        run -= 1
+    for j in range(3):
+        rates[run, j] = rate[j]
+    run += 1
+    for j in range(3):
+        total = 0.0
+        for i in range(run):
+            total += rates[i, j]
+        found[0, j] = mean = total / run
+        total = 0.0
+        for i in range(run):
+            total += (rates[i, j] - mean) * (rates[i, j] - mean)
+        found[1, j] = total / max(run - 1, 1)
+    return run
 
 
 @compiled("i8(i8[::1], i8, i8, i8, i8)")
 def next_cell(times: NDArray[np.int64], first: int, end: int, width_ns: int, cell: int) -> int:
     """The first of rows first ... end-1 that lies in another cell of the grid of time than `cell`;
     -1 where none does."""
+    begin_ns = cell * width_ns
     for i in range(first, end):
-        if times[i] // width_ns != cell:
+        if not 0 <= times[i] - begin_ns < width_ns:
             return i
     return -1
-
-
-def judge(
-    times: NDArray[np.int64], samples: Array, first: int, end: int, limits: QuietLimits
-) -> Window:
-    """Judge rows first ... end-1 as one window."""
-    mean, sd = np.zeros(6), np.zeros(6)
-    _moments(samples, first, end, mean, sd)
-    x, y, z, *force_sd = sd.tolist()
-    mx, my, mz = mean[:3].tolist()
-    quiet = (
-        end - first >= FEWEST_SAMPLES
-        and max(x, y, z) < limits.rate_sd
-        and max(force_sd) < limits.force_sd
-        and max(abs(mx), abs(my), abs(mz)) < limits.mean_rate
-    )
-    rate = mean[:3]
-    return Window(int(times[end - 1]), end - first, rate, mean[3:], quiet, 1, rate, np.zeros(3))
 
 
 class StandstillDetector:
@@ -110,8 +128,8 @@ class StandstillDetector:
     def __init__(self, limits: QuietLimits) -> None:
         self.limits = limits
         self._first: int | None = None
-        self._reference: Array | None = None
-        self._run: list[Array] = []
+        self._reference: list[float] | None = None
+        self._rates, self._run = np.zeros((LONGEST_RUN, 3)), 0
 
     def feed(
         self, times: NDArray[np.int64], samples: Array, start: int, new: int, end: int
@@ -130,24 +148,33 @@ class StandstillDetector:
             row = stop
             first = self._first - start
             if 0 <= first < stop:
-                windows.append(self._judged(judge(times, samples, first, stop, self.limits)))
+                windows.append(self._judge(int(times[stop - 1]), samples, first, stop))
             self._first = start + stop
         return windows
 
-    def _judged(self, w: Window) -> Window:
-        """With the quiet windows before it: none itself if the mean force has left that of the
-        first window of this rest."""
-        if not w.quiet:
-            self._reference, self._run = None, []
-            return w
-        if self._reference is None:
-            self._reference = w.mean_force
-        elif np.abs(w.mean_force - self._reference).max() > self.limits.force_sd:
-            self._reference, self._run = None, []
-            return replace(w, quiet=False)
-        self._run = [*self._run, w.mean_rate][-LONGEST_RUN:]
-        if len(self._run) == 1:
-            return w
-        rate: Array = np.add.reduce(self._run) / len(self._run)
-        scatter: Array = np.add.reduce(np.square(self._run - rate)) / (len(self._run) - 1)
-        return replace(w, run=len(self._run), run_rate=rate, scatter=scatter)
+    def _judge(self, end_ns: int, samples: Array, first: int, end: int) -> Window:
+        """Judge rows first ... end-1 as one window, with the quiet windows before it: it is none
+        itself if the mean force has left that of the first window of this rest."""
+        limits, found = self.limits, np.empty((4, 3))
+        _moments(samples, first, end, found)
+        mean_rate, mean_force, rate_sd, force_sd = found.tolist()
+        quiet = (
+            end - first >= FEWEST_SAMPLES
+            and max(rate_sd) < limits.rate_sd
+            and max(force_sd) < limits.force_sd
+            and max(map(abs, mean_rate)) < limits.mean_rate
+        )
+        if quiet and self._reference is not None:
+            both = zip(mean_force, self._reference, strict=True)
+            quiet = max(abs(now - then) for now, then in both) <= limits.force_sd
+        rate, force = found[0], found[1]
+        run_rate, scatter, run = rate, np.zeros(3), 1
+        if not quiet:
+            self._reference, self._run = None, 0
+        else:
+            self._reference = self._reference or mean_force
+            of_run = np.empty((2, 3))
+            self._run = run = _lengthen(self._rates, self._run, rate, of_run)
+            if run > 1:
+                run_rate, scatter = of_run[0], of_run[1]
+        return Window(end_ns, end - first, rate, force, quiet, run, run_rate, scatter)
