@@ -88,6 +88,15 @@ def longest_step(times: Stamps, before_ns: int) -> tuple[int, int]:
     return longest, latest
 
 
+@compiled("UniTuple(i8, 2)(i8[::1])")
+def _extremes(intervals: Stamps) -> tuple[int, int]:
+    """The shortest and the longest of intervals (m,), m > 0."""
+    shortest = longest = intervals[0]
+    for i in range(len(intervals)):
+        shortest, longest = min(shortest, intervals[i]), max(longest, intervals[i])
+    return shortest, longest
+
+
 class ImuBuffer:
     """IMU samples of the last `keep_s` seconds and the solution recorded at each.
 
@@ -226,6 +235,11 @@ class ImuBuffer:
         if self._unjudged < PERIOD_WINDOW:
             return
         intervals = np.concatenate(self._intervals)
+        shortest, longest = _extremes(intervals)
+        far = PERIOD_CHANGE * self._period_ns
+        if self._period_ns - far < shortest and longest < self._period_ns + far:
+            # No median is far from the period, where nothing is.
+            intervals = intervals[len(intervals) // PERIOD_WINDOW * PERIOD_WINDOW :]
         while len(intervals) >= PERIOD_WINDOW:
             half = PERIOD_WINDOW // 2
             middle = np.partition(intervals[:PERIOD_WINDOW], (half - 1, half))
