@@ -58,7 +58,10 @@ def _tabulate(
     for i in range(times.shape[0]):
         values[i, 0] = times[i] * 1e-9
         values[i, 1] = nav[i, LAT] * _DEG
-        values[i, 2] = ((nav[i, LON] + np.pi) % (2.0 * np.pi) - np.pi) * _DEG
+        turned = nav[i, LON] + np.pi
+        if not 0.0 <= turned < 2.0 * np.pi:
+            turned %= 2.0 * np.pi
+        values[i, 2] = (turned - np.pi) * _DEG
         values[i, 3] = nav[i, HEIGHT]
         q = nav[i, Q0:]
         rpy = rpy_from_quaternion(q[0], q[1], q[2], q[3])
