@@ -322,10 +322,10 @@ def _apply_time_order(
 
     A single stamp far in the future thus costs its own row, not all that follow.
     """
-    chosen = np.flatnonzero(keep)
-    times = t[chosen]
-    if len(times) < 2 or bool((np.diff(times) > 0.0).all()):
+    times = t if keep.all() else t[keep]
+    if bool((times[1:] > times[:-1]).all()):
         return
+    chosen = np.flatnonzero(keep)
     in_order = np.zeros(len(t), dtype=np.bool_)
     in_order[chosen[_longest_increasing(times)]] = True
     newest = -inf

@@ -66,13 +66,22 @@ def _stack(raw: RawTable, names: tuple[str, ...]) -> Floats:
 class ImuTable:
     """Mean angular rate (rad/s) and specific force (m/s^2) since the row before, sensor axes.
 
-    `t_s` (n,); `gyro` and `accel` (n, 3).
+    `t_s` (n,); `samples` (n, 6): `gyro` and `accel` (n, 3), side by side.
     """
 
     t_s: Floats
-    gyro: Floats
-    accel: Floats
+    samples: Floats
     rejected: list[Rejection]
+
+    @property
+    def gyro(self) -> Floats:
+        """The rates."""
+        return self.samples[:, :3]
+
+    @property
+    def accel(self) -> Floats:
+        """The forces."""
+        return self.samples[:, 3:]
 
 
 def read_imu(path: Path | str) -> ImuTable:
@@ -83,7 +92,7 @@ def read_imu(path: Path | str) -> ImuTable:
         *(Column(name, low=-1000.0, high=1000.0) for name in _ACCEL),
     ]
     raw = read_table(path, columns)
-    return ImuTable(raw.columns["t_s"], _stack(raw, _GYRO), _stack(raw, _ACCEL), raw.rejected)
+    return ImuTable(raw.columns["t_s"], _stack(raw, _GYRO + _ACCEL), raw.rejected)
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,6 +67,20 @@ def squares(samples: Array, first: int, end: int) -> float:
     return total
 
 
+@compiled("void(f8[:, ::1], f8[::1])")
+def _magnitudes(samples: Array, found: Array) -> None:
+    for i in range(samples.shape[0]):
+        x, y, z = samples[i, 3], samples[i, 4], samples[i, 5]
+        found[i] = np.sqrt(x * x + y * y + z * z)
+
+
+def magnitudes(samples: Array) -> Array:
+    """Of the forces of samples (m, 6)."""
+    found = np.empty(len(samples))
+    _magnitudes(samples, found)
+    return found
+
+
 @compiled("UniTuple(i8, 2)(i8[:], i8, i8[::1])")
 def _steps(times: Stamps, before_ns: int, intervals: Stamps) -> tuple[int, int]:
     """Write the intervals (m,) between `before_ns` and times (m,), m > 0; shortest and longest."""

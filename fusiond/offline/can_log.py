@@ -199,10 +199,9 @@ class _Replay:
             others = len(self._imu) - len(kept)
             rejected.append(Rejection(0, "second_imu", f"{others} samples", others))
         times = np.array([t_ns for t_ns, _ in kept], dtype=np.int64)
-        gyro = np.array([m.gyro_rad_s for _, m in kept], dtype=np.float64).reshape(-1, 3)
-        accel = np.array([m.accel_m_s2 for _, m in kept], dtype=np.float64).reshape(-1, 3)
+        samples = [(*m.gyro_rad_s, *m.accel_m_s2) for _, m in kept]
         t_s = times.astype(np.float64) * 1e-9
-        return ImuTable(t_s, gyro, accel, rejected)
+        return ImuTable(t_s, np.array(samples, dtype=np.float64).reshape(-1, 6), rejected)
 
 
 # --------------------------------------------------------------------------- frames

@@ -26,6 +26,7 @@ from fusiond.files.csv_tables import counts
 from fusiond.files.solution_csv import STATUS
 from fusiond.files.tables import ImuTable
 from fusiond.models.model import Model
+from fusiond.navigation.imu_buffer import longest_step
 from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import Arrival
@@ -179,7 +180,6 @@ def _run(
     progress: Callable[[int, int], None],
 ) -> None:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
-    samples = np.hstack([imu.gyro, imu.accel])
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
     # So many samples have come when arrival k comes.
     breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
@@ -200,7 +200,7 @@ def _run(
         for arrival in arrivals[given:ahead]:
             _give(navigator, arrival)
         if upto > done:
-            navigator.add_imu(times[done:upto], samples[done:upto])
+            navigator.add_imu(times[done:upto], imu.samples[done:upto])
         navigator.advance(record=True)
         recorder.take()
         given, done = ahead, upto
@@ -237,7 +237,7 @@ def _is_late(arrival: Arrival, config: Config) -> bool:
 
 
 def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:
-    return bool((np.diff(times) > gap_ns).any())
+    return len(times) > 0 and longest_step(times, int(times[0]))[0] > gap_ns
 
 
 class _Recorder:

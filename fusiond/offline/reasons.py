@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.files.csv_tables import Rejection, counts
 from fusiond.files.tables import ImuTable
+from fusiond.navigation.imu_buffer import magnitudes, squares
 from fusiond.navigator.imu_units import CourseTurns, force_unit, rms_unit
 from fusiond.offline.aid_files import Arrival
 
@@ -43,12 +45,12 @@ def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str
     """The sentence, where forces or rates are not in the units that the columns' names say."""
     if not len(imu.t_s):
         return None
-    median = float(np.median(np.linalg.norm(imu.accel, axis=1)))
+    median = float(np.median(magnitudes(imu.samples)))
     return force_unit(median) or _rate_unit(imu, section, arrivals)
 
 
 def _rate_unit(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:
-    rms = float(np.sqrt(np.mean(np.sum(imu.gyro**2, axis=1))))
+    rms = math.sqrt(squares(imu.samples, 0, len(imu.samples)) / len(imu.samples))
     return rms_unit(rms) or _course_turns(imu, section, arrivals).said()
 
 
