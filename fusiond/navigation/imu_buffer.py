@@ -273,7 +273,7 @@ class ImuBuffer:
                 drop = min(drop, self.needed - self.start)
             drop = max(0, drop - MARGIN)
             for array in (self.times, self.samples, self.densities, self.nav, self.sigmas):
-                array[: self.end - drop] = array[drop : self.end].copy()
+                array[: self.end - drop] = array[drop : self.end]
             self.start += drop
             self.end -= drop
             self._head[START] = self.start
