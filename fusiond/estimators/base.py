@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.doubt import open_by, unsettle
-from fusiond.estimators.memory import GAP, memory
+from fusiond.estimators.memory import AHEAD, GAP, memory
 from fusiond.estimators.propagation import (
     CARRY,
     HOLD_HEIGHT,
+    PASSING,
     RECORD,
     propagate_for,
     sensor_estimates,
@@ -80,6 +81,8 @@ class Snapshot(NamedTuple):
     covs: Array
     dxs: Array
     step: Array
+    sums: Array
+    held: Array | None
     holding: bool
     extra: object
 
@@ -106,6 +109,9 @@ class Estimator(Protocol):
     nav: Array
     xi: Array
     step: Array
+    passing: bool
+    """Whether it was brought where it is in passing: before an aid is folded in it has to be
+    propagated there otherwise."""
     published: Published
     """What solutions are published by: at first the clock of the model's receiver."""
     turned: float
@@ -139,8 +145,12 @@ class Estimator(Protocol):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n)."""
 
-    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
-        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+    def propagate(
+        self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
+    ) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
+        `passing`, if nothing is to be folded in there: what comes later is to the bit what it would
+        be had nobody asked."""
 
     def update(self, aid: Linearised) -> Outcome:
         """Fold one aid in, or name why not."""
@@ -189,6 +199,7 @@ class ErrorStateFilter:
         self.model = model
         self.t_ns = 0
         self.sample = 0
+        self.passing = False
         self.published = Published(model.time_slot)
         m = memory(model, round(gap_s * 1e9), shares, self.carries_transition)
         self._memory, self._array, self.nav, self.xi, self.step = m, m.array, m.nav, m.xi, m.step
@@ -243,11 +254,18 @@ class ErrorStateFilter:
         self._covs[:] = 0.0
         self._covs[:, :n, :n] = p / self._shares[:, None, None]
         self._dxs[:], self._holding, self.wider[:] = 0.0, False, 0.0
+        self._memory.sums[:], self._memory.head[AHEAD], self.passing = 0.0, 0, False
         self.step[:] = step_before(nav)
 
-    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
-        """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
+    def propagate(
+        self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
+    ) -> None:
+        """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
+        `passing`, if nothing is to be folded in there."""
         options = self._options
+        if passing:
+            options |= PASSING
+        self.passing = passing
         if record:
             options |= RECORD
         if self._holding or self._carrying:
@@ -371,6 +389,8 @@ class ErrorStateFilter:
             self._covs.copy(),
             self._dxs.copy(),
             self.step.copy(),
+            self._memory.sums.copy(),
+            self._memory.held.copy() if self._memory.head[AHEAD] else None,
             self._holding,
             self._own_snapshot(),
         )
@@ -380,6 +400,10 @@ class ErrorStateFilter:
         self.t_ns, self.sample = s.t_ns, s.sample
         self.nav[:], self.xi[:], self._covs[:], self.step[:] = s.nav, s.xi, s.covs, s.step
         self._dxs[:], self._holding = s.dxs, s.holding
+        self._memory.sums[:], self.passing = s.sums, s.held is not None
+        self._memory.head[AHEAD] = self.passing
+        if s.held is not None:
+            self._memory.held[:] = s.held
         self._own_restore(s.extra)
 
     def _own_snapshot(self) -> object:

@@ -5,12 +5,12 @@ transition M (9 rows), the transition T of the parameters (decay of Markov state
 rate d is a state, o <- o + h d):
 
     P11 <- M P M^T,   P12 <- M P T^T,   P22 <- T P22 T^T
-    P <- P + q diag(W h + s^2 (1 - D^2)),  half of the W h of the navigation errors before, half
-    after
+    P <- P + q diag(G),   G = W h + s^2 (1 - D^2),   half of it before, the rest after
 
-W the white noise (trapezoid rule), s the steady sigma of Markov states, q a factor on all noise (1,
-or 1 / beta in a federated filter's local filters). From interval to interval P12 alone is kept;
-`mirror` makes P21 of it where somebody reads P.
+W the white noise (trapezoid rule; what a Markov state has of it before decays, so that more of it
+comes after), s the steady sigma of Markov states, D their decay, q a factor on all noise (1, or 1 /
+beta in a federated filter's local filters). From interval to interval P12 alone is kept; `mirror`
+makes P21 of it where somebody reads P.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def covariance_for(width: int) -> Callable[..., None]:
         decays(h, noise, width, kept)
         decay, grown = kept[KEPT : KEPT + width], kept[KEPT + width : KEPT + 2 * width]
         half = 0.5 * q
-        for i in range(CORE_SIZE):
+        for i in range(width):
             flat[i * width + i] += half * grown[i]
 
         gather(flat, sensor_slot, weight, sensor)
@@ -209,7 +209,7 @@ def covariance_for(width: int) -> Callable[..., None]:
                 for j in range(decay.shape[0]):
                     flat[i * width + j] *= of_row * decay[j]
         for i in range(CORE_SIZE, width):
-            flat[i * width + i] += q * grown[i]
+            flat[i * width + i] += (q - half * decay[i] * decay[i]) * grown[i]
         for i in range(CORE_SIZE):
             for j in range(i):
                 mean = 0.5 * (core[i * CORE_STRIDE + j] + core[j * CORE_STRIDE + i])

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.estimators.covariance import work_size
+from fusiond.estimators.covariance import KEPT, work_size
+from fusiond.estimators.crossing import SUMS
 from fusiond.estimators.reading import WIDER, Published
 from fusiond.estimators.turned_axes import TURN_SIZE
 from fusiond.models.model import Model
@@ -23,28 +24,31 @@ Array = NDArray[np.float64]
 LINE_BYTES, LINE = 64, 8
 """A line of the cache, in bytes and in doubles."""
 
-SIZE, ROOM, USED, RECORDED, TRANSITION, GAP = range(6)
+SIZE, ROOM, USED, RECORDED, TRANSITION, GAP, AHEAD = range(7)
 """What the array begins with, a line of int64: states; covariances, and error estimates, that there
 is room for; how many covariances are propagated, from the first on; of which one sigmas are
-recorded; 1 if there is a transition matrix; ns beyond which no sample may stand."""
+recorded; 1 if there is a transition matrix; ns beyond which no sample may stand; 1 if covariances
+are ahead of those that are held, by what has been added up."""
 NAV_AT, STEP_AT = LINE, LINE + NAV_SIZE
 WIDER_AT, PUBLISHED_AT = STEP_AT + STEP_SIZE, STEP_AT + STEP_SIZE + WIDER
-SCRATCH_AT = PUBLISHED_AT + len(Published._fields)
+SUMS_AT = PUBLISHED_AT + len(Published._fields)
+SCRATCH_AT = SUMS_AT + SUMS
 SCRATCH_AT += -SCRATCH_AT % LINE
 """What lies where behind it, in doubles; the scratch begins a line."""
 
 
 def scratch_size(width: int) -> int:
     """Doubles of scratch for a row width, whole lines: what covariances need, then `propagate`."""
-    size = work_size(width) + COEFFICIENTS + 24 + TURN_SIZE
+    size = work_size(width) + COEFFICIENTS + 24 + TURN_SIZE + KEPT + 2 * width
     return size + -size % LINE
 
 
 class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above, nav (10,),
     the last step (28,), the variances (9,) that what is published is `wider` by, `Published` (3,),
-    `work` for kernels that propagate a covariance, `covs` (k, width, width), `phi` (width, width)
-    or (0, 0), `xi` (n,), `dxs` (k, n), `shares` (k,)."""
+    the `sums` (25,) of fusiond.estimators.crossing, `work` for kernels that propagate a covariance,
+    `covs` (k, width, width) and how they were before what has been added up, `held`, `phi` (width,
+    width) or (0, 0), `xi` (n,), `dxs` (k, n), `shares` (k,)."""
 
     array: Array
     head: NDArray[np.int64]
@@ -52,8 +56,10 @@ class Memory(NamedTuple):
     step: Array
     wider: Array
     published: Array
+    sums: Array
     work: Array
     covs: Array
+    held: Array
     phi: Array
     xi: Array
     dxs: Array
@@ -66,13 +72,13 @@ def memory(model: Model, gap_ns: int, shares: tuple[float, ...], transition: boo
     by whole ones."""
     n, width, k = model.size, model.width, len(shares)
     side = width if transition else 0
-    sizes = (k * width * width, side * side, n, k * n, k, model.packed.size)
+    sizes = (k * width * width, k * width * width, side * side, n, k * n, k, model.packed.size)
     first = SCRATCH_AT + scratch_size(width)
     total = first + sum(sizes)
     lines = np.zeros(total + LINE)
     begin = -lines.ctypes.data % LINE_BYTES // 8
     array = lines[begin : begin + total]
-    covs, phi, xi, dxs, factors, of_model = np.split(array[first:], np.cumsum(sizes)[:-1])
+    covs, held, phi, xi, dxs, factors, of_model = np.split(array[first:], np.cumsum(sizes)[:-1])
     factors[:], of_model[:] = shares, model.packed
     head = array[:LINE].view(np.int64)
     head[[SIZE, ROOM, USED, TRANSITION, GAP]] = n, k, k, transition, gap_ns
@@ -83,8 +89,10 @@ def memory(model: Model, gap_ns: int, shares: tuple[float, ...], transition: boo
         array[STEP_AT:WIDER_AT],
         array[WIDER_AT:PUBLISHED_AT],
         array[PUBLISHED_AT : PUBLISHED_AT + len(Published._fields)],
+        array[SUMS_AT : SUMS_AT + SUMS],
         array[SCRATCH_AT : SCRATCH_AT + work_size(width)],
         covs.reshape(k, width, width),
+        held.reshape(k, width, width),
         phi.reshape(side, side),
         xi,
         dxs.reshape(k, n),

@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.covariance import (
-    covariance_for,
-    kept_part,
+    decays,
     mirror,
     propagate_error,
     propagate_parameters,
     transition_for,
     work_size,
 )
+from fusiond.estimators.crossing import DENSITIES, GRID_NS, SPAN, STEPS, SUMS, add_up, cross_for
 from fusiond.estimators.memory import (
+    AHEAD,
     GAP,
     LINE,
     NAV_AT,
@@ -32,22 +33,22 @@ from fusiond.estimators.memory import (
     SCRATCH_AT,
     SIZE,
     STEP_AT,
+    SUMS_AT,
     TRANSITION,
     USED,
     WIDER_AT,
     scratch_size,
 )
 from fusiond.estimators.reading import in_fix_time, sigmas, widen
-from fusiond.estimators.turned_axes import rest_axes, rest_rows, turn_at_rest, turn_down, turn_tilt
+from fusiond.estimators.turned_axes import rest_rows, turn_at_rest
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
+from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS
 from fusiond.navigation.imu_buffer import END, HEAD_SIZE, HOLD, ROW_SIZE, START
 from fusiond.navigation.rotation import rpy_from_quaternion
 from fusiond.navigation.strapdown import (
     NAV_SIZE,
     Q0,
-    STEP_DCM,
     STEP_RESTS_S,
     STEP_SIZE,
     strapdown_step,
@@ -56,16 +57,8 @@ from fusiond.navigation.strapdown import (
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# What the vehicle may do while the IMU is silent, one sigma of the mean rate (rad/s) and force
-# (m/s^2) against the sample that is held: a car that turns or brakes at a comfortable limit. Real
-# drives showed up to 0.09 rad/s (pitch, an engine that shakes the IMU) and 0.12 rad/s (yaw, 4 s in
-# town) and 0.4 to 0.8 m/s^2 RMS over silences of 0.05 to 4 s, with single ones of four times that.
-GAP_RATE_RAD_S = 0.1
-GAP_FORCE_M_S2 = 1.0
-
-
 # What a propagation does beside the usual, added up.
-HOLD_HEIGHT, RECORD, CARRY, TURN_TILT = 1, 2, 4, 8
+HOLD_HEIGHT, RECORD, CARRY, TURN_TILT, PASSING = 1, 2, 4, 8, 16
 
 
 @compiled("void(f8[::1], i8[::1], i8[::1], f8[::1])")
@@ -114,50 +107,6 @@ def slopes(
     return silent
 
 
-@compiled("void(f8[::1], i8, b1[::1], f8, f8)", forceinline=True)
-def widen_for_gap(
-    cov: Array, width: int, active: NDArray[np.bool_], whole: float, h: float
-) -> None:
-    """Add to `cov`, flat and of `width` rows, what h seconds of an IMU silence of `whole` seconds
-    leave unknown."""
-    for r in range(CORE_SIZE):
-        if not active[r]:
-            continue
-        at = r * width + r
-        if r < 3:
-            cov[at] += GAP_RATE_RAD_S**2 * whole * h
-        elif r < 6:
-            cov[at] += GAP_FORCE_M_S2**2 * whole * h
-        else:
-            cov[at] += 0.25 * GAP_FORCE_M_S2**2 * whole**3 * h
-
-
-@compiled("void(f8[::1], i8, b1[::1], f8[::1], f8[::1], i8, f8)", forceinline=True)
-def shake(
-    cov: Array,
-    width: int,
-    active: NDArray[np.bool_],
-    step: Array,
-    densities: Array,
-    row: int,
-    h: float,
-) -> None:
-    """Add to `cov`, flat and of `width` rows, what h seconds of noise of a row of `densities`
-    (6 m,), body axes, leave: C diag(n) C^T h."""
-    for first in (0, 3):
-        at = 6 * row + first
-        if densities[at] + densities[at + 1] + densities[at + 2] == 0.0:
-            continue
-        for i in range(3):
-            for j in range(3):
-                if active[first + i] and active[first + j]:
-                    total = 0.0
-                    for k in range(3):
-                        a, b = step[STEP_DCM + 3 * i + k], step[STEP_DCM + 3 * j + k]
-                        total += a * b * densities[at + k]
-                    cov[(first + i) * width + first + j] += h * total
-
-
 @compiled(
     "void(f8[::1], f8[::1], f8[::1], f8[:, ::1], i8, f8[::1], f8, b1, i8, f8[::1])", allocates=True
 )
@@ -189,7 +138,7 @@ def published_ahead(
 @cache
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
-    propagate_covariance, propagate_transition = covariance_for(width), transition_for(width)
+    cross, propagate_transition = cross_for(width), transition_for(width)
     worked, behind, square = work_size(width), SCRATCH_AT + scratch_size(width), width * width
 
     @compiled("UniTuple(i8, 2)(f8[::1], f8[::1], i8, i8, i8, i8)", variant=width)
@@ -203,23 +152,26 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         beyond `noise`. Samples from `sample` on may be used; the last one only as far as `target`,
         so a target inside an interval splits it. `options` are HOLD_HEIGHT, RECORD, with which the
         solution and a covariance's sigmas at the end of each whole sample go into the IMU's rows,
-        CARRY, with which the error estimates are propagated too, and TURN_TILT, with which a turn
-        that is not known turns the axes of a tilt. Each covariance has its noise divided by its
-        share.
+        CARRY, with which the error estimates are propagated too, TURN_TILT, with which a turn that
+        is not known turns the axes of a tilt, and PASSING, with which nothing is folded in at
+        `target`: covariances are brought there, but go on from where they were. Each covariance has
+        its noise divided by its share.
         """
         hold_height = (options & HOLD_HEIGHT) != 0
         record, carry = (options & RECORD) != 0, (options & CARRY) != 0
-        turning = (options & TURN_TILT) != 0
+        turning, passing = (options & TURN_TILT) != 0, (options & PASSING) != 0
         head, imu_head = state[:LINE].view(np.int64), imu[:HEAD_SIZE].view(np.int64)
         n, room, used = head[SIZE], head[ROOM], head[USED]
         gap_ns = min(head[GAP], imu_head[HOLD])
         start, end = imu_head[START], imu_head[END]
         nav, step = state[NAV_AT:STEP_AT], state[STEP_AT:WIDER_AT]
-        wider, by = state[WIDER_AT:PUBLISHED_AT], state[PUBLISHED_AT:SCRATCH_AT]
+        wider, by = state[WIDER_AT:PUBLISHED_AT], state[PUBLISHED_AT:SUMS_AT]
+        sums = state[SUMS_AT : SUMS_AT + SUMS]
         time_slot, clock_sd_s, axes_sd_rad = int(by[0]), by[1], by[2]
         work, scratch = state[SCRATCH_AT : SCRATCH_AT + worked], state[SCRATCH_AT + worked : behind]
         rest = state[behind:]
         covs, rest = rest[: room * square], rest[room * square :]
+        held, rest = rest[: room * square], rest[room * square :]
         of = head[RECORDED] * square
         recorded, transition = covs[of : of + square].reshape((width, width)), head[TRANSITION]
         phi, rest = rest[: transition * square], rest[transition * square :]
@@ -234,20 +186,37 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         samples, densities = rows[m : 7 * m], rows[7 * m : 13 * m]
         nav_out, sigma_out = rows[13 * m : 23 * m], rows[23 * m :]
         sensor_slot, sensor_kind = sensor_terms[:12], sensor_terms[12:]
-        c = scratch[:COEFFICIENTS]
-        kept = kept_part(work, width)
-        rate, force = (
-            scratch[COEFFICIENTS : COEFFICIENTS + 3],
-            scratch[COEFFICIENTS + 3 : COEFFICIENTS + 6],
+        c, scratch = scratch[:COEFFICIENTS], scratch[COEFFICIENTS:]
+        rate, force, rate_slope, force_slope = (
+            scratch[:3],
+            scratch[3:6],
+            scratch[6:9],
+            scratch[9:12],
         )
-        rate_slope = scratch[COEFFICIENTS + 6 : COEFFICIENTS + 9]
-        force_slope = scratch[COEFFICIENTS + 9 : COEFFICIENTS + 12]
-        estimate = scratch[COEFFICIENTS + 12 : COEFFICIENTS + 24]
-        turn = scratch[COEFFICIENTS + 24 : COEFFICIENTS + 29]
+        estimate, turn, kept = scratch[12:24], scratch[24:29], scratch[29:]
+        mean = sums[STEPS:DENSITIES]
         decaying = rate_terms.shape[0] > 0
         for j in range(CORE_SIZE, n):
             decaying = decaying or noise[j] > 0.0
         sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
+        given = (
+            covs,
+            held,
+            used,
+            shares,
+            nav,
+            sums,
+            c,
+            turn,
+            turning,
+            active,
+            sensor_terms,
+            rate_terms,
+            noise,
+            work,
+        )
+        alone = record or carry or transition != 0
+        ahead, there = head[AHEAD] != 0, head[AHEAD] != 0
         i = sample - start
         while i < end and now < target:
             stop = min(times[i], target)
@@ -256,75 +225,36 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 silent = slopes(times, samples, i, gap_ns, rate_slope, force_slope)
                 compensate(samples, i, estimate, rate, force)
                 rests = turning and step[STEP_RESTS_S] > 0.0
+                single = alone or silent or rests
+                if single and sums[SPAN] > 0.0:  # what came before is no part of it
+                    cross(ahead, False, 0.0, False, *given)
+                    ahead = False
                 w, x, y, z = nav[Q0], nav[Q0 + 1], nav[Q0 + 2], nav[Q0 + 3]
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
-                coefficients(nav, step, h, c)
+                add_up(sums, step, h, densities, i)
+                there = False
                 if rests:
                     turn_at_rest(w, x, y, z, nav[Q0:], turn)
-                # The held sample of a gap is a guess: its error acts over the whole of it.
-                whole = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
-                for k in range(used):
-                    cov, q = covs[k * square : (k + 1) * square], 1.0 / shares[k]
-                    known = cov[2 * width + 2]
-                    north, east = cov[0], cov[width + 1]
-                    propagate_covariance(
-                        cov,
-                        step,
-                        c,
-                        h,
-                        active,
-                        sensor_terms,
-                        rate_terms,
-                        noise,
-                        q,
-                        work,
-                    )
-                    shake(cov, width, active, step, densities, i, h / shares[k])
-                    if silent:
-                        widen_for_gap(cov, width, active, whole, h / shares[k])
-                    if rests:
-                        rest_axes(cov, width, n, turn, sensor_slot, sensor_kind)
-                    elif turning:
-                        grown_north, grown_east = cov[0] - north, cov[width + 1] - east
-                        turn_tilt(cov, width, known)
-                        turn_down(
-                            cov,
-                            width,
-                            step,
-                            sensor_slot,
-                            sensor_kind,
-                            grown_north,
-                            grown_east,
-                        )
+                if single or stop // GRID_NS > now // GRID_NS:
+                    # The held sample of a gap is a guess: its error acts over the whole of it.
+                    silence = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
+                    cross(ahead, False, silence, rests, *given)
+                    ahead = False
+                if decaying or carry:
+                    decays(h, noise, width, kept)
                 if transition:
                     propagate_transition(
-                        phi,
-                        step,
-                        c,
-                        h,
-                        active,
-                        sensor_terms,
-                        rate_terms,
-                        noise,
-                        work,
+                        phi, mean, c, h, active, sensor_terms, rate_terms, noise, work
                     )
                     if rests:
                         rest_rows(phi, width, width, turn, sensor_slot, sensor_kind)
                 if carry:
                     for k in range(room):
+                        dx = dxs[k * n : (k + 1) * n]
                         propagate_error(
-                            dxs[k * n : (k + 1) * n],
-                            step,
-                            c,
-                            h,
-                            active,
-                            sensor_terms,
-                            rate_terms,
-                            kept,
-                            work,
+                            dx, mean, c, h, active, sensor_terms, rate_terms, kept, work
                         )
                         if rests:
-                            dx = dxs[k * n : (k + 1) * n]
                             rest_rows(dx, 1, 1, turn, sensor_slot, sensor_kind)
                 if decaying:
                     propagate_parameters(xi, h, rate_terms, kept)
@@ -337,6 +267,12 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                     sigmas(recorded, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
                     widen(wider, out)
                 i += 1
+        if sums[SPAN] > 0.0:
+            if not there:
+                cross(ahead, passing, 0.0, False, *given)
+            elif not passing:
+                sums[SPAN] = 0.0
+        head[AHEAD] = sums[SPAN] > 0.0
         for k in range(used):
             mirror(covs[k * square : (k + 1) * square], width, n)
         return i + start, now

@@ -200,12 +200,12 @@ class Timeline:
         for entry in entries[self._next :]:
             if (t_ns := entry.key[0]) > latest:
                 break
-            if t_ns > estimator.t_ns:
+            if t_ns > estimator.t_ns or estimator.passing:
                 estimator.propagate(self.imu, t_ns, record)
                 self._checkpoint()
             self._count(entry, self._apply(entry))
             self._next += 1
-        estimator.propagate(self.imu, latest, record)
+        estimator.propagate(self.imu, latest, record, passing=True)
         self._checkpoint()
         self._forget(latest - self._keep_ns)
 
@@ -229,10 +229,10 @@ class Timeline:
                 at_ns = self._keys[row][0]
                 if at_ns > t_ns:
                     break
-                if at_ns > estimator.t_ns:
+                if at_ns > estimator.t_ns or estimator.passing:
                     estimator.propagate(self.imu, at_ns)
                 self._apply(self._entries[row])
-            estimator.propagate(self.imu, t_ns)
+            estimator.propagate(self.imu, t_ns, passing=True)
             yield
         finally:
             estimator.restore(present)

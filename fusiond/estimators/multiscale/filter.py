@@ -122,7 +122,9 @@ class MultiscaleEstimator(ErrorStateFilter):
         super().initialise(t_ns, sample, nav, xi, covariance)
         self._begin_anew(super().covariance.copy())
 
-    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+    def propagate(
+        self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
+    ) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
         if not record:
             super().propagate(imu, target_ns)

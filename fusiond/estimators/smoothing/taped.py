@@ -127,7 +127,9 @@ class TapedKalman(TiltAxesFilter):
 
     # ------------------------------------------------------------------ the filter
 
-    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+    def propagate(
+        self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
+    ) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
         if self._ops and target_ns > self.t_ns:
             self._close()

@@ -106,10 +106,12 @@ class UnscentedEstimator(KalmanEstimator):
         )
         return self._weighed(aid, Innovation(z, h, r))
 
-    def propagate(self, imu: ImuBuffer, target_ns: int, record: bool = False) -> None:
+    def propagate(
+        self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
+    ) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it."""
         if not self.propagation:
-            super().propagate(imu, target_ns, record)
+            super().propagate(imu, target_ns, record, passing)
             return
         model = self.model
         first, self.t_ns = propagate_points(
