@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
-from fusiond.navigation.rotation import dcm_from_rpy, quaternion_to_dcm, rotate_quaternion
+from fusiond.navigation.rotation import dcm_from_rpy
 
 Array = NDArray[np.float64]
 
@@ -50,62 +50,6 @@ def levelling_jacobian(dcm: Array, lat: float, height: float) -> Array:
     """d phi / d(force error) (3, 3) of an attitude that was levelled at C_nb = `dcm`."""
     g = gravity(lat, height)
     return np.vstack([dcm[1] / g, -dcm[0] / g, np.zeros(3)])
-
-
-@compiled(
-    "void(i8[::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1])",
-    allocates=True,
-)
-def integrate_felt(
-    times: NDArray[np.int64],
-    samples: Array,
-    biases: Array,
-    counts: NDArray[np.int64],
-    gained: Array,
-    turned: Array,
-    slopes: Array,
-) -> None:
-    """Integrate samples (m, 6) of rate and force less biases (6,) of force and rate in the axes of
-    their begin; write what they come to after `counts` (k,) of them, in order of size: the velocity
-    gained (k, 3), the attitude (k, 3, 3), the slopes of that velocity by the biases (k, 3, 6).
-
-    `times` (m + 1,) ns holds the begin before the first sample. Over tens of seconds: Earth rate,
-    transport and Coriolis are left out, and so is gravity. With C' = C [w - b_w]x the attitude's
-    error, a rotation vector in the axes of the begin, is D db_w with D' = -C, and the velocity's is
-    -int C dt db_f + int [D db_w]x C f dt: so D is the velocity's slope by force, too, and that by
-    rate is V with V' = -[C f]x D.
-    """
-    q = np.array([1.0, 0.0, 0.0, 0.0])
-    dcm = np.eye(3)
-    v, d, s = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
-    f, mid = np.empty(3), np.empty((3, 3))
-    done = 0
-    for k in range(counts.shape[0]):
-        for i in range(done, counts[k]):
-            h = (times[i + 1] - times[i]) * 1e-9
-            x = 0.5 * h * (samples[i, 0] - biases[3])
-            y = 0.5 * h * (samples[i, 1] - biases[4])
-            z = 0.5 * h * (samples[i, 2] - biases[5])
-            rotate_quaternion(q, x, y, z, False)
-            quaternion_to_dcm(q, dcm)
-            for r in range(3):
-                f[r] = 0.0
-                for j in range(3):
-                    f[r] += dcm[r, j] * (samples[i, 3 + j] - biases[j])
-                    mid[r, j] = d[r, j] - 0.5 * h * dcm[r, j]
-                    d[r, j] -= h * dcm[r, j]
-                v[r] += h * f[r]
-            for j in range(3):
-                s[0, j] -= h * (f[1] * mid[2, j] - f[2] * mid[1, j])
-                s[1, j] -= h * (f[2] * mid[0, j] - f[0] * mid[2, j])
-                s[2, j] -= h * (f[0] * mid[1, j] - f[1] * mid[0, j])
-            rotate_quaternion(q, x, y, z, False)
-        done = max(done, counts[k])
-        quaternion_to_dcm(q, dcm)
-        gained[k] = v
-        turned[k] = dcm
-        slopes[k, :, :3] = d
-        slopes[k, :, 3:] = s
 
 
 @compiled(
@@ -141,7 +85,7 @@ def judge_felt(
     (`fusiond.navigator.alignment.motion_fit`).
 
     Of a stretch of samples: seconds (k,), rate and force (k, 6) as sensed at the fixes; the
-    integrals over it (`integrate_felt`), with the biases that were taken off; of the fixes
+    integrals over it (fusiond.navigation.felt), with the biases that were taken off; of the fixes
     velocity, sigma and lever (k, 3). Of the guess: C_0 (3, 3), the velocity (3,) at the first fix,
     biases, C_0 D (3, 3) of the last fix, the offset `late` in its sigmas, `sd_late_s`. A velocity
     gained has the white noise of `force_variance` t + `rate_variance` t^3 beside its own.

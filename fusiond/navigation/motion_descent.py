@@ -15,9 +15,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.navigation.alignment import integrate_felt, judge_felt
+from fusiond.navigation.alignment import judge_felt
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.felt import integrate_felt
 from fusiond.navigation.rotation import dcm_elements, rotation_vector_to_quaternion
 
 Array = NDArray[np.float64]

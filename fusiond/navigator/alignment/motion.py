@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import VelocityOffer
-from fusiond.navigation.alignment import integrate_felt
+from fusiond.navigation.felt import integrate_felt
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment.start import velocity_of
 
