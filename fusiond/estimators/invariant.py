@@ -63,29 +63,24 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
 from fusiond.estimators.base import Outcome, gate_threshold
+from fusiond.estimators.invariant_error import (
+    about_down,
+    mount,
+    rotation_vector,
+    take_out,
+    turn_step,
+    vehicle_axes,
+    write_jacobian,
+)
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.tilt_axes import TiltAxesFilter, keep_down_rows, keep_downward
-from fusiond.estimators.update import Plain, feed_back
+from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.error_model import DR, DV, PHI
-from fusiond.navigation.rotation import (
-    dcm_from_quaternion,
-    rotation_vector_to_quaternion,
-    skew,
-)
-from fusiond.navigation.strapdown import (
-    HEIGHT,
-    LAT,
-    LON,
-    Q0,
-    STEP_DCM,
-    STEP_FORCE_N,
-    STEP_SMOOTH_N,
-    VN,
-)
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 Array = NDArray[np.float64]
 
@@ -153,7 +148,7 @@ class InvariantFilter(TiltAxesFilter):
         self.turns = False
         """Whether updates run in xi: the heading may be far off."""
         self._doubted = False
-        self._mounting = model.slots_of(MOUNTING)
+        self._mounts = model.indices[MOUNTING]
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
         that fails its gate counts as one at the gate: it may be the measurement's fault."""
@@ -161,9 +156,7 @@ class InvariantFilter(TiltAxesFilter):
     def of_vehicle(self, nav: Array, xi: Array, sign: float = 1.0) -> Array:
         """M (n, n): dx of one whose attitude error is the vehicle's; its inverse with -1."""
         m = np.eye(self.model.size)
-        if self._mounting:
-            m[PHI : PHI + 3, self._mounting] = sign * self.vehicle(nav, xi)[:, 1:]
-        m[~self.model.active] = 0.0
+        mount(m, nav, xi, self._mounts, self.model.active, sign)
         return m
 
     def turning(self, nav: Array, p: Array) -> Turning:
@@ -177,54 +170,42 @@ class InvariantFilter(TiltAxesFilter):
 
     def jacobian(self, error: Array, turning: Turning) -> Array:
         """J (n, n) at the state that an error (n,) leads to; attitude errors are the vehicle's."""
-        j, turn, whole = np.eye(self.model.size), _about_down(error[PHI + 2]), turn_of(error)
-        for first in (PHI, DV, DR):
-            j[first : first + 3, first : first + 3] = turn
-        velocity = turning.velocity
-        if turning.speeds:
-            velocity = velocity - error[DV : DV + 3]
-            j[DV : DV + 3, DV : DV + 3] = whole
-        j[DV : DV + 3, PHI : PHI + 3] = skew(whole @ velocity) @ turn
-        j[DR : DR + 3, PHI : PHI + 3] = skew(whole @ turning.place) @ turn
+        j = np.empty((self.model.size, self.model.size))
+        write_jacobian(error, *turning, j)
         return j
 
     def straight(self, turning: Turning) -> Array:
         """J^-1 (n, n) at no error."""
-        j = np.eye(self.model.size)
-        j[DV : DV + 3, PHI : PHI + 3] = -skew(turning.velocity)
-        j[DR : DR + 3, PHI : PHI + 3] = -skew(turning.place)
-        return j
+        nothing = np.zeros(self.model.size)
+        return 2.0 * np.eye(self.model.size) - self.jacobian(nothing, turning)
 
     def vehicle(self, nav: Array, xi: Array) -> Array:
         """C_nv (3, 3) of the vehicle, which goes the way it faces."""
-        dcm = dcm_from_quaternion(nav[Q0:])
-        if not self._mounting:
-            return dcm
-        pitch, yaw = xi[self._mounting]
-        return dcm @ turned_by(np.array([0.0, pitch, yaw])).T
+        axes = np.empty((3, 3))
+        vehicle_axes(nav, xi, self._mounts, axes)
+        return axes
 
     def without(self, nav: Array, xi: Array, error: Array, turning: Turning) -> tuple[Array, Array]:
         """The state (10,) and parameters (n,) less an `error` (n,) in xi."""
-        turn, d = turn_of(error), error.copy()
-        about_down = _about_down(error[PHI + 2])
-        for first, part in ((DV, turning.velocity), (DR, turning.place)):
-            axes = turn if turning.speeds and first == DV else about_down
-            d[first : first + 3] = part - turn @ part + axes @ error[first : first + 3]
-        if self._mounting:
-            turn = turn @ turned_by(self.vehicle(nav, xi)[:, 1:] @ error[self._mounting])
-        d[PHI : PHI + 3] = _rotation_vector(turn)
-        d[~self.model.active] = 0.0
         nav, xi = nav.copy(), xi.copy()
-        feed_back(nav, xi, d)
+        take_out(nav, xi, error, *turning, self._mounts, self.model.active)
         return nav, xi
+
+    def _to_dx(self, nav: Array, xi: Array, error: Array, turning: Turning) -> Array:
+        """M J (n, n) at the state that an error (n,) leads to."""
+        j = self.jacobian(error, turning)
+        mount(j, nav, xi, self._mounts, self.model.active, 1.0)
+        return j
 
     def between(self, nav: Array, xi: Array, turning: Turning) -> Array:
         """The error (n,) in xi of this filter's state, if another's were true."""
         mine, true = self.vehicle(self.nav, self.xi), self.vehicle(nav, xi)
         error, turn = xi - self.xi, true @ mine.T
         psi = math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-        back = _about_down(-psi)
-        error[PHI : PHI + 2], error[PHI + 2] = _rotation_vector(back @ turn)[:2], psi
+        back, tilt = np.empty((3, 3)), np.empty(3)
+        about_down(-psi, back)
+        rotation_vector(back @ turn, tilt)
+        error[PHI : PHI + 2], error[PHI + 2] = tilt[:2], psi
         apart = self.nav[VN : VN + 3] - nav[VN : VN + 3], _way(nav, self.nav)
         for first, d, part in zip((DV, DR), apart, turning[:2], strict=True):
             axes = turn.T if turning.speeds and first == DV else back
@@ -266,6 +247,9 @@ class InvariantFilter(TiltAxesFilter):
         return super().plain()
 
     def _update(self, aid: Linearised) -> Outcome:
+        rows = aid.innovation(self.state)
+        if isinstance(rows, NotApplicable):
+            return Outcome(rows.outcome)
         before = self.of_vehicle(self.nav, self.xi, -1.0)
         p = before @ self.covariance @ before.T
         prior = float(p[PHI + 2, PHI + 2])
@@ -274,12 +258,12 @@ class InvariantFilter(TiltAxesFilter):
         turning = self.turning(self.nav, p)
         straight = self.straight(turning)
         p = straight @ p @ straight.T
-        found = self._seek(aid, p, turning, 0.0)
+        found = self._seek(aid, p, turning, rows)
         if isinstance(found, NotApplicable):
             return Outcome(found.outcome)
         if prior > WIDE_SD_RAD**2 and found.covariance[PHI + 2, PHI + 2] < TOLD * prior:
             for beginning in BEGINNINGS_RAD:
-                other = self._seek(aid, p, turning, beginning)
+                other = self._seek(aid, p, turning, None, beginning)
                 if not isinstance(other, NotApplicable) and other.likelier(found):
                     found = other
         self.log_likelihood = found.log_likelihood
@@ -288,15 +272,15 @@ class InvariantFilter(TiltAxesFilter):
         if not found.passed:
             return Outcome("gated", found.nis, found.degrees, (), found.rows)
         nav, xi = self.without(self.nav, self.xi, found.error, turning)
-        after = self.of_vehicle(nav, xi) @ self.jacobian(found.error, turning)
+        after = self._to_dx(nav, xi, found.error, turning)
         p = after @ found.covariance @ after.T
         before = self._estimate()
         keep_downward(before, nav, xi, self._biases)
-        for rows in (p, p.T):
-            keep_down_rows(rows, self.nav[Q0:], nav[Q0:], *self._biases)
+        for both in (p, p.T):
+            keep_down_rows(both, self.nav[Q0:], nav[Q0:], *self._biases)
         self.covariance[:] = 0.5 * (p + p.T)
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
-        self.step[:] = _turned(self.step, self.turned)
+        turn_step(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
     def _unfelt(self, p: Array) -> None:
@@ -310,25 +294,34 @@ class InvariantFilter(TiltAxesFilter):
                 p[:, DV + axis] -= turned[axis] * p[:, PHI + 2]
 
     def _seek(
-        self, aid: Linearised, p: Array, turning: Turning, psi: float
+        self,
+        aid: Linearised,
+        p: Array,
+        turning: Turning,
+        rows: Innovation | None,
+        psi: float = 0.0,
     ) -> Sought | NotApplicable:
-        """Gauss-Newton with P_xi (n, n), from a heading that is off by `psi` (rad)."""
-        error = np.zeros(self.model.size)
+        """Gauss-Newton with P_xi (n, n), from a heading that is off by `psi` (rad), or from `rows`
+        of this filter's own state."""
+        error, nav, xi = np.zeros(self.model.size), self.nav, self.xi
         error[PHI + 2] = psi
         for _ in range(ITERATIONS):
-            nav, xi = self.without(self.nav, self.xi, error, turning)
-            step = _turned(self.step, float(error[PHI + 2]))
-            rows = aid.innovation(State(nav, xi, step, self.model, self.covariance))
-            if isinstance(rows, NotApplicable):
-                return rows
-            to_dx = self.of_vehicle(nav, xi) @ self.jacobian(error, turning)
+            if rows is None:
+                nav, xi = self.without(self.nav, self.xi, error, turning)
+                step = self.step.copy()
+                turn_step(step, float(error[PHI + 2]))
+                found = aid.innovation(State(nav, xi, step, self.model, self.covariance))
+                if isinstance(found, NotApplicable):
+                    return found
+                rows = found
+            to_dx = self._to_dx(nav, xi, error, turning)
             h = np.ascontiguousarray(rows.h @ to_dx)
-            found = self._solved(aid, Innovation(rows.z + h @ error, h, rows.r), p)
-            last, error = error, found.error
-            sd = np.sqrt(np.maximum(np.diag(found.covariance), 1e-30))
+            sought = self._solved(aid, Innovation(rows.z + h @ error, h, rows.r), p)
+            last, error, rows = error, sought.error, None
+            sd = np.sqrt(np.maximum(np.diag(sought.covariance), 1e-30))
             if not np.abs((error - last) / sd).max() > CONVERGED:
                 break
-        return found
+        return sought
 
     def _solved(self, aid: Linearised, rows: Innovation, p: Array) -> Sought:
         """The update of xi = 0 with P_xi (n, n) by rows that are linear in it."""
@@ -371,39 +364,3 @@ def _way(a: Array, b: Array) -> Array:
             a[HEIGHT] - height,
         ]
     )
-
-
-def _turned(step: Array, psi: float) -> Array:
-    """The last step (28,) of a vehicle that is turned by psi (rad)."""
-    step, turn = step.copy(), _about_down(psi)
-    for first in (STEP_FORCE_N, STEP_SMOOTH_N):
-        step[first : first + 3] = turn @ step[first : first + 3]
-    dcm = step[STEP_DCM:STEP_SMOOTH_N].reshape(3, 3)
-    dcm[:] = turn @ dcm
-    return step
-
-
-def _about_down(psi: float) -> Array:
-    c, s = math.cos(psi), math.sin(psi)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def turn_of(error: Array) -> Array:
-    """E (3, 3) of an error (n,) in xi."""
-    return _about_down(error[PHI + 2]) @ turned_by(np.array([error[PHI], error[PHI + 1], 0.0]))
-
-
-def turned_by(phi: Array) -> Array:
-    """exp(phi x) (3, 3)."""
-    x, y, z = (float(v) for v in phi)
-    return dcm_from_quaternion(np.array(rotation_vector_to_quaternion(x, y, z)))
-
-
-def _rotation_vector(dcm: Array) -> Array:
-    """The phi (3,) of exp(phi x); of half a turn about down, where no axis is told."""
-    axis = 0.5 * np.array([dcm[2, 1] - dcm[1, 2], dcm[0, 2] - dcm[2, 0], dcm[1, 0] - dcm[0, 1]])
-    sine = float(np.linalg.norm(axis))
-    angle = math.atan2(sine, 0.5 * (float(np.trace(dcm)) - 1.0))
-    if sine < 1e-9:
-        return np.array([0.0, 0.0, angle])
-    return axis * (angle / sine)

@@ -19,7 +19,7 @@ from fusiond.navigation.alignment import judge_felt
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.felt import integrate_felt
-from fusiond.navigation.rotation import dcm_elements, rotation_vector_to_quaternion
+from fusiond.navigation.rotation import turn_to_dcm
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -36,21 +36,11 @@ ITERATIONS, CONVERGED, HALVINGS, STALLED = 16, 0.1, 6, 1.0
 BENT_RAD = 0.01
 
 
-@compiled("void(f8, f8, f8, f8[:, ::1])", allocates=True)
-def _exp(x: float, y: float, z: float, dcm: Array) -> None:
-    """Write exp(phi x) (3, 3) of a rotation vector."""
-    q = np.array(rotation_vector_to_quaternion(x, y, z))
-    found = dcm_elements(q)
-    for i in range(3):
-        for j in range(3):
-            dcm[i, j] = found[3 * i + j]
-
-
 @compiled("void(f8[::1], f8[::1], f8[::1])", allocates=True)
 def moved(guess: Array, step: Array, there: Array) -> None:
     """Write a guess `there` (19,) that is by a step (13,) from another."""
     turn = np.empty((3, 3))
-    _exp(step[0], step[1], step[2], turn)
+    turn_to_dcm(step[0], step[1], step[2], turn)
     for i in range(3):
         for j in range(3):
             there[3 * i + j] = 0.0
@@ -95,7 +85,7 @@ def judge_guess(
     for i in range(3):
         for j in range(3):
             phi[i] += slopes[k - 1, i, j] * (biases[3 + j] - felt_biases[3 + j])
-    _exp(phi[0], phi[1], phi[2], turn)
+    turn_to_dcm(phi[0], phi[1], phi[2], turn)
     for i in range(3):
         for j in range(3):
             for n in range(3):

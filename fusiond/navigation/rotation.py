@@ -65,6 +65,12 @@ def rotation_vector_to_quaternion(
     return c, s * x, s * y, s * z
 
 
+@compiled("void(f8, f8, f8, f8[:, ::1])", allocates=True)
+def turn_to_dcm(x: float, y: float, z: float, dcm: Array) -> None:
+    """Write exp(phi x) (3, 3) of a rotation vector (rad)."""
+    quaternion_to_dcm(np.array(rotation_vector_to_quaternion(x, y, z)), dcm)
+
+
 @compiled("void(f8[::1], f8, f8, f8, b1)")
 def rotate_quaternion(q: Array, x: float, y: float, z: float, on_the_left: bool) -> None:
     """q <- exp(v) (x) q (navigation axes) or q (x) exp(v) (body axes); renormalised."""

@@ -11,11 +11,17 @@ from numpy.typing import NDArray
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.invariant import InvariantFilter, Turning, turned_by
+from fusiond.estimators.invariant import InvariantFilter, Turning
 from fusiond.models.catalogue import make_model
 from fusiond.models.vehicle import mounting
 from fusiond.navigation.error_model import DR, DV, PHI
-from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm, skew, wrap_angle
+from fusiond.navigation.rotation import (
+    dcm_from_quaternion,
+    dcm_from_rpy,
+    rpy_from_dcm,
+    skew,
+    wrap_angle,
+)
 from tests import runs
 
 Array = NDArray[np.float64]
@@ -49,7 +55,7 @@ def test_jacobian_about_the_state_that_an_error_leads_to(yaw_rad: float, speeds:
     turning, error = Turning(VELOCITY, PLACE, speeds), _error(f, yaw_rad)
     nav, xi = f.without(f.nav, f.xi, error, turning)
     jacobian = f.of_vehicle(nav, xi) @ f.jacobian(error, turning)
-    turn = turned_by(np.array([0.0, 0.0, yaw_rad]))
+    turn = dcm_from_rpy(0.0, 0.0, yaw_rad)
     for k in range(f.model.size):
         ends = []
         for step in (1e-5, -1e-5):
@@ -94,7 +100,7 @@ def test_an_arc_of_headings_is_found_at_any_angle() -> None:
         by_turn[DV : DV + 3, PHI : PHI + 3] = skew(np.array([9.0, -11.0, 0.0]))
         f.covariance[:] = by_turn @ p @ by_turn.T
         f.turns = True
-        turn = turned_by(np.array([0.0, 0.0, math.radians(off_deg)]))
+        turn = dcm_from_rpy(0.0, 0.0, math.radians(off_deg))
         truth[3:6] = turn @ truth[3:6]
         velocity = tuple(float(v) for v in truth[3:6])
         aid = VelocityAid("gnss", 0, 0.9999, velocity, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
