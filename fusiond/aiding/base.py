@@ -165,6 +165,12 @@ class Aid:
         return 0.0
 
     @property
+    def always(self) -> tuple[object, ...] | None:
+        """Of an aid that is not measured: what it says, whenever it holds; `packed` goes by nothing
+        else. None of one that is."""
+        return None
+
+    @property
     def white(self) -> bool:
         """Whether its errors are configured to share nothing from one to the next."""
         return False

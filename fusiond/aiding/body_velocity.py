@@ -314,6 +314,11 @@ class NonHolonomicAid(Aid):
     def across_sd_m_s(self) -> float:
         return self.sd_m_s
 
+    @property
+    def always(self) -> tuple[object, ...] | None:
+        own = self.sd_m_s, self.across_sd_m_s, self.sd_down_m_s, self.min_speed_m_s
+        return type(self), self.gate, self.robust, self.lever, own
+
     def across(self, state: State) -> tuple[float, float]:
         model, slots = state.model, _slots(state.model, SIDE_DRIFT)
         at = state.nav, state.step, state.xi, model.column_of, model.hold_height

@@ -91,6 +91,9 @@ class Isolation(Kept):
         self.shown: tuple[float, ...] = ()
         """By how much (m, m/s) the series that was judged last was off, if it had a bias."""
         self._pass = 1.0 - false_alarm
+        self._always: dict[tuple[object, ...], Ordinary | None] = {}
+        self._model: Model | None = None
+        """Of what is the same for aids that are not measured: of what model."""
 
     # ------------------------------------------------------------------ what others ask
 
@@ -140,7 +143,13 @@ class Isolation(Kept):
 
     def ordinary(self, aid: Aid, model: Model, tilts: bool) -> Ordinary | None:
         """What `take` wants of an aid for filters of a model; None where it is never ordinary."""
-        return ordinary.made(aid, model, tilts, self._pass)
+        if (always := aid.always) is None:
+            return ordinary.made(aid, model, tilts, self._pass)
+        if model is not self._model:
+            self._model, self._always = model, {}
+        if always not in self._always:
+            self._always[always] = ordinary.made(aid, model, tilts, self._pass)
+        return self._always[always]
 
     # ------------------------------------------------------------------ judgement
 
