@@ -31,7 +31,7 @@ from fusiond.integrity.moved import FINE_M
 from fusiond.integrity.proof import residual_of
 from fusiond.integrity.punctual import MOVING_M_S
 from fusiond.integrity.series import Said, Series, said
-from fusiond.integrity.slip import Slip, take_slip
+from fusiond.integrity.slip import take_slip
 from fusiond.integrity.support import FORGET_NS, OTHERS_NS
 from fusiond.integrity.tilt import Tilting, remember, too_far
 from fusiond.models.model import Model
@@ -209,9 +209,6 @@ def take(
     every_ns, means = t_ns - record.heard_ns, record.means
     if (packed := means.ready(degrees)) is None:
         return None
-    slip = record.slip.packed
-    if record.no_slip:
-        slip = slip.copy()
     shown, nis, north, east, whitened = _take(
         *filter_,
         slots,
@@ -222,7 +219,7 @@ def take(
         tilts,
         packed,
         limit,
-        slip,
+        record.slip.packed,
         tilting.sums,
         tilting.before,
     )
@@ -230,8 +227,6 @@ def take(
         return None
     record.every_ns, record.heard_ns, record.fused_ns = every_ns, t_ns, t_ns
     means.unlikely = shown & UNUSUAL > 0
-    if record.no_slip:
-        record.slip = Slip(slip)
     if position is not None:
         record.sd_m, record.away_m = sd, math.hypot(north, east)
     elif velocity is not None:

@@ -106,6 +106,8 @@ class Series:
         """A copy for a checkpoint."""
         copy = Series(*_FIELDS(self))
         copy.means = self.means.copied()
+        if self.no_slip:
+            copy.slip = self.slip.copied()
         return copy
 
     def forget(self) -> None:

@@ -79,18 +79,22 @@ def take_slip(
 
 
 class Slip:
-    """What goes across as a series has shown it; never changed."""
+    """What goes across as a series has shown it."""
 
     __slots__ = ("packed",)
 
     def __init__(self, packed: Array | None = None) -> None:
         self.packed = np.zeros(_SIZE) if packed is None else packed
-        """What `take_slip` changes a copy of."""
+        """What `take_slip` changes, of a series that is nobody else's."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Slip) and self.packed.tobytes() == other.packed.tobytes()
 
     __hash__ = None  # type: ignore[assignment]
+
+    def copied(self) -> Slip:
+        """A copy for a checkpoint."""
+        return Slip(self.packed.copy())
 
     @property
     def opened(self) -> float:
