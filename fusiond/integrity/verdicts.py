@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,9 @@ class Verdicts:
             waiting, series.waiting = series.waiting, []
             for _, alike in groupby(waiting, key=lambda each: len(each[1])):
                 numbers, rows, nis = zip(*alike, strict=True)
-                for row, verdict in series.monitor.add_whitened(np.array(rows), nis):
+                whitened = np.fromiter(chain.from_iterable(rows), np.float64)
+                judged = series.monitor.add_whitened(whitened.reshape(len(rows), -1), nis)
+                for row, verdict in judged:
                     turned.append((numbers[row], source, verdict))
         for _, source, verdict in sorted(turned):
             self._on_change(source, verdict)

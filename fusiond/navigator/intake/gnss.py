@@ -195,8 +195,9 @@ def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:
     """How much of the error that fixes by code share there is in one by carrier phase."""
     if o.bias_sd_m == 0.0:
         return (1.0, 1.0, 1.0)
-    north, east, down = (math.sqrt(PHASE_SHARE) * each for each in sd)
-    return north / o.bias_sd_m, east / o.bias_sd_m, down / o.bias_down_sd_m
+    (north, east, down), part = sd, math.sqrt(PHASE_SHARE)
+    level, vertical = o.bias_sd_m, o.bias_down_sd_m
+    return part * north / level, part * east / level, part * down / vertical
 
 
 def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:
