@@ -17,7 +17,6 @@ velocity tell forward from backward (fusiond.navigator.alignment.motion_fit).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -262,20 +261,17 @@ class Ways:
 
 def ways(
     past: motion.Past,
-    usable: Sequence[VelocityOffer],
+    m: motion.Measured,
+    latest: VelocityOffer,
     options: AlignmentOptions,
     noise: ImuNoise,
     g: float,
-    most: int = motion.MOST_FIXES,
     sd_late_s: float = 0.0,
 ) -> Ways:
-    """Of velocities in order of time, of `most` of them, evenly, where they are more; they are
-    late by 0 to within `sd_late_s`."""
-    every = math.ceil(len(usable) / most)
-    fixes = usable[::-1][::every][::-1]
-    m = motion.measured(fixes)
+    """Of velocities in order of time, `latest` the last; they are late by 0 to within
+    `sd_late_s`."""
     f = motion.felt(past, m.instants, motion.rate_before_motion(past, m))
-    return Ways(f, past, m, fixes[-1], options, noise, g, sd_late_s)
+    return Ways(f, past, m, latest, options, noise, g, sd_late_s)
 
 
 def _on_the_move(
@@ -291,7 +287,8 @@ def _on_the_move(
         return None
     lat, _, height = (float(v) for v in place[1])
     late = _sd_late_s(by, velocity)
-    either = ways(imu, usable, by.options, by.noise, gravity(lat, height), sd_late_s=late)
+    m, g = motion.measured(usable, motion.MOST_FIXES), gravity(lat, height)
+    either = ways(imu, m, usable[-1], by.options, by.noise, g, late)
     rate = either.felt.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
     best = min(forward_fit, backward_fit, key=lambda x: x.cost)

@@ -313,16 +313,16 @@ class Lateness:
             fixes.pop()
         if len(fixes) < FEWEST or place is None:
             return
-        g = gravity(place.lat_rad, place.height_m or 0.0)
-
+        by = fixes[-1], self._options, self._noise, gravity(place.lat_rad, place.height_m or 0.0)
+        said = {most: motion.measured(fixes, most) for most in (ALL_FIXES, MOST_FIXES)}
         # Of each lateness (ns) and share of the fixes: some are asked for twice or three times.
         known: dict[tuple[int, int], tuple[float, int]] = {}
 
         def cost(late_s: float, most: int = ALL_FIXES) -> Fitting:
             asked = round(late_s * 1e9), math.ceil(len(fixes) / most)
             if asked not in known:
-                shifted = [o._replace(t_ns=o.t_ns - asked[0]) for o in fixes]
-                either = ways(past, shifted, self._options, self._noise, g, most)
+                m = said[most]
+                either = ways(past, m._replace(instants=m.instants - asked[0]), *by)
                 forward = either.fit(backward=False)
                 yield
                 backward = either.fit(backward=True)

@@ -8,6 +8,7 @@ Source: Wu and Pan, Velocity/position integration formula part I, IEEE T-AES 49 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -114,8 +115,10 @@ def span_since(imu: ImuBuffer, t_ns: int) -> Span:
     return Span(imu.times[first : imu.end].copy(), imu.samples[first : imu.end].copy())
 
 
-def measured(fixes: Sequence[VelocityOffer]) -> Measured:
-    """What some fixes say."""
+def measured(fixes: Sequence[VelocityOffer], most: int) -> Measured:
+    """What some fixes say; `most` of them, evenly, where they are more, the last among them."""
+    every = math.ceil(len(fixes) / most)
+    fixes = fixes[::-1][::every][::-1]
     found = [velocity_of(x) for x in fixes]
     return Measured(
         np.array([x.t_ns for x in fixes]),
