@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch, System
+from drivers.measurements import Measurement
+from drivers.raw.messages import RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
@@ -32,7 +33,7 @@ from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import Arrival
 from fusiond.offline.outages import Outage
 from fusiond.offline.reasons import FileRead, apart, nothing_navigated, wrong_units
-from fusiond.offline.recorded import Recorded, read_recorded, valid_ns
+from fusiond.offline.recorded import BROADCAST, Recorded, read_recorded, valid_ns
 from fusiond.offline.rows import Rows, RowsWriter
 
 if TYPE_CHECKING:
@@ -183,7 +184,7 @@ def _run(
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
     # So many samples have come when arrival k comes.
     breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
-    late = [_is_late(a, navigator.config) for a in arrivals]
+    late = _late(arrivals, navigator.config)
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
     done = given = told = 0
     while done < len(times) or given < len(arrivals):
@@ -217,23 +218,30 @@ def _run(
 
 def _give(navigator: Navigator, arrival: Arrival) -> None:
     m = arrival.measurement
-    if isinstance(m, Ephemeris | Klobuchar):
+    if isinstance(m, BROADCAST):
         navigator.learn(m)
         return
     navigator.add(m, valid_ns(m), arrival.sd_time_s)
 
 
-def _is_late(arrival: Arrival, config: Config) -> bool:
-    """Whether samples of its validity, or of an aid that it holds, come before it does."""
-    m = arrival.measurement
-    if isinstance(m, Ephemeris | Klobuchar):
-        return False
-    if isinstance(m, RawGnssEpoch):
-        return True  # corrected for the place where the filter has come to
-    section = config.aiding.get(m.source)
-    delayed = isinstance(section, GnssAiding) and section.velocity_delay_s > 0.0
-    delayed |= isinstance(section, WheelAiding) and section.latency_s > 0.0
-    return delayed or config.imu.time_offset_s > 0.0 or valid_ns(m) < arrival.t_arrival_ns
+def _late(arrivals: Sequence[Arrival], config: Config) -> list[bool]:
+    """Of each, whether samples of its validity, or of an aid that it holds, come before it does."""
+    ahead = config.imu.time_offset_s > 0.0
+    delayed = {
+        source
+        for source, section in config.aiding.items()
+        if (isinstance(section, GnssAiding) and section.velocity_delay_s > 0.0)
+        or (isinstance(section, WheelAiding) and section.latency_s > 0.0)
+    }
+
+    def is_late(t_ns: int, m: Measurement | RawEvent) -> bool:
+        if isinstance(m, BROADCAST):
+            return False
+        if isinstance(m, RawGnssEpoch):
+            return True  # corrected for the place where the filter has come to
+        return ahead or m.source in delayed or valid_ns(m) < t_ns
+
+    return [is_late(arrival.t_arrival_ns, arrival.measurement) for arrival in arrivals]
 
 
 def _has_gap(times: NDArray[np.int64], gap_ns: int) -> bool:

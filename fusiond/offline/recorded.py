@@ -80,6 +80,10 @@ def read_recorded(
     return Recorded(config, imu, arrivals, files, events, held)
 
 
+BROADCAST = Ephemeris, Klobuchar
+"""What a satellite sends is valid at no instant. (A union would be made anew at each question.)"""
+
+
 def valid_ns(m: Measurement | RawGnssEpoch) -> int:
     """The instant of the IMU's clock that a recorded measurement is valid at."""
     stamp = getattr(m, "stamp", None)
@@ -105,14 +109,12 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
     """Of the measurements' instants; what a satellite broadcasts has none."""
     instants = [
-        valid_ns(row.measurement)
-        for row in rows
-        if not isinstance(row.measurement, Ephemeris | Klobuchar)
+        valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
     ]
     return (min(instants) * 1e-9, max(instants) * 1e-9) if instants else None
 
 
 def _withheld(m: Measurement | RawEvent, outages: Sequence[Outage]) -> bool:
-    if isinstance(m, Ephemeris | Klobuchar):
+    if isinstance(m, BROADCAST):
         return False
     return withheld(m.source, valid_ns(m) * 1e-9, outages)

@@ -62,7 +62,7 @@ class Sections:
 
     def met(self, m: object) -> None:
         """A measurement has passed the door."""
-        if isinstance(m, PositionFix | DelayedFix):
+        if isinstance(m, (PositionFix, DelayedFix)):
             self.place = m.lat_rad, m.lon_rad
             if isinstance(m.stamp, UtcStamp):
                 self.utc_ns = m.stamp.utc_ns

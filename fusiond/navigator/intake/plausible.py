@@ -89,21 +89,19 @@ def _finite(values: Iterable[float]) -> str | None:
 def _place(
     lat_rad: float, lon_rad: float, height_m: float | None, limits: Plausibility | None
 ) -> str | None:
-    if not (math.isfinite(lat_rad) and math.isfinite(lon_rad)):
-        return "not_finite"
     # What devices send that have no position: nobody is there to the last digit.
     nowhere = lat_rad == 0.0 == lon_rad
     if nowhere or not (within(lat_rad, LATITUDE_RAD) and within(lon_rad, LONGITUDE_RAD)):
-        return "position_implausible"
+        return _finite((lat_rad, lon_rad)) or "position_implausible"
     if height_m is None:
         return None
     return _finite((height_m,)) if limits is None else _height(height_m, limits)
 
 
 def _height(height_m: float, limits: Plausibility) -> str | None:
-    if not math.isfinite(height_m):
-        return "not_finite"
-    return None if within(height_m, limits.height_m) else "height_implausible"
+    if within(height_m, limits.height_m):  # which what is not finite is not
+        return None
+    return _finite((height_m,)) or "height_implausible"
 
 
 def _speed(velocity: Iterable[float | None], limits: Plausibility) -> str | None:
@@ -117,7 +115,7 @@ def _sigma(stated: Iterable[float | None], limits: tuple[float, float]) -> str |
     """0 is what devices print that know none."""
     refused, (least, most) = None, limits
     for s in stated:
-        if s is not None and s != 0.0 and not least <= s <= most:
+        if s and not least <= s <= most:
             if math.isnan(s):
                 return "not_finite"
             refused = "sigma_implausible"
