@@ -67,6 +67,7 @@ from fusiond.estimators.invariant_error import (
     about_down,
     mount,
     rotation_vector,
+    solve,
     take_out,
     turn_step,
     vehicle_axes,
@@ -334,16 +335,16 @@ class InvariantFilter(TiltAxesFilter):
             codes, passed = tuple(by_rows.codes.tolist()), bool((by_rows.codes == KEPT).any())
             y = tuple(by_rows.y.tolist())
             return Sought(by_rows.dx, by_rows.cov, by_rows.nis, passed, 0.0, y, codes)
-        s = h @ p @ h.T + np.diag(r)
-        gain = np.linalg.solve(s, h @ p).T
-        kept = np.eye(self.model.size) - gain @ h
-        after = kept @ p @ kept.T + (gain * r) @ gain.T
-        nis = float(nu @ np.linalg.solve(s, nu))
+        white, across = np.zeros(len(nu)), np.empty(h.shape)
+        nis, log = solve(nu, h, r, p, white, across)
         threshold = gate_threshold(aid.gate, len(nu))
-        log = -0.5 * (min(nis, threshold) + float(np.linalg.slogdet(s)[1]))
-        passed = nis <= threshold
-        whitened = np.linalg.solve(np.linalg.cholesky(s), nu) if passed else nu
-        return Sought(gain @ nu, after, nis, passed, log, tuple(whitened.tolist()))
+        log = -0.5 * (min(nis, threshold) + log)
+        gain, whitened = across.T, tuple(white.tolist())
+        if not math.isfinite(nis):
+            return Sought(nothing, p, nis, False, log, whitened)
+        kept = np.eye(self.model.size) - gain @ h
+        after = kept @ p @ kept.T + (gain * r) @ across
+        return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
         return self.turns, self._doubted, self.undoubted

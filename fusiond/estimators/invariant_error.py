@@ -162,3 +162,50 @@ def turn_step(step: Array, psi: float) -> None:
     for j in range(STEP_DCM, STEP_DCM + 3):
         north, east = step[j], step[j + 3]
         step[j], step[j + 3] = c * north - s * east, s * north + c * east
+
+
+@compiled(
+    "Tuple((f8, f8))(f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[:, ::1])", allocates=True
+)
+def solve(nu: Array, h: Array, r: Array, p: Array, y: Array, gain: Array) -> tuple[float, float]:
+    """nu^T S^-1 nu and ln |S| for nu (m,), H (m, n), r (m,) variances and P (n, n), infinite and 0
+    where S is not positive; write L^-1 nu (m,), S = L L^T, and K^T (m, n)."""
+    m, n = h.shape
+    nis = log = 0.0
+    for a in range(m):
+        for j in range(n):
+            gain[a, j] = 0.0
+        for i in range(n):
+            if h[a, i] != 0.0:
+                for j in range(n):
+                    gain[a, j] += h[a, i] * p[i, j]
+    factor = np.zeros((m, m))
+    for a in range(m):
+        for b in range(a + 1):
+            total = r[a] if a == b else 0.0
+            for i in range(n):
+                total += gain[a, i] * h[b, i]
+            for c in range(b):
+                total -= factor[a, c] * factor[b, c]
+            if b < a:
+                factor[a, b] = total / factor[b, b]
+            elif total > 0.0:
+                factor[a, a] = math.sqrt(total)
+            else:
+                return math.inf, 0.0
+        y[a] = nu[a]
+        for b in range(a):
+            y[a] -= factor[a, b] * y[b]
+        y[a] /= factor[a, a]
+        nis += y[a] * y[a]
+        log += 2.0 * math.log(factor[a, a])
+    for j in range(n):
+        for a in range(m):
+            for b in range(a):
+                gain[a, j] -= factor[a, b] * gain[b, j]
+            gain[a, j] /= factor[a, a]
+        for a in range(m - 1, -1, -1):
+            for b in range(a + 1, m):
+                gain[a, j] -= factor[b, a] * gain[b, j]
+            gain[a, j] /= factor[a, a]
+    return nis, log
