@@ -83,6 +83,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -347,6 +348,7 @@ class Hedge:
                 self._put(name, None)
 
 
+@cache
 def _series_of(name: str) -> str:
     """Whose answer is awaited of what is kept under a name."""
     for what in (TILT, LATE, STRAYS, MOVED, LATELY):

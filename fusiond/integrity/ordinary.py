@@ -175,7 +175,7 @@ def made(aid: Aid, model: Model, tilts: bool, probability: float) -> Ordinary | 
     packed = aid.packed(model)
     if packed is None:
         return None
-    degrees = int(packed.slots[ROWS])
+    degrees: int = packed.slots.item(ROWS)
     limits = THRESHOLDS[aid.gate, degrees], THRESHOLDS[probability, degrees]
     says = said(aid.offers())
     measured = says[0] or says[1]
