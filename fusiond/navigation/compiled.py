@@ -24,6 +24,7 @@ closure says which), and the count starts somewhere else in each process, for nu
 from __future__ import annotations
 
 import hashlib
+import inspect
 import itertools
 import os
 import secrets
@@ -38,7 +39,7 @@ import numba
 from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
 
-from fusiond.navigation.kernel_cache import KernelCache, remove_strays
+from fusiond.navigation.kernel_cache import KernelCache, kept_in
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -56,17 +57,20 @@ def _cache_folder() -> Path:
     digest = hashlib.sha256(f"{sys.implementation.cache_tag} {numba.__version__}".encode())
     package = Path(__file__).resolve().parents[1]
     for room in ROOMS:
-        for source in sorted((package / room).rglob("*.py")):
-            digest.update(source.read_bytes())
+        for folder, inner, files in os.walk(package / room):
+            inner[:] = sorted({*inner} - {"__pycache__"})
+            for name in sorted(files):
+                if name.endswith(".py"):
+                    with open(f"{folder}/{name}", "rb", buffering=0) as source:
+                        digest.update(source.read())
     given = os.environ.get("NUMBA_CACHE_DIR")
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fusiond"
     return (Path(given) if given else user) / f"kernels-{digest.hexdigest()[:16]}"
 
 
 FOLDER = _cache_folder()
-remove_strays(FOLDER)
 _names: dict[str, int] = {}  # in the order of definition: what a kernel calls comes before it
-_in_cache = set(os.listdir(FOLDER)) if FOLDER.is_dir() else set()
+_in_cache = kept_in(FOLDER)
 _waiting: dict[int, Callable[[], None]] = {}
 _gathered: list[Callable[[], None]] | None = None
 
@@ -94,9 +98,11 @@ def compiled(
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
         place = _names[name] = len(_names)
         options.update(error_model="numpy", _nrt=allocates)
+        setattr(function, "__signature__", inspect.signature(function))  # noqa: B010 - asked twice
         kernel = numba.njit(**options)(function)
-        kernel._cache = cache = KernelCache(FOLDER, name, partial(load_kernels, place))
-        if cache.file_name(signature, kernel.targetctx) in _in_cache:
+        missing = partial(load_kernels, place)
+        kernel._cache = cache = KernelCache(FOLDER, name, signature, kernel.targetctx, missing)
+        if cache.file_name in _in_cache:
             _load_when_called(kernel, signature, place)
         elif _gathered is not None:
             _gathered.append(_load_when_called(kernel, signature, place))
@@ -152,7 +158,14 @@ def _load_when_called(kernel: Any, signature: str, place: int) -> Callable[[], N
         with global_compiler_lock:
             if _waiting.pop(place, None) is not None:
                 del kernel._compile_for_args
-                kernel.compile(signature)
+                found = kernel._cache.linked(kernel.targetctx)
+                if found is None:
+                    kernel.compile(signature)
+                else:
+                    kernel.targetctx.insert_user_function(
+                        found.entry_point, found.fndesc, [found.library]
+                    )
+                    kernel.add_overload(found)
                 kernel.disable_compile()
 
     def first_call(*_: Any, **__: Any) -> Any:

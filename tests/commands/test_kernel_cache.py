@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -106,9 +107,8 @@ def test_kernels_of_different_processes_work_together(
 
 def _symbols(file: Path) -> tuple[str, set[str]]:
     """The symbol of a kernel, and all that its native code defines under numba's mangled names."""
-    library, function = pickle.loads(file.read_bytes()[32:])[:2]
-    bitcode = library[2][1]
-    functions = llvm.parse_bitcode(bitcode).functions
+    _, function, _, bitcode = pickle.loads(file.read_bytes()[32:])[:4]
+    functions = llvm.parse_bitcode(zlib.decompress(bitcode)).functions
     defined = {f.name for f in functions if not f.is_declaration and f.name.startswith("_ZN")}
     return function.mangled_name, defined
 
