@@ -36,10 +36,17 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+import numpy as np
 from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.types import Array
+from numba.np.numpy_support import FROM_DTYPE, map_layout
 
 from fusiond.navigation.kernel_cache import KernelCache, kept_in
+
+# numba's functions have no types.
+_array: Any = Array
+_layout: Any = map_layout
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -100,6 +107,7 @@ def compiled(
         options.update(error_model="numpy", _nrt=allocates)
         setattr(function, "__signature__", inspect.signature(function))  # noqa: B010 - asked twice
         kernel = numba.njit(**options)(function)
+        kernel.typeof_pyval = partial(_type_of, kernel)
         missing = partial(load_kernels, place)
         kernel._cache = cache = KernelCache(FOLDER, name, signature, kernel.targetctx, missing)
         if cache.file_name in _in_cache:
@@ -175,3 +183,14 @@ def _load_when_called(kernel: Any, signature: str, place: int) -> Callable[[], N
     kernel._compile_for_args = first_call
     _waiting[place] = load
     return load
+
+
+def _type_of(kernel: Any, value: Any) -> Any:
+    """What numba's dispatcher says of an argument's type, which it asks for once a kind of array:
+    to be sure that it is no masked one it would import them, as long as linking twenty kernels."""
+    kind = FROM_DTYPE.get(value.dtype) if type(value) is np.ndarray else None
+    if kind is None:
+        return type(kernel).typeof_pyval(kernel, value)
+    found = _array(kind, value.ndim, _layout(value), readonly=not value.flags.writeable)
+    kernel._types_active_call.add(found)
+    return found

@@ -29,6 +29,9 @@ from collections.abc import Callable, Iterator
 from itertools import count
 from statistics import NormalDist
 
+import numpy as np
+from numpy.typing import NDArray
+
 _EPSILON = sys.float_info.epsilon
 _TINY = 1e-300  # in place of a denominator of zero (Lentz)
 # From here on four terms of Stirling's series leave less than a rounding: 1 / (1188 a^9).
@@ -46,6 +49,14 @@ def gaussian_quantile(p: float) -> float:
     if 0.0 < p < 1.0:
         return _STANDARD.inv_cdf(p)
     return {0.0: -math.inf, 1.0: math.inf}.get(p, math.nan)
+
+
+def median(values: NDArray[np.float64]) -> float:
+    """Of values (n,), one at least; nan where one is. numpy's own, to be sure that these are no
+    masked ones, imports all of those: as long as a start takes to link twenty kernels."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, (low, high, -1))
+    return float(ordered[-1] if np.isnan(ordered[-1]) else 0.5 * (ordered[low] + ordered[high]))
 
 
 def gamma_tails(shape: float, x: float) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_range
+from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
 from fusiond.navigator.imu_units import other_unit
@@ -189,7 +190,7 @@ class ImuDoor:
 
 def _unit(samples: Array) -> str:
     """What else the forces of refused samples (m, 6) say by their magnitude."""
-    magnitude = float(np.median(np.linalg.norm(samples[:, 3:], axis=1)))
+    magnitude = median(np.linalg.norm(samples[:, 3:], axis=1))
     unit = other_unit(magnitude)
     if unit is None:
         return ""

@@ -14,6 +14,7 @@ from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.files.csv_tables import Rejection, counts
 from fusiond.files.tables import ImuTable
+from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import magnitudes, squares
 from fusiond.navigator.imu_units import CourseTurns, force_unit, rms_unit
 from fusiond.offline.aid_files import Arrival
@@ -45,8 +46,7 @@ def wrong_units(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str
     """The sentence, where forces or rates are not in the units that the columns' names say."""
     if not len(imu.t_s):
         return None
-    median = float(np.median(magnitudes(imu.samples)))
-    return force_unit(median) or _rate_unit(imu, section, arrivals)
+    return force_unit(median(magnitudes(imu.samples))) or _rate_unit(imu, section, arrivals)
 
 
 def _rate_unit(imu: ImuTable, section: Imu, arrivals: Sequence[Arrival]) -> str | None:

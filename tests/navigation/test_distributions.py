@@ -14,6 +14,7 @@ from fusiond.navigation.distributions import (
     gamma_quantile,
     gamma_tails,
     gaussian_quantile,
+    median,
     noncentrality,
 )
 
@@ -73,3 +74,9 @@ def test_what_is_rarer_without_any_noncentrality_has_none() -> None:
 def test_no_number_ends_no_sum() -> None:
     assert all(math.isnan(tail) for tail in gamma_tails(3.0, math.nan))
     assert math.isnan(f_tail(8.0, 30.0, math.nan))
+
+
+def test_median_is_that_of_numpy() -> None:
+    values = np.random.default_rng(1).normal(9.8, 1.0, 1001)
+    for some in (values, values[:1000], values[:2], values[:1], np.append(values, math.nan)):
+        np.testing.assert_array_equal(median(some), np.median(some))
