@@ -14,38 +14,28 @@ sigma that it states or that is known of it. It is 0 where the resolution is fin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeVar, dataclass_transform
+from drivers.immutable import immutable
 
-T = TypeVar("T")
 Vector3 = tuple[float, float, float]
-
-
-@dataclass_transform(frozen_default=True)
-def measured(kind: type[T]) -> type[T]:
-    """A dataclass with slots that is frozen for the type checker alone: at run time a frozen one
-    costs four times as much to make, and a bus or a file has thousands of them a second."""
-    return dataclass(slots=True, unsafe_hash=True)(kind)
-
 
 # --------------------------------------------------------------------------- stamps
 
 
-@measured
+@immutable()
 class ArrivalStamp:
     """The device gave no time: true `latency_s` before the measurement was seen."""
 
     latency_s: float = 0.0
 
 
-@measured
+@immutable()
 class MonotonicStamp:
     """Already on the host's monotonic clock (files, simulation)."""
 
     t_ns: int
 
 
-@measured
+@immutable()
 class KernelStamp:
     """Receive stamp of the kernel, CLOCK_REALTIME, in ns; `latency_s` from validity to stamp."""
 
@@ -53,7 +43,7 @@ class KernelStamp:
     latency_s: float = 0.0
 
 
-@measured
+@immutable()
 class DeviceStamp:
     """A device's own free-running clock, unwrapped by the driver; `device` names that clock."""
 
@@ -61,14 +51,14 @@ class DeviceStamp:
     ticks_ns: int
 
 
-@measured
+@immutable()
 class UtcStamp:
     """A full UTC instant as POSIX nanoseconds (a leap second repeats the last second's count)."""
 
     utc_ns: int
 
 
-@measured
+@immutable()
 class TimeOfDayStamp:
     """A time of day without a date, in one of several possible zones.
 
@@ -89,7 +79,7 @@ Stamp = ArrivalStamp | MonotonicStamp | KernelStamp | DeviceStamp | UtcStamp | T
 # --------------------------------------------------------------------------- measurements
 
 
-@measured
+@immutable()
 class ImuSample:
     """Mean angular rate (rad/s) and specific force (m/s^2) since the sample before, sensor axes."""
 
@@ -100,7 +90,7 @@ class ImuSample:
     accel_m_s2: Vector3
 
 
-@measured
+@immutable()
 class PositionFix:
     """A GNSS receiver's fix of its antenna, with velocity where the receiver gives one.
 
@@ -126,7 +116,7 @@ class PositionFix:
     rounding_sd_v_m_s: float = 0.0
 
 
-@measured
+@immutable()
 class DelayedFix:
     """A BeiDou RDSS fix: the terminal's position at the instant its request left the antenna.
 
@@ -146,7 +136,7 @@ class DelayedFix:
     height_given: bool = False
 
 
-@measured
+@immutable()
 class Attitude:
     """Roll, pitch, yaw (rad, NED to body, 3-2-1) with one sigma; a NaN angle is not given.
 
@@ -161,7 +151,7 @@ class Attitude:
     sd_rpy_rad: Vector3
 
 
-@measured
+@immutable()
 class Bearing:
     """Direction from the antenna to a known point (SAR image match), in *sensor* axes.
 
@@ -181,7 +171,7 @@ class Bearing:
     point: Vector3 | None = None
 
 
-@measured
+@immutable()
 class Heading:
     """True heading of the body's forward axis (rad, from north, clockwise), one sigma if given."""
 
@@ -193,7 +183,7 @@ class Heading:
     rounding_sd_rad: float = 0.0
 
 
-@measured
+@immutable()
 class MagneticHeading:
     """What a compass says: heading of the body's forward axis from magnetic north (rad, clockwise),
     with whatever deviation the vehicle's own iron and currents make."""
@@ -205,7 +195,7 @@ class MagneticHeading:
     rounding_sd_rad: float = 0.0
 
 
-@measured
+@immutable()
 class Height:
     """Ellipsoidal height of the body origin (m), one sigma if given.
 
@@ -222,7 +212,7 @@ class Height:
     barometric: bool = False
 
 
-@measured
+@immutable()
 class WheelSpeed:
     """Speed of the vehicle along its forward axis at the wheel's point (m/s), one sigma if given.
 
@@ -241,7 +231,7 @@ class WheelSpeed:
     shared_step_m_s: float = 0.0
 
 
-@measured
+@immutable()
 class TimeReport:
     """UTC as a device states it (NMEA RMC/ZDA, RDSS SJXX/BDZDA), to discipline the clock.
 
@@ -268,7 +258,7 @@ Measurement = (
 )
 
 
-@measured
+@immutable()
 class DeviceEvent:
     """Something an operator should know about a device: a stable code and one sentence."""
 

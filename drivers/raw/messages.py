@@ -13,9 +13,9 @@ BDT = GPST - 14 s. `Ephemeris` keeps the system's own time, `RawGnssEpoch` is in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
+from drivers.immutable import immutable
 from drivers.measurements import Stamp
 
 System = Literal["G", "E", "C"]
@@ -42,7 +42,7 @@ CARRIER_HZ: dict[tuple[System, str], float] = {
 """Carrier by system and RINEX band (the first character of a signal): RINEX 3.05, table A23."""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RawSignal:
     """One signal of one satellite. Range rate is positive while the distance grows.
 
@@ -65,7 +65,7 @@ class RawSignal:
         return f"{self.system}{self.prn:02d}"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RawGnssEpoch:
     """All signals of one instant of the receiver's clock, which is GPS time `week`, `tow_s`.
 
@@ -81,7 +81,7 @@ class RawGnssEpoch:
     clock_reset: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Ephemeris:
     """Broadcast Keplerian ephemeris of one satellite (IS-GPS-200, BDS-SIS-ICD, Galileo OS SIS ICD).
 
@@ -127,7 +127,7 @@ class Ephemeris:
         return f"{self.system}{self.prn:02d}"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Klobuchar:
     """Ionosphere coefficients as broadcast: `alpha` s / semicircle^i, `beta` s / semicircle^i."""
 

@@ -34,13 +34,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from drivers.immutable import immutable
 from fusiond.aiding.base import (
     Aid,
     Innovation,
     NotApplicable,
     State,
     Vector3,
-    immutable,
     misaligned_axes,
 )
 from fusiond.aiding.offers import HeadingOffer

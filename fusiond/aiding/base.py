@@ -9,13 +9,14 @@ So a position row of z is "INS minus fix", as in the papers. H is dense, (m, n).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal, NamedTuple, Protocol, TypeVar, dataclass_transform
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.offers import Offer
 from fusiond.aiding.packed import Packed
 from fusiond.models.model import Model
@@ -24,7 +25,6 @@ from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_from_quaternion, rotation_vector_to_quaternion
 from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
 
-T = TypeVar("T")
 Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
@@ -32,13 +32,6 @@ Feedback = Literal["at_once", "hold", "release"]
 aid says so; or now, all that was held."""
 LENT_ROWS = 3
 """Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
-
-
-@dataclass_transform(frozen_default=True, field_specifiers=(field,))
-def immutable(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
-    """A dataclass with slots that is frozen for the type checker alone: at run time a frozen one
-    costs four times as much to make, and each fix makes three aids of some ten fields."""
-    return dataclass(slots=True, eq=eq)
 
 
 @compiled("f8(f8[::1])")

@@ -33,6 +33,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from drivers.immutable import immutable
 from fusiond.aiding.base import (
     Aid,
     Array,
@@ -40,7 +41,6 @@ from fusiond.aiding.base import (
     NotApplicable,
     State,
     Vector3,
-    immutable,
     misaligned_axes,
 )
 from fusiond.gnss.ecef import ned_axes, to_ecef

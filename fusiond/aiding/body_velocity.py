@@ -34,7 +34,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
+from drivers.immutable import immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import STEADY, SpeedOffer
 from fusiond.aiding.packed import AMOUNT, NO_SLIP, SPEED, Packed, slots_of

@@ -20,8 +20,9 @@ import math
 
 import numpy as np
 
+from drivers.immutable import immutable
 from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Innovation, NotApplicable, State, immutable
+from fusiond.aiding.base import Innovation, NotApplicable, State
 from fusiond.aiding.offers import HeadingOffer
 from fusiond.models.blocks import Block
 from fusiond.navigation.rotation import rpy_from_dcm, wrap_angle

@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
+from drivers.immutable import immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.offers import HeightOffer
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.strapdown import HEIGHT, VE, VN

@@ -42,8 +42,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.antenna import Matrix, antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
 from fusiond.aiding.packed import POSITION, Packed, slots_of

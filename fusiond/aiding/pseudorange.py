@@ -39,7 +39,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, immutable
+from drivers.immutable import immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M

@@ -23,11 +23,11 @@ docs/rdss-accuracy.md has the derivation, what belongs into s_rho, and the figur
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from drivers.immutable import immutable
 from fusiond.aiding.base import Array, NotApplicable
 from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
 
@@ -62,7 +62,7 @@ class Covariance(NamedTuple):
     height: Array
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RdssGeometry:
     """Two geostationary satellites at `longitudes_deg`, east positive."""
 

@@ -28,7 +28,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Feedback, Innovation, NotApplicable, State, Vector3, immutable
+from drivers.immutable import immutable
+from fusiond.aiding.base import Aid, Feedback, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew

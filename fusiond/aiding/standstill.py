@@ -40,20 +40,19 @@ Source: Groves, 2nd ed., section 15.3.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.base import (
     Aid,
     Innovation,
     NotApplicable,
     State,
     Vector3,
-    immutable,
     rate_columns,
 )
 from fusiond.aiding.witnesses import Measured, Witnesses
@@ -111,7 +110,7 @@ def _evenly(windows: int, window_s: float) -> float:
     return (windows - 1) / quantile(windows - 1, SCATTERS) / (1.0 - alike)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Rest:
     """The hypothesis that the vehicle stood in a quiet window; sigmas of the module's text."""
 

@@ -27,12 +27,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from drivers.immutable import immutable
 from drivers.raw.messages import SPEED_OF_LIGHT_M_S, Ephemeris, System
 from fusiond.navigation.compiled import compiled
 
@@ -208,7 +208,7 @@ class SatelliteStates(NamedTuple):
     clock_drift: Array
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Orbits:
     """Ephemerides of n satellites, stacked once: `elements` (n, 31)."""
 

@@ -32,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from drivers.immutable import immutable
 from drivers.raw.messages import (
     CARRIER_HZ,
     SPEED_OF_LIGHT_M_S,
@@ -66,7 +67,7 @@ PLAN_HOLDS_S = 10.0
 """Ephemerides are chosen anew after this: it is what one may be used beyond its limit."""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RangeNoise:
     """One sigma of the terms above.
 
@@ -103,7 +104,7 @@ class RangeNoise:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RangeOptions:
     """Masks and choices. `systems`: which to use."""
 

@@ -87,5 +87,5 @@ def seconds_from_toe(ephemeris: Ephemeris, week: int, tow_s: float) -> float:
 
 
 def _differs_only_in_time(a: Ephemeris, b: Ephemeris) -> bool:
-    names = [n for n in Ephemeris.__slots__ if n not in {"t_seen_ns", "source"}]
+    names = [n for n in Ephemeris.__match_args__ if n not in {"t_seen_ns", "source"}]
     return all(getattr(a, n) == getattr(b, n) for n in names)

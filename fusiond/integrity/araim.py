@@ -47,13 +47,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.distributions import gaussian_quantile
 
@@ -70,7 +71,7 @@ ALL_IN_VIEW_SHARE = 0.5
 follow: half, as nothing says that either is more precious."""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Requirement:
     """What is allowed, as probabilities over the same exposure as the priors: an approach, an hour.
     It holds so many independent `samples`. `tolerance_m` is that of a protection level."""
@@ -90,7 +91,7 @@ LPV_200 = Requirement(9.8e-8, 2e-9, 3.9e-6, 9e-8, 1e-8, 8e-8, 1e-5)
 """Approaches with vertical guidance down to 200 ft: the reference's table of constants."""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Epoch:
     """Satellites of one epoch and what may be wrong with them.
 

@@ -35,13 +35,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.distributions import (
     f_quantile,
@@ -68,7 +69,7 @@ POWER = 0.9
 _LAG = np.arange(1, LAGS + 1)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class ConsistencyOptions:
     """How one source is judged; docs/consistency.md has the figures behind the defaults."""
 
@@ -93,7 +94,7 @@ class ConsistencyOptions:
             raise ValueError(f"gate {self.gate}: a probability above 0")
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Consistency:
     """What the tests found. Figures that need more epochs than there are, are NaN."""
 

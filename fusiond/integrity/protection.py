@@ -32,13 +32,13 @@ integrity and continuity over time in advanced RAIM, PLANS 2020.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.integrity.araim import protection_level
 from fusiond.navigation.distributions import gaussian_quantile
 
@@ -51,7 +51,7 @@ AXIS_SHARE = (0.25, 0.25, 0.5)
 """Of the risk to north, east, down: half to the horizontal, half to the vertical."""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class IntegrityRisk:
     """What is allowed, and how likely faults are: `risk` of an error beyond the level and
     `false_alarm` of a separation beyond its threshold, each an hour; `priors` (devices,)."""

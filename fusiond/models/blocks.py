@@ -13,8 +13,8 @@ state. What a block does to the navigation errors is said by its `columns`
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+from drivers.immutable import immutable
 from fusiond.navigation.error_model import FORCE_ERROR, FORCE_SCALE, RATE_ERROR, RATE_SCALE
 
 CLOCK_OFFSET, CLOCK_DRIFT = "clock_offset", "clock_drift"
@@ -31,7 +31,7 @@ PARAMETER_COLUMNS = {
 }
 
 
-@dataclass(frozen=True)
+@immutable()
 class ImuNoise:
     """IMU error model in SI units, one sigma.
 
@@ -50,7 +50,7 @@ class ImuNoise:
     force_scale: float
 
 
-@dataclass(frozen=True)
+@immutable()
 class ClockNoise:
     """Receiver clock as ranges (c times its error), one sigma or noise density.
 
@@ -68,7 +68,7 @@ class ClockNoise:
     drift_steady: float = 0.0
 
 
-@dataclass(frozen=True)
+@immutable()
 class Block:
     """A group of states.
 

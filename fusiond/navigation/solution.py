@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import StrEnum
 from math import nan
+
+from drivers.immutable import immutable
 
 Vector3 = tuple[float, float, float]
 _UNKNOWN: Vector3 = (nan, nan, nan)
@@ -36,7 +38,7 @@ class BoundState(StrEnum):
     BEYOND = "beyond"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Bound:
     """Protection levels of a solution: horizontal and vertical, NaN where none is computed,
     infinite where nothing bounds the error (fusiond.integrity.protection)."""
@@ -46,7 +48,7 @@ class Bound:
     vpl_m: float = nan
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Solution:
     """Navigation state of the body origin at one instant, with one sigma each.
 

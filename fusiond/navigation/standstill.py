@@ -15,11 +15,10 @@ T-BME 57 (2010), the moving-variance and rate-energy detectors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
@@ -33,7 +32,7 @@ BIAS_SIGMAS = 3.0
 LONGEST_RUN = 10
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class QuietLimits:
     """Upper limits: standard deviations per axis and mean rate, SI units; the window in ns."""
 
@@ -43,7 +42,7 @@ class QuietLimits:
     mean_rate: float
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Window:
     """A finished window: its end, means (3,) and whether the sensor was quiet in all of it.
 

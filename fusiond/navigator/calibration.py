@@ -23,12 +23,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.integrity.series import NEVER_NS
 from fusiond.models.blocks import Block
 from fusiond.models.model import Model
@@ -92,7 +92,7 @@ class CalibrationState(StrEnum):
     SETTLED = "settled"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Slot:
     """Where a parameter lives: its published name, the block's kind (of `CALIBRATED`) and name, its
     slot in the model, published units per SI unit, prior sigma (published units) and random walk
@@ -107,7 +107,7 @@ class Slot:
     walk: float
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Parameter:
     """A parameter beyond its configured value, in published units: value, one sigma, and the
     configured sigma."""

@@ -16,8 +16,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
 from fusiond.configuration.aiding import RawAiding
@@ -44,7 +45,7 @@ class Seen(NamedTuple):
     cno_db_hz: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Sky:
     """The last epoch: satellites used, refused ones by reason, DOPs, RMS of the normalised
     innovations of the ranges that were used; where all of them stand."""

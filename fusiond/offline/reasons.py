@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.immutable import immutable
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import sensor_to_body
@@ -22,7 +22,7 @@ from fusiond.offline.aid_files import Arrival
 _TIMES = {"time_backwards", "time_ahead"}
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class FileRead:
     """A file's rows as they were read: s of its own time from the first to the last that is used
     (None: none is), how many are, and those that are not."""

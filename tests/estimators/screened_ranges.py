@@ -6,7 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State, immutable
+from drivers.immutable import immutable
+from fusiond.aiding.base import Aid, Innovation, Linearised, NotApplicable, State
 from fusiond.aiding.position import PositionAid
 from fusiond.models.blocks import CLOCK_OFFSET
 

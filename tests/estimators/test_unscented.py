@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.attitude import HeadingAid
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.settings import imu_noise

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.immutable import immutable
 from drivers.measurements import Height, MonotonicStamp
-from fusiond.aiding.base import Aid, Innovation, State, immutable
+from fusiond.aiding.base import Aid, Innovation, State
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
 from tests.navigator.vehicle import CONFIG, drive, feed, outcomes_of, started

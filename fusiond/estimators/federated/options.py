@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
+
+from drivers.immutable import immutable
 
 Mode = Literal["no_reset", "fusion_reset", "zero_reset", "rescale"]
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class FederatedOptions:
     """How a federated filter shares, resets and isolates.
 

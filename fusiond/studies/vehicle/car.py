@@ -23,10 +23,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from drivers.measurements import Height, MonotonicStamp, PositionFix, WheelSpeed
 from drivers.rounding import SHARED_SD, rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, immutable
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.body_velocity import NonHolonomicAid
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
