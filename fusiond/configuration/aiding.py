@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import (
     BaseModel,
@@ -31,6 +31,12 @@ class Section(BaseModel):
     """Base of every section: frozen, unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    @classmethod
+    def unsaid(cls) -> Self:
+        """Where the file has no such section: `cls()`, less the validator that pydantic would build
+        for each alone, beside that of the whole, and then find nothing to validate."""
+        return cls.model_construct()
 
 
 class Aiding(Section):

@@ -72,7 +72,7 @@ class Estimator(Section):
     """Without a fused position for longer the mode is `coasting`."""
     invalid_sd_m: PositiveFloat = 5000.0
     """Horizontal sigma beyond which the mode is `invalid`."""
-    federated: Federated = Field(default_factory=Federated)
+    federated: Federated = Field(default_factory=Federated.unsaid)
     """The section of that name below."""
-    multiscale: Multiscale = Field(default_factory=Multiscale)
-    unscented: Unscented = Field(default_factory=Unscented)
+    multiscale: Multiscale = Field(default_factory=Multiscale.unsaid)
+    unscented: Unscented = Field(default_factory=Unscented.unsaid)

@@ -175,8 +175,8 @@ class NonHolonomic(Section):
 
 
 class Constraints(Section):
-    zero_velocity: ZeroVelocity = Field(default_factory=ZeroVelocity)
-    non_holonomic: NonHolonomic = Field(default_factory=NonHolonomic)
+    zero_velocity: ZeroVelocity = Field(default_factory=ZeroVelocity.unsaid)
+    non_holonomic: NonHolonomic = Field(default_factory=NonHolonomic.unsaid)
 
 
 class Alignment(Section):
@@ -286,7 +286,7 @@ class Mqtt(Section):
 class Source(BaseModel):
     """A device: which driver serves it; the other keys are that driver's options."""
 
-    model_config = ConfigDict(extra="allow", frozen=True)
+    model_config = ConfigDict(extra="allow", frozen=True, defer_build=True)
     driver: str
 
     @property
@@ -304,19 +304,19 @@ class Config(Section):
     """Where the last solution is kept for the next start; the unit's state directory by default."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """What the daemon writes to its log: this and what matters more."""
-    imu: Imu = Field(default_factory=Imu)
+    imu: Imu = Field(default_factory=Imu.unsaid)
     sources: dict[str, Source] = Field(default_factory=dict)
     aiding: dict[str, AnyAiding] = Field(default_factory=dict)
-    constraints: Constraints = Field(default_factory=Constraints)
-    alignment: Alignment = Field(default_factory=Alignment)
-    estimator: Estimator = Field(default_factory=Estimator)
-    consistency: ConsistencyTest = Field(default_factory=ConsistencyTest)
-    integrity: Integrity = Field(default_factory=Integrity)
-    scheduler: Scheduler = Field(default_factory=Scheduler)
-    clock: ClockOptions = Field(default_factory=ClockOptions)
-    mqtt: Mqtt = Field(default_factory=Mqtt)
-    recording: Recording = Field(default_factory=Recording)
-    outputs: Outputs = Field(default_factory=Outputs)
+    constraints: Constraints = Field(default_factory=Constraints.unsaid)
+    alignment: Alignment = Field(default_factory=Alignment.unsaid)
+    estimator: Estimator = Field(default_factory=Estimator.unsaid)
+    consistency: ConsistencyTest = Field(default_factory=ConsistencyTest.unsaid)
+    integrity: Integrity = Field(default_factory=Integrity.unsaid)
+    scheduler: Scheduler = Field(default_factory=Scheduler.unsaid)
+    clock: ClockOptions = Field(default_factory=ClockOptions.unsaid)
+    mqtt: Mqtt = Field(default_factory=Mqtt.unsaid)
+    recording: Recording = Field(default_factory=Recording.unsaid)
+    outputs: Outputs = Field(default_factory=Outputs.unsaid)
 
     @property
     def plausibility(self) -> Plausibility:
