@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import fusiond.navigator.raw_gnss  # noqa: F401 - compiled before there are workers
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import TableError

@@ -79,8 +79,10 @@ def process(
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     with compiling():
+        from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.process import process as run_process  # noqa: PLC0415
 
+        raw_receivers(loaded.aiding)  # what they compile comes with the rest
     wanted = _systems_argument(systems)
     try:
         with config_errors(), data_errors(), progress_bar("processing") as bar:
@@ -123,8 +125,10 @@ def calibrate(
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     with compiling():
+        from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
 
+        raw_receivers(loaded.aiding)  # what they compile comes with the rest
     try:
         with config_errors(), data_errors(), progress_bar("calibrating") as bar:
             found = run_calibrate(loaded, imu, aids, can, bar or (lambda done, total: None))

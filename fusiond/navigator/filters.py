@@ -14,7 +14,6 @@ from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
-from fusiond.estimators.federated.options import FederatedOptions
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.verdicts import Verdicts
@@ -28,6 +27,7 @@ from fusiond.navigation.vibration import Vibration
 
 if TYPE_CHECKING:
     from fusiond.estimators.federated.filter import FederatedFilter
+    from fusiond.estimators.federated.options import FederatedOptions
 
 
 def model_of(config: Config, *extra: Block) -> Model:
@@ -119,6 +119,8 @@ def federated(
 
 
 def _federated(config: Config, model: Model) -> FederatedFilter:
+    from fusiond.estimators.federated.options import FederatedOptions  # noqa: PLC0415
+
     o = config.estimator.federated
     names = o.sources or tuple(config.aiding)
     options = FederatedOptions(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +39,15 @@ from fusiond.navigator.intake.gnss import told_by_operator
 from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
 from fusiond.navigator.readout import publish_by_own_clock, solution_of
-from fusiond.navigator.saved_calibration import SavedCalibration, refuted, take_up
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.standing import Standing
 from fusiond.navigator.state_file import RefusedStateError
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
-from fusiond.navigator.warm_start import WarmStart
 from fusiond.navigator.worth import Begun, Worth
+
+if TYPE_CHECKING:
+    from fusiond.navigator.saved_calibration import SavedCalibration
+    from fusiond.navigator.warm_start import WarmStart
 
 Array = NDArray[np.float64]
 
@@ -222,7 +225,7 @@ class Navigator:
             if start is None or self._late() or self._aligner.waits(start, self._lateness):
                 return
             if self.calibration is not None and not self.on_trial:
-                start = take_up(start, self.model, self.calibration)
+                start = self.calibration.taken_up(start, self.model)
             self.calibrating.restart()
             first = self.imu.index_after(start.t_ns) + self.imu.start
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
@@ -269,7 +272,7 @@ class Navigator:
         e, watch = self.estimator, self.calibrating
         if not (watch.look(e.t_ns, e.xi, e.covariance) or watch.turned) or not self.calibration:
             return
-        if wrong := watch.turned or refuted(watch.parameters, self.calibration):
+        if wrong := watch.turned or self.calibration.refuted(watch.parameters):
             self._event("calibration_refused", f"{wrong}: without it, aligning anew")
             self.calibration = None
             self.reset(f"the saved calibration is wrong: {wrong}")

@@ -87,6 +87,32 @@ class SavedCalibration:
     values: Annotated[dict[Name, tuple[Value, Sigma]], Field(max_length=64)]
     version: Literal[1] = 1
 
+    def taken_up(self, start: Start, model: Model) -> Start:
+        """The start with these parameters: their sigma is that of then and what may have
+        changed, at most that of the configuration."""
+        xi, p = start.xi.copy(), start.covariance.copy()
+        for s in calibration_slots(model):
+            if s.name not in self.values:
+                continue
+            value, sd = self.values[s.name]
+            sd = min(math.hypot(sd, CHANGES[s.kind]), s.prior_sd) / s.factor
+            xi[s.index] = value / s.factor
+            p[s.index], p[:, s.index] = 0.0, 0.0
+            p[s.index, s.index] = sd**2
+        return replace(start, xi=xi, covariance=p)
+
+    def refuted(self, parameters: Iterable[Parameter]) -> str | None:
+        """What speaks against it once it was taken up: a value that has left it by four sigma of
+        what may have changed, one time in 16,000 by chance. An offset in time may wander anywhere
+        on a long drive. None where nothing does."""
+        for p in parameters:
+            if p.name in self.values and p.kind not in WANDERING:
+                value, sd = self.values[p.name]
+                sd = min(math.hypot(sd, CHANGES[p.kind]), p.prior_sd)
+                if sd < p.prior_sd and abs(p.value - value) > 4.0 * sd:
+                    return f"{p.name} was {value:+.3g} and is now {p.value:+.3g}"
+        return None
+
 
 _SAVED = TypeAdapter(SavedCalibration)
 
@@ -139,31 +165,3 @@ def load_calibration(path: Path, model: Model, digest: str) -> SavedCalibration 
         if abs(value) > MOST_SIGMAS * s.prior_sd:
             raise DamagedStateError(f"{s.name}: {value:g} is {MOST_SIGMAS:g} sigmas off or more")
     return saved
-
-
-def take_up(start: Start, model: Model, saved: SavedCalibration) -> Start:
-    """The start with the parameters of `saved`: their sigma is that of then and what may have
-    changed, at most that of the configuration."""
-    xi, p = start.xi.copy(), start.covariance.copy()
-    for s in calibration_slots(model):
-        if s.name not in saved.values:
-            continue
-        value, sd = saved.values[s.name]
-        sd = min(math.hypot(sd, CHANGES[s.kind]), s.prior_sd) / s.factor
-        xi[s.index] = value / s.factor
-        p[s.index], p[:, s.index] = 0.0, 0.0
-        p[s.index, s.index] = sd**2
-    return replace(start, xi=xi, covariance=p)
-
-
-def refuted(parameters: Iterable[Parameter], saved: SavedCalibration) -> str | None:
-    """What speaks against a calibration that was taken up: a value that has left it by four sigma
-    of what may have changed, one time in 16,000 by chance. An offset in time may wander anywhere
-    on a long drive. None where nothing does."""
-    for p in parameters:
-        if p.name in saved.values and p.kind not in WANDERING:
-            value, sd = saved.values[p.name]
-            sd = min(math.hypot(sd, CHANGES[p.kind]), p.prior_sd)
-            if sd < p.prior_sd and abs(p.value - value) > 4.0 * sd:
-                return f"{p.name} was {value:+.3g} and is now {p.value:+.3g}"
-    return None

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+from drivers.immutable import immutable
 from drivers.measurements import DelayedFix, PositionFix, UtcStamp
 from fusiond.aiding.base import Aid
 from fusiond.aiding.wander import Wander
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
-from fusiond.navigator.raw_gnss import RawGnss
+
+if TYPE_CHECKING:
+    from fusiond.navigator.raw_gnss import RawGnss
 
 S = TypeVar("S", bound=Aiding)
 T = TypeVar("T")
@@ -25,17 +27,23 @@ class Instants(NamedTuple):
     seen_ns: int
 
 
+def raw_receivers(aiding: Mapping[str, AnyAiding]) -> dict[str, RawGnss]:
+    """By name. Their code is imported where there is one: to load it takes a start's time."""
+    raw = {name: each for name, each in aiding.items() if isinstance(each, RawAiding)}
+    if not raw:
+        return {}
+    from fusiond.navigator.raw_gnss import RawGnss  # noqa: PLC0415
+
+    return {name: RawGnss(name, section) for name, section in raw.items()}
+
+
 class Sections:
     """The configuration's `[aiding.NAME]` by source name; `receivers` are those whose raw data are
     the aid, not their fixes."""
 
     def __init__(self, aiding: Mapping[str, AnyAiding]) -> None:
         self.aiding = aiding
-        self.receivers = {
-            name: RawGnss(name, section)
-            for name, section in aiding.items()
-            if isinstance(section, RawAiding)
-        }
+        self.receivers = raw_receivers(aiding)
         self.place: tuple[float, float] | None = None
         """Latitude and longitude (rad) of the last fix."""
         self.by_code: set[tuple[str, int]] = set()
@@ -110,7 +118,7 @@ class Sections:
         return names
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Kind:
     """A kind of measurement.
 

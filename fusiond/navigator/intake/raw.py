@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import Aid
-from fusiond.aiding.pseudorange import RANGE_BIAS
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.settings import clock_noise
 from fusiond.models.blocks import Block, clock_blocks, position_bias
@@ -21,6 +20,8 @@ def aids(m: RawGnssEpoch, sections: Sections, when: Instants) -> list[Aid] | str
 
 def blocks(source: str, section: RawAiding, sections: Sections) -> list[Block]:
     """A clock offset a system, drift, and errors that ranges share."""
+    from fusiond.aiding.pseudorange import RANGE_BIAS  # noqa: PLC0415 - as fusiond.navigator.raw_gnss
+
     found = clock_blocks(section.systems, clock_noise(section))
     if section.bias_sd_m > 0.0:
         tau_s = section.bias_correlation_s
