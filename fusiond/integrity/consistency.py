@@ -167,7 +167,6 @@ class Limits(NamedTuple):
 
     shape: float
     scale: float
-    nis_interval: Interval
     nis_limits: Interval
     weights: Array
     freedom: Interval
@@ -175,9 +174,7 @@ class Limits(NamedTuple):
     portmanteau: float
 
 
-NO_LIMITS = Limits(
-    math.nan, math.nan, _UNKNOWN, _UNKNOWN, np.zeros(LAGS), _UNKNOWN, _UNKNOWN, math.nan
-)
+NO_LIMITS = Limits(math.nan, math.nan, _UNKNOWN, np.zeros(LAGS), _UNKNOWN, _UNKNOWN, math.nan)
 
 
 @lru_cache(maxsize=2048)
@@ -187,18 +184,10 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
     n = dof if whitened else k
     d, nu = 8.0 + 207.0 / n - 1670.0 / n**2, 13.6 + 0.277 * n
     r = -gaussian_quantile((1.0 - INTERVAL_LEVEL) / 2.0) / math.sqrt(n)
-
-    def between(outside: float) -> Interval:
-        return (
-            scale * gamma_quantile(shape, outside / 2.0),
-            scale * gamma_quantile(shape, outside / 2.0, upper=True),
-        )
-
     return Limits(
         shape,
         scale,
-        between(1.0 - INTERVAL_LEVEL),
-        between(level),
+        _between(shape, scale, level),
         n + 2.0 * (1.0 - _LAG / k),
         (d, nu),
         (-r, r),
@@ -206,23 +195,37 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
     )
 
 
-def _average_law(k: int, dof: int, gate: float) -> tuple[float, float]:
-    """Shape and scale of the gamma law of the average of K chi-squares cut off at the gate.
+def _between(shape: float, scale: float, outside: float) -> Interval:
+    """What a gamma law leaves with this probability, half of it at either end."""
+    return (
+        scale * gamma_quantile(shape, outside / 2.0),
+        scale * gamma_quantile(shape, outside / 2.0, upper=True),
+    )
 
-    E[x^j; x < g] of a chi-square with m degrees: m (m + 2) .. (m + 2j - 2) F_{m+2j}(g).
-    """
-    m = dof / k
-    g = 2.0 * gamma_quantile(m / 2.0, gate)
-    mean = m * gamma_tails(m / 2.0 + 1.0, g / 2.0)[0] / gate
-    variance = m * (m + 2.0) * gamma_tails(m / 2.0 + 2.0, g / 2.0)[0] / gate - mean * mean
+
+def _average_law(k: int, dof: int, gate: float) -> tuple[float, float]:
+    """Shape and scale of the gamma law of the average of K chi-squares cut off at the gate."""
+    mean, variance = _cut_off(dof / k, gate)
     return k * mean * mean / variance, variance / (mean * dof)
 
 
 @lru_cache(maxsize=256)
-def _detectable(
+def _cut_off(m: float, gate: float) -> tuple[float, float]:
+    """Mean and variance of a chi-square with m degrees that is cut off at the gate.
+
+    E[x^j; x < g] = m (m + 2) .. (m + 2j - 2) F_{m+2j}(g).
+    """
+    g = 2.0 * gamma_quantile(m / 2.0, gate)
+    mean = m * gamma_tails(m / 2.0 + 1.0, g / 2.0)[0] / gate
+    variance = m * (m + 2.0) * gamma_tails(m / 2.0 + 2.0, g / 2.0)[0] / gate - mean * mean
+    return mean, variance
+
+
+@lru_cache(maxsize=256)
+def _told(
     k: int, dof: int, alpha: float, gate: float, whitened: bool
-) -> tuple[Interval, float]:
-    """NIS ratios and a single lag's rho that are noticed with POWER."""
+) -> tuple[Interval, Interval, float]:
+    """The average's interval; NIS ratios and a single lag's rho that are noticed with POWER."""
     limits = limits_of(k, dof, alpha, gate, whitened)
     low, high = limits.nis_limits
     ratio = (
@@ -230,7 +233,8 @@ def _detectable(
         high / (limits.scale * gamma_quantile(limits.shape, POWER, upper=True)),
     )
     shift = noncentrality(limits.portmanteau, LAGS, 1.0 - POWER)
-    return ratio, min(1.0, math.sqrt(shift / (dof if whitened else k)))
+    interval = _between(limits.shape, limits.scale, 1.0 - INTERVAL_LEVEL)
+    return interval, ratio, min(1.0, math.sqrt(shift / (dof if whitened else k)))
 
 
 def judge(
@@ -254,7 +258,7 @@ def judge(
     if k < FEWEST:
         return replace(TOO_FEW, k=k, dof=dof, alpha=alpha)
     limits = limits_of(k, dof, alpha, gate, whitened)
-    ratio, single = _detectable(k, dof, alpha, gate, whitened)
+    interval, ratio, single = _told(k, dof, alpha, gate, whitened)
     values = np.asarray(rho, dtype=float)
     q = float(limits.weights @ (values * values))
     tails = gamma_tails(limits.shape, average / limits.scale)
@@ -266,7 +270,7 @@ def judge(
         k=k,
         dof=dof,
         nis_average=average,
-        nis_interval=limits.nis_interval,
+        nis_interval=interval,
         nis_limits=limits.nis_limits,
         nis_p=min(1.0, 2.0 * min(tails)),
         rho=tuple(float(r) for r in values),
