@@ -15,7 +15,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from io import DEFAULT_BUFFER_SIZE, BytesIO, TextIOWrapper
 from math import inf, isfinite, nan
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.files.dialect import DialectError, Text, first_line, plain_csv
 from fusiond.files.fixed_decimal import newlines, parse_rows
 
@@ -43,7 +43,7 @@ class MissingPackageError(Exception):
     """A format of files needs a package that is not installed; the text says which."""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Rejection:
     """A row that is not used: line in the file (the header is 1; 0: it has none), reason's name,
     what was seen, and how often."""
@@ -58,7 +58,7 @@ class Rejection:
         return f"{where}{self.reason}: {self.detail}"
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Column:
     """A numeric column: its header, whether it must be there and filled, and its allowed range.
 
@@ -73,7 +73,7 @@ class Column:
     positive: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Rule:
     """A condition between columns that no true row meets: `impossible(columns)` flags rows (n,)."""
 
@@ -85,7 +85,7 @@ class Rule:
 TIME = Column("t_s", low=-_MAX_TIME_S, high=_MAX_TIME_S)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RawTable:
     """The rows that may be true, by column name (n,), and those that may not, in file order."""
 

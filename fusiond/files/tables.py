@@ -10,11 +10,11 @@ beyond the range of navigation-grade and MEMS inertial units, 10 km/s beyond orb
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from drivers.immutable import immutable
 from drivers.standard_atmosphere import PRESSURE_PA
 from fusiond.files.csv_tables import (
     TIME,
@@ -62,7 +62,7 @@ def _stack(raw: RawTable, names: tuple[str, ...]) -> Floats:
 # --------------------------------------------------------------------------- measurements
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class ImuTable:
     """Mean angular rate (rad/s) and specific force (m/s^2) since the row before, sensor axes.
 
@@ -95,7 +95,7 @@ def read_imu(path: Path | str) -> ImuTable:
     return ImuTable(raw.columns["t_s"], _stack(raw, _GYRO + _ACCEL), raw.rejected)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class GnssTable:
     """GNSS fixes of the antenna: geodetic position (rad, rad, m), velocity NED, one sigma each.
 
@@ -146,7 +146,7 @@ def read_gnss(path: Path | str) -> GnssTable:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class RdssTable:
     """RDSS fixes: `t_s` of validity, `t_arrival_s`, position (rad, rad, m), class (m); all (n,)."""
 
@@ -185,7 +185,7 @@ def read_rdss(path: Path | str) -> RdssTable:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class AttitudeTable:
     """Roll, pitch, yaw (rad, NED to body, 3-2-1) and one sigma, (n, 3); NaN is not given."""
 
@@ -228,7 +228,7 @@ def _angle_without_sigma(angle: str, sd: str) -> Rule:
     return Rule("missing", f"{sd} is not given", lambda c: np.isfinite(c[angle]) & np.isnan(c[sd]))
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class BearingTable:
     """Azimuth and elevation (rad, sensor axes) of known points and one sigma, (n, 2); `point`
     latitude, longitude (rad), height (m), (n, 3). NaN sigma is not given."""
@@ -273,7 +273,7 @@ def read_bearing(path: Path | str) -> BearingTable:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class WheelTable:
     """Speed along the vehicle's forward axis and one sigma (m/s), (n,).
 
@@ -314,7 +314,7 @@ def read_wheel(path: Path | str) -> WheelTable:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class BarometerTable:
     """Pressure of the air (Pa) and one sigma of the height that it stands for (m), (n,)."""
 
@@ -337,7 +337,7 @@ def read_barometer(path: Path | str) -> BarometerTable:
 # --------------------------------------------------------------------------- trajectories
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class TrajectoryTable:
     """A truth or a solution: position (rad, rad, m), velocity NED, attitude, one sigma each.
 

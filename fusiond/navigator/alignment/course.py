@@ -17,12 +17,12 @@ velocity tell forward from backward (fusiond.navigator.alignment.motion_fit).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.alignment import level
@@ -236,7 +236,7 @@ def _reversing(by: Basis, velocity: VelocityOffer) -> str:
     return ""
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Ways:
     """Measured velocities against what the IMU felt; what fits best is asked for each way."""
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.navigation.distributions import median
 from fusiond.navigator.alignment.start import as_geodetic
 
 Array = NDArray[np.float64]
@@ -59,7 +60,7 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
     if steps is None or not (looked := steps.dt_s <= LONGEST_S).any():
         return epochs
     size = np.hypot(*steps.off_m.T)
-    chance = LEAP_SIGMAS * float(np.median(size[looked])) / math.sqrt(2.0 * math.log(2.0))
+    chance = LEAP_SIGMAS * median(size[looked]) / math.sqrt(2.0 * math.log(2.0))
     speed = np.hypot(*steps.v_m_s.T)
     leaps = np.flatnonzero(looked & (size > np.maximum(chance, SAME_S * speed)))
     return epochs[leaps[-1] + 1 :] if leaps.size else epochs

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.felt import integrate_felt
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -44,7 +44,7 @@ class Past(Protocol):
     def index_after(self, t_ns: int) -> int: ...
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Span:
     """A `Past` that stays as it is."""
 

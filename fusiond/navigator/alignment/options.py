@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+from drivers.immutable import immutable
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG
 
@@ -13,7 +13,7 @@ from fusiond.configuration.settings import DEG
 MAX_REVERSE_M_S = 8.0
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class AlignmentOptions:
     """SI units; `heading` the allowed sources in order of preference, `window_s` the length of the
     standstill detector's windows, `rate_sd_rad_s` what a vehicle at rest may turn, `no_slip_m` from

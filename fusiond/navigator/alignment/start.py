@@ -4,12 +4,13 @@ covariance."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.immutable import immutable
 from fusiond.aiding.offers import HeadingOffer, Offer, PositionOffer, VelocityOffer
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
@@ -87,7 +88,7 @@ class Moves(NamedTuple):
     acceleration: Array
 
 
-@dataclass(frozen=True, slots=True)
+@immutable()
 class Start:
     """A filter's start: instant, nav (10,), parameters (n,), P (n, n), and how it was found.
 
