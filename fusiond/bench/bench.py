@@ -258,13 +258,12 @@ def _step_ratio(
     100 IMU samples and the aids, in order of validity; median over the repetitions.
     """
     model, centralised, buffer = _filter(STEP_SECONDS * STEP_RATE_HZ, STEP_RATE_HZ)
-    start = centralised.snapshot()
-    p = centralised.covariance.copy()
+    nav, xi, p = centralised.nav.copy(), centralised.xi.copy(), centralised.covariance.copy()
     ratios = []
     for _ in range(repetitions + 1):
         spent = []
         for estimator in (make(model, Imu().gap_s), KalmanEstimator(model, Imu().gap_s)):
-            estimator.initialise(0, 0, start.nav, start.xi, p)
+            estimator.initialise(0, 0, nav, xi, p)
             gc.collect()
             before = time.process_time()
             for aid in aids:

@@ -72,16 +72,12 @@ class Outcome(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """All that a later restore needs; `extra` is the estimator's own."""
+    """All that a later restore needs, `kept` and `held` as `Memory` has them; `extra` is the
+    estimator's own."""
 
     t_ns: int
     sample: int
-    nav: Array
-    xi: Array
-    covs: Array
-    dxs: Array
-    step: Array
-    sums: Array
+    kept: Array
     held: Array | None
     holding: bool
     extra: object
@@ -381,30 +377,19 @@ class ErrorStateFilter:
 
     def snapshot(self) -> Snapshot:
         """A copy of everything."""
-        return Snapshot(
-            self.t_ns,
-            self.sample,
-            self.nav.copy(),
-            self.xi.copy(),
-            self._covs.copy(),
-            self._dxs.copy(),
-            self.step.copy(),
-            self._memory.sums.copy(),
-            self._memory.held.copy() if self._memory.head[AHEAD] else None,
-            self._holding,
-            self._own_snapshot(),
-        )
+        m = self._memory
+        held = m.held.copy() if m.head[AHEAD] else None
+        extra = self._own_snapshot()
+        return Snapshot(self.t_ns, self.sample, m.kept.copy(), held, self._holding, extra)
 
     def restore(self, s: Snapshot) -> None:
         """Back to a snapshot, bit for bit."""
-        self.t_ns, self.sample = s.t_ns, s.sample
-        self.nav[:], self.xi[:], self._covs[:], self.step[:] = s.nav, s.xi, s.covs, s.step
-        self._dxs[:], self._holding = s.dxs, s.holding
-        self._memory.sums[:], self.passing = s.sums, s.held is not None
-        self._memory.head[AHEAD] = self.passing
+        m = self._memory
+        self.t_ns, self.sample, m.kept[:], _, self._holding, extra = s
+        m.head[AHEAD] = self.passing = s.held is not None
         if s.held is not None:
-            self._memory.held[:] = s.held
-        self._own_restore(s.extra)
+            m.held[:] = s.held
+        self._own_restore(extra)
 
     def _own_snapshot(self) -> object:
         """What a kind of estimator keeps beside the shared state; never changed afterwards."""

@@ -29,40 +29,46 @@ SIZE, ROOM, USED, RECORDED, TRANSITION, GAP, AHEAD = range(7)
 is room for; how many covariances are propagated, from the first on; of which one sigmas are
 recorded; 1 if there is a transition matrix; ns beyond which no sample may stand; 1 if covariances
 are ahead of those that are held, by what has been added up."""
-NAV_AT, STEP_AT = LINE, LINE + NAV_SIZE
-WIDER_AT, PUBLISHED_AT = STEP_AT + STEP_SIZE, STEP_AT + STEP_SIZE + WIDER
-SUMS_AT = PUBLISHED_AT + len(Published._fields)
-SCRATCH_AT = SUMS_AT + SUMS
-SCRATCH_AT += -SCRATCH_AT % LINE
-"""What lies where behind it, in doubles; the scratch begins a line."""
+WIDER_AT, PUBLISHED_AT = LINE, LINE + WIDER
+NAV_AT = PUBLISHED_AT + len(Published._fields)
+NAV_AT += -NAV_AT % LINE
+STEP_AT, SUMS_AT = NAV_AT + NAV_SIZE, NAV_AT + NAV_SIZE + STEP_SIZE
+XI_AT = SUMS_AT + SUMS
+"""What lies where behind it, in doubles; then come parameters and error estimates, and on the next
+line covariances, with which ends what a snapshot copies, from the navigation state on."""
+
+
+def line_after(doubles: int) -> int:
+    """Where the next line begins."""
+    return doubles + -doubles % LINE
 
 
 def scratch_size(width: int) -> int:
     """Doubles of scratch for a row width, whole lines: what covariances need, then `propagate`."""
-    size = work_size(width) + COEFFICIENTS + 24 + TURN_SIZE + KEPT + 2 * width
-    return size + -size % LINE
+    return line_after(work_size(width) + COEFFICIENTS + 24 + TURN_SIZE + KEPT + 2 * width)
 
 
 class Memory(NamedTuple):
-    """`array` and the parts of it that are written from Python: `head` (8,) as above, nav (10,),
-    the last step (28,), the variances (9,) that what is published is `wider` by, `Published` (3,),
-    the `sums` (25,) of fusiond.estimators.crossing, `work` for kernels that propagate a covariance,
-    `covs` (k, width, width) and how they were before what has been added up, `held`, `phi` (width,
-    width) or (0, 0), `xi` (n,), `dxs` (k, n), `shares` (k,)."""
+    """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
+    (9,) that what is published is `wider` by, `Published` (3,); `kept`, all that a snapshot copies:
+    nav (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.crossing, `xi` (n,), `dxs`
+    (k, n), `covs` (k, width, width); the covariances before what has been added up, flat, `held`;
+    `phi` (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares` (k,)."""
 
     array: Array
     head: NDArray[np.int64]
-    nav: Array
-    step: Array
     wider: Array
     published: Array
+    kept: Array
+    nav: Array
+    step: Array
     sums: Array
-    work: Array
+    xi: Array
+    dxs: Array
     covs: Array
     held: Array
     phi: Array
-    xi: Array
-    dxs: Array
+    work: Array
     shares: Array
 
 
@@ -72,29 +78,31 @@ def memory(model: Model, gap_ns: int, shares: tuple[float, ...], transition: boo
     by whole ones."""
     n, width, k = model.size, model.width, len(shares)
     side = width if transition else 0
-    sizes = (k * width * width, k * width * width, side * side, n, k * n, k, model.packed.size)
-    first = SCRATCH_AT + scratch_size(width)
-    total = first + sum(sizes)
+    square, scratch = k * width * width, scratch_size(width)
+    first = line_after(XI_AT + n + k * n)
+    total = first + 2 * square + side * side + scratch + k + model.packed.size
     lines = np.zeros(total + LINE)
     begin = -lines.ctypes.data % LINE_BYTES // 8
     array = lines[begin : begin + total]
-    covs, held, phi, xi, dxs, factors, of_model = np.split(array[first:], np.cumsum(sizes)[:-1])
+    sizes = (square, square, side * side, scratch, k)
+    covs, held, phi, work, factors, of_model = np.split(array[first:], np.cumsum(sizes))
     factors[:], of_model[:] = shares, model.packed
     head = array[:LINE].view(np.int64)
     head[[SIZE, ROOM, USED, TRANSITION, GAP]] = n, k, k, transition, gap_ns
     return Memory(
         array,
         head,
-        array[NAV_AT:STEP_AT],
-        array[STEP_AT:WIDER_AT],
         array[WIDER_AT:PUBLISHED_AT],
         array[PUBLISHED_AT : PUBLISHED_AT + len(Published._fields)],
-        array[SUMS_AT : SUMS_AT + SUMS],
-        array[SCRATCH_AT : SCRATCH_AT + work_size(width)],
+        array[NAV_AT : first + square],
+        array[NAV_AT:STEP_AT],
+        array[STEP_AT:SUMS_AT],
+        array[SUMS_AT:XI_AT],
+        array[XI_AT : XI_AT + n],
+        array[XI_AT + n : XI_AT + n + k * n].reshape(k, n),
         covs.reshape(k, width, width),
-        held.reshape(k, width, width),
+        held,
         phi.reshape(side, side),
-        xi,
-        dxs.reshape(k, n),
+        work[: work_size(width)],
         factors,
     )

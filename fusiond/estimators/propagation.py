@@ -21,7 +21,7 @@ from fusiond.estimators.covariance import (
     transition_for,
     work_size,
 )
-from fusiond.estimators.crossing import DENSITIES, GRID_NS, SPAN, STEPS, SUMS, add_up, cross_for
+from fusiond.estimators.crossing import DENSITIES, GRID_NS, SPAN, STEPS, add_up, cross_for
 from fusiond.estimators.memory import (
     AHEAD,
     GAP,
@@ -30,13 +30,13 @@ from fusiond.estimators.memory import (
     PUBLISHED_AT,
     RECORDED,
     ROOM,
-    SCRATCH_AT,
     SIZE,
     STEP_AT,
     SUMS_AT,
     TRANSITION,
     USED,
     WIDER_AT,
+    XI_AT,
     scratch_size,
 )
 from fusiond.estimators.reading import in_fix_time, sigmas, widen
@@ -139,7 +139,7 @@ def published_ahead(
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
     cross, propagate_transition = cross_for(width), transition_for(width)
-    worked, behind, square = work_size(width), SCRATCH_AT + scratch_size(width), width * width
+    worked, scratched, square = work_size(width), scratch_size(width), width * width
 
     @compiled("UniTuple(i8, 2)(f8[::1], f8[::1], i8, i8, i8, i8)", variant=width)
     def propagate(
@@ -164,18 +164,18 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         n, room, used = head[SIZE], head[ROOM], head[USED]
         gap_ns = min(head[GAP], imu_head[HOLD])
         start, end = imu_head[START], imu_head[END]
-        nav, step = state[NAV_AT:STEP_AT], state[STEP_AT:WIDER_AT]
-        wider, by = state[WIDER_AT:PUBLISHED_AT], state[PUBLISHED_AT:SUMS_AT]
-        sums = state[SUMS_AT : SUMS_AT + SUMS]
+        wider, by = state[WIDER_AT:PUBLISHED_AT], state[PUBLISHED_AT:NAV_AT]
         time_slot, clock_sd_s, axes_sd_rad = int(by[0]), by[1], by[2]
-        work, scratch = state[SCRATCH_AT : SCRATCH_AT + worked], state[SCRATCH_AT + worked : behind]
-        rest = state[behind:]
+        nav, step, sums = state[NAV_AT:STEP_AT], state[STEP_AT:SUMS_AT], state[SUMS_AT:XI_AT]
+        upto = XI_AT + n + room * n
+        xi, dxs = state[XI_AT : XI_AT + n], state[XI_AT + n : upto]
+        rest = state[(upto + LINE - 1) // LINE * LINE :]
         covs, rest = rest[: room * square], rest[room * square :]
         held, rest = rest[: room * square], rest[room * square :]
         of = head[RECORDED] * square
         recorded, transition = covs[of : of + square].reshape((width, width)), head[TRANSITION]
         phi, rest = rest[: transition * square], rest[transition * square :]
-        xi, dxs, rest = rest[:n], rest[n : n + room * n], rest[n + room * n :]
+        work, scratch, rest = rest[:worked], rest[worked:scratched], rest[scratched:]
         shares, model = rest[:room], rest[room:]
         noise, sensor_terms = model[: 3 * n], model[3 * n : 3 * n + 24].view(np.int64)
         flags = model.shape[0] - (n + 7) // 8

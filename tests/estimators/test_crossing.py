@@ -123,10 +123,10 @@ def test_what_is_seen_in_passing_is_what_an_aid_would_find() -> None:
 
 def test_a_start_forgets_what_was_added_up() -> None:
     estimator, buffer, _ = begun(KalmanEstimator)
-    begin = estimator.snapshot()
+    nav, xi = estimator.nav.copy(), estimator.xi.copy()
     estimator.propagate(buffer, GRID_NS // 2, passing=True)
     again, _, _ = begun(KalmanEstimator)
     for one in (estimator, again):
-        one.initialise(0, 0, begin.nav, begin.xi, np.eye(one.model.size))
+        one.initialise(0, 0, nav, xi, np.eye(one.model.size))
         one.propagate(buffer, 3 * GRID_NS)
     assert np.array_equal(estimator.covariance, again.covariance)
