@@ -50,10 +50,10 @@ def scratch_size(width: int) -> int:
 
 class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
-    (9,) that what is published is `wider` by, `Published` (3,); `kept`, all that a snapshot copies:
-    nav (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.crossing, `xi` (n,), `dxs`
-    (k, n), `covs` (k, width, width); the covariances before what has been added up, flat, `held`;
-    `phi` (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares` (k,)."""
+    (9,) that what is published is `wider` by, `Published` (3,); all that is `kept` by a snapshot:
+    nav (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.crossing, `xi` (n,),
+    `dxs` (k, n), `covs` (k, width, width); those before what has been added up, flat, `held`; `phi`
+    (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares` (k,)."""
 
     array: Array
     head: NDArray[np.int64]
