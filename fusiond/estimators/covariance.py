@@ -48,7 +48,7 @@ def kept_part(work: Array, width: int) -> Array:
 
 
 @compiled("void(f8[::1], i8[::1], f8[::1])", forceinline=True)
-def _weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
+def weights(step: Array, sensor_terms: Indices, weight: Array) -> None:
     """Write `weight` (12,): by how much each parameter acts on its axis error, `step` (28,)."""
     for i in range(12):
         weight[i] = 0.0
@@ -174,7 +174,7 @@ def covariance_for(width: int) -> Callable[..., None]:
         core = core_work[15 * CORE_STRIDE :]
         weight = work[15 * width + 24 * CORE_STRIDE : 15 * width + 24 * CORE_STRIDE + 12]
         kept = work[15 * width + 24 * CORE_STRIDE + 12 :]
-        _weights(step, sensor_terms, weight)
+        weights(step, sensor_terms, weight)
         decays(h, noise, width, kept)
         decay, grown = kept[KEPT : KEPT + width], kept[KEPT + width : KEPT + 2 * width]
         half = 0.5 * q
@@ -257,7 +257,7 @@ def transition_for(width: int) -> Callable[..., None]:
         weight = work[15 * width + 24 * CORE_STRIDE : 15 * width + 24 * CORE_STRIDE + 12]
         kept = work[15 * width + 24 * CORE_STRIDE + 12 :]
         decay = kept[KEPT : KEPT + width]
-        _weights(step, sensor_terms, weight)
+        weights(step, sensor_terms, weight)
         gather(flat, sensor_terms[:12], weight, sensor)
         apply(flat, sensor, c, top)
         _keep_active(top, width, active)
@@ -307,7 +307,7 @@ def propagate_error(
     rows = work[6 * CORE_STRIDE : 15 * CORE_STRIDE]
     out = work[15 * CORE_STRIDE : 24 * CORE_STRIDE]
     weight = work[24 * CORE_STRIDE : 24 * CORE_STRIDE + 12]
-    _weights(step, sensor_terms, weight)
+    weights(step, sensor_terms, weight)
     sensor[:] = 0.0
     for i in range(12):
         sensor[i // 2 * CORE_STRIDE] += weight[i] * dx[sensor_terms[i]]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.between import SIZE as BETWEEN
 from fusiond.estimators.covariance import KEPT, work_size
 from fusiond.estimators.crossing import SUMS
 from fusiond.estimators.reading import WIDER, Published
@@ -45,7 +46,8 @@ def line_after(doubles: int) -> int:
 
 def scratch_size(width: int) -> int:
     """Doubles of scratch for a row width, whole lines: what covariances need, then `propagate`."""
-    return line_after(work_size(width) + COEFFICIENTS + 24 + TURN_SIZE + KEPT + 2 * width)
+    own = COEFFICIENTS + 24 + TURN_SIZE + BETWEEN + KEPT + 2 * width
+    return line_after(work_size(width) + own)
 
 
 class Memory(NamedTuple):

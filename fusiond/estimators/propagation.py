@@ -13,6 +13,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.estimators.between import ROW, ROWS, WAITING, begin, fill, first_order
+from fusiond.estimators.between import SIZE as BETWEEN
 from fusiond.estimators.covariance import (
     decays,
     mirror,
@@ -39,7 +41,7 @@ from fusiond.estimators.memory import (
     XI_AT,
     scratch_size,
 )
-from fusiond.estimators.reading import in_fix_time, sigmas, widen
+from fusiond.estimators.reading import ENTRIES, entries, in_fix_time, moving, sigmas_of, widen
 from fusiond.estimators.turned_axes import rest_rows, turn_at_rest
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
@@ -172,8 +174,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         rest = state[(upto + LINE - 1) // LINE * LINE :]
         covs, rest = rest[: room * square], rest[room * square :]
         held, rest = rest[: room * square], rest[room * square :]
-        of = head[RECORDED] * square
-        recorded, transition = covs[of : of + square].reshape((width, width)), head[TRANSITION]
+        of, transition = head[RECORDED] * square, head[TRANSITION]
         phi, rest = rest[: transition * square], rest[transition * square :]
         work, scratch, rest = rest[:worked], rest[worked:scratched], rest[scratched:]
         shares, model = rest[:room], rest[room:]
@@ -193,7 +194,9 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             scratch[6:9],
             scratch[9:12],
         )
-        estimate, turn, kept = scratch[12:24], scratch[24:29], scratch[29:]
+        estimate, turn = scratch[12:24], scratch[24:29]
+        between, kept = scratch[29 : 29 + BETWEEN], scratch[29 + BETWEEN :]
+        reached, whole = between[ENTRIES : 2 * ENTRIES], between[2 * ENTRIES : 3 * ENTRIES]
         mean = sums[STEPS:DENSITIES]
         decaying = rate_terms.shape[0] > 0
         for j in range(CORE_SIZE, n):
@@ -215,7 +218,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             noise,
             work,
         )
-        alone = record or carry or transition != 0
+        q, count, span = 1.0 / shares[head[RECORDED]], 0, 0.0
+        alone = carry or transition != 0
         ahead, there = head[AHEAD] != 0, head[AHEAD] != 0
         i = sample - start
         while i < end and now < target:
@@ -227,8 +231,15 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 rests = turning and step[STEP_RESTS_S] > 0.0
                 single = alone or silent or rests
                 if single and sums[SPAN] > 0.0:  # what came before is no part of it
+                    if count:
+                        span = sums[SPAN]
+                        first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
                     cross(ahead, False, 0.0, False, *given)
                     ahead = False
+                    if count:
+                        entries(covs[of:], width, time_slot, clock_sd_s, reached)
+                        fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
+                        count = 0
                 w, x, y, z = nav[Q0], nav[Q0 + 1], nav[Q0 + 2], nav[Q0 + 3]
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
                 add_up(sums, step, h, densities, i)
@@ -238,8 +249,15 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if single or stop // GRID_NS > now // GRID_NS:
                     # The held sample of a gap is a guess: its error acts over the whole of it.
                     silence = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
+                    if count:
+                        span = sums[SPAN]
+                        first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
                     cross(ahead, False, silence, rests, *given)
                     ahead = False
+                    if count:
+                        entries(covs[of:], width, time_slot, clock_sd_s, reached)
+                        fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
+                        count = 0
                 if decaying or carry:
                     decays(h, noise, width, kept)
                 if transition:
@@ -263,13 +281,39 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             if now == times[i]:
                 if record:
                     in_fix_time(nav, xi, step, time_slot, nav_out[10 * i : 10 * i + 10])
-                    out = sigma_out[9 * i : 9 * i + 9]
-                    sigmas(recorded, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
-                    widen(wider, out)
+                    if sums[SPAN] > 0.0:
+                        if count == 0:
+                            p = held[of:] if ahead else covs[of:]
+                            begin(p, width, sensor_terms, time_slot, clock_sd_s, between)
+                        waits = between[WAITING + ROW * count : WAITING + ROW * (count + 1)]
+                        first_order(between, q, sums, noise, sensor_terms, time_slot, waits)
+                        moving(nav, step, waits[ENTRIES:])
+                        waits[ROW - 1] = sums[SPAN]
+                        count += 1
+                        if count == ROWS:
+                            for j in range(ENTRIES):
+                                whole[j] = waits[j]
+                            cross(ahead, True, 0.0, False, *given)
+                            entries(covs[of:], width, time_slot, clock_sd_s, reached)
+                            fill(between, count, sums[SPAN], axes_sd_rad, wider, sigma_out, i + 1)
+                            ahead, there, count = True, True, 0
+                    else:
+                        entries(covs[of:], width, time_slot, clock_sd_s, reached)
+                        moving(nav, step, scratch)
+                        out = sigma_out[9 * i : 9 * i + 9]
+                        sigmas_of(reached, scratch, axes_sd_rad, out)
+                        widen(wider, out)
                 i += 1
         if sums[SPAN] > 0.0:
             if not there:
+                if count:
+                    span = sums[SPAN]
+                    first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
                 cross(ahead, passing, 0.0, False, *given)
+                if count:
+                    entries(covs[of:], width, time_slot, clock_sd_s, reached)
+                    fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
+                    count = 0
             elif not passing:
                 sums[SPAN] = 0.0
         head[AHEAD] = sums[SPAN] > 0.0

@@ -55,6 +55,8 @@ Array = NDArray[np.float64]
 
 WIDER = 9
 """Variances of `widen`."""
+ENTRIES, MOVING = 22, 12
+"""Numbers of `entries` and of `moving`."""
 
 
 class Published(NamedTuple):
@@ -107,7 +109,62 @@ def in_fix_time(nav: Array, xi: Array, step: Array, time_slot: int, out: Array) 
     )
 
 
-@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])")
+@compiled("void(f8[::1], i8, i8, f8, f8[::1])", forceinline=True)
+def entries(cov: Array, width: int, time_slot: int, clock_sd_s: float, out: Array) -> None:
+    """Write `out` (22,): of P, flat and of `width` rows, what sigmas are made of. Variances of
+    position and velocity (n, e, d), of phi, its covariances (ne, nd, ed), those of position,
+    velocity and phi with the clock of `Published`, and its variance."""
+    for i in range(3):
+        out[i], out[3 + i] = cov[(6 + i) * (width + 1)], cov[(3 + i) * (width + 1)]
+        out[6 + i] = cov[i * (width + 1)]
+        for j in range(3):
+            row = (6, 3, 0)[j] + i
+            out[12 + 3 * j + i] = cov[row * width + time_slot] if time_slot >= 0 else 0.0
+    out[9], out[10], out[11] = cov[1], cov[2], cov[width + 2]
+    out[21] = cov[time_slot * (width + 1)] if time_slot >= 0 else clock_sd_s * clock_sd_s
+
+
+@compiled("void(f8[::1], f8[::1], f8[::1])", forceinline=True)
+def moving(nav: Array, step: Array, out: Array) -> None:
+    """Write `out` (12,): velocity, acceleration and turn (n, e, d) of nav (10,) and its last step
+    (28,), sine of the pitch, cosine and sine of the yaw."""
+    for i in range(3):
+        out[i], out[3 + i], out[6 + i] = nav[VN + i], _acceleration(nav, step, i), _turning(step, i)
+    out[9] = -step[STEP_DCM + 6]
+    cp = math.sqrt(max(1e-12, 1.0 - out[9] * out[9]))
+    out[10], out[11] = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
+
+
+@compiled("void(f8[::1], f8[::1], f8, f8[::1])", forceinline=True)
+def sigmas_of(p: Array, motion: Array, axes_sd_rad: float, out: Array) -> None:
+    """Write one sigma (9,) as `sigmas` does, of `entries` (22,) and of what is `moving` (12,)."""
+    tt = p[21]
+    for i in range(3):
+        v, a = motion[i], motion[3 + i]
+        out[i] = math.sqrt(max(0.0, p[i] + v * (v * tt - 2.0 * p[12 + i])))
+        out[3 + i] = math.sqrt(max(0.0, p[3 + i] + a * (a * tt - 2.0 * p[15 + i])))
+    askew = axes_sd_rad * axes_sd_rad
+    u0, u1, u2 = motion[6], motion[7], motion[8]
+    t0, t1, t2 = p[18], p[19], p[20]
+    a = p[6] + askew + u0 * (u0 * tt + 2.0 * t0)
+    b = p[7] + askew + u1 * (u1 * tt + 2.0 * t1)
+    c = p[8] + askew + u2 * (u2 * tt + 2.0 * t2)
+    d = p[9] + u0 * (u1 * tt + t1) + u1 * t0
+    e = p[10] + u0 * (u2 * tt + t2) + u2 * t0
+    f = p[11] + u1 * (u2 * tt + t2) + u2 * t1
+    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
+    # 0], and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
+    sp, cy, sy = motion[9], motion[10], motion[11]
+    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
+    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
+    cross = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
+    tangent = sp / cp
+    out[6] = math.sqrt(max(0.0, along)) / cp
+    out[7] = math.sqrt(max(0.0, cross))
+    out[8] = math.sqrt(max(0.0, tangent * tangent * along + c + 2.0 * tangent * (cy * e + sy * f)))
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])", allocates=True)
 def sigmas(
     cov: Array,
     nav: Array,
@@ -122,43 +179,10 @@ def sigmas(
     By the clock and the axes of `Published`. Roll, pitch and yaw follow from phi by Euler
     kinematics, with C_nb as `step` (28,) holds it.
     """
-    t = time_slot
-    tt = cov[t, t] if t >= 0 else clock_sd_s * clock_sd_s
-    for i in range(3):
-        position, velocity = cov[6 + i, 6 + i], cov[3 + i, 3 + i]
-        if tt > 0.0:
-            v, a = nav[VN + i], _acceleration(nav, step, i)
-            rt = cov[6 + i, t] if t >= 0 else 0.0
-            vt = cov[3 + i, t] if t >= 0 else 0.0
-            position = max(0.0, position + v * (v * tt - 2.0 * rt))
-            velocity = max(0.0, velocity + a * (a * tt - 2.0 * vt))
-        out[i] = math.sqrt(position)
-        out[3 + i] = math.sqrt(velocity)
-    askew = axes_sd_rad * axes_sd_rad
-    a, b, c = cov[0, 0] + askew, cov[1, 1] + askew, cov[2, 2] + askew
-    d, e, f = cov[0, 1], cov[0, 2], cov[1, 2]
-    if tt > 0.0:
-        u0, u1, u2 = _turning(step, 0), _turning(step, 1), _turning(step, 2)
-        t0 = cov[0, t] if t >= 0 else 0.0
-        t1 = cov[1, t] if t >= 0 else 0.0
-        t2 = cov[2, t] if t >= 0 else 0.0
-        a += u0 * (u0 * tt + 2.0 * t0)
-        b += u1 * (u1 * tt + 2.0 * t1)
-        c += u2 * (u2 * tt + 2.0 * t2)
-        d += u0 * (u1 * tt + t1) + u1 * t0
-        e += u0 * (u2 * tt + t2) + u2 * t0
-        f += u1 * (u2 * tt + t2) + u2 * t1
-    # Rows of d(rpy)/d(phi) without sign: 1/cos(pitch) [cos yaw, sin yaw, 0], [-sin yaw, cos yaw,
-    # 0], and [tan(pitch) cos yaw, tan(pitch) sin yaw, 1].
-    sp = -step[STEP_DCM + 6]
-    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
-    cy, sy = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
-    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
-    cross = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
-    tangent = sp / cp
-    out[6] = math.sqrt(max(0.0, along)) / cp
-    out[7] = math.sqrt(max(0.0, cross))
-    out[8] = math.sqrt(max(0.0, tangent * tangent * along + c + 2.0 * tangent * (cy * e + sy * f)))
+    p, motion = np.empty(ENTRIES), np.empty(MOVING)
+    entries(cov.reshape(cov.size), cov.shape[1], time_slot, clock_sd_s, p)
+    moving(nav, step, motion)
+    sigmas_of(p, motion, axes_sd_rad, out)
 
 
 @compiled("void(f8[::1], f8[::1])", forceinline=True)

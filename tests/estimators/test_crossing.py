@@ -14,9 +14,11 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import ErrorStateFilter
+from fusiond.estimators.between import ROWS
 from fusiond.estimators.crossing import GRID_NS
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.reading import Published
 from fusiond.estimators.unscented.filter import UnscentedEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model
@@ -130,3 +132,44 @@ def test_a_start_forgets_what_was_added_up() -> None:
         one.initialise(0, 0, nav, xi, np.eye(one.model.size))
         one.propagate(buffer, 3 * GRID_NS)
     assert np.array_equal(estimator.covariance, again.covariance)
+
+
+@pytest.mark.parametrize("shaken", [False, True])
+def test_what_is_recorded_of_a_sample_is_what_is_found_there(shaken: bool) -> None:
+    recorded, buffer, aids = begun(InvariantFilter, shaken)
+    asked, _, _ = begun(InvariantFilter, shaken)
+    recorded.publish_by(Published(-1, 0.01, 0.002))  # by its own clock, and by another unit's axes
+    asked.publish_by(Published(-1, 0.01, 0.002))
+    row, largest = 0, 0.0
+    for aid in aids:
+        recorded.propagate(buffer, aid.t_ns, record=True)
+        while buffer.times[row] < aid.t_ns:
+            asked.propagate(buffer, int(buffer.times[row]), passing=True)
+            apart = np.abs(buffer.sigmas[row] / asked.sigmas() - 1.0).max()
+            largest = max(largest, float(apart))
+            row += 1
+        asked.propagate(buffer, aid.t_ns)
+        assert recorded.update(aid) == asked.update(aid)
+        assert np.array_equal(recorded.covariance, asked.covariance)
+    assert row > 7000
+    assert 0.0 < largest < 1e-4
+
+
+def test_more_samples_than_may_wait_are_recorded_all_the_same() -> None:
+    imu = Imu(rate_hz=4000.0)
+    model = make_model("ins21", imu_noise(imu))
+    count = 5 * ROWS
+    times = 250_000 * np.arange(1, count + 1)
+    samples = np.tile([0.01, 0.0, 0.02, 1.0, 0.0, -9.8], (count, 1))
+    buffer = runs.filled_buffer(imu, times, samples)
+    nav = runs.level_nav((0.0, 0.0, 0.3), (5.0, 0.0, 0.0))
+    sd = runs.initial_sd(model, np.radians([0.3, 0.3, 2.0]), 0.2, 3.0)
+    recorded, asked = (KalmanEstimator(model, imu.gap_s) for _ in range(2))
+    for each in (recorded, asked):
+        each.initialise(0, 0, nav, np.zeros(model.size), np.diag(sd**2))
+    recorded.propagate(buffer, int(times[-1]), record=True)
+    for row in range(count):
+        asked.propagate(buffer, int(times[row]), passing=True)
+        assert buffer.sigmas[row] == pytest.approx(asked.sigmas(), rel=1e-6)
+    asked.propagate(buffer, int(times[-1]))
+    assert np.array_equal(recorded.covariance, asked.covariance)
