@@ -143,6 +143,74 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     cross, propagate_transition = cross_for(width), transition_for(width)
     worked, scratched, square = work_size(width), scratch_size(width), width * width
 
+    @compiled(
+        "void(b1, b1, f8, b1, i8, i8, f8[::1], f8[::1], f8[::1], i8, f8, f8, f8, i8, f8[::1],"
+        " f8[::1], i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1, b1[::1], i8[::1], i8[::1],"
+        " f8[::1], f8[::1])",
+        variant=width,
+        forceinline=True,
+    )
+    def bring(
+        ahead: bool,
+        keep: bool,
+        silence: float,
+        rests: bool,
+        count: int,
+        i: int,
+        between: Array,
+        sigma_out: Array,
+        wider: Array,
+        time_slot: int,
+        clock_sd_s: float,
+        axes_sd_rad: float,
+        q: float,
+        of: int,
+        covs: Array,
+        held: Array,
+        used: int,
+        shares: Array,
+        nav: Array,
+        sums: Array,
+        c: Array,
+        turn: Array,
+        turning: bool,
+        active: NDArray[np.bool_],
+        sensor_terms: Indices,
+        rate_terms: Indices,
+        noise: Array,
+        work: Array,
+    ) -> None:
+        """`cross`, and the sigmas of the `count` samples before row i that have waited for it, of
+        the covariance that begins `of` doubles behind the first."""
+        span = sums[SPAN]
+        if count:
+            whole = between[2 * ENTRIES : 3 * ENTRIES]
+            first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
+        cross(
+            ahead,
+            keep,
+            silence,
+            rests,
+            covs,
+            held,
+            used,
+            shares,
+            nav,
+            sums,
+            c,
+            turn,
+            turning,
+            active,
+            sensor_terms,
+            rate_terms,
+            noise,
+            work,
+        )
+        if count:
+            reached = between[ENTRIES : 2 * ENTRIES]
+            entries(covs[of:], width, time_slot, clock_sd_s, reached)
+            fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
+
     @compiled("UniTuple(i8, 2)(f8[::1], f8[::1], i8, i8, i8, i8)", variant=width)
     def propagate(
         state: Array, imu: Array, sample: int, now: int, target: int, options: int
@@ -196,13 +264,22 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         )
         estimate, turn = scratch[12:24], scratch[24:29]
         between, kept = scratch[29 : 29 + BETWEEN], scratch[29 + BETWEEN :]
-        reached, whole = between[ENTRIES : 2 * ENTRIES], between[2 * ENTRIES : 3 * ENTRIES]
+        reached = between[ENTRIES : 2 * ENTRIES]
         mean = sums[STEPS:DENSITIES]
         decaying = rate_terms.shape[0] > 0
         for j in range(CORE_SIZE, n):
             decaying = decaying or noise[j] > 0.0
         sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
+        q = 1.0 / shares[head[RECORDED]]
         given = (
+            between,
+            sigma_out,
+            wider,
+            time_slot,
+            clock_sd_s,
+            axes_sd_rad,
+            q,
+            of,
             covs,
             held,
             used,
@@ -218,8 +295,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             noise,
             work,
         )
-        q, count, span = 1.0 / shares[head[RECORDED]], 0, 0.0
-        alone = carry or transition != 0
+        alone, count = carry or transition != 0, 0
         ahead, there = head[AHEAD] != 0, head[AHEAD] != 0
         i = sample - start
         while i < end and now < target:
@@ -231,15 +307,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 rests = turning and step[STEP_RESTS_S] > 0.0
                 single = alone or silent or rests
                 if single and sums[SPAN] > 0.0:  # what came before is no part of it
-                    if count:
-                        span = sums[SPAN]
-                        first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
-                    cross(ahead, False, 0.0, False, *given)
-                    ahead = False
-                    if count:
-                        entries(covs[of:], width, time_slot, clock_sd_s, reached)
-                        fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
-                        count = 0
+                    bring(ahead, False, 0.0, False, count, i, *given)
+                    ahead, count = False, 0
                 w, x, y, z = nav[Q0], nav[Q0 + 1], nav[Q0 + 2], nav[Q0 + 3]
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
                 add_up(sums, step, h, densities, i)
@@ -249,15 +318,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if single or stop // GRID_NS > now // GRID_NS:
                     # The held sample of a gap is a guess: its error acts over the whole of it.
                     silence = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
-                    if count:
-                        span = sums[SPAN]
-                        first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
-                    cross(ahead, False, silence, rests, *given)
-                    ahead = False
-                    if count:
-                        entries(covs[of:], width, time_slot, clock_sd_s, reached)
-                        fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
-                        count = 0
+                    bring(ahead, False, silence, rests, count, i, *given)
+                    ahead, count = False, 0
                 if decaying or carry:
                     decays(h, noise, width, kept)
                 if transition:
@@ -291,11 +353,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         waits[ROW - 1] = sums[SPAN]
                         count += 1
                         if count == ROWS:
-                            for j in range(ENTRIES):
-                                whole[j] = waits[j]
-                            cross(ahead, True, 0.0, False, *given)
-                            entries(covs[of:], width, time_slot, clock_sd_s, reached)
-                            fill(between, count, sums[SPAN], axes_sd_rad, wider, sigma_out, i + 1)
+                            bring(ahead, True, 0.0, False, count, i + 1, *given)
                             ahead, there, count = True, True, 0
                     else:
                         entries(covs[of:], width, time_slot, clock_sd_s, reached)
@@ -306,14 +364,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 i += 1
         if sums[SPAN] > 0.0:
             if not there:
-                if count:
-                    span = sums[SPAN]
-                    first_order(between, q, sums, noise, sensor_terms, time_slot, whole)
-                cross(ahead, passing, 0.0, False, *given)
-                if count:
-                    entries(covs[of:], width, time_slot, clock_sd_s, reached)
-                    fill(between, count, span, axes_sd_rad, wider, sigma_out, i)
-                    count = 0
+                bring(ahead, passing, 0.0, False, count, i, *given)
             elif not passing:
                 sums[SPAN] = 0.0
         head[AHEAD] = sums[SPAN] > 0.0
