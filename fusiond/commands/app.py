@@ -109,7 +109,7 @@ def _leave(code: int | str | None) -> NoReturn:
     alone = threading.active_count() == 1 and not (sys.gettrace() or sys.getprofile())
     if alone and not isinstance(code, str):
         atexit._run_exitfuncs()
-        with suppress(OSError):  # which the interpreter then tells
+        with suppress(OSError, ValueError):  # full, gone or closed: the interpreter tells it
             print(end="", flush=True)
             print(end="", flush=True, file=sys.stderr)
             os._exit(code or 0)

@@ -250,3 +250,27 @@ def test_interrupt_exits_130(tmp_path: Path) -> None:
         process.wait()
     assert process.returncode == 130
     assert "Traceback" not in text
+
+
+def test_what_runs_at_the_end_runs_whatever_becomes_of_the_output() -> None:
+    """A command ends the process by itself: after what is registered for that, and by its code."""
+    code = (
+        "import atexit, sys\n"
+        "from fusiond.commands import app\n"
+        "sys.argv[1:] = {arguments}\n"
+        "atexit.register(lambda: (print('the end'), {closing}))\n"
+        "app.main()\n"
+    )
+    for closing in ("None", "sys.stdout.close()"):
+        for arguments, expected in ((["--version"], 0), (["no such command"], 2)):
+            text = code.format(arguments=arguments, closing=closing)
+            done = subprocess.run(
+                [sys.executable, "-c", text],
+                check=False,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE_S,
+            )
+            assert done.returncode == expected, done.stderr
+            assert done.stdout.endswith("the end\n")
+            assert "Traceback" not in done.stderr
