@@ -117,6 +117,8 @@ class Aid:
     """It bounds the horizontal position: a solution that has it is not coasting."""
     moves: ClassVar[bool] = False
     """It bounds the horizontal velocity."""
+    rolls: ClassVar[bool] = False
+    """It measures a speed along the vehicle."""
     constraint: ClassVar[bool] = False
     """Not measured but known of the vehicle: its innovations are neither independent nor white, and
     no verdict on a sigma follows from them."""
@@ -234,6 +236,18 @@ class Linearised(Protocol):
     def gate(self) -> float: ...
     @property
     def robust(self) -> bool: ...
+    @property
+    def device(self) -> str: ...
+    @property
+    def locates(self) -> bool: ...
+    @property
+    def moves(self) -> bool: ...
+    @property
+    def rolls(self) -> bool: ...
+    @property
+    def constraint(self) -> bool: ...
+    @property
+    def no_slip(self) -> bool: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
 

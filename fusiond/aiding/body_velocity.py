@@ -358,6 +358,8 @@ class WheelSpeedAid(Aid):
     is beyond `SIGN_SIGMAS` of its sigma, and not known elsewhere (`direction_unknown`).
     """
 
+    rolls: ClassVar[bool] = True
+
     speed_m_s: float
     sd_m_s: float
     lever: Vector3

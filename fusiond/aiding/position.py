@@ -6,8 +6,8 @@ r"""Position of an antenna: a GNSS fix, with or without height.
         + noise
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
-ionosphere), s what part of it there is in this one, c one that lasts for seconds, north and east,
-of w metres (fusiond.aiding.wander), tau how much later than its stamp the fix is
+ionosphere), s what part of it there is in this one, c one that lasts for seconds, of w metres, down
+as many more as the fix's own sigma is larger there (fusiond.aiding.wander), tau how much later than its stamp the fix is
 valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
 (fusiond.aiding.felt); where the model has states for them they are estimated, true minus estimated
 in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by v s_t, which
@@ -121,7 +121,7 @@ def position_rows(
 ) -> None:
     """Write z (m,), H (m, n) and r (m,) for the first m of north, east, down, with what offset in
     time and lever arm leave out by P (n, n), or (0, 0) where none is known. `bias` (up to 3,),
-    `time` (0 or 1,), `rest` (0 or 3,), `wander` (0 or 2,): slots in `xi`."""
+    `time` (0 or 1,), `rest` (0 or 3,), `wander` (0 or 3,): slots in `xi`."""
     m, n = h.shape
     h[:] = 0.0
     share = (s0, s1, s2)
@@ -152,8 +152,10 @@ def position_rows(
             z[i] += share[i] * xi[bias[i]]
             h[i, bias[i]] = -share[i]
         if i < wander.size:
-            z[i] += wander_m * xi[wander[i]]
-            h[i, wander[i]] = -wander_m
+            # Down it is as much larger as the fix says that its errors are.
+            w = wander_m if i < 2 else 2.0 * wander_m * sd2 / (sd0 + sd1)
+            z[i] += w * xi[wander[i]]
+            h[i, wander[i]] = -w
     for slot in time:
         late_s = xi[slot]
         v, of_v, columns = np.empty(m), np.zeros((m, n)), np.empty(n, dtype=np.int64)

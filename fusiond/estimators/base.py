@@ -13,14 +13,14 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.doubt import open_by, unsettle
+from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
+from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.memory import AHEAD, GAP, memory
 from fusiond.estimators.propagation import (
     CARRY,
@@ -41,6 +41,9 @@ from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import step_before
 
 Array = NDArray[np.float64]
+
+
+AS_STATED = np.ones(3)
 
 
 class _Thresholds(dict[tuple[float, int], float]):
@@ -113,7 +116,9 @@ class Estimator(Protocol):
     turned: float
     """By how much (rad) the last update that was fused turned the axes in which P has the tilt."""
     wider: Array
-    """Variances (9,) that `sigmas` has beyond P's (fusiond.integrity.hedge)."""
+    """Variances (9,) that `sigmas` has beyond P's: what hypotheses of a fault leave open."""
+    hypotheses: Hypotheses | None
+    """The bank of hypotheses beside it; None where it has none."""
 
     @property
     def state(self) -> State:
@@ -148,8 +153,9 @@ class Estimator(Protocol):
         `passing`, if nothing is to be folded in there: what comes later is to the bit what it would
         be had nobody asked."""
 
-    def update(self, aid: Linearised) -> Outcome:
-        """Fold one aid in, or name why not."""
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one aid in, or name why not; the variances of its rows, up to three, count `noise`
+        times (3,)."""
 
     def plain(self) -> Plain | None:
         """For kernels that do what `update` does; None where it does something else."""
@@ -157,14 +163,8 @@ class Estimator(Protocol):
     def look(self, aid: Linearised) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
 
-    def doubt(
-        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
-    ) -> None:
-        """Widen P: by an aid's innovation, or what its series is `apart` (m,) from the filter, what
-        it measures, or attitude and sensor errors."""
-
-    def unsettle(self, share: float) -> None:
-        """Add that share of what a doubt of the motion adds to the sensor errors' variances."""
+    def adopt(self, mean: Array, spread: Array) -> None:
+        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""
@@ -191,13 +191,19 @@ class ErrorStateFilter:
     carries_transition: ClassVar[bool] = False
     """Whether `_phi` (width, width) is propagated, too."""
 
-    def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
+    def __init__(
+        self,
+        model: Model,
+        gap_s: float,
+        shares: tuple[float, ...] = (1.0,),
+        faults: FaultTable = NO_FAULTS,
+    ) -> None:
         self.model = model
         self.t_ns = 0
         self.sample = 0
         self.passing = False
         self.published = Published(model.time_slot)
-        m = memory(model, round(gap_s * 1e9), shares, self.carries_transition)
+        m = memory(model, round(gap_s * 1e9), shares, self.carries_transition, faults)
         self._memory, self._array, self.nav, self.xi, self.step = m, m.array, m.nav, m.xi, m.step
         self.wider, self._phi, self._shares = m.wider, m.phi, m.shares
         self._covs: Array = m.covs
@@ -208,6 +214,7 @@ class ErrorStateFilter:
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
+        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.columns else None
         self._holding = False
         self._carrying = False
         self.turned = 0.0
@@ -252,6 +259,8 @@ class ErrorStateFilter:
         self._dxs[:], self._holding, self.wider[:] = 0.0, False, 0.0
         self._memory.sums[:], self._memory.head[AHEAD], self.passing = 0.0, 0, False
         self.step[:] = step_before(nav)
+        if self.hypotheses is not None:
+            self.hypotheses.begin(t_ns)
 
     def propagate(
         self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
@@ -328,6 +337,8 @@ class ErrorStateFilter:
             return Outcome(rows.outcome)
         z, h, r = rows
         cov, dx = self.covariance.copy(), self._dxs[0]
+        if self.hypotheses is not None:
+            cov += self.hypotheses.opened_of_all()
         if aid.screened:
             s = self._screen(aid, rows, cov, dx)
             codes = tuple(s.codes.tolist())
@@ -336,21 +347,14 @@ class ErrorStateFilter:
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
 
-    def doubt(
-        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
-    ) -> None:
-        """Widen P: by an aid's innovation what it measures, and its offset in time, which a drift
-        along the track has taught, by what it was at first; or attitude and sensor errors."""
-        rows = self._linearise(aid)
-        if isinstance(rows, NotApplicable):
-            return
-        used = len(rows.z) if measured else 0
-        if measured:
-            late = self.model.indices[getattr(aid, "time", "")]
-            self._covs[:, late, late] += self.model.initial[late] ** 2
-        for row, least in enumerate(apart[:used]):
-            rows.z[row] = math.copysign(max(abs(rows.z[row]), least), rows.z[row])
-        self._doubt(Innovation(rows.z[:used], rows.h[:used], rows.r[:used]), motion)
+    def adopt(self, mean: Array, spread: Array) -> None:
+        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
+        n = self.model.size
+        self._feed_back(mean)
+        self._cov[:n, :n] += spread
+        self.wider[:] = 0.0
+        if self.hypotheses is not None:
+            self.hypotheses.begin(self.t_ns)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
@@ -364,16 +368,6 @@ class ErrorStateFilter:
         if not aid.robust or isinstance(rows, NotApplicable):
             return rows
         return reweighted(rows, self.model, self.covariance, self._dxs[0])
-
-    def _doubt(self, rows: Innovation, motion: bool) -> None:
-        """Widen what is kept between updates by an innovation."""
-        z = rows.z - rows.h @ self._dxs[0]
-        open_by(self._covs[0], self.model, z, rows.h, motion)
-
-    def unsettle(self, share: float) -> None:
-        """Add that share of what a doubt of the motion adds to the sensor errors' variances."""
-        for cov in self._covs:
-            unsettle(cov, self.model, share)
 
     def snapshot(self) -> Snapshot:
         """A copy of everything."""

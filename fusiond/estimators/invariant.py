@@ -62,7 +62,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.base import Outcome, gate_threshold
+from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
+from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.invariant_error import (
     about_down,
     mount,
@@ -99,10 +100,6 @@ FELT_SIGMAS = 1.0
 # Below this sigma of the heading both coordinates say the same: at 15 m/s the velocity across is
 # known to 0.5 m/s, and a speed that is off by a tenth changes what no slip says by 5 cm/s.
 PLAIN_SD_RAD = math.radians(2.0)
-# Above this sigma of the heading, as after a doubt of the motion (DOUBTED_ATTITUDE_RAD and a gyro
-# that is wrong by DOUBTED_RATE_RAD_S), they do not: a correction of 12 deg in a bend at 20 m/s
-# leaves 0.04 m/s^2 in the bias of an accelerometer, three of its sigmas.
-LARGE_SD_RAD = 2.0 * PLAIN_SD_RAD
 
 
 class Turning(NamedTuple):
@@ -139,16 +136,16 @@ class Sought(NamedTuple):
 class InvariantFilter(TiltAxesFilter):
     """The centralised filter, whose updates run in xi while it `turns`.
 
-    One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`, and turns again
-    when a doubt of the motion has made it known no better than `LARGE_SD_RAD`.
+    One that `settles` turns no more when the heading is known to `PLAIN_SD_RAD`.
     """
 
-    def __init__(self, model: Model, gap_s: float, settles: bool = True) -> None:
-        super().__init__(model, gap_s)
+    def __init__(
+        self, model: Model, gap_s: float, settles: bool = True, faults: FaultTable = NO_FAULTS
+    ) -> None:
+        super().__init__(model, gap_s, faults)
         self._settles = settles
         self.turns = False
         """Whether updates run in xi: the heading may be far off."""
-        self._doubted = False
         self._mounts = model.indices[MOUNTING]
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
@@ -217,33 +214,23 @@ class InvariantFilter(TiltAxesFilter):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.turns = self._doubted = False
+        self.turns = False
 
-    def doubt(
-        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
-    ) -> None:
-        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
-        super().doubt(aid, measured, motion, apart)
-        self._doubted |= motion
-
-    def _turns_again(self) -> bool:
-        return self._doubted and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
-
-    def update(self, aid: Linearised) -> Outcome:
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
-        if self._turns_again():
-            self.turns = True
         if not self.turns or self._holding:
-            return super().update(aid)
+            return super().update(aid, noise)
         self.turned = 0.0
         outcome = self._update(aid)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
-            self.turns = self._doubted = False
+            self.turns = False
+            if self.hypotheses is not None:  # their effects were of other coordinates
+                self.hypotheses.begin(self.t_ns)
         return outcome
 
     def plain(self) -> Plain | None:
         """For kernels that do what `update` does; None where it does something else."""
-        if self.turns or (self._doubted and self._turns_again()):
+        if self.turns:
             return None
         return super().plain()
 
@@ -347,11 +334,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self._doubted, self.undoubted
+        return self.turns, self.undoubted
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self._doubted, self.undoubted = extra
+        self.turns, self.undoubted = extra
 
 
 def _way(a: Array, b: Array) -> Array:

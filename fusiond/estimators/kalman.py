@@ -11,19 +11,30 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import THRESHOLDS, ErrorStateFilter, Outcome
+from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
+from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
+from fusiond.estimators.fold import fold_and_account
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.update import Plain, fuse, work
 from fusiond.models.model import Model
+
+Array = NDArray[np.float64]
 
 
 class KalmanEstimator(ErrorStateFilter):
     """The centralised filter (`fusiond.estimators.base.Estimator`)."""
 
-    def __init__(self, model: Model, gap_s: float, shares: tuple[float, ...] = (1.0,)) -> None:
-        super().__init__(model, gap_s, shares)
+    def __init__(
+        self,
+        model: Model,
+        gap_s: float,
+        shares: tuple[float, ...] = (1.0,),
+        faults: FaultTable = NO_FAULTS,
+    ) -> None:
+        super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
         none = np.empty(0, dtype=np.int64)
         self._plain = Plain(
@@ -33,15 +44,15 @@ class KalmanEstimator(ErrorStateFilter):
             np.empty(LENT_ROWS * (3 + model.size + model.width)),
         )
 
-    def update(self, aid: Linearised) -> Outcome:
-        """Fold one aid in, or name why not."""
-        return self._fold_in(aid)
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
+        """Fold one aid in, or name why not; `noise` (3,) times its variances."""
+        return self._fold_in(aid, noise)
 
     def plain(self) -> Plain | None:
         """For kernels that do what `update` does; None where it does something else."""
         return None if self._holding else self._plain
 
-    def _fold_in(self, aid: Linearised) -> Outcome:
+    def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
@@ -49,10 +60,17 @@ class KalmanEstimator(ErrorStateFilter):
             return self._update_by_rows(aid, innovation)
         z, h, r = innovation
         degrees = z.shape[0]
+        if noise is not AS_STATED and degrees <= LENT_ROWS:
+            r *= noise[:degrees]
         threshold = THRESHOLDS[aid.gate, degrees]
         y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
         nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
-        nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
+        bank = self.hypotheses
+        if bank is None or self._holding or degrees > LENT_ROWS:
+            nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
+        else:
+            of = bank.bank, bank.table.ints, bank.table.numbers, aid.t_ns, *bank.of(aid), bank.work
+            nis = fold_and_account(nav, xi, cov, dx, z, h, r, threshold, y, g, *of)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):

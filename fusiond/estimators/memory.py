@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from fusiond.estimators.between import SIZE as BETWEEN
 from fusiond.estimators.covariance import KEPT, work_size
 from fusiond.estimators.crossing import SUMS
+from fusiond.estimators.fault_bank import FaultTable, bank_size, begin_bank
 from fusiond.estimators.reading import WIDER, Published
 from fusiond.estimators.turned_axes import TURN_SIZE
 from fusiond.models.model import Model
@@ -25,18 +26,19 @@ Array = NDArray[np.float64]
 LINE_BYTES, LINE = 64, 8
 """A line of the cache, in bytes and in doubles."""
 
-SIZE, ROOM, USED, RECORDED, TRANSITION, GAP, AHEAD = range(7)
+SIZE, ROOM, USED, RECORDED, TRANSITION, GAP, AHEAD, BANK = range(8)
 """What the array begins with, a line of int64: states; covariances, and error estimates, that there
 is room for; how many covariances are propagated, from the first on; of which one sigmas are
 recorded; 1 if there is a transition matrix; ns beyond which no sample may stand; 1 if covariances
-are ahead of those that are held, by what has been added up."""
+are ahead of those that are held, by what has been added up; doubles of the bank of hypotheses."""
 WIDER_AT, PUBLISHED_AT = LINE, LINE + WIDER
 NAV_AT = PUBLISHED_AT + len(Published._fields)
 NAV_AT += -NAV_AT % LINE
 STEP_AT, SUMS_AT = NAV_AT + NAV_SIZE, NAV_AT + NAV_SIZE + STEP_SIZE
 XI_AT = SUMS_AT + SUMS
 """What lies where behind it, in doubles; then come parameters and error estimates, and on the next
-line covariances, with which ends what a snapshot copies, from the navigation state on."""
+line covariances and the bank, with which ends what a snapshot copies, from the navigation state
+on."""
 
 
 def line_after(doubles: int) -> int:
@@ -54,8 +56,9 @@ class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
     (9,) that what is published is `wider` by, `Published` (3,); all that is `kept` by a snapshot:
     nav (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.crossing, `xi` (n,),
-    `dxs` (k, n), `covs` (k, width, width); those before what has been added up, flat, `held`; `phi`
-    (width, width) or (0, 0); `work` for kernels that propagate a covariance; `shares` (k,)."""
+    `dxs` (k, n), `covs` (k, width, width), the `bank` of fusiond.estimators.fault_bank; covariances
+    before what has been added up, flat, `held`; `phi` (width, width) or (0, 0); `work` for kernels
+    that propagate a covariance; `shares` (k,)."""
 
     array: Array
     head: NDArray[np.int64]
@@ -68,41 +71,47 @@ class Memory(NamedTuple):
     xi: Array
     dxs: Array
     covs: Array
+    bank: Array
     held: Array
     phi: Array
     work: Array
     shares: Array
 
 
-def memory(model: Model, gap_ns: int, shares: tuple[float, ...], transition: bool) -> Memory:
+def memory(
+    model: Model, gap_ns: int, shares: tuple[float, ...], transition: bool, faults: FaultTable
+) -> Memory:
     """For filters of these shares of the noise, k of them; `phi` where a `transition` is asked
     for. Rows of matrices begin lines where they are as long as some: they are then read and written
     by whole ones."""
     n, width, k = model.size, model.width, len(shares)
     side = width if transition else 0
     square, scratch = k * width * width, scratch_size(width)
+    hypotheses = bank_size(faults, n, width)
     first = line_after(XI_AT + n + k * n)
-    total = first + 2 * square + side * side + scratch + k + model.packed.size
+    total = first + 2 * square + hypotheses + side * side + scratch + k + model.packed.size
     lines = np.zeros(total + LINE)
     begin = -lines.ctypes.data % LINE_BYTES // 8
     array = lines[begin : begin + total]
-    sizes = (square, square, side * side, scratch, k)
-    covs, held, phi, work, factors, of_model = np.split(array[first:], np.cumsum(sizes))
+    sizes = (square, hypotheses, square, side * side, scratch, k)
+    covs, bank, held, phi, work, factors, of_model = np.split(array[first:], np.cumsum(sizes))
     factors[:], of_model[:] = shares, model.packed
     head = array[:LINE].view(np.int64)
-    head[[SIZE, ROOM, USED, TRANSITION, GAP]] = n, k, k, transition, gap_ns
+    head[[SIZE, ROOM, USED, TRANSITION, GAP, BANK]] = n, k, k, transition, gap_ns, hypotheses
+    begin_bank(bank, faults)
     return Memory(
         array,
         head,
         array[WIDER_AT:PUBLISHED_AT],
         array[PUBLISHED_AT : PUBLISHED_AT + len(Published._fields)],
-        array[NAV_AT : first + square],
+        array[NAV_AT : first + square + hypotheses],
         array[NAV_AT:STEP_AT],
         array[STEP_AT:SUMS_AT],
         array[SUMS_AT:XI_AT],
         array[XI_AT : XI_AT + n],
         array[XI_AT + n : XI_AT + n + k * n].reshape(k, n),
         covs.reshape(k, width, width),
+        bank,
         held,
         phi.reshape(side, side),
         work[: work_size(width)],

@@ -24,8 +24,10 @@ from fusiond.estimators.covariance import (
     work_size,
 )
 from fusiond.estimators.crossing import DENSITIES, GRID_NS, SPAN, STEPS, add_up, cross_for
+from fusiond.estimators.fault_bank import SENSITIVITIES, walk_path
 from fusiond.estimators.memory import (
     AHEAD,
+    BANK,
     GAP,
     LINE,
     NAV_AT,
@@ -45,7 +47,7 @@ from fusiond.estimators.reading import ENTRIES, entries, in_fix_time, moving, si
 from fusiond.estimators.turned_axes import rest_rows, turn_at_rest
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS
+from fusiond.navigation.error_model import COEFFICIENTS, CORE_SIZE, WIDTHS, coefficients
 from fusiond.navigation.imu_buffer import END, HEAD_SIZE, HOLD, ROW_SIZE, START
 from fusiond.navigation.rotation import rpy_from_quaternion
 from fusiond.navigation.strapdown import (
@@ -144,9 +146,41 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     worked, scratched, square = work_size(width), scratch_size(width), width * width
 
     @compiled(
-        "void(b1, b1, f8, b1, i8, i8, f8[::1], f8[::1], f8[::1], i8, f8, f8, f8, i8, f8[::1],"
-        " f8[::1], i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1, b1[::1], i8[::1], i8[::1],"
+        "void(f8[::1], i8, f8[::1], f8[::1], f8, f8[::1], b1, f8[::1], b1[::1], i8[::1], i8[::1],"
         " f8[::1], f8[::1])",
+        variant=width,
+    )
+    def carry_hypotheses(
+        bank: Array,
+        now: int,
+        nav: Array,
+        sums: Array,
+        span: float,
+        c: Array,
+        rests: bool,
+        turn: Array,
+        active: NDArray[np.bool_],
+        sensor_terms: Indices,
+        rate_terms: Indices,
+        noise: Array,
+        work: Array,
+    ) -> None:
+        """Carry the sensitivities of a bank over what `sums` hold, `span` seconds until `now`."""
+        walk_path(bank, nav, now * 1e-9, span)
+        rows = bank[int(bank[SENSITIVITIES]) :]
+        size = noise.shape[0] // 3 * width
+        for block in range(rows.shape[0] // size):
+            part = rows[block * size : (block + 1) * size]
+            propagate_transition(
+                part, sums[STEPS:DENSITIES], c, span, active, sensor_terms, rate_terms, noise, work
+            )
+            if rests:
+                rest_rows(part, width, width, turn, sensor_terms[:12], sensor_terms[12:])
+
+    @compiled(
+        "void(b1, b1, f8, b1, i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], i8, f8, f8, f8, i8,"
+        " f8[::1], f8[::1], i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1, b1[::1], i8[::1],"
+        " i8[::1], f8[::1], f8[::1])",
         variant=width,
         forceinline=True,
     )
@@ -157,6 +191,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         rests: bool,
         count: int,
         i: int,
+        now: int,
+        bank: Array,
         between: Array,
         sigma_out: Array,
         wider: Array,
@@ -206,6 +242,11 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
             noise,
             work,
         )
+        if bank.size and not keep:
+            carry_hypotheses(
+                *(bank, now, nav, sums, span, c, rests, turn),
+                *(active, sensor_terms, rate_terms, noise, work),
+            )
         if count:
             reached = between[ENTRIES : 2 * ENTRIES]
             entries(covs[of:], width, time_slot, clock_sd_s, reached)
@@ -241,6 +282,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         xi, dxs = state[XI_AT : XI_AT + n], state[XI_AT + n : upto]
         rest = state[(upto + LINE - 1) // LINE * LINE :]
         covs, rest = rest[: room * square], rest[room * square :]
+        bank, rest = rest[: head[BANK]], rest[head[BANK] :]
         held, rest = rest[: room * square], rest[room * square :]
         of, transition = head[RECORDED] * square, head[TRANSITION]
         phi, rest = rest[: transition * square], rest[transition * square :]
@@ -272,6 +314,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         sensor_estimates(xi, sensor_slot, sensor_kind, estimate)
         q = 1.0 / shares[head[RECORDED]]
         given = (
+            bank,
             between,
             sigma_out,
             wider,
@@ -307,7 +350,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 rests = turning and step[STEP_RESTS_S] > 0.0
                 single = alone or silent or rests
                 if single and sums[SPAN] > 0.0:  # what came before is no part of it
-                    bring(ahead, False, 0.0, False, count, i, *given)
+                    bring(ahead, False, 0.0, False, count, i, now, *given)
                     ahead, count = False, 0
                 w, x, y, z = nav[Q0], nav[Q0 + 1], nav[Q0 + 2], nav[Q0 + 3]
                 strapdown_step(nav, rate, force, rate_slope, force_slope, h, hold_height, step)
@@ -318,7 +361,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 if single or stop // GRID_NS > now // GRID_NS:
                     # The held sample of a gap is a guess: its error acts over the whole of it.
                     silence = (times[i] - times[i - 1]) * 1e-9 if silent else 0.0
-                    bring(ahead, False, silence, rests, count, i, *given)
+                    bring(ahead, False, silence, rests, count, i, stop, *given)
                     ahead, count = False, 0
                 if decaying or carry:
                     decays(h, noise, width, kept)
@@ -353,7 +396,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         waits[ROW - 1] = sums[SPAN]
                         count += 1
                         if count == ROWS:
-                            bring(ahead, True, 0.0, False, count, i + 1, *given)
+                            bring(ahead, True, 0.0, False, count, i + 1, now, *given)
                             ahead, there, count = True, True, 0
                     else:
                         entries(covs[of:], width, time_slot, clock_sd_s, reached)
@@ -364,8 +407,14 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                 i += 1
         if sums[SPAN] > 0.0:
             if not there:
-                bring(ahead, passing, 0.0, False, count, i, *given)
+                bring(ahead, passing, 0.0, False, count, i, now, *given)
             elif not passing:
+                if bank.size:  # the covariances are there already
+                    coefficients(nav, mean, sums[SPAN], c)
+                    carry_hypotheses(
+                        *(bank, now, nav, sums, sums[SPAN], c, False, turn),
+                        *(active, sensor_terms, rate_terms, noise, work),
+                    )
                 sums[SPAN] = 0.0
         head[AHEAD] = sums[SPAN] > 0.0
         for k in range(used):

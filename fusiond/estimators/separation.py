@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import Outcome, gate_threshold
-from fusiond.estimators.doubt import open_by
+from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.federated.options import local_of
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
@@ -60,14 +59,14 @@ class SeparatedEstimator(KalmanEstimator):
         """(devices, 3), m: position of the solution without each device minus the published one."""
         return self._dxs[0, POSITION] - self._dxs[1:, POSITION]
 
-    def update(self, aid: Linearised) -> Outcome:
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
             return Outcome(innovation.outcome)
         held, self._holding = self._holding, True
         try:
-            outcome = super().update(aid)
+            outcome = super().update(aid, noise)
         finally:
             self._holding = held
         self._fold_into_subsets(aid, innovation)
@@ -88,20 +87,13 @@ class SeparatedEstimator(KalmanEstimator):
             self._fold_into_subsets(aid, innovation)
         return outcome
 
-    def doubt(
-        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
-    ) -> None:
-        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors, which
-        all share. What a device measures is no concern of the subset without it."""
-        super().doubt(aid, measured, motion, apart)
-        rows = self._linearise(aid)
-        if isinstance(rows, NotApplicable):
-            return
-        own = self._device(aid)
-        for k in range(len(self.devices)):
-            used = len(rows.z) if measured and k != own else 0
-            z, h = rows.z[:used], rows.h[:used]
-            open_by(self._covs[k + 1], self.model, z - h @ self._dxs[k + 1], h, motion)
+    def adopt(self, mean: Array, spread: Array) -> None:
+        """Take a fault's effect out of the state, which all share: its mean (n,), and P grows by
+        `spread` (n, n)."""
+        super().adopt(mean, spread)
+        n = self.model.size
+        self._covs[1:, :n, :n] += spread
+        self._dxs[1:] -= mean
 
     def release(self) -> None:
         """Feed back what was carried."""

@@ -76,7 +76,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Linearised
 from fusiond.estimators.antenna_place import antenna_slots, keep_antenna
-from fusiond.estimators.base import Outcome
+from fusiond.estimators.base import AS_STATED, Outcome
+from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT
 from fusiond.estimators.turn_rate import gyro_slots, keep_turn
@@ -249,8 +250,8 @@ class TiltAxesFilter(KalmanEstimator):
     the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
     of an antenna where a lever arm is estimated (fusiond.estimators.antenna_place)."""
 
-    def __init__(self, model: Model, gap_s: float) -> None:
-        super().__init__(model, gap_s)
+    def __init__(self, model: Model, gap_s: float, faults: FaultTable = NO_FAULTS) -> None:
+        super().__init__(model, gap_s, faults=faults)
         # Slots and axes, the vertical one first: without it there is none to take what is left.
         found = [
             (slot, axis) for axis in (2, 0, 1) for slot in model.parameters(FORCE_ERROR + axis)
@@ -279,20 +280,18 @@ class TiltAxesFilter(KalmanEstimator):
         super().initialise(t_ns, sample, nav, xi, covariance)
         self.undoubted = True
 
-    def doubt(
-        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
-    ) -> None:
-        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
-        super().doubt(aid, measured, motion, apart)
-        self.undoubted &= not motion
+    def adopt(self, mean: Array, spread: Array) -> None:
+        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
+        super().adopt(mean, spread)
+        self.undoubted = False
 
-    def update(self, aid: Linearised) -> Outcome:
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
         self.turned = 0.0
         if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
-            return self._fold_in(aid)
+            return self._fold_in(aid, noise)
         before = self._estimate()
-        outcome = self._fold_in(aid)
+        outcome = self._fold_in(aid, noise)
         if outcome.name == "fused":
             self._carry_over(before)
         return outcome
@@ -321,6 +320,10 @@ class TiltAxesFilter(KalmanEstimator):
         """P after an update of an `_estimate` `before`."""
         slots = self._biases, *self._kept
         self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
+        if self.hypotheses is not None:
+            for v in self.hypotheses.sensitivities:
+                turn_rows(v, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
+                keep_rows(v, before, self.nav, self.xi, self.turned, *self._kept)
 
     @property
     def _keeps_turn(self) -> bool:

@@ -137,7 +137,6 @@ class WarmKeeper:
                 self._boot_id,
                 _asleep_ns(),
                 confirmed=not navigator.unconfirmed,
-                moved=navigator.timeline.isolation.handed_on(navigator.estimator.t_ns),
             )
             return KeptState(state, self._clock.known())
         except ValidationError as error:

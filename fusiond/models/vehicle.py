@@ -62,9 +62,9 @@ def time_offset(name: str, sd_s: float) -> Block:
 
 
 def fix_wander(name: str, lasts_s: float) -> Block:
-    """An error north and east that fixes share for a while, of sigma one: an aid says how many
-    metres it counts (fusiond.aiding.wander)."""
-    return Block(name, "1", ("n", "e"), (-1, -1), initial=1.0, steady=1.0, tau_s=lasts_s)
+    """An error that fixes share for a while, of sigma one: an aid says how many metres it counts
+    (fusiond.aiding.wander)."""
+    return Block(name, "1", ("n", "e", "d"), (-1,) * 3, initial=1.0, steady=1.0, tau_s=lasts_s)
 
 
 def antenna_lever(name: str, sd_m: float) -> Block:

@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from fusiond.integrity.series import NEVER_NS
 from fusiond.models.blocks import Block
 from fusiond.models.model import Model
 from fusiond.models.vehicle import (
@@ -46,6 +45,9 @@ from fusiond.models.vehicle import (
 )
 
 Array = NDArray[np.float64]
+
+# Before any instant that a clock can say.
+NEVER_NS = -(2**62)
 
 CALIBRATED = (
     MOUNTING,

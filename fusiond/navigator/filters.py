@@ -6,7 +6,7 @@ one runs. Each is imported where it is asked for: loading its kernels takes a st
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from fusiond.configuration.aiding import GnssAiding
@@ -16,6 +16,7 @@ from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.estimators.separation import SeparatedEstimator
+from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
@@ -63,13 +64,19 @@ def _unasked(config: Config, block: Block) -> bool:
     return silent and block.name.startswith(ANTENNA_LEVER)
 
 
-def estimator_of(config: Config, model: Model) -> Estimator:
-    """The estimator that `[estimator] filter` names."""
+def kinds_of_config(config: Config, model: Model) -> list[Kind]:
+    """What may be wrong of a vehicle's sensors."""
+    aiding = {name: section.kind for name, section in config.aiding.items()}
+    return kinds_of(model, aiding or {"gnss": "gnss"}, config.constraints.non_holonomic.enabled)
+
+
+def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Estimator:
+    """The estimator that `[estimator] filter` names, with a bank of the `kinds` where it can."""
     match config.estimator.filter:
         case "kalman":
             if config.integrity.watched:
                 return SeparatedEstimator(model, config.imu.gap_s, config.positioning)
-            return InvariantFilter(model, config.imu.gap_s)
+            return InvariantFilter(model, config.imu.gap_s, faults=table_of(kinds))
         case "multiscale":
             from fusiond.estimators.multiscale.filter import MultiscaleEstimator  # noqa: PLC0415
 

@@ -7,7 +7,7 @@ filter as far as the IMU reaches, `solution` reads the state at an instant.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,35 +15,39 @@ from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
-from fusiond.aiding.standstill import TURNS_AT_REST
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
+from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
-from fusiond.navigator.alignment.lateness import Lateness
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
-from fusiond.navigator.filters import estimator_of, imu_buffer_of, model_of, verdicts_of
+from fusiond.navigator.filters import (
+    estimator_of,
+    imu_buffer_of,
+    kinds_of_config,
+    model_of,
+    verdicts_of,
+)
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS, FailedAids, broken
 from fusiond.navigator.imu_change import hand_over, publish_by_axes
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
-from fusiond.navigator.left_out import LeftOut
 from fusiond.navigator.protection import ProtectionWatch
-from fusiond.navigator.readout import publish_by_own_clock, solution_of
+from fusiond.navigator.readout import solution_of
 from fusiond.navigator.saved_state import SavedState
-from fusiond.navigator.standing import Standing
+from fusiond.navigator.service_events import ServiceEvents
 from fusiond.navigator.state_file import RefusedStateError
+from fusiond.navigator.status import Begun, NavigationStatus
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
-from fusiond.navigator.worth import Begun, Worth
 
 if TYPE_CHECKING:
     from fusiond.navigator.saved_calibration import SavedCalibration
@@ -68,7 +72,7 @@ class Navigator:
         saved: SavedState | None = None,
         on_event: Callable[[str, str], None] | None = None,
         on_outcome: Callable[[Entry], None] | None = None,
-        estimator: Callable[[Config, Model], Estimator] = estimator_of,
+        estimator: Callable[[Config, Model, Sequence[Kind]], Estimator] = estimator_of,
     ) -> None:
         self.config = config
         self._saved = saved
@@ -82,18 +86,19 @@ class Navigator:
         self.imu = imu_buffer_of(config)
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
-        self.estimator = estimator(config, self.model)
+        kinds = kinds_of_config(config, self.model)
+        self.estimator = estimator(config, self.model, kinds)
         publish_by_axes(self.estimator, imu)
         self.verdicts = verdicts_of(config, self.model, self._event)
         self.timeline = Timeline(
-            self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome
+            *(self.estimator, self.imu, e.buffer_s, e.checkpoint_s, self._outcome),
+            kinds if self.estimator.hypotheses is not None else (),
         )
         self._on_outcome = on_outcome
         self._constraints = ConstraintMaker(config.constraints, self._noise)
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedAids(self._event)
-        self._left_out = LeftOut(self.timeline, names, self._event)
-        self._standing = Standing(config.plausibility.max_speed_m_s, bool(of_vehicle))
+        self._service = ServiceEvents(self.timeline, names, self._event)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
@@ -105,11 +110,7 @@ class Navigator:
         self.calibration: SavedCalibration | None = None
         """What an earlier drive has shown, taken up by each alignment until it is refuted."""
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
-        self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
-        self._worth = Worth(
-            *(config, self.estimator, self.imu, self.timeline),
-            *(self._door, self._units, self._standing, self._lateness),
-        )
+        self._status = NavigationStatus(config, self.estimator, self.imu, self._door, self._units)
         self._aligner = self._new_aligner()
 
     def _new_aligner(self) -> Aligner:
@@ -186,7 +187,6 @@ class Navigator:
             return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
-        aids = self._lateness.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
         self._units.fix(m, t_ns, self.imu, aids)
@@ -197,9 +197,6 @@ class Navigator:
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
-        self._lateness.stop()
-        if self.started is not None:
-            self._standing.ended(self.timeline.isolation)
         self.timeline.clear()
         self._protection.restart()
         self.started, self._saved, self.warm = None, saved, None
@@ -222,7 +219,7 @@ class Navigator:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
-            if start is None or self._late() or self._aligner.waits(start, self._lateness):
+            if start is None:
                 return
             if self.calibration is not None and not self.on_trial:
                 start = self.calibration.taken_up(start, self.model)
@@ -231,13 +228,11 @@ class Navigator:
             self.estimator.initialise(start.t_ns, first, start.nav, start.xi, start.covariance)
             if isinstance(self.estimator, InvariantFilter):
                 self.estimator.turns = start.turns
-            standing = self._standing
-            self.timeline.start(start.contradicted, start.used, standing.failed, standing.moved)
+            self.timeline.start(start.used)
             self.verdicts.reset()
             self.started = start
             self._afterwards = Afterwards(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
-            self._standing.started(start.t_ns)
             self._event("aligned", f"heading from {start.how}")
         self.timeline.run(record)
         self.verdicts.tell()
@@ -247,18 +242,12 @@ class Navigator:
             return
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
-        e, isolation = self.estimator, self.timeline.isolation
-        failure = self.calibrating.turned or self._lateness.changed(e, self._standing.failed)
-        failure = failure or self._standing.failure(e.t_ns, isolation, e.nav)
+        failure = self.calibrating.turned or self._status.failure(self.timeline.diagnosis)
         if failure is not None:
-            self._standing.given_up(e.t_ns)
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
-        doubtful = self._lateness.due(e.t_ns) and self._standing.doubtful(e, isolation)
-        if (doubtful or self._lateness.pending) and self._late():
-            return
-        self._left_out.tell()
+        self._service.tell()
         if self.warm is not None and self.warm.refused_by is not None:
             why = f"{self.warm.refused_by} speaks against the state of before the restart"
             self._event("warm_start_refused", f"{why}: aligning anew")
@@ -282,26 +271,13 @@ class Navigator:
         e, start = self.estimator, self._afterwards
         if start is None:
             return False
-        doubted = bool(self.timeline.isolation.doubts)
+        doubted = bool(self.timeline.diagnosis.findings)
         wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.witnesses, doubted)
         if wrong is None:
             return False
-        if wrong[0] != "heading_contradicted":  # that was the claim's fault, not the sensors'
-            self._standing.given_up(e.t_ns)
         self._event(*wrong)
         self.reset(wrong[1])
         self._aligner.known.told.add(wrong[0])
-        return True
-
-    def _late(self) -> bool:
-        """Whether a receiver is found to be late; alignment then begins anew, by its last fixes at
-        the instants at which they were true."""
-        found = self._lateness.look(self.imu)
-        if found is None:
-            return False
-        publish_by_own_clock(self.estimator, found.sd_s)  # it has said when the fixes were
-        self.reset(found.why)
-        self._aligner.aids(self._lateness.kept())
         return True
 
     def _warm_start(self) -> Start | None:
@@ -309,9 +285,7 @@ class Navigator:
         if self.warm is None or not self.imu.end:
             return None
         try:
-            start = self.warm.start(self.imu.oldest_ns)
-            self._standing.moved = self.warm.moved
-            return start
+            return self.warm.start(self.imu.oldest_ns)
         except RefusedStateError as error:
             self._event("warm_state_refused", str(error))
             self.warm = None
@@ -330,7 +304,7 @@ class Navigator:
 
     def isolated(self, source: str) -> str | None:
         """Why the fault detection leaves a source out; None if it does not."""
-        return self._left_out.reason(source)
+        return self._service.reason(source)
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, of all that has been run by `advance`.
@@ -360,7 +334,7 @@ class Navigator:
         begun = None
         if self.started is not None:
             begun = Begun(self.started.how, self.unconfirmed, self._last_position_ns)
-        return self._worth.of(t_ns, begun, self._aligner.reason)
+        return self._status.of(t_ns, begun, self._aligner.reason)
 
     # ------------------------------------------------------------------ inside
 
@@ -376,7 +350,7 @@ class Navigator:
         if self.warm is not None and aid.locates:
             self.warm.judge(source, name)
         if name == "fused":
-            if not (entry.judged or entry.assumed) and outcome.whitened:
+            if not entry.judged and outcome.whitened:
                 entry.judged = True
                 self.verdicts.judge(aid, outcome)
             t_ns = entry.key[0]
@@ -384,8 +358,6 @@ class Navigator:
                 self.last_fused_ns[source] = t_ns
             if aid.locates and t_ns > self._last_position_ns:
                 self._last_position_ns = t_ns
-        elif name == TURNS_AT_REST:
-            self._standing.turned(entry.key[0])
         if aid.screened:
             aid.judged(outcome.rows, outcome.whitened)
             if name in JUDGED:

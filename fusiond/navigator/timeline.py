@@ -9,10 +9,9 @@ that is due comes first.
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -20,16 +19,9 @@ import numpy as np
 
 from fusiond.aiding.base import Aid, Feedback
 from fusiond.aiding.offers import Offer
-from fusiond.aiding.standstill import TURNING, TURNS_AT_REST
 from fusiond.estimators.base import Estimator, Outcome, Snapshot
-from fusiond.integrity.action import MEASURED, MOTION, NONE, Action
-from fusiond.integrity.isolation import Isolation
-from fusiond.integrity.kept import Memory
-from fusiond.integrity.moved import Moved
-from fusiond.integrity.ordinary import ASSUMED, SITS, Ordinary
-from fusiond.integrity.proof import UNPROVEN_SIGMAS
-from fusiond.integrity.series import Said, said
-from fusiond.models.vehicle import MOUNTING
+from fusiond.integrity.catalogue import Kind
+from fusiond.integrity.diagnosis import Diagnosis, Memory
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import STEP_RESTS_S
 from fusiond.navigator.health_check import RAISED_BY_NUMBERS
@@ -39,7 +31,6 @@ Key = tuple[int, str, int]
 
 # Outcomes that say something of a source.
 JUDGED = frozenset({"fused", "gated", "isolated"})
-TURNS = frozenset({TURNING, TURNS_AT_REST})
 # Aids that may wait for the start or for the IMU: more than a minute of all that a well-equipped
 # vehicle sends. Beyond it the oldest are given up.
 MOST_WAITING = 4096
@@ -57,12 +48,8 @@ class Entry:
     key: Key
     aid: Aid
     feedback: Feedback = "at_once"
-    tilts: bool = False
-    ordinary: Ordinary | None = None
-    says: Said | None = None
     outcome: Outcome | None = None
     judged: bool = False
-    assumed: bool = False
     error: str = ""
     raw: RawInnovation | None = None
 
@@ -96,6 +83,7 @@ class Timeline:
         keep_s: float,
         checkpoint_s: float,
         on_outcome: Callable[[Entry], None] | None = None,
+        kinds: Sequence[Kind] = (),
     ) -> None:
         self.estimator = estimator
         self.imu = imu
@@ -109,29 +97,16 @@ class Timeline:
         self._keys: list[Key] = []
         self._next = 0
         self._checkpoints: list[_Checkpoint] = []
-        self.isolation = Isolation()
-        self._wider = self.isolation.hedge.wider
+        self.diagnosis = Diagnosis(kinds)
         self._isolates = estimator.isolates
-        self._failed = False
-        self._mounting = estimator.model.slots_of(MOUNTING)
-        self._mounting_sd = max(estimator.model.initial[self._mounting].tolist(), default=0.0)
 
-    def start(
-        self,
-        contradicted: bool = False,
-        used: Collection[Offer] = (),
-        failed: bool = False,
-        moved: Moved | None = None,
-    ) -> None:
+    def start(self, used: Collection[Offer] = ()) -> None:
         """Begin at the estimator's state: nothing earlier can be applied any more, and nothing that
-        it was made of, `used`, once more. `contradicted`: positions have moved otherwise than their
-        velocities; `failed`: the navigation before this one was given up; `moved`: what is used had
-        left it."""
-        self._next, self._failed = 0, failed
-        self.isolation.reset(contradicted, failed, moved)
-        self._hedge()
+        it was made of, `used`, once more."""
+        self._next = 0
+        self.diagnosis.reset()
         self._checkpoints = [
-            _Checkpoint(self.estimator.snapshot(), None, self.isolation.snapshot())
+            _Checkpoint(self.estimator.snapshot(), None, self.diagnosis.snapshot())
         ]
         t_ns = self.estimator.t_ns
         self._give_up(bisect_left(self._keys, (t_ns, "", 0)), "no_alignment")
@@ -169,9 +144,7 @@ class Timeline:
         first = " " if aid.moves and not aid.locates else ""
         feedback = aid.feedback
         key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
-        # Where a model knows no sensor errors, those that there are tilt it: that is its nature.
-        tilts = (aid.locates or aid.moves) and self.estimator.model.sensor_errors
-        entry = Entry(key, aid, feedback, tilts)
+        entry = Entry(key, aid, feedback)
         if self._checkpoints and not self._precedes(self._checkpoints[0], key):
             self._count(entry, Outcome("too_old"))
             return entry
@@ -180,7 +153,6 @@ class Timeline:
         if at < last and self._keys[at] == key:
             self._count(entry, Outcome("duplicate"))
             return entry
-        entry.ordinary = self.isolation.ordinary(aid, self.estimator.model, tilts)
         self._keys.insert(at, key)
         self._entries.insert(at, entry)
         if self._checkpoints and (
@@ -220,9 +192,8 @@ class Timeline:
         estimator = self.estimator
         present = estimator.snapshot()
         checkpoint = next(c for c in reversed(self._checkpoints) if c.snapshot.t_ns <= t_ns)
-        memory = self.isolation.snapshot()
-        self.isolation.restore(checkpoint.memory)
-        self._hedge()
+        memory = self.diagnosis.snapshot()
+        self.diagnosis.restore(checkpoint.memory)
         estimator.restore(checkpoint.snapshot)
         try:
             for row in range(self._following(checkpoint), len(self._entries)):
@@ -236,8 +207,7 @@ class Timeline:
             yield
         finally:
             estimator.restore(present)
-            self.isolation.restore(memory)
-            self._hedge()
+            self.diagnosis.restore(memory)
 
     def _give_up(self, count: int, name: str) -> None:
         """Drop the first `count` of those that wait."""
@@ -255,78 +225,24 @@ class Timeline:
             return Outcome("failed")
 
     def _applied(self, entry: Entry) -> Outcome:
-        estimator, isolation, aid = self.estimator, self.isolation, entry.aid
-        one = entry.ordinary
-        if one is not None and (plain := estimator.plain()) is not None:
-            raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-            if (found := isolation.take(aid, one, plain, estimator)) is not None:
-                outcome, shown, action = found
-                entry.raw = raw
-                if not entry.judged:
-                    entry.assumed = shown & ASSUMED > 0
-                wider = isolation.hedge.wider
-                if shown or wider or wider is not self._wider or self._failed:
-                    self._act(aid, action, shown & SITS > 0 or bool(wider) or self._failed)
-                return outcome
+        estimator, diagnosis = self.estimator, self.diagnosis
         if entry.feedback == "release":
             estimator.release()
         elif entry.feedback == "hold":
             estimator.hold()
-        if entry.tilts:
-            if (share := isolation.unsettled(aid.t_ns)) and not self._isolates:
-                estimator.unsettle(share)
-            isolation.correcting(estimator.nav, estimator.covariance)
-        aid = aid.at(estimator.nav)
+        aid = entry.aid.at(estimator.nav)
         entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-        coarse = isolation.coarseness(aid)
-        if coarse == math.inf:
-            outcome = estimator.look(aid)
-        elif aid.locates and isolation.unproven(aid.source, aid.t_ns):
-            outcome = self._unproven(aid)
-        else:
-            outcome = estimator.update(aid if coarse == 1.0 else aid.coarser(coarse))
-            if aid.rests_s:
-                estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
-        if not entry.judged:
-            entry.assumed = isolation.assumes(aid)
-        if outcome.name in TURNS:
-            isolation.turns_at_rest(aid.felt_turn(estimator.state))
-            self._hedge()
-        if outcome.name in JUDGED and not self._isolates:
-            says, state = entry.says, estimator.state
-            nav, p = state.nav, state.covariance
-            assert p is not None, "of a filter"
-            if says is None or aid is not entry.aid:
-                says = entry.says = said(aid.offers())
-            action = isolation.judge(aid, outcome, nav, p, state, says)
-            if action is NONE and entry.tilts and outcome.name == "fused":
-                action = isolation.corrected(aid.t_ns, nav, p, estimator.turned)
-            self._act(aid, action)
+        if self._isolates:
+            return estimator.update(aid)
+        one = diagnosis.comes(aid, estimator)
+        outcome = estimator.look(aid) if one.out else estimator.update(aid, one.noise)
+        if aid.rests_s:
+            estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
+        if outcome.name in JUDGED:
+            correction = diagnosis.judge(aid, one, outcome, estimator)
+            if correction is not None:
+                estimator.adopt(correction.mean, correction.spread)
         return outcome
-
-    def _act(self, aid: Aid, action: Action, sits: bool = True) -> None:
-        """Do what came of an aid, of which the mounting is known as well where it `sits`."""
-        if action is not NONE:
-            apart = self.isolation.shown
-            self.estimator.doubt(aid, action in MEASURED, action in MOTION, apart)
-        if sits and aid.constraint and self._mounting:
-            angle = self.estimator.xi.item
-            angles = [angle(slot) for slot in self._mounting]
-            self.isolation.hedge.sits(angles, 0.0 if self._failed else self._mounting_sd)
-        if self.isolation.hedge.wider is not self._wider:
-            self._hedge()
-
-    def _hedge(self) -> None:
-        """What the estimator publishes is as wide as the isolation has it now."""
-        self._wider = wider = self.isolation.hedge.wider
-        self.estimator.wider[:] = sum(wider.values())
-
-    def _unproven(self, aid: Aid) -> Outcome:
-        """Fold one aid in whose motion is yet to be seen, as coarser than it says: its innovation
-        says nothing of the sigma that it states."""
-        estimator = self.estimator
-        self.isolation.comes(aid, estimator.state, estimator.covariance)
-        return estimator.update(aid.coarser(UNPROVEN_SIGMAS))._replace(whitened=())
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:
         before, entry.outcome = entry.outcome, outcome
@@ -343,7 +259,7 @@ class Timeline:
         if self.estimator.t_ns - last.snapshot.t_ns >= self._checkpoint_ns:
             last_key = self._keys[self._next - 1] if self._next else last.last_key
             self._checkpoints.append(
-                _Checkpoint(self.estimator.snapshot(), last_key, self.isolation.snapshot())
+                _Checkpoint(self.estimator.snapshot(), last_key, self.diagnosis.snapshot())
             )
 
     def _rewind(self, key: Key) -> None:
@@ -353,8 +269,7 @@ class Timeline:
             self._checkpoints.pop()
         checkpoint = self._checkpoints[-1]
         self.estimator.restore(checkpoint.snapshot)
-        self.isolation.restore(checkpoint.memory)
-        self._hedge()
+        self.diagnosis.restore(checkpoint.memory)
         self._next = self._following(checkpoint)
         self.counters.rewinds += 1
         self.counters.rewound_ns += max(0, before - key[0])

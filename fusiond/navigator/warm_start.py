@@ -46,7 +46,6 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fusiond.estimators.base import Estimator
-from fusiond.integrity.moved import Moved
 from fusiond.models.model import Model
 from fusiond.navigation.error_model import CORE_SIZE, DR, DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -90,25 +89,13 @@ Running = Annotated[float, Field(ge=0.0, le=1e8)]
 
 
 @dataclass(frozen=True, slots=True, config=STRICT)
-class WarmMoved:
-    """As of `fusiond.integrity.moved.Moved`: what a receiver may be off by."""
-
-    device: Annotated[str, Field(max_length=128)]
-    since_ns: Nanoseconds
-    lasted_ns: Nanoseconds
-    squares: tuple[Way, Way, Way]
-    speeds: tuple[Running, Running]
-    tilt: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
-
-
-@dataclass(frozen=True, slots=True, config=STRICT)
 class WarmState:
     """A navigation state: instant, nav (10,), parameters (n,), P (n, n) as its lower triangle.
 
     `t_ns` is CLOCK_MONOTONIC of the boot `boot_id`, `asleep_ns` CLOCK_BOOTTIME minus that clock;
     `config` the digest of the configuration whose states these are, `how` the heading's origin,
     `confirmed` whether anything has shown that heading. `turn_rad_s` is the rate of the heading,
-    `push_m_s2` the acceleration along the way, `moved` what one of its sources may be off by.
+    `push_m_s2` the acceleration along the way.
     """
 
     boot_id: Annotated[str, Field(min_length=1, max_length=64)]
@@ -124,7 +111,6 @@ class WarmState:
     xi: Annotated[tuple[float, ...], Field(max_length=64)]
     covariance: Annotated[tuple[float, ...], Field(max_length=64 * 65 // 2)]
     confirmed: bool = True
-    moved: WarmMoved | None = None
     version: Literal[1] = 1
 
 
@@ -152,15 +138,6 @@ class WarmStart:
         self.on_trial = True
         return _after_gap(self._state, self._model, self._covariance, t_ns, gap_s)
 
-    @property
-    def moved(self) -> Moved | None:
-        """What a source may be off by that the navigation goes on with."""
-        known = self._state.moved
-        if known is None:
-            return None
-        lasts = known.since_ns, known.lasted_ns
-        return Moved(known.device, *lasts, known.squares, known.speeds, known.tilt)
-
     def judge(self, source: str, outcome: str) -> None:
         """A position aid of `source` has been applied: the first to be fused or gated decides."""
         if self.on_trial and outcome in ("fused", "gated"):
@@ -178,10 +155,9 @@ def warm_state(
     asleep_ns: int,
     *,
     confirmed: bool,
-    moved: Moved | None,
 ) -> WarmState:
-    """What the estimator holds, what the IMU felt last, and what a source may have `moved` by.
-    Raises pydantic's `ValidationError` if no vehicle can have that."""
+    """What the estimator holds and what the IMU felt last. Raises pydantic's `ValidationError` if
+    no vehicle can have that."""
     turn, push = _manoeuvre(estimator, imu)
     nav = estimator.nav.tolist()
     longitude = (nav[1] + math.pi) % (2.0 * math.pi) - math.pi
@@ -200,7 +176,6 @@ def warm_state(
         xi=tuple(estimator.xi.tolist()),
         covariance=tuple(estimator.covariance[rows].tolist()),
         confirmed=confirmed,
-        moved=None if moved is None else WarmMoved(*moved),
     )
 
 

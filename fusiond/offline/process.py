@@ -26,6 +26,7 @@ from fusiond.estimators.base import Estimator
 from fusiond.files.csv_tables import counts
 from fusiond.files.solution_csv import STATUS
 from fusiond.files.tables import ImuTable
+from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import longest_step
 from fusiond.navigator.filters import estimator_of
@@ -138,10 +139,10 @@ def _process(
 # The smoother's kernels are loaded where it is asked for.
 
 
-def _taped(config: Config, model: Model) -> Estimator:
+def _taped(config: Config, model: Model, kinds: Sequence[Kind]) -> Estimator:
     from fusiond.offline.smooth import taped  # noqa: PLC0415
 
-    return taped(config, model)
+    return taped(config, model, kinds)
 
 
 def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:

@@ -16,6 +16,7 @@ P_s = P - P Lambda P is a small difference of large numbers where smoothing help
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,6 +28,7 @@ from fusiond.estimators.smoothing.backward import Corrections, Smoother, correct
 from fusiond.estimators.smoothing.node import Nodes
 from fusiond.estimators.smoothing.taped import NEVER, Node, TapedKalman, nodes_of
 from fusiond.files.solution_csv import SMOOTHED, STATUS
+from fusiond.integrity.catalogue import Kind, table_of
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
@@ -41,14 +43,14 @@ BLOCK_NODES, BLOCK_ROWS, MOST_BYTES = 2048, 8192, 512_000_000
 _SMOOTHED, _INVALID = STATUS.index(SMOOTHED), STATUS.index(Mode.INVALID)
 
 
-def taped(config: Config, model: Model) -> TapedKalman:
+def taped(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> TapedKalman:
     """The estimator of a configuration, with a tape; it computes no protection levels, which are
     not of a smoothed solution. ConfigError for a filter that has no tape."""
     if config.estimator.filter != "kalman":
         raise ConfigError(
             f"estimator.filter: {config.estimator.filter!r} cannot be smoothed; choose 'kalman'"
         )
-    return TapedKalman(model, config.imu.gap_s)
+    return TapedKalman(model, config.imu.gap_s, faults=table_of(kinds))
 
 
 class SmoothedRows:

@@ -37,8 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
-from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
-from fusiond.estimators.doubt import open_by
+from fusiond.estimators.base import AS_STATED, ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.federated.bank import combine
 from fusiond.estimators.federated.isolation import INNOVATION, FaultDetection
 from fusiond.estimators.federated.options import FederatedOptions, local_of
@@ -128,7 +127,7 @@ class FederatedFilter(ErrorStateFilter):
 
     # ------------------------------------------------------------------ update
 
-    def update(self, aid: Linearised) -> Outcome:
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not.
 
         NIS and whitened innovation of the outcome are those of what is published; those of a
@@ -224,14 +223,6 @@ class FederatedFilter(ErrorStateFilter):
         """The covariances that are kept between updates, with their shares."""
         return [(self._covs[0], 1.0)]
 
-    def _open(self, i: Innovation, motion: bool) -> None:
-        """Open the bank for an innovation that is in doubt."""
-        raise NotImplementedError
-
-    def _doubt(self, rows: Innovation, motion: bool) -> None:
-        self._bring_up()
-        self._open(rows, motion)
-
     def _fold(self, local: int | None, i: Innovation) -> str:
         """Take an innovation that has passed in, of a local filter or of all; its outcome."""
         raise NotImplementedError
@@ -245,10 +236,6 @@ class FederatedFilter(ErrorStateFilter):
         raise NotImplementedError
 
     # ------------------------------------------------------------------ parts of an update
-
-    def _widen_by(self, cov: Array, dx: Array, i: Innovation, motion: bool) -> None:
-        """Open a filter for an innovation that is in doubt."""
-        open_by(cov, self.model, i.z - i.h @ dx, i.h, motion)
 
     @staticmethod
     def _fuse_into(cov: Array, dx: Array, i: Innovation, share: float = 1.0) -> None:

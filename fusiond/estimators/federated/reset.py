@@ -49,9 +49,6 @@ class ResetFilter(FederatedFilter):
     ) -> None:
         super().__init__(model, gap_s, names, options, 2)
 
-    def _open(self, i: Innovation, motion: bool) -> None:
-        self._widen_by(self._covs[0], self._dxs[0], i, motion)
-
     def _fold(self, local: int | None, i: Innovation) -> str:
         if local is None or self.options.mode == "zero_reset":
             self._fuse_into(self._covs[0], self._dxs[0], i)

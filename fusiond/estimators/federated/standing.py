@@ -124,12 +124,6 @@ class StandingFilter(FederatedFilter):
         bank = zip(self._bank, self._bank_shares.tolist(), strict=True)
         return [(self._covs[0], 1.0), *bank]
 
-    def _open(self, i: Innovation, motion: bool) -> None:
-        for k in self._members():
-            self._widen_by(self._bank[k], self._bank_dxs[k], i, motion)
-        self._widen_by(self._covs[0], self._dxs[0], i, motion)
-        self._mark()
-
     def _fold(self, local: int | None, i: Innovation) -> str:
         if local is None:
             for k in self._members():

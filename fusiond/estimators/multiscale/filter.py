@@ -26,8 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.base import ErrorStateFilter, Outcome, gate_threshold
-from fusiond.estimators.doubt import open_by
+from fusiond.estimators.base import AS_STATED, ErrorStateFilter, Outcome, gate_threshold
 from fusiond.estimators.memory import RECORDED, USED
 from fusiond.estimators.multiscale.block import (
     Block,
@@ -147,7 +146,7 @@ class MultiscaleEstimator(ErrorStateFilter):
         self._covs[0], self._dxs[1], self._carrying = 0.0, 0.0, False
         self._phi[:] = np.eye(len(self._phi))
 
-    def update(self, aid: Linearised) -> Outcome:
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
         innovation = self._linearise(aid)
         if isinstance(innovation, NotApplicable):
@@ -198,12 +197,6 @@ class MultiscaleEstimator(ErrorStateFilter):
         update(o.block.cov, o.block.mean, total, rows_on(o.w, len(o.w) - 1, h), r)
         self._commit(o, total, h, r)
         return Outcome("fused", s.nis, int(kept.sum()), tuple(s.y.tolist()), codes)
-
-    def _doubt(self, rows: Innovation, motion: bool) -> None:
-        """Blocks that were wrong are given up, and the start comes again from a wider P."""
-        wide = self.covariance
-        open_by(wide, self.model, rows.z - rows.h @ self._dxs[0], rows.h, motion)
-        self._begin_anew(wide)
 
     def _open(self) -> _Open:
         """The block that ends now, with all that was measured before. Nothing changes."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import Outcome, Screened, Snapshot
+from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.reading import Published
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
@@ -66,9 +67,13 @@ class TapedKalman(TiltAxesFilter):
     carries_transition = True
 
     def __init__(
-        self, model: Model, gap_s: float, on_ended: Callable[[Node], None] = lambda newest: None
+        self,
+        model: Model,
+        gap_s: float,
+        on_ended: Callable[[Node], None] = lambda newest: None,
+        faults: FaultTable = NO_FAULTS,
     ) -> None:
-        super().__init__(model, gap_s)
+        super().__init__(model, gap_s, faults)
         self.newest: Node | None = None
         self.rewound = NEVER
         """The oldest sample that was taken back since somebody set this to `NEVER`."""
@@ -147,10 +152,10 @@ class TapedKalman(TiltAxesFilter):
         """None: the tape keeps the rows of each update."""
         return None
 
-    def _fold_in(self, aid: Linearised) -> Outcome:
+    def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
         np.copyto(self._before, self._covs[0])
         held = self._dxs[0].copy()
-        outcome = super()._fold_in(aid)
+        outcome = super()._fold_in(aid, noise)
         rows = self._rows
         if outcome.name == "fused" and not isinstance(rows, NotApplicable):
             z, h, r = rows
@@ -187,18 +192,11 @@ class TapedKalman(TiltAxesFilter):
             np.copyto(self._before, cov)
         return screened
 
-    def doubt(
-        self, aid: Linearised, measured: bool, motion: bool, apart: tuple[float, ...] = ()
-    ) -> None:
-        """Widen P: by an aid's innovation what it measures, or attitude and sensor errors."""
+    def adopt(self, mean: Array, spread: Array) -> None:
+        """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
         self._close()  # with P as it was: what was before does not jump
-        super().doubt(aid, measured, motion, apart)
-        self._close()
-
-    def unsettle(self, share: float) -> None:
-        """Add that share of what a doubt of the motion adds to the sensor errors' variances."""
-        self._close()
-        super().unsettle(share)
+        self._fed_back += mean
+        super().adopt(mean, spread)
         self._close()
 
     def release(self) -> None:

@@ -19,9 +19,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.base import Outcome
+from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.propagation import propagate_points, turn_attitude
 from fusiond.estimators.unscented.sigma_points import factor, linear_form, spread_states
@@ -29,6 +30,8 @@ from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
+
+Array = NDArray[np.float64]
 
 SPREAD = math.sqrt(3.0)
 """Sigmas from the mean to a point: the fourth moment of a Gaussian (Julier, Uhlmann, eq. 20)."""
@@ -47,10 +50,10 @@ class UnscentedEstimator(KalmanEstimator):
         self.spread = spread
         self.propagation = propagation
 
-    def update(self, aid: Linearised) -> Outcome:
+    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
         before = self.nav.copy()
-        outcome = super().update(aid)
+        outcome = super().update(aid, noise)
         if self.propagation and outcome.name == "fused" and not self._holding:
             turn_attitude(self._covs[0], before, self.nav)
         return outcome

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import HeadingOffer, HeightOffer, PositionOffer, VelocityOffer
 from fusiond.aiding.witnesses import LEAST_SD_M_S, Witnesses
-from fusiond.integrity.proof import NO_TREND, Offset
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Place, as_geodetic, velocity_of
+from fusiond.navigator.alignment.trend import NO_TREND, Offset
 from fusiond.navigator.saved_state import SavedState
 
 Array = NDArray[np.float64]

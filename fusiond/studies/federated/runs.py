@@ -186,7 +186,7 @@ def _run(
     imu = ImuBuffer(rate, HISTORY_S, np.eye(3), 0.0, STUDY_IMU.gap_s)
     timeline = Timeline(estimator, imu, HISTORY_S, CHECKPOINT_S)
     if not filter_.isolates:
-        timeline.isolation = Trusting()
+        timeline.diagnosis = Trusting()
     p = np.diag(initial_sd(model) ** 2)
     estimator.initialise(0, 0, start, np.zeros(model.size), p)
     timeline.start()

@@ -123,7 +123,7 @@ def live(
     for estimator in filters:
         buffer = ImuBuffer(rate_hz, HISTORY_S, np.eye(3), 0.0, flight.IMU.gap_s)
         timelines.append(Timeline(estimator, buffer, HISTORY_S, CHECKPOINT_S))
-        timelines[-1].isolation = Trusting()
+        timelines[-1].diagnosis = Trusting()
         timelines[-1].start()
     for k, aids in enumerate(given):
         second = slice(k * count, (k + 1) * count)

@@ -1,4 +1,4 @@
-"""What the solution is worth, and why: the mode, judged by whoever of the navigator's parts knows.
+"""Navigation status: the mode of a running solution, from what is published of it.
 
 The first reason that holds is told; the order is that of their weight. What each mode means to who
 reads it: `fusiond.navigation.solution`.
@@ -11,13 +11,12 @@ from typing import NamedTuple
 
 from fusiond.configuration.schema import Config
 from fusiond.estimators.base import Estimator
+from fusiond.integrity.diagnosis import Diagnosis
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.solution import Mode
-from fusiond.navigator.alignment.lateness import Lateness
+from fusiond.navigation.strapdown import VE, VN
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
-from fusiond.navigator.standing import Standing
-from fusiond.navigator.timeline import Timeline
 
 
 class Begun(NamedTuple):
@@ -29,7 +28,7 @@ class Begun(NamedTuple):
     position_ns: int
 
 
-class Worth:
+class NavigationStatus:
     """Judges the solution of one navigator, whose parts it looks at and changes nothing of."""
 
     def __init__(
@@ -37,21 +36,16 @@ class Worth:
         config: Config,
         estimator: Estimator,
         imu: ImuBuffer,
-        timeline: Timeline,
         door: ImuDoor,
         units: RateUnits,
-        standing: Standing,
-        lateness: Lateness,
     ) -> None:
         self._gap_s = config.imu.gap_s
         self._limits = config.estimator
+        self._max_speed_m_s = config.plausibility.max_speed_m_s
         self._estimator = estimator
         self._imu = imu
-        self._timeline = timeline
         self._door = door
         self._units = units
-        self._standing = standing
-        self._lateness = lateness
 
     def of(self, t_ns: int, begun: Begun | None, aligning: str) -> tuple[Mode, str]:
         """The mode at `t_ns`; without a navigation `aligning` is what the alignment waits for."""
@@ -64,17 +58,30 @@ class Worth:
             return Mode.WAITING if begun is None else Mode.INVALID, self._door.silence(silent)
         if begun is None:
             return Mode.ALIGNING, aligning
-        e, p = self._estimator, self._estimator.covariance.item
-        if not 0.0 <= (variance := p(6, 6) + p(7, 7)) <= self._limits.invalid_sd_m**2:
-            return Mode.INVALID, f"horizontal sigma {math.sqrt(variance):.0f} m"
+        sd_m = self._horizontal_sd_m()
+        if not sd_m <= self._limits.invalid_sd_m:
+            return Mode.INVALID, f"horizontal sigma {sd_m:.0f} m"
         if begun.unconfirmed:
             return Mode.COASTING, f"heading from {begun.how}; {begun.unconfirmed}"
-        if (why := self._standing.unproven(e.t_ns)) is not None:
-            return Mode.INVALID, why
-        shaken = self._standing.shaken(e, self._timeline.isolation) or self._lateness.suspects
-        if (why := shaken or self._units.unproven(e)) is not None:
+        if (why := self._units.unproven(self._estimator)) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - begun.position_ns) * 1e-9
         if unaided > self._limits.coast_after_s:
             return Mode.COASTING, f"no position fused for {unaided:.0f} s"
         return Mode.NAVIGATING, f"heading from {begun.how}"
+
+    def failure(self, diagnosis: Diagnosis) -> str | None:
+        """Why navigation must begin anew; None while it need not."""
+        e = self._estimator
+        speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
+        if speed > self._max_speed_m_s:
+            return f"{speed:.0f} m/s is faster than this vehicle can be"
+        if (device := diagnosis.contradicts) is not None:
+            return f"positions and velocities of {device} fit each other, not the filter"
+        if diagnosis.positions_out and not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
+            return "no position in service, and the solution is not valid any more"
+        return None
+
+    def _horizontal_sd_m(self) -> float:
+        sd = self._estimator.sigmas()
+        return math.hypot(sd.item(0), sd.item(1))

@@ -1,4 +1,4 @@
-"""Sources that the fault detection leaves out: told to the operator, and asked for by name."""
+"""Sources that are out of service, told to the operator and asked for by name; faults told."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fusiond.estimators.federated.options import local_of
 from fusiond.navigator.timeline import Timeline
 
 
-class LeftOut:
+class ServiceEvents:
     """What timeline and estimator leave out; `on_event(code, text)` hears of it.
 
     `names`: the estimator's own sources, of which a name may stand for several series.
@@ -23,6 +23,7 @@ class LeftOut:
     ) -> None:
         self._timeline, self._names, self._event = timeline, names, on_event
         self._told: dict[str, str] = {}
+        self._told_ns: dict[str, int] = {}
 
     @property
     def _estimator(self) -> Estimator:
@@ -30,7 +31,12 @@ class LeftOut:
 
     def tell(self) -> None:
         """Events where the isolated sources are no longer those last told."""
-        now = self._estimator.isolated | self._timeline.isolation.excluded
+        for finding in self._timeline.diagnosis.findings:
+            told_ns = self._told_ns.get(finding.kind.name, -1)
+            if finding.kind.corrected and finding.t_ns > told_ns:
+                self._told_ns[finding.kind.name] = finding.t_ns
+                self._event("sensor_fault", finding.text)
+        now = self._estimator.isolated | self._timeline.diagnosis.excluded
         if now == self._told:
             return
         for source, reason in now.items():
@@ -43,7 +49,7 @@ class LeftOut:
 
     def reason(self, source: str) -> str | None:
         """Why a source of aids is left out; None if it is not."""
-        if (reason := self._timeline.isolation.excluded.get(source)) is not None:
+        if (reason := self._timeline.diagnosis.excluded.get(source)) is not None:
             return reason
         found = self._estimator.isolated
         if not found:

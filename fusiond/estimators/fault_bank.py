@@ -1,0 +1,345 @@
+r"""Bank of fault hypotheses beside a filter: each a separate-bias estimator that is carried along.
+
+Hypothesis f: since t_f something is wrong by a constant b (p numbers) that enters the motion or the
+measurements by a known signature,
+
+    dx' = F dx + G w + B b          z = H dx + D b + v        dx computed less true
+
+The mean of the filter's error under f is V b. With the filter's own gain K, innovation nu and the
+variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt(W),
+
+    between updates     V <- Phi V                       the kernels of the transition matrix
+    each row            s = (H V + D) / sqrt(W)          L += s^T s   e += s^T y   J += y^2   N += 1
+    if it was fused     V <- V - g s
+
+    size of the fault   b = M (e + S^-1 m),  M = (L + S^-1)^-1      prior b ~ N(m, S)
+    evidence            l = e^T L^-1 e                   chi-square of p if nothing is wrong
+    left unexplained    J - l                            chi-square of N - p if it is f
+    log odds            log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
+                        + e^T m - m^T L m / 2
+
+An onset is not known: each kind runs from restarts at two alternating phases of each of `AGES_S`,
+so that one of them has always run for T to 2 T. A fault of the inertial unit begins as a step of
+states, V = 1 at its onset; one of a measurement is its rows' D. A delay of tau is the filter's own
+past, D = p(t) - p(t - tau), of a path by dead reckoning that is kept here.
+
+All of it lies in the filter's memory: a snapshot copies it, a rewind restores it to the bit.
+
+Source: Friedland, Treatment of bias in recursive filtering, IEEE Trans. AC 14 (1969), 359; Willsky,
+Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear
+systems, IEEE Trans. AC 21 (1976), 108.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.strapdown import VN
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+AGES_S = (1.0, 4.0, 16.0, 64.0)
+"""Times T between two restarts of a phase. The youngest is a second: a fault whose onset is missed
+by four does not fit any more, and another that does is accused in its place."""
+AGES_NS = tuple(round(age * 1e9) for age in AGES_S)
+RESTARTS = 2 * len(AGES_S)
+
+STATES, POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, DELAY, SPEED, ROWS = range(8)
+"""Signatures: a step of states, of one number in all of them or of as many numbers; an offset of a position, one that grows with time, the same of a
+velocity; a delay; a share of the speed; an offset of each of an aid's rows."""
+PLACES, MOVES, ROLLS, OTHER, NOTHING = range(5)
+"""What an aid's rows are: a position, a velocity, a speed, something of its own, nothing that can
+be at fault."""
+
+# Columns of the table of kinds: signature, device, size p, first column, slots of a step, class.
+SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS = 0, 1, 2, 3, 4, 7
+KIND_INTS = 8
+# And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), prior mean of its amount.
+PRIOR, LOG_RATE, LAG, MEAN = 0, 3, 4, 5
+KIND_NUMBERS = 6
+
+# The bank's array: head, ring of the path, groups, sensitivities. The head holds which restart each
+# age is at (4), the instant (s), place (m) and number of entries of the path, where V begins.
+_RESTARTED, _PATH_S, _PATH, _ENTRIES, SENSITIVITIES, HEAD = 0, 4, 5, 8, 9, 16
+RING, POINT, RING_S = 64, 7, 0.1
+GROUPS = HEAD + RING * POINT
+# A group: L (9), e (3), J, N, how often a measured aid has been seen, onset (s), log odds, weight,
+# what is left unexplained beyond chance.
+L_AT, E_AT, J_AT, N_AT, SEEN, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, GROUP = (
+    *(0, 9, 12, 13, 14, 15, 16, 17, 18),
+    20,
+)
+UNEXPLAINED_SIGMAS = 4.0
+"""One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
+FEWEST_SEEN = 2.0
+"""A single epoch accuses whoever is nearest."""
+
+
+class FaultTable(NamedTuple):
+    """Kinds of faults as the kernels read them, `ints` (k, 8) and `numbers` (k, 6), how many
+    columns they have in all, and the devices whose numbers they name."""
+
+    ints: Indices
+    numbers: Array
+    columns: int
+    devices: tuple[str, ...] = ()
+
+
+NO_FAULTS = FaultTable(
+    np.zeros((0, KIND_INTS), dtype=np.int64), np.zeros((0, KIND_NUMBERS)), columns=0
+)
+
+
+def bank_size(table: FaultTable, n: int, width: int) -> int:
+    """Doubles of a bank beside a filter of n states in rows of `width`."""
+    if not table.columns:
+        return 0
+    groups = RESTARTS * table.ints.shape[0]
+    return GROUPS + groups * GROUP + chunks_of(table.columns, width) * n * width
+
+
+def chunks_of(columns: int, width: int) -> int:
+    """Blocks of `width` columns that hold all."""
+    return -(-columns // width)
+
+
+def begin_bank(bank: Array, table: FaultTable) -> None:
+    """Write what of a new bank never changes."""
+    if bank.size:
+        bank[SENSITIVITIES] = GROUPS + RESTARTS * table.ints.shape[0] * GROUP
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8)")
+def _begin_group(
+    bank: Array, ints: Indices, n: int, width: int, kind: int, restart: int, t_s: float
+) -> None:
+    """Begin one kind's restart anew, with its onset now."""
+    at = GROUPS + (RESTARTS * kind + restart) * GROUP
+    for j in range(GROUP):
+        bank[at + j] = 0.0
+    bank[at + ONSET] = t_s
+    bank[at + LOG_ODDS] = -np.inf
+    v = bank[int(bank[SENSITIVITIES]) :]
+    size = ints[kind, SIZE]
+    for c in range(size):
+        column = ints[kind, FIRST] + restart * size + c
+        first = column // width * n * width + column % width
+        for i in range(n):
+            v[first + i * width] = 0.0
+        if ints[kind, SIGNATURE] == STATES:
+            for j in range(3):
+                if (j == c or size == 1) and ints[kind, SLOTS + j] >= 0:
+                    v[first + ints[kind, SLOTS + j] * width] = 1.0
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
+def begin_all(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> None:
+    """Begin all hypotheses anew; what the path was remains."""
+    for kind in range(ints.shape[0]):
+        for restart in range(RESTARTS):
+            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9)
+    for k in range(len(AGES_NS)):
+        bank[_RESTARTED + k] = t_ns // AGES_NS[k]
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
+def restart_due(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> None:
+    """Begin anew those restarts whose turn has come at `t_ns`: of the age T every T, in turns."""
+    for k in range(len(AGES_NS)):
+        turn = t_ns // AGES_NS[k]
+        if bank[_RESTARTED + k] != turn:
+            bank[_RESTARTED + k] = turn
+            for kind in range(ints.shape[0]):
+                _begin_group(bank, ints, n, width, kind, 2 * k + turn % 2, t_ns * 1e-9)
+
+
+@compiled("void(f8[::1], f8[::1], f8, f8)")
+def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
+    """Carry the path on by `step_s` at the velocity of `nav` (10,), and keep where it is."""
+    for i in range(3):
+        bank[_PATH + i] += step_s * nav[VN + i]
+    bank[_PATH_S] = now_s
+    entries = int(bank[_ENTRIES])
+    if entries > 0:
+        last = HEAD + (entries - 1) % RING * POINT
+        if now_s - bank[last] < RING_S - 1e-6:
+            return
+    at = HEAD + entries % RING * POINT
+    bank[at] = now_s
+    for i in range(3):
+        bank[at + 1 + i], bank[at + 4 + i] = bank[_PATH + i], nav[VN + i]
+    bank[_ENTRIES] = entries + 1.0
+
+
+@compiled("f8(f8[::1], f8, i8)")
+def _past(bank: Array, t_s: float, component: int) -> float:
+    """Component (place 0 to 2, velocity 3 to 5) of the path at `t_s`, linear between two points;
+    not a number where it is not kept."""
+    entries = int(bank[_ENTRIES])
+    for back in range(min(entries, RING) - 1):
+        at = HEAD + (entries - 1 - back) % RING * POINT
+        before = HEAD + (entries - 2 - back) % RING * POINT
+        if bank[before] <= t_s:
+            share = (t_s - bank[before]) / (bank[at] - bank[before])
+            a, b = bank[before + 1 + component], bank[at + 1 + component]
+            return a + share * (b - a)
+    return np.nan
+
+
+@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")
+def _signature(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    kind: int,
+    measures: int,
+    device: int,
+    t_s: float,
+    age_s: float,
+    nav: Array,
+    row: int,
+    component: int,
+) -> float:
+    """D of a row for a component of a kind that has run for `age_s`."""
+    of, d = ints[kind, SIGNATURE], 0.0
+    if of == STATES or ints[kind, DEVICE] != device:
+        return 0.0
+    if of == DELAY:
+        lag = numbers[kind, LAG]
+        if measures == PLACES:
+            d = bank[_PATH + row] + (t_s - bank[_PATH_S]) * nav[VN + row]
+            d -= _past(bank, t_s - lag, row)
+        elif measures == MOVES:
+            d = nav[VN + row] - _past(bank, t_s - lag, 3 + row)
+        return d if math.isfinite(d) else 0.0
+    if of == SPEED:
+        return -math.hypot(nav[VN], nav[VN + 1]) if measures == ROLLS else 0.0
+    if row != component:
+        return 0.0
+    if measures == PLACES and of in (POSITION, POSITION_RAMP):
+        d = -age_s if of == POSITION_RAMP else -1.0
+    elif measures == MOVES and of in (VELOCITY, VELOCITY_RAMP):
+        d = -age_s if of == VELOCITY_RAMP else -1.0
+    elif measures == OTHER and of == ROWS:
+        d = -1.0
+    return d
+
+
+@compiled(
+    "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
+    "f8[:, ::1], f8[::1])"
+)
+def sensitivity_rows(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    n: int,
+    width: int,
+    t_ns: int,
+    measures: int,
+    device: int,
+    nav: Array,
+    h: Array,
+    r: Array,
+    g: Array,
+    work: Array,
+) -> int:
+    """Write L^-1 (H V + D) of an aid's rows at `t_ns` to `work`, a row of columns each; how many
+    columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav (10,)."""
+    m, kinds = h.shape[0], ints.shape[0]
+    v = bank[int(bank[SENSITIVITIES]) :]
+    blocks = v.shape[0] // (n * width)
+    columns = blocks * width
+    t_s = t_ns * 1e-9
+    for a in range(m):
+        s = work[a * columns : (a + 1) * columns]
+        along = 0.0
+        for i in range(n):
+            along += h[a, i] * g[a, i]
+        # Of S = (h g) root + r, which is root^2.
+        root = 0.5 * (along + math.sqrt(along * along + 4.0 * r[a]))
+        for b in range(blocks):
+            part = s[b * width : (b + 1) * width]
+            for j in range(width):
+                part[j] = 0.0
+            for i in range(n):
+                c = h[a, i]
+                if c != 0.0:
+                    first = (b * n + i) * width
+                    rows = v[first : first + width]
+                    for j in range(width):
+                        part[j] += c * rows[j]
+        for kind in range(kinds):
+            if ints[kind, SIGNATURE] == STATES or ints[kind, DEVICE] != device:
+                continue
+            size = ints[kind, SIZE]
+            for restart in range(RESTARTS):
+                age_s = t_s - bank[GROUPS + (RESTARTS * kind + restart) * GROUP + ONSET]
+                for c in range(size):
+                    s[ints[kind, FIRST] + restart * size + c] += _signature(
+                        bank, ints, numbers, kind, measures, device, t_s, age_s, nav, a, c
+                    )
+        for b in range(a):
+            common, before = 0.0, work[b * columns : (b + 1) * columns]
+            for i in range(n):
+                common += h[a, i] * g[b, i]
+            for j in range(columns):
+                s[j] -= common * before[j]
+        for j in range(columns):
+            s[j] /= root
+    return columns
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1], b1, f8[::1])")
+def account(
+    bank: Array,
+    ints: Indices,
+    n: int,
+    width: int,
+    measures: int,
+    y: Array,
+    g: Array,
+    fused: bool,
+    work: Array,
+) -> None:
+    """Take in what `sensitivity_rows` has left in `work` with the whitened innovation y (m,);
+    `fused` where the filter folds the rows in, with g (m, w) as `whiten` leaves it."""
+    m, kinds = y.shape[0], ints.shape[0]
+    v = bank[int(bank[SENSITIVITIES]) :]
+    blocks = v.shape[0] // (n * width)
+    columns = blocks * width
+    counts = 1.0 if measures != NOTHING else 0.0
+    square = 0.0
+    for a in range(m):
+        square += y[a] * y[a]
+    for kind in range(kinds):
+        size = ints[kind, SIZE]
+        for restart in range(RESTARTS):
+            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
+            first = ints[kind, FIRST] + restart * size
+            for a in range(m):
+                s = work[a * columns + first :]
+                for c in range(size):
+                    group[E_AT + c] += s[c] * y[a]
+                    for d in range(size):
+                        group[L_AT + 3 * c + d] += s[c] * s[d]
+            group[J_AT] += square
+            group[N_AT] += m
+            group[SEEN] += counts
+    if fused:
+        for b in range(blocks):
+            for i in range(n):
+                first = (b * n + i) * width
+                rows = v[first : first + width]
+                for a in range(m):
+                    c = g[a, i]
+                    if c != 0.0:
+                        s = work[a * columns + b * width :]
+                        for j in range(width):
+                            rows[j] -= c * s[j]

@@ -1,0 +1,216 @@
+r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
+
+    log odds            log(rate T) + boost + e^T M e / 2 - log det(I + S L) / 2
+    weight              w_f = odds_f / (1 + sum of all odds): the posterior probability
+    left unexplained    J - l against N - p by chi-square's mean and variance
+    left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
+                        the estimate of the filter, which is that of nothing wrong
+
+`boost` (k,) is what is known of a kind beyond its rate: what was wrong of a source may last.
+
+Source: as of fusiond.estimators.fault_bank; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for
+the moments of a mixture.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.fault_bank import (
+    AGES_S,
+    CLASS,
+    E_AT,
+    FEWEST_SEEN,
+    FIRST,
+    GROUP,
+    GROUPS,
+    J_AT,
+    L_AT,
+    LOG_ODDS,
+    LOG_RATE,
+    MEAN,
+    N_AT,
+    PRIOR,
+    RESTARTS,
+    SEEN,
+    SENSITIVITIES,
+    SIZE,
+    UNEXPLAINED,
+    UNEXPLAINED_SIGMAS,
+    WEIGHT,
+)
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_TINY = 1e-9
+"""A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
+LEAST_WEIGHT = 1e-7
+"""What is as unlikely opens nothing: of a kilometre a third of a metre."""
+# What `judge` writes: the group with the largest odds of those that explain, its log odds, the
+# largest of another class, the largest of class 0, and the weight of all.
+BEST, BEST_ODDS, RIVAL_ODDS, SENSOR_ODDS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
+
+
+@compiled("f8(f8[::1], i8, f8[::1], f8, f8[::1])", allocates=True)
+def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> float:
+    """M = (L + share S^-1)^-1 of a group into m (9,) and behind it b (3,); `numbers` (6,) of its
+    kind. Returns what the log odds gain by it, where `share` is 1, or else what it explains, l; by
+    Gauss and Jordan with a positive matrix."""
+    a = np.empty((3, 6))
+    mean = numbers[MEAN] if share == 1.0 else 0.0
+    for i in range(size):
+        for j in range(size):
+            a[i, j] = group[L_AT + 3 * i + j]
+            a[i, size + j] = 1.0 if i == j else 0.0
+        a[i, i] += share / (numbers[PRIOR + i] * numbers[PRIOR + i])
+    logarithm = 0.0
+    for k in range(size):
+        pivot = a[k, k]
+        logarithm += math.log(pivot * numbers[PRIOR + k] * numbers[PRIOR + k])
+        for j in range(2 * size):
+            a[k, j] /= pivot
+        for i in range(size):
+            if i != k:
+                c = a[i, k]
+                for j in range(2 * size):
+                    a[i, j] -= c * a[k, j]
+    gained = 0.0
+    for i in range(size):
+        m[9 + i] = mean
+        for j in range(size):
+            m[3 * i + j] = a[i, size + j]
+            beyond = group[E_AT + j]  # e - L m
+            for k in range(size):
+                beyond -= group[L_AT + 3 * j + k] * mean
+            m[9 + i] += a[i, size + j] * beyond
+    for i in range(size):
+        beyond = group[E_AT + i]
+        along = group[E_AT + i] * mean
+        for k in range(size):
+            beyond -= group[L_AT + 3 * i + k] * mean
+            along -= 0.5 * mean * group[L_AT + 3 * i + k] * mean
+        gained += 0.5 * beyond * (m[9 + i] - mean) + along
+    return gained - 0.5 * logarithm if share == 1.0 else 2.0 * gained
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8[::1])", allocates=True)
+def judge(bank: Array, ints: Indices, numbers: Array, boost: Array, found: Array) -> None:
+    """Write log odds, weight and what is left unexplained of each group, and `found` (5,)."""
+    kinds = ints.shape[0]
+    m = np.empty(12)
+    largest = 0.0
+    for kind in range(kinds):
+        size = ints[kind, SIZE]
+        for restart in range(RESTARTS):
+            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
+            group[LOG_ODDS], group[WEIGHT], group[UNEXPLAINED] = -np.inf, 0.0, 0.0
+            if group[N_AT] == 0.0:
+                continue
+            gained = solve(group, size, numbers[kind], 1.0, m)
+            rate = numbers[kind, LOG_RATE] + math.log(AGES_S[restart // 2])
+            group[LOG_ODDS] = rate + boost[kind] + gained
+            largest = max(largest, group[LOG_ODDS])
+            explained = solve(group, size, numbers[kind], _TINY, m)
+            degrees = max(group[N_AT] - size, 1.0)
+            most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
+            group[UNEXPLAINED] = group[J_AT] - explained - most
+    total = math.exp(-largest)
+    for kind in range(kinds):
+        for restart in range(RESTARTS):
+            at = GROUPS + (RESTARTS * kind + restart) * GROUP
+            total += math.exp(bank[at + LOG_ODDS] - largest)
+    found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
+    found[BEST_ODDS] = found[RIVAL_ODDS] = found[SENSOR_ODDS] = -np.inf
+    of = -1
+    for turn in range(2):
+        for kind in range(kinds):
+            for restart in range(RESTARTS):
+                number = RESTARTS * kind + restart
+                group = bank[GROUPS + number * GROUP :]
+                if turn == 0:
+                    group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
+                if group[SEEN] < FEWEST_SEEN or group[UNEXPLAINED] > 0.0:
+                    continue
+                if turn == 0:
+                    if group[LOG_ODDS] > found[BEST_ODDS]:
+                        found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
+                        of = ints[kind, CLASS]
+                    if ints[kind, CLASS] == 0:
+                        found[SENSOR_ODDS] = max(found[SENSOR_ODDS], group[LOG_ODDS])
+                elif ints[kind, CLASS] != of:
+                    found[RIVAL_ODDS] = max(found[RIVAL_ODDS], group[LOG_ODDS])
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)
+def mixture(bank: Array, ints: Indices, numbers: Array, n: int, width: int, opened: Array) -> None:
+    """Write what the weighed hypotheses leave open of the first rows of the error state (q, q)."""
+    kinds, q = ints.shape[0], opened.shape[0]
+    v = bank[int(bank[SENSITIVITIES]) :]
+    opened[:] = 0.0
+    m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
+    for kind in range(kinds):
+        size = ints[kind, SIZE]
+        for restart in range(RESTARTS):
+            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
+            weight = group[WEIGHT]
+            if weight < LEAST_WEIGHT:
+                continue
+            solve(group, size, numbers[kind], 1.0, m)
+            for c in range(size):
+                for d in range(size):
+                    x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
+                column = ints[kind, FIRST] + restart * size + c
+                first = column // width * n * width + column % width
+                for i in range(q):
+                    rows[c, i] = v[first + i * width]
+            for i in range(q):
+                for c in range(size):
+                    along = 0.0
+                    for d in range(size):
+                        along += x[c, d] * rows[d, i]
+                    for j in range(q):
+                        opened[i, j] += rows[c, j] * along
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1])", allocates=True)
+def estimate(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    n: int,
+    width: int,
+    number: int,
+    size_and_variance: Array,
+    effect: Array,
+) -> None:
+    """Write b (3,) and M (9,) of a group, and what V b and V M V^T are: `effect` (1 + n, n)."""
+    kind, restart = number // RESTARTS, number % RESTARTS
+    size = ints[kind, SIZE]
+    group = bank[GROUPS + number * GROUP :]
+    v = bank[int(bank[SENSITIVITIES]) :]
+    m = np.empty(12)
+    solve(group, size, numbers[kind], 1.0, m)
+    size_and_variance[:] = 0.0
+    effect[:] = 0.0
+    rows = np.empty((3, n))
+    for c in range(size):
+        size_and_variance[c] = m[9 + c]
+        column = ints[kind, FIRST] + restart * size + c
+        first = column // width * n * width + column % width
+        for i in range(n):
+            rows[c, i] = v[first + i * width]
+            effect[0, i] += rows[c, i] * m[9 + c]
+        for d in range(size):
+            size_and_variance[3 + 3 * c + d] = m[3 * c + d]
+    for i in range(n):
+        for c in range(size):
+            along = 0.0
+            for d in range(size):
+                along += m[3 * c + d] * rows[d, i]
+            for j in range(n):
+                effect[1 + i, j] += rows[c, j] * along

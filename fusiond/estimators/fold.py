@@ -1,0 +1,112 @@
+"""A compiled kernel: gate, update, feedback, and what the bank of hypotheses makes of the rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.fault_bank import (
+    CLASS,
+    FIRST,
+    GROUP,
+    GROUPS,
+    RESTARTS,
+    SIZE,
+    WEIGHT,
+    account,
+    restart_due,
+    sensitivity_rows,
+)
+from fusiond.estimators.fault_odds import LEAST_WEIGHT, solve
+from fusiond.estimators.update import feed_back, fold_in, whiten
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])", allocates=True)
+def nis_if_sensors_fail(
+    bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Array
+) -> float:
+    """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
+    leave open, as they are weighed; `work` as `sensitivity_rows` leaves it."""
+    rows = y.shape[0]
+    c, m = np.eye(rows), np.empty(12)
+    for kind in range(ints.shape[0]):
+        if ints[kind, CLASS] != 0:
+            continue
+        size = ints[kind, SIZE]
+        for restart in range(RESTARTS):
+            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
+            weight = group[WEIGHT]
+            if weight < LEAST_WEIGHT:
+                continue
+            solve(group, size, numbers[kind], 1.0, m)
+            first = ints[kind, FIRST] + restart * size
+            for a in range(rows):
+                for b in range(rows):
+                    for i in range(size):
+                        for j in range(size):
+                            x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
+                            s = work[a * columns + first + i] * work[b * columns + first + j]
+                            c[a, b] += s * x
+    # y^T C^-1 y by elimination.
+    left, nis = y.copy(), 0.0
+    for k in range(rows):
+        nis += left[k] * left[k] / c[k, k]
+        for i in range(k + 1, rows):
+            share = c[i, k] / c[k, k]
+            left[i] -= share * left[k]
+            for j in range(k + 1, rows):
+                c[i, j] -= share * c[k, j]
+    return nis
+
+
+@compiled(
+    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, f8[::1],"
+    "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1])"
+)
+def fold_and_account(
+    nav: Array,
+    xi: Array,
+    cov: Array,
+    dx: Array,
+    z: Array,
+    h: Array,
+    r: Array,
+    threshold: float,
+    y: Array,
+    g: Array,
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    t_ns: int,
+    measures: int,
+    device: int,
+    work: Array,
+) -> float:
+    """As `fusiond.estimators.update.fuse` without holding, with the bank beside it; `measures` and
+    `device` as of `sensitivity_rows`.
+
+    A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
+    would never be found else. Where such a fault, as likely as it is, explains it, it is folded in.
+    """
+    n, width = dx.shape[0], cov.shape[0]
+    nis = whiten(cov, z, h, r, y, g)
+    if not nis < np.inf:
+        return nis
+    restart_due(bank, ints, n, width, t_ns)
+    columns = sensitivity_rows(
+        bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work
+    )
+    judged = nis
+    if nis > threshold:
+        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
+    account(bank, ints, n, width, measures, y, g, judged <= threshold, work)
+    if judged <= threshold:
+        dx[:] = 0.0
+        fold_in(cov, dx, y, g)
+        feed_back(nav, xi, dx)
+        dx[:] = 0.0
+    return judged

@@ -1,0 +1,149 @@
+"""The bank of one filter as the rest of the code sees it: kernels of fusiond.estimators.fault_bank
+and fusiond.estimators.fault_odds on its part of the filter's memory."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Linearised
+from fusiond.estimators.fault_bank import (
+    GROUP,
+    GROUPS,
+    LOG_ODDS,
+    MOVES,
+    NOTHING,
+    ONSET,
+    OTHER,
+    PLACES,
+    RESTARTS,
+    ROLLS,
+    SEEN,
+    SENSITIVITIES,
+    UNEXPLAINED,
+    WEIGHT,
+    FaultTable,
+    begin_all,
+    chunks_of,
+)
+from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
+from fusiond.models.model import Model
+
+Array = NDArray[np.float64]
+
+
+class Estimated(NamedTuple):
+    """A hypothesis as it stands: number of its kind, onset (s), log odds against nothing wrong,
+    size b (p,), M (p, p), and its effect on the error state: V b (n,), V M V^T (n, n)."""
+
+    kind: int
+    onset_s: float
+    log_odds: float
+    size: Array
+    covariance: Array
+    mean: Array
+    spread: Array
+
+
+class Hypotheses:
+    """A bank of `table` in `bank`, beside a filter of `model`."""
+
+    def __init__(self, bank: Array, table: FaultTable, model: Model) -> None:
+        self.bank, self.table = bank, table
+        self.n, self.width = model.size, model.width
+        kinds = table.ints.shape[0]
+        self.boost = np.zeros(kinds)
+        """Log odds (k,) that a kind has beyond its rate."""
+        self.found = np.full(FOUND, -np.inf)
+        """What the last `judge` has found."""
+        self.work = np.zeros(4 * chunks_of(table.columns, model.width) * model.width)
+        self._groups = bank[GROUPS : GROUPS + RESTARTS * kinds * GROUP].reshape(
+            kinds, RESTARTS, GROUP
+        )
+        n, w, v = self.n, self.width, bank[int(bank[SENSITIVITIES]) :]
+        self.sensitivities = v.reshape(-1, n, w)
+        """V, a block (n, w) of columns after another."""
+        self._nine = np.zeros((9, 9))
+        self._of_source: dict[str, tuple[int, int]] = {}
+
+    @property
+    def fixed(self) -> tuple[object, ...]:
+        """What kernels take of it before all else."""
+        return self.bank, self.table.ints, self.table.numbers, self.n, self.width
+
+    def of(self, aid: Linearised) -> tuple[int, int]:
+        """What an aid's rows are, as of fusiond.estimators.fault_bank, and the number of its device;
+        -1 where no kind is of it."""
+        known = self._of_source.get(aid.source)
+        if known is None:
+            devices = self.table.devices
+            device = devices.index(aid.device) if aid.device in devices else -1
+            known = self._of_source[aid.source] = _measures(aid), device
+        return known
+
+    def begin(self, t_ns: int) -> None:
+        """Begin all hypotheses anew at `t_ns`."""
+        begin_all(self.bank, self.table.ints, self.n, self.width, t_ns)
+
+    def judge(self) -> Array:
+        """Odds of all; what they come to, `found` (5,)."""
+        judge(self.bank, self.table.ints, self.table.numbers, self.boost, self.found)
+        return self.found
+
+    def opened(self) -> Array:
+        """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
+        anew by the next call."""
+        mixture(*self.fixed, self._nine)
+        return self._nine
+
+    def opened_of_all(self) -> Array:
+        """The same of all states (n, n)."""
+        out = np.zeros((self.n, self.n))
+        mixture(*self.fixed, out)
+        return out
+
+    def estimated(self, number: int) -> Estimated:
+        """The hypothesis of a group."""
+        kind = number // RESTARTS
+        group = self._groups[kind, number % RESTARTS]
+        found, effect = np.zeros(12), np.zeros((1 + self.n, self.n))
+        estimate(*self.fixed, number, found, effect)
+        p = int(self.table.ints[kind, 2])
+        return Estimated(
+            kind,
+            float(group[ONSET]),
+            float(group[LOG_ODDS]),
+            found[:p],
+            found[3:].reshape(3, 3)[:p, :p],
+            effect[0],
+            effect[1:],
+        )
+
+    @property
+    def log_odds(self) -> Array:
+        """Log odds (k, restarts) of the last `judge`."""
+        return self._groups[:, :, LOG_ODDS]
+
+    @property
+    def explains(self) -> NDArray[np.bool_]:
+        """(k, restarts): seen more than once, and no more is left than chance leaves."""
+        return (self._groups[:, :, SEEN] >= 2.0) & (self._groups[:, :, UNEXPLAINED] <= 0.0)
+
+    @property
+    def weights(self) -> Array:
+        """Posterior probabilities (k, restarts) of the last `judge`."""
+        return self._groups[:, :, WEIGHT]
+
+
+def _measures(aid: Linearised) -> int:
+    if aid.constraint and not aid.no_slip:
+        return NOTHING
+    if aid.screened:  # its rows are ranges
+        return OTHER
+    if aid.locates:
+        return PLACES
+    if aid.moves:
+        return MOVES
+    return ROLLS if aid.rolls else OTHER

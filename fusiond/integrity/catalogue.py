@@ -1,0 +1,259 @@
+"""The catalogue of what may be wrong: a hypothesis a kind, and what such a fault is like.
+
+Each names its size in the unit in which people are told, the prior of that size and how often such
+a fault begins, each with its source; by which signature it enters the motion or the measurements
+(fusiond.estimators.fault_bank); and which measurements it spoils.
+
+Rates are an engineer's, of devices on vehicles in streets, where no standard counts them: a
+receiver errs beyond its sigma for itself ten times in an hour of town (multipath, reflections), is
+late or stuck once in ten hours (its line, its firmware); an inertial unit breaks, slips or turns in
+its mount once in a thousand hours. Ten times the rate is what half of a chi-square of 4.6 is: it
+moves no decision by an epoch. Sizes are one sigma of a normal prior: a fault of four times that is
+told as soon.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from drivers.immutable import immutable
+from fusiond.estimators.fault_bank import (
+    CLASS,
+    DELAY,
+    DEVICE,
+    FIRST,
+    KIND_INTS,
+    KIND_NUMBERS,
+    LAG,
+    LOG_RATE,
+    MEAN,
+    POSITION,
+    POSITION_RAMP,
+    PRIOR,
+    RESTARTS,
+    ROWS,
+    SIGNATURE,
+    SIZE,
+    SLOTS,
+    SPEED,
+    STATES,
+    VELOCITY,
+    VELOCITY_RAMP,
+    FaultTable,
+)
+from fusiond.models.model import Model
+from fusiond.models.vehicle import FIX_TIME, VELOCITY_TIME
+from fusiond.navigation.error_model import FORCE_ERROR, PHI, RATE_ERROR
+
+DEG = math.degrees(1.0)
+SENSOR, PLACE, MOTION, TIME, OWN = range(5)
+"""Classes: between kinds of one class nobody has to choose before something is done."""
+RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 0.01, 1e-3
+LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
+"""Delays, each of which stands for those around it, by so much of it at one sigma: a delay that is
+no longer than what the state for it admits is that state's."""
+
+
+@immutable()
+class Kind:
+    """One hypothesis: `size` numbers of a prior `sd` (SI), told times `per_unit` in `unit`; it
+    begins `per_hour`. `slots` of a step of states, `lag_s` of a delay. Of its `device` it spoils
+    what `locates` and what `moves`, or all."""
+
+    name: str
+    text: str
+    unit: str
+    signature: int
+    of: int
+    sd: tuple[float, ...]
+    per_hour: float
+    per_unit: float = 1.0
+    device: str = ""
+    slots: tuple[int, ...] = ()
+    lag_s: float = 0.0
+    mean: float = 0.0
+    axes: tuple[str, ...] = ("north", "east", "down")
+    locates: bool = True
+    moves: bool = True
+
+    @property
+    def size(self) -> int:
+        """Of how many numbers the fault is."""
+        return len(self.sd)
+
+    @property
+    def corrected(self) -> bool:
+        """Whether the filter goes on without it: it is one of its states."""
+        return self.signature == STATES
+
+
+def sensor_kinds(model: Model) -> list[Kind]:
+    """Of the inertial unit, as steps of those states that the model has for it."""
+    rates = [model.parameters(RATE_ERROR + axis) for axis in range(3)]
+    forces = [model.parameters(FORCE_ERROR + axis) for axis in range(3)]
+    body = ("x", "y", "z")
+    found = []
+    if all(rates):
+        # A damaged or loose gyro: a degree a second, a hundred times the bias of a data sheet.
+        found.append(
+            Kind(
+                *("gyro", "the gyros have stepped", "deg/s", STATES, SENSOR),
+                *((1.0 / DEG,) * 3, SENSOR_PER_H, DEG),
+                slots=tuple(slots[0] for slots in rates),
+                axes=body,
+            )
+        )
+    if all(forces):
+        found.append(
+            Kind(
+                *("accelerometer", "the accelerometers have stepped", "m/s^2", STATES, SENSOR),
+                *((0.5,) * 3, SENSOR_PER_H),
+                slots=tuple(slots[0] for slots in forces),
+                axes=body,
+            )
+        )
+    # A unit that slips in its mount does so by degrees.
+    attitude = Kind(
+        *("mount", "the inertial unit has turned", "deg", STATES, SENSOR),
+        *((10.0 / DEG,) * 3, SENSOR_PER_H, DEG),
+        slots=(PHI, PHI + 1, PHI + 2),
+    )
+    return [*found, attitude]
+
+
+def position_kinds(device: str) -> list[Kind]:
+    """Of positions: off, or running away. Sizes: a reflection in a street is metres to tens of
+    metres off (Groves, 2nd ed., section 9.4.4); what pulls a receiver away does so at a metre a
+    second."""
+    of = {"device": device, "moves": False}
+    return [
+        Kind(
+            *("position", f"{device} position is off", "m", POSITION, PLACE),
+            *((20.0, 20.0, 20.0), RECEIVER_PER_H),
+            **of,
+        ),
+        Kind(
+            *("position_drift", f"{device} position runs away", "m/s", POSITION_RAMP, PLACE),
+            *((1.0, 1.0, 1.0), RECEIVER_PER_H),
+            **of,
+        ),
+    ]
+
+
+def velocity_kinds(device: str) -> list[Kind]:
+    """Of velocities: off, or running away."""
+    of = {"device": device, "locates": False}
+    return [
+        Kind(
+            *("velocity", f"{device} velocity is off", "m/s", VELOCITY, MOTION),
+            *((2.0, 2.0, 2.0), RECEIVER_PER_H),
+            **of,
+        ),
+        Kind(
+            *("velocity_drift", f"{device} velocity runs away", "m/s^2", VELOCITY_RAMP, MOTION),
+            *((0.2, 0.2, 0.2), RECEIVER_PER_H),
+            **of,
+        ),
+    ]
+
+
+def delay_kinds(device: str) -> list[Kind]:
+    """Of a device: late by about so much. The amount is one of the lag: its share of it is told."""
+    return [
+        Kind(
+            *("delay", f"{device} is late", "s", DELAY, TIME),
+            *((LAG_SPREAD,), LATE_PER_H, lag_s),
+            device=device,
+            lag_s=lag_s,
+            mean=1.0,
+            axes=("",),
+        )
+        for lag_s in LAGS_S
+    ]
+
+
+def time_kinds(device: str, model: Model) -> list[Kind]:
+    """Of a device's offset in time, as a step of the states for it: a line's latency is known to a
+    tenth of a second."""
+    slots = [slots[0] for name in _times(device) if (slots := model.slots_of(name))]
+    if not slots:
+        return []
+    step = Kind(
+        *("time_offset", f"{device} stamps have stepped", "s", STATES, TIME),
+        *((max(float(model.initial[slot]) for slot in slots),), LATE_PER_H),
+        device=device,
+        slots=tuple(slots),
+        axes=("",),
+    )
+    return [step]
+
+
+def _times(device: str) -> tuple[str, ...]:
+    names = (FIX_TIME, VELOCITY_TIME)
+    return tuple(name if device == "gnss" else f"{name}_{device}" for name in names)
+
+
+def speed_kinds(device: str) -> list[Kind]:
+    """Of a wheel: its scale, of which minus one is a wheel that stands still."""
+    of = Kind(
+        *("wheel_scale", f"{device} speed is off by", "%", SPEED, OWN),
+        *((0.5,), LATE_PER_H, 100.0),
+        device=device,
+        axes=("",),
+    )
+    return [of]
+
+
+def row_kinds(
+    device: str, text: str, unit: str, sd: tuple[float, ...], per_unit: float, axes: tuple[str, ...]
+) -> list[Kind]:
+    """Of any other measurement: each of its rows is off."""
+    of = Kind(
+        *("offset", f"{device} {text}", unit, ROWS, OWN),
+        *(sd, RECEIVER_PER_H, per_unit),
+        device=device,
+        axes=axes,
+    )
+    return [of]
+
+
+def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]:
+    """All of a model and the devices of `aiding`, name to kind of section; with a vehicle that does
+    not slip where `slips`."""
+    found = sensor_kinds(model)
+    for device, kind in aiding.items():
+        if kind == "gnss":
+            found += [*position_kinds(device), *velocity_kinds(device)]
+            found += [*time_kinds(device, model), *delay_kinds(device)]
+        elif kind == "rdss":
+            found += position_kinds(device)[:1]
+        elif kind == "wheel":
+            found += speed_kinds(device)
+        elif kind in ("heading", "compass"):
+            found += row_kinds(device, "heading is off", "deg", (0.2,), DEG, ("",))
+        elif kind == "height":
+            found += row_kinds(device, "height is off", "m", (20.0,), 1.0, ("",))
+    if slips:
+        found += row_kinds("non_holonomic", "the vehicle slips", "m/s", (0.5,), 1.0, ("",))
+    return found
+
+
+def table_of(kinds: Sequence[Kind]) -> FaultTable:
+    """The same for the kernels."""
+    ints = np.zeros((len(kinds), KIND_INTS), dtype=np.int64)
+    numbers = np.ones((len(kinds), KIND_NUMBERS))
+    devices = tuple(dict.fromkeys(kind.device for kind in kinds if kind.device))
+    columns = 0
+    for row, kind in enumerate(kinds):
+        ints[row, SIGNATURE], ints[row, CLASS] = kind.signature, kind.of
+        ints[row, DEVICE] = devices.index(kind.device) if kind.device else -2
+        ints[row, SIZE], ints[row, FIRST] = kind.size, columns
+        ints[row, SLOTS : SLOTS + 3] = (*kind.slots, -1, -1, -1)[:3]
+        numbers[row, PRIOR : PRIOR + kind.size] = kind.sd
+        numbers[row, LOG_RATE] = math.log(kind.per_hour / 3600.0)
+        numbers[row, LAG], numbers[row, MEAN] = kind.lag_s, kind.mean
+        columns += RESTARTS * kind.size
+    return FaultTable(ints, numbers, columns, devices)

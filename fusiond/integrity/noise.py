@@ -1,0 +1,102 @@
+r"""One noise scale a series: by how much its variance is more than it states, as it has shown.
+
+Whitened innovations y (d,) of a series are N(0, I) and white while filter and series are as
+modelled. Where the series states too little, or its errors last from one to the next, their
+long-run variance is more than one, component by component,
+
+    s = gamma_0 + 2 sum_k (1 - k / (K + 1)) gamma_k,    gamma_k = E[u_i u_(i-k)],   u = y sqrt(s)
+
+and white errors of s times the stated variance have the same sums, which is what a filter that
+looks back further than the errors last makes of them. It counts with max(1, s): a receiver that
+states too little is weighed, not accused, and one that states too much is believed.
+
+What is shown lately may be the beginning of a fault: it counts when `WAITS_NS` have gone by, and
+not if the series has left service meanwhile.
+
+Source: Bartlett's estimate of a spectrum at zero, as Newey and West, Econometrica 55 (1987), 703;
+Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15 (1970).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
+
+Array = NDArray[np.float64]
+
+LAGS = 8
+COUNT = 600.0
+"""Innovations that are averaged: two minutes of 5 Hz."""
+PRIOR_COUNT = 60.0
+"""What is stated weighs as much as so many: the estimate scatters by half of itself then."""
+WAITS_NS = 15_000_000_000
+"""A drift of 0.1 m/s is found within twice this; longer ones hide nothing."""
+MOST = 100.0
+"""Of a variance: ten times the sigma. What is beyond is no noise."""
+_ROWS = 3
+# The array of a series: scales (3); how many innovations are learned from and how many wait, since
+# when (s), how many the ring holds; sums of the lags learned and waiting, (3, K + 1) each; the ring.
+_LEARNED, _WAITING, _SINCE, _HELD = 3, 4, 5, 6
+_SUMS = 8
+_NEW = _SUMS + _ROWS * (LAGS + 1)
+_RING = _NEW + _ROWS * (LAGS + 1)
+SIZE = _RING + _ROWS * LAGS
+
+
+def unlearned() -> Array:
+    """A series of which nothing is known."""
+    packed = np.zeros(SIZE)
+    packed[:_ROWS] = 1.0
+    return packed
+
+
+@compiled("void(f8[::1])", forceinline=True)
+def _settle(packed: Array) -> None:
+    """Take in what has waited."""
+    n = packed[_WAITING]
+    learned = packed[_LEARNED]
+    keep = 1.0 if learned + n <= COUNT else max(0.0, COUNT - n) / learned
+    for j in range(_ROWS * (LAGS + 1)):
+        packed[_SUMS + j] = keep * packed[_SUMS + j] + packed[_NEW + j]
+        packed[_NEW + j] = 0.0
+    packed[_LEARNED] = keep * learned + n
+    packed[_WAITING] = 0.0
+    total = packed[_LEARNED] + PRIOR_COUNT
+    for i in range(_ROWS):
+        at = _SUMS + i * (LAGS + 1)
+        s = (packed[at] + PRIOR_COUNT) / total
+        for k in range(1, LAGS + 1):
+            s += 2.0 * (1.0 - k / (LAGS + 1.0)) * packed[at + k] / total
+        packed[i] = min(max(s, 1.0), MOST)
+
+
+@compiled("void(f8[::1], f8, f8, f8, f8, i8)")
+def learn(packed: Array, t_s: float, y0: float, y1: float, y2: float, rows: int) -> None:
+    """Take in an innovation of so many rows at `t_s`, whitened with the scales as they are."""
+    if packed[_WAITING] == 0.0:
+        packed[_SINCE] = t_s
+    elif t_s - packed[_SINCE] >= WAITS_NS * 1e-9:
+        _settle(packed)
+        packed[_SINCE] = t_s
+    y = (y0, y1, y2)
+    held = int(packed[_HELD])
+    for i in range(rows):
+        u = y[i] * np.sqrt(packed[i])
+        at = _NEW + i * (LAGS + 1)
+        packed[at] += u * u
+        for k in range(1, min(held, LAGS) + 1):
+            packed[at + k] += u * packed[_RING + _ROWS * ((held - k) % LAGS) + i]
+    for i in range(rows):
+        packed[_RING + _ROWS * (held % LAGS) + i] = y[i] * np.sqrt(packed[i])
+    packed[_HELD] = held + 1.0
+    packed[_WAITING] += 1.0
+
+
+@compiled("void(f8[::1])")
+def forget_lately(packed: Array) -> None:
+    """What waits was of a fault."""
+    for j in range(_ROWS * (LAGS + 1)):
+        packed[_NEW + j] = 0.0
+    packed[_WAITING] = packed[_HELD] = 0.0

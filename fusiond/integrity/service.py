@@ -1,0 +1,160 @@
+r"""Which series of measurements are in service: one table of states, with named transitions.
+
+A series is what one source says of one thing (`gnss`, `gnss_velocity`).
+
+    nominal      its measurements are fused
+    suspected    the last one failed its gate
+    out          they are looked at, not fused
+    probation    fused again, after they were out
+
+    from                  to           when
+    nominal, probation    suspected    `gate`: a measurement fails
+    suspected             nominal      one passes
+    suspected             out          the third in a row fails, and no fault of the inertial unit
+                                       explains it
+    any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
+                                       itself to the bit while the vehicle moves
+    out                   probation    `READMIT_COUNT` in a row pass against what is published
+    probation             nominal      it has been in service for as long as it was out
+
+Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
+four sigma lasts are one case in a thousand. Time alone re-admits nothing.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import Offer, PositionOffer, SpeedOffer, VelocityOffer
+from fusiond.integrity.noise import forget_lately, learn, unlearned
+
+Array = NDArray[np.float64]
+
+REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
+# Position repeated to the bit so often while the vehicle moves: receivers print metres to the
+# centimetre or finer, so that two alike are chance, three are not.
+REPEATED = 2
+# Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
+# repeats the one before, as this series has shown it (average of so many).
+CHANCE, REPEATS_KEPT = 1e-9, 100.0
+# What has not been heard of for so long (ns) is judged anew.
+FORGET_NS = 10_000_000_000
+
+
+class Service(enum.StrEnum):
+    """States of a series."""
+
+    NOMINAL = "nominal"
+    SUSPECTED = "suspected"
+    OUT = "out"
+    PROBATION = "probation"
+
+
+@dataclass(slots=True)
+class Series:
+    """One series: its state and since when, why it is out, failures and passes in a row."""
+
+    source: str
+    device: str
+    locates: bool
+    moves: bool
+    state: Service = Service.NOMINAL
+    since_ns: int = 0
+    heard_ns: int = 0
+    reason: str = ""
+    failed: int = 0
+    passed: int = 0
+    was_out_ns: int = 0
+    value: tuple[float, ...] | None = None
+    repeats: int = 0
+    noise: Array = field(default_factory=unlearned)
+    repeating: float = 1.0
+    """Probability that a value repeats the one before it, as shown so far in motion."""
+
+    @staticmethod
+    def of(aid: Aid) -> Series:
+        """A new one, for the first of its measurements."""
+        return Series(aid.source, aid.device, aid.locates, aid.moves, since_ns=aid.t_ns)
+
+    def copied(self) -> Series:
+        """A copy for a checkpoint."""
+        return replace(self, noise=self.noise.copy())
+
+    @property
+    def out(self) -> bool:
+        """Whether it is looked at, and not fused."""
+        return self.state is Service.OUT
+
+    def hear(self, t_ns: int) -> None:
+        """One has come."""
+        if t_ns - self.heard_ns > FORGET_NS:
+            self.failed = self.passed = self.repeats = 0
+            if self.state is Service.SUSPECTED:
+                self.state, self.since_ns = Service.NOMINAL, t_ns
+        self.heard_ns = t_ns
+
+    def exclude(self, t_ns: int, reason: str) -> None:
+        """It leaves service."""
+        self.state, self.since_ns, self.reason = Service.OUT, t_ns, reason
+        forget_lately(self.noise)
+        self.failed = self.passed = 0
+
+    def gated(self, t_ns: int, explained: bool) -> None:
+        """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
+        self.failed += 1
+        if self.failed >= REFUSED_IN_A_ROW and not explained:
+            self.exclude(t_ns, "disagrees")
+        elif self.state is not Service.SUSPECTED:
+            self.state, self.since_ns = Service.SUSPECTED, t_ns
+
+    def fused(self, t_ns: int, whitened: tuple[float, ...]) -> None:
+        """One has passed, with that innovation."""
+        rows = len(whitened)
+        if 0 < rows <= 3:
+            y0, y1, y2 = (*whitened, 0.0, 0.0)[:3]
+            learn(self.noise, t_ns * 1e-9, y0, y1, y2, rows)
+        self.failed = 0
+        if self.state is Service.SUSPECTED:
+            self.state, self.since_ns = Service.NOMINAL, t_ns
+        elif self.state is Service.PROBATION and t_ns - self.since_ns > self.was_out_ns:
+            self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
+
+    def looked_at(self, t_ns: int, passes: bool) -> None:
+        """One that is out was compared with what is published."""
+        self.passed = self.passed + 1 if passes else 0
+        if self.passed >= READMIT_COUNT:
+            self.was_out_ns = t_ns - self.since_ns
+            self.state, self.since_ns = Service.PROBATION, t_ns
+            self.failed = self.passed = 0
+
+    def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
+        """Whether a new value makes so many alike to the bit, of a vehicle that is `moving`, that it
+        is no measurement. What stands may repeat."""
+        same = moving and value == self.value
+        self.value, self.repeats = value, self.repeats + 1 if same else 0
+        if self.locates or self.moves:
+            return self.repeats >= REPEATED
+        chance = min(max(self.repeating, 0.01), 1.0 - 1e-12)
+        if moving and not same:
+            self.repeating += -self.repeating / REPEATS_KEPT
+        elif moving:
+            self.repeating += (1.0 - self.repeating) / REPEATS_KEPT
+        return same and self.repeats >= math.log(CHANCE) / math.log(chance)
+
+
+def value_of(offers: tuple[Offer, ...] | list[Offer]) -> tuple[float, ...] | None:
+    """What a sensor that hangs repeats to the bit."""
+    for offer in offers:
+        if isinstance(offer, PositionOffer):
+            return offer.lat_rad, offer.lon_rad
+        if isinstance(offer, VelocityOffer):
+            return offer.v_ned
+        if isinstance(offer, SpeedOffer):
+            return (offer.speed_m_s,)
+    return None

@@ -1,0 +1,54 @@
+"""A line through innovations of a position against time: whether they run away."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+
+class Offset(NamedTuple):
+    """A position's innovation north and east (m), and one sigma of the measurement (m)."""
+
+    north: float
+    east: float
+    sd: float
+
+
+class Trend(NamedTuple):
+    """Sums over innovations of a position (m) against time (s), for a line by least squares."""
+
+    n: int = 0
+    t: float = 0.0
+    tt: float = 0.0
+    north: float = 0.0
+    east: float = 0.0
+    t_north: float = 0.0
+    t_east: float = 0.0
+    sd: float = 0.0
+
+    def with_one(self, z: Offset, t_s: float) -> Trend:
+        """With one innovation more."""
+        return Trend(
+            self.n + 1,
+            self.t + t_s,
+            self.tt + t_s * t_s,
+            self.north + z.north,
+            self.east + z.east,
+            self.t_north + t_s * z.north,
+            self.t_east + t_s * z.east,
+            max(self.sd, z.sd),
+        )
+
+    @property
+    def slope(self) -> tuple[float, float]:
+        """How fast they run away (m/s), and the sigma of one of its axes; infinite where nothing is
+        known."""
+        spread = self.tt - self.t * self.t / self.n if self.n else 0.0
+        if spread <= 0.0:
+            return 0.0, math.inf
+        north = (self.t_north - self.t * self.north / self.n) / spread
+        east = (self.t_east - self.t * self.east / self.n) / spread
+        return math.hypot(north, east), self.sd / math.sqrt(spread)
+
+
+NO_TREND = Trend()
