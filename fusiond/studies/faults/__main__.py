@@ -22,6 +22,8 @@ from fusiond.studies.faults.runs import rows, run_row
 from fusiond.studies.faults.scenes import SHARES
 from fusiond.studies.faults.service import jobs as service_jobs
 from fusiond.studies.faults.service import service_run
+from fusiond.studies.faults.sharpness import jobs as sharpness_jobs
+from fusiond.studies.faults.sharpness import sharpness_run
 from fusiond.studies.faults.tables import TABLES, put_into
 from fusiond.studies.monte_carlo import over, runs_on, step_counter
 from fusiond.workers.pool import Pool, processors
@@ -36,7 +38,8 @@ def main() -> int:
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
     parser.add_argument("--faulty", type=int, metavar="HOURS", help="hours with faults in them")
     parser.add_argument("--service", type=int, metavar="DRIVES", help="time without service")
-    parser.add_argument("--seeds", choices=SHARES, default=SHARES[0], help="drives of --service")
+    parser.add_argument("--sharpness", type=int, metavar="DRIVES", help="sigma, so many a cell")
+    parser.add_argument("--seeds", choices=SHARES, default=SHARES[0], help="of the last two")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
     parser.add_argument("--recording", type=Path, metavar="P", help="tables or a CAN log, instead")
@@ -66,6 +69,10 @@ def main() -> int:
         kind = "service"
         one = partial(service_run, share=asked.seeds)
         found = _run(one, service_jobs(asked.service), asked.workers)
+    elif asked.sharpness is not None:
+        kind = "sharpness"
+        cells = partial(sharpness_run, share=asked.seeds)
+        found = _run(cells, sharpness_jobs(asked.sharpness), asked.workers)
     else:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
         if asked.only not in {None, *FAULTS}:

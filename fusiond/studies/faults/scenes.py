@@ -35,7 +35,7 @@ from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.studies.faults.drawn import drawn_by
 from fusiond.studies.faults.recording import Received, Recording, gnss_fixes
-from fusiond.studies.faults.runs import ANTENNA_M
+from fusiond.studies.faults.runs import ANTENNA_M, VEHICLE
 
 Share = Literal["looked", "scored"]
 SHARES: tuple[Share, ...] = ("looked", "scored")
@@ -95,9 +95,10 @@ SHARING_RTK = replace(RTK, name="RTK, shared errors", shared_m=(0.02 * _HALF, 0.
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A class of IMU and a receiver, whether its lever arm is given, and what else is told."""
+    """A class of IMU, or the data sheet of `config/vehicle.toml`, and a receiver; whether its lever
+    arm is given, and what else is told."""
 
-    sensor: SensorClass
+    sensor: SensorClass | Literal["data sheet"]
     receiver: Receiver
     lever_given: bool = True
     told: Told = "all"
@@ -111,7 +112,10 @@ class Vehicle:
         if self.told == "all":
             gnss |= {"time_offset_sd_s": 0.0}
             slip |= KNOWN
-        imu = {"axes": ("+x", "-y", "-z"), "rate_hz": RATE_HZ, "sensor_class": self.sensor}
+        own: dict[str, Any] = {"sensor_class": self.sensor}
+        if self.sensor == "data sheet":
+            own = VEHICLE.imu.model_dump(exclude_unset=True)
+        imu = {**own, "axes": ("+x", "-y", "-z"), "rate_hz": RATE_HZ}
         return Config.model_validate(
             {
                 "imu": imu,
@@ -124,7 +128,7 @@ class Vehicle:
     def unit(self) -> Config:
         """The configuration whose IMU is the one on board."""
         config = self.config()
-        if self.told != "class":
+        if self.told != "class" or self.sensor == "data sheet":
             return config
         own = {
             key: value if "_noise_" in key else TYPICAL * value
@@ -134,8 +138,8 @@ class Vehicle:
 
 
 KNOWN: dict[str, Any] = {
-    "sd_m_s": 0.02,
-    "sd_down_m_s": 0.02,
+    "sd_m_s": 0.005,
+    "sd_down_m_s": 0.005,
     "drift_sd_m_s": 0.0,
     "mounting_sd_deg": 0.0,
     "lever_arm_sd_m": 0.0,

@@ -1,6 +1,7 @@
 """How long a vehicle is without service for a fault of a minute, and behind an outage.
 
-A drawn drive of `DURATION_S`, a MEMS unit, one receiver of one fix a second, no slip, noise told.
+A drawn drive of `DURATION_S`, the MEMS unit of `config/vehicle.toml`, one receiver of one fix a
+second, no slip, noise told.
 Each of `FAULTS` begins at an instant drawn between `BEGINS_S` and lasts `LASTS_S`; the same drive
 with nothing wrong, at the same instants, is what is steady. What is judged is published at 10 Hz:
 
@@ -167,7 +168,7 @@ def _steady(
     receiver: Receiver, number: int, share: Share, duration_s: float
 ) -> tuple[Scene, Published]:
     """A drive, and what is published with nothing wrong."""
-    vehicle = Vehicle("mems", receiver, told="noise")
+    vehicle = Vehicle("data sheet", receiver, told="noise")
     on = scene(vehicle, share, number, duration_s)
     return on, published(on.config, on.recording, on.truth)
 

@@ -12,6 +12,7 @@ from fusiond.studies.faults.hours import rates
 from fusiond.studies.faults.markdown import number, table
 from fusiond.studies.faults.power import powers
 from fusiond.studies.faults.service_tables import service
+from fusiond.studies.faults.sharpness_tables import sharpness
 
 Rows = list[dict[str, Any]]
 
@@ -192,6 +193,7 @@ TABLES: Mapping[str, Callable[[Rows], str]] = {
     "faulty": faulty,
     "recorded": recorded,
     "service": service,
+    "sharpness": sharpness,
 }
 
 
