@@ -1,5 +1,5 @@
-"""Run the fault matrix or rows of it, how well faults are detected, how often none is one, or what
-becomes of those that happen now and then."""
+"""Run the fault matrix or rows of it, how well faults are detected, how often none is one, what
+becomes of those that happen now and then, how long they cost service, or how sharp sigma is."""
 
 from __future__ import annotations
 
@@ -19,6 +19,11 @@ from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import jobs, power_run
 from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
 from fusiond.studies.faults.runs import rows, run_row
+from fusiond.studies.faults.scenes import SHARES
+from fusiond.studies.faults.service import jobs as service_jobs
+from fusiond.studies.faults.service import service_run
+from fusiond.studies.faults.sharpness import jobs as sharpness_jobs
+from fusiond.studies.faults.sharpness import sharpness_run
 from fusiond.studies.faults.tables import TABLES, put_into
 from fusiond.studies.monte_carlo import over, runs_on, step_counter
 from fusiond.workers.pool import Pool, processors
@@ -32,6 +37,9 @@ def main() -> int:
     parser.add_argument("--power", type=int, metavar="RUNS", help="detection, so many runs a size")
     parser.add_argument("--alarms", type=int, metavar="HOURS", help="hours with nothing wrong")
     parser.add_argument("--faulty", type=int, metavar="HOURS", help="hours with faults in them")
+    parser.add_argument("--service", type=int, metavar="DRIVES", help="time without service")
+    parser.add_argument("--sharpness", type=int, metavar="DRIVES", help="sigma, so many a cell")
+    parser.add_argument("--seeds", choices=SHARES, default=SHARES[0], help="of the last two")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
     parser.add_argument("--recording", type=Path, metavar="P", help="tables or a CAN log, instead")
@@ -57,6 +65,14 @@ def main() -> int:
     elif asked.faulty is not None:
         kind = "faulty"
         found = _run(faulty_hour_of, range(asked.seed, asked.seed + asked.faulty), asked.workers)
+    elif asked.service is not None:
+        kind = "service"
+        one = partial(service_run, share=asked.seeds)
+        found = _run(one, service_jobs(asked.service), asked.workers)
+    elif asked.sharpness is not None:
+        kind = "sharpness"
+        cells = partial(sharpness_run, share=asked.seeds)
+        found = _run(cells, sharpness_jobs(asked.sharpness), asked.workers)
     else:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
         if asked.only not in {None, *FAULTS}:
@@ -65,7 +81,7 @@ def main() -> int:
             parser.error(f"{asked.only} has the phases {', '.join(FAULTS[asked.only].phases)}")
         found = _run(partial(run_row, seed=asked.seed, drive=asked.drive), wanted, asked.workers)
     if asked.json is not None:
-        document = {"seed": asked.seed, "rows": found}
+        document = {"seed": asked.seed, "seeds": asked.seeds, "rows": found}
         asked.json.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
     text = TABLES[kind](found)
     if asked.table is not None:

@@ -26,21 +26,21 @@ def drawn(number: int) -> Drive:
     return drawn_by(np.random.default_rng([2026, number]))
 
 
-def drawn_by(rng: np.random.Generator) -> Drive:
+def drawn_by(rng: np.random.Generator, duration_s: float = DURATION_S) -> Drive:
     """The drive that a generator draws."""
-    legs = _legs(rng)
+    legs = _legs(rng, duration_s)
     course_deg, bank_ratio = rng.uniform(0.0, 360.0), rng.uniform(-0.1, 0.02)
 
     def path(duration_s: float) -> Path:
         there = (*legs, Leg(duration_s))
         return follow(there, duration_s, course_deg=course_deg, bank_ratio=bank_ratio)
 
-    return Drive(path, gnss_rate_hz=float(rng.choice(RATES_HZ)))
+    return Drive(path, gnss_rate_hz=float(rng.choice(RATES_HZ)), duration_s=duration_s)
 
 
-def _legs(rng: np.random.Generator) -> list[Leg]:
+def _legs(rng: np.random.Generator, duration_s: float) -> list[Leg]:
     legs, speed, t_s = [Leg(REST_S)], 0.0, REST_S
-    while t_s < DURATION_S:
+    while t_s < duration_s:
         kind = rng.choice(KINDS, p=SHARES) if speed else "speed"
         if kind == "stop":
             braking = Leg(max(5.0, speed / 2.0), speed_m_s=0.0)

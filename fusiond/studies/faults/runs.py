@@ -161,8 +161,10 @@ def driven(
     duration_s: float,
     look: Callable[[Solution, int], Sample],
     watch: Callable[[Navigator], None] | None = None,
+    every_ticks: int = TICKS_PER_S,
 ) -> Course:
-    """Feed a navigator with a recording; `look` at its solution at second 1, row 0, and on."""
+    """Feed a navigator with a recording; `look` at its solution every so many ticks from the first
+    of them, row 0, on: at each second."""
     samples: list[Sample] = []
     events: list[Event] = []
     now_s = 0.0
@@ -184,8 +186,8 @@ def driven(
                 taken += 1
                 navigator.add(item.measurement, item.t_ns, 0.0, item.seen_ns)
             navigator.advance()
-            if tick % TICKS_PER_S == 0:
-                samples.append(look(navigator.solution(now_ns), tick // TICKS_PER_S - 1))
+            if tick % every_ticks == 0:
+                samples.append(look(navigator.solution(now_ns), tick // every_ticks - 1))
                 if watch is not None:
                     watch(navigator)
         except Exception as error:  # whatever leaves the navigator ends the daemon: a finding

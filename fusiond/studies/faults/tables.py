@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from fusiond.studies.faults.faulty_hours import by_fault
 from fusiond.studies.faults.hours import rates
+from fusiond.studies.faults.markdown import number, table
 from fusiond.studies.faults.power import powers
+from fusiond.studies.faults.service_tables import service
+from fusiond.studies.faults.sharpness_tables import sharpness
 
 Rows = list[dict[str, Any]]
 
@@ -80,17 +82,17 @@ def matrix(found: Rows) -> str:
                 row["fault"],
                 row["phase"],
                 row["verdict"],
-                _number(row["noticed_s"], "never"),
+                number(row["noticed_s"], "never"),
                 _counted(codes),
                 ", ".join(row["modes"]) or "-",
-                _number(row["largest_horizontal_m"], "inf"),
-                _number(row["largest_yaw_deg"], "inf"),
-                f"{_number(row['largest_ratio'], 'inf')} {row['largest_ratio_of']}".strip(),
-                _number(row["longest_lie_s"], "-"),
-                _number(row["recovered_s"], "never"),
+                number(row["largest_horizontal_m"], "inf"),
+                number(row["largest_yaw_deg"], "inf"),
+                f"{number(row['largest_ratio'], 'inf')} {row['largest_ratio_of']}".strip(),
+                number(row["longest_lie_s"], "-"),
+                number(row["recovered_s"], "never"),
             )
         )
-    return _table(MATRIX, lines) + _count(found)
+    return table(MATRIX, lines) + _count(found)
 
 
 def _count(found: Rows) -> str:
@@ -106,16 +108,16 @@ def power(found: Rows) -> str:
             row["fault"],
             row["size"],
             f"{row['noticed']} of {row['runs']}",
-            _number(row["median_s"], "-"),
-            _number(row["slowest_s"], "-"),
-            _number(row["largest_horizontal_m"], "inf"),
-            _number(row["largest_ratio"], "inf"),
+            number(row["median_s"], "-"),
+            number(row["slowest_s"], "-"),
+            number(row["largest_horizontal_m"], "inf"),
+            number(row["largest_ratio"], "inf"),
             str(row["lies"]),
-            _number(row["longest_lie_s"], "-"),
+            number(row["longest_lie_s"], "-"),
         )
         for row in powers(found)
     ]
-    return _table(POWER, lines) + "\n"
+    return table(POWER, lines) + "\n"
 
 
 def alarms(found: Rows) -> str:
@@ -135,15 +137,15 @@ def faulty(found: Rows) -> str:
             row["fault"],
             str(row["times"]),
             f"{row['noticed']} of {row['begun']}",
-            _number(row["noticed_median_s"], "-"),
-            _number(row["noticed_slowest_s"], "-"),
+            number(row["noticed_median_s"], "-"),
+            number(row["noticed_slowest_s"], "-"),
             f"{row['recovered']} of {row['begun']}",
-            _number(row["recovered_median_s"], "-"),
-            _number(row["recovered_slowest_s"], "-"),
-            _number(row["largest_ratio"], "inf"),
+            number(row["recovered_median_s"], "-"),
+            number(row["recovered_slowest_s"], "-"),
+            number(row["largest_ratio"], "inf"),
             str(row["beyond_s"]),
             str(row["lies"]),
-            _number(row["longest_lie_s"], "-"),
+            number(row["longest_lie_s"], "-"),
         )
         for row in by_fault(found)
     ]
@@ -154,7 +156,7 @@ def faulty(found: Rows) -> str:
     quiet = sum(row["hours"] for row in found)
     other_s = sum(row["not_navigating_s"] for row in found)
     return (
-        f"{_table(HAPPENED, lines)}\n\n{len(happened)} faults in {hours:.4g} hours simulated; "
+        f"{table(HAPPENED, lines)}\n\n{len(happened)} faults in {hours:.4g} hours simulated; "
         f"{crashes} ended the navigator. Beyond five sigma in mode `navigating`: {beyond_s} s.\n"
         f"\n{_told(found)}\n\n{quiet:.4g} hours quiet, and {other_s:g} s as far from any fault in "
         f"another mode than `navigating`. {_beyond(found)}\n"
@@ -174,7 +176,7 @@ def _told(found: Rows) -> str:
         )
         for row in rates(found)
     ]
-    return _table(ALARMS, lines)
+    return table(ALARMS, lines)
 
 
 def _beyond(found: Rows) -> str:
@@ -190,6 +192,8 @@ TABLES: Mapping[str, Callable[[Rows], str]] = {
     "alarms": alarms,
     "faulty": faulty,
     "recorded": recorded,
+    "service": service,
+    "sharpness": sharpness,
 }
 
 
@@ -203,16 +207,5 @@ def put_into(page: Path, kind: str, text: str) -> None:
     page.write_text(f"{before}{begin}\n{text}\n{end}{after}")
 
 
-def _table(header: Iterable[str], lines: Iterable[tuple[str, ...]]) -> str:
-    header = tuple(header)
-    return "\n".join(
-        "| " + " | ".join(line) + " |" for line in (header, ("---",) * len(header), *lines)
-    )
-
-
 def _counted(codes: Mapping[str, int]) -> str:
     return ", ".join(f"{code} x{n}" if n > 1 else code for code, n in codes.items()) or "-"
-
-
-def _number(value: float | None, none: str) -> str:
-    return none if value is None or math.isnan(value) else f"{value:.3g}"

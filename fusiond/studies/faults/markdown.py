@@ -1,0 +1,19 @@
+"""Tables of Markdown and the numbers in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+
+def table(header: Iterable[str], lines: Iterable[tuple[str, ...]]) -> str:
+    """A table of Markdown."""
+    header = tuple(header)
+    return "\n".join(
+        "| " + " | ".join(line) + " |" for line in (header, ("---",) * len(header), *lines)
+    )
+
+
+def number(value: float | None, none: str) -> str:
+    """Three figures of a value, `none` where there is none."""
+    return none if value is None or math.isnan(value) else f"{value:.3g}"

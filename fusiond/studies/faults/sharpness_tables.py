@@ -1,0 +1,99 @@
+"""What `sharpness` found, as Markdown: how many cells are right, sums by what they share, and a
+line a cell and phase."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from fusiond.studies.faults.markdown import table
+from fusiond.studies.faults.published import AXES
+from fusiond.studies.faults.sharpness import PHASES, figures, outside
+
+Row = dict[str, Any]
+Rows = list[Row]
+
+SUMS = ("cells", "phase", "runs", *AXES)
+LINES = ("IMU", "receiver", "Hz", "lever arm", "phase", *AXES)
+COUNTS = ("told", "phase", *AXES)
+TOLD = {"all": "all", "class": "the class alone"}
+_ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
+    ("all told", lambda r: True),
+    ("code", lambda r: r["receiver"] == "code"),
+    ("code, shared errors", lambda r: r["receiver"] == "code, shared errors"),
+    ("RTK", lambda r: r["receiver"] == "RTK"),
+    ("RTK, shared errors", lambda r: r["receiver"] == "RTK, shared errors"),
+    ("1 Hz", lambda r: r["rate_hz"] == 1.0),
+    ("10 Hz", lambda r: r["rate_hz"] == 10.0),
+    ("lever arm given", lambda r: bool(r["lever_given"])),
+    ("lever arm not given", lambda r: not r["lever_given"]),
+    ("consumer", lambda r: r["imu"] == "consumer"),
+    ("mems", lambda r: r["imu"] == "mems"),
+    ("tactical", lambda r: r["imu"] == "tactical"),
+)
+
+
+def sharpness(found: Rows) -> str:
+    """Three tables and a line of sums."""
+    told = [row for row in found if row["told"] == "all"]
+    by_class = [row for row in found if row["told"] != "all"]
+    sums = [
+        (name, phase, str(len(rows)), *_entries(rows, phase))
+        for name, holds in _ALL
+        if (rows := [row for row in told if holds(row)])
+        for phase in PHASES
+    ]
+    sums += [
+        ("the class alone", phase, str(len(by_class)), *_entries(by_class, phase))
+        for phase in PHASES
+        if by_class
+    ]
+    lines = []
+    for rows in _by_cell(found):
+        cell = rows[0]
+        lever = "given" if cell["lever_given"] else "not given"
+        imu = cell["imu"] if cell["told"] == "all" else f"{cell['imu']}, the class alone"
+        at = (imu, cell["receiver"], f"{cell['rate_hz']:g}", lever)
+        lines += [(*at, phase, *_entries(rows, phase)) for phase in PHASES]
+    crashes = sum(row["crash"] is not None for row in found)
+    drives = len({row["drive"] for row in found})
+    return (
+        f"{table(COUNTS, _counts(found))}\n\n{table(SUMS, sums)}\n\n{table(LINES, lines)}\n\n"
+        f"{len(found)} runs, {drives} a cell; {crashes} ended the navigator.\n"
+    )
+
+
+def _by_cell(found: Rows) -> Iterable[Rows]:
+    for cell in sorted({row["cell"] for row in found}):
+        yield [row for row in found if row["cell"] == cell]
+
+
+def _entries(rows: Rows, phase: str) -> tuple[str, ...]:
+    return tuple(_entry(*figures(rows, phase, name)) for name in AXES)
+
+
+def _entry(nees: float, spread: float, ratio: float) -> str:
+    """NEES, marked where it is not right, and sigma over RMS."""
+    if math.isnan(nees):
+        return "-"
+    text = f"{nees:.2f}"
+    mark = {"right": text, "perhaps": f"{text}?", "outside": f"**{text}**"}
+    return f"{mark[outside(nees, spread)]} ({ratio:.2f})"
+
+
+def _counts(found: Rows) -> list[tuple[str, ...]]:
+    """Right, perhaps and outside of cells, by what is told, phase and quantity."""
+    lines = []
+    for told, name in TOLD.items():
+        cells = [rows for rows in _by_cell(found) if rows[0]["told"] == told]
+        for phase in PHASES:
+            columns = []
+            for quantity in AXES:
+                numbers = [figures(rows, phase, quantity)[:2] for rows in cells]
+                count = Counter(outside(*each) for each in numbers if not math.isnan(each[0]))
+                columns.append(f"{count['right']}, {count['perhaps']}, {count['outside']}")
+            if cells:
+                lines.append((name, phase, *columns))
+    return lines
