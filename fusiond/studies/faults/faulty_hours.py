@@ -118,7 +118,7 @@ def faulty_hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     doubts: set[int] = set()
 
     def watch(navigator: Navigator) -> None:
-        doubts.update(navigator.timeline.isolation.doubts)
+        doubts.update(f.t_ns for f in navigator.timeline.diagnosis.findings)
 
     course = navigate(config, recording, truth, watch)
     modes = [sample.mode for sample in course.samples]

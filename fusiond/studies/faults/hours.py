@@ -33,7 +33,7 @@ from scipy.stats import chi2
 from drivers.measurements import PositionFix, WheelSpeed
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
-from fusiond.integrity.isolation import FALSE_ALARM
+FALSE_ALARM = 1e-6
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
@@ -166,7 +166,7 @@ def hour_of(seed: int, duration_s: float = HOUR_S) -> dict[str, Any]:
     doubts: set[int] = set()
 
     def watch(navigator: Navigator) -> None:
-        doubts.update(navigator.timeline.isolation.doubts)
+        doubts.update(f.t_ns for f in navigator.timeline.diagnosis.findings)
 
     course = navigate(config, recording, truth, watch)
     since_s = next((s.t_s for s in course.samples if s.mode == NAVIGATING), duration_s)
