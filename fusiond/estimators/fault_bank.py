@@ -18,8 +18,9 @@ variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt
     log odds            log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
                         + e^T m - m^T L m / 2
 
-An onset is not known: each kind runs from restarts at two alternating phases of each of `AGES_S`,
-so that one of them has always run for T to 2 T. A fault of the inertial unit begins as a step of
+An onset is not known: each kind runs from restarts of several periods T, in turns. What has turned
+out to be a likely onset takes the place of a less likely one of the next longer period before it
+begins anew. A fault of the inertial unit begins as a step of
 states, V = 1 at its onset; one of a measurement is its rows' D. A delay of tau is the filter's own
 past, D = p(t) - p(t - tau), of a path by dead reckoning that is kept here.
 
@@ -44,15 +45,23 @@ from fusiond.navigation.strapdown import VN
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-AGES_S = (1.0, 4.0, 16.0, 64.0)
-"""Times T between two restarts of a phase. The youngest is a second: a fault whose onset is missed
-by four does not fit any more, and another that does is accused in its place."""
-AGES_NS = tuple(round(age * 1e9) for age in AGES_S)
-RESTARTS = 2 * len(AGES_S)
+PERIODS_S = (0.5, 2.0, 8.0, 32.0)
+"""Time between two restarts of a level. The youngest is half a second: a fault whose onset is missed
+by seconds does not fit any more, and another that does is accused in its place."""
+SLOTS_OF = (4, 2, 2, 2)
+"""Restarts of a level, in turns: one has always run for at least so many periods less one."""
+RESTARTS = sum(SLOTS_OF)
+LEVEL_OF = tuple(level for level, count in enumerate(SLOTS_OF) for _ in range(count))
+BEGINS_AT = tuple(sum(SLOTS_OF[:level]) for level in range(len(SLOTS_OF)))
+PERIODS_NS = tuple(round(period * 1e9) for period in PERIODS_S)
+PROMOTED = 3.0
+"""Log odds by which an onset must be likelier than one of the level above to take its place when its
+own turn to begin anew has come: twenty to one."""
 
 STATES, POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, DELAY, SPEED, ROWS = range(8)
-"""Signatures: a step of states, of one number in all of them or of as many numbers; an offset of a position, one that grows with time, the same of a
-velocity; a delay; a share of the speed; an offset of each of an aid's rows."""
+"""Signatures: a step of states, of one number in all of them or of as many numbers; an offset of a
+position, one that grows with time, the same of a velocity; a delay; a share of the speed; an offset
+of each of an aid's rows."""
 PLACES, MOVES, ROLLS, OTHER, NOTHING = range(5)
 """What an aid's rows are: a position, a velocity, a speed, something of its own, nothing that can
 be at fault."""
@@ -60,7 +69,7 @@ be at fault."""
 # Columns of the table of kinds: signature, device, size p, first column, slots of a step, class.
 SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS = 0, 1, 2, 3, 4, 7
 KIND_INTS = 8
-# And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), prior mean of its amount.
+# And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean.
 PRIOR, LOG_RATE, LAG, MEAN = 0, 3, 4, 5
 KIND_NUMBERS = 6
 
@@ -144,19 +153,50 @@ def begin_all(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> None
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
             _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9)
-    for k in range(len(AGES_NS)):
-        bank[_RESTARTED + k] = t_ns // AGES_NS[k]
+    for level in range(len(PERIODS_NS)):
+        bank[_RESTARTED + level] = t_ns // PERIODS_NS[level]
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8)")
+def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart: int) -> None:
+    """A restart that is about to begin anew takes the place of the less likely one of the level
+    above, if that is much less likely."""
+    level = LEVEL_OF[restart] + 1
+    if level >= len(SLOTS_OF):
+        return
+    at = GROUPS + RESTARTS * kind * GROUP
+    odds, least, found = bank[at + restart * GROUP + LOG_ODDS], np.inf, -1
+    for slot in range(BEGINS_AT[level], BEGINS_AT[level] + SLOTS_OF[level]):
+        if bank[at + slot * GROUP + LOG_ODDS] < least:
+            least, found = bank[at + slot * GROUP + LOG_ODDS], slot
+    if found < 0 or not odds > least + PROMOTED:
+        return
+    for j in range(GROUP):
+        bank[at + found * GROUP + j] = bank[at + restart * GROUP + j]
+    v = bank[int(bank[SENSITIVITIES]) :]
+    size = ints[kind, SIZE]
+    for c in range(size):
+        own = ints[kind, FIRST] + restart * size + c
+        other = ints[kind, FIRST] + found * size + c
+        first = own // width * n * width + own % width
+        second = other // width * n * width + other % width
+        for i in range(n):
+            v[second + i * width] = v[first + i * width]
 
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
 def restart_due(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> None:
-    """Begin anew those restarts whose turn has come at `t_ns`: of the age T every T, in turns."""
-    for k in range(len(AGES_NS)):
-        turn = t_ns // AGES_NS[k]
-        if bank[_RESTARTED + k] != turn:
-            bank[_RESTARTED + k] = turn
+    """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
+    one that has just been handed on is not the next to begin."""
+    for back in range(len(PERIODS_NS)):
+        level = len(PERIODS_NS) - 1 - back
+        turn = t_ns // PERIODS_NS[level]
+        if bank[_RESTARTED + level] != turn:
+            bank[_RESTARTED + level] = turn
+            slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
             for kind in range(ints.shape[0]):
-                _begin_group(bank, ints, n, width, kind, 2 * k + turn % 2, t_ns * 1e-9)
+                _promote(bank, ints, n, width, kind, slot)
+                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9)
 
 
 @compiled("void(f8[::1], f8[::1], f8, f8)")

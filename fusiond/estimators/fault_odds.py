@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
-    AGES_S,
     CLASS,
     E_AT,
     FEWEST_SEEN,
@@ -30,9 +29,11 @@ from fusiond.estimators.fault_bank import (
     J_AT,
     L_AT,
     LOG_ODDS,
+    LEVEL_OF,
     LOG_RATE,
     MEAN,
     N_AT,
+    PERIODS_S,
     PRIOR,
     RESTARTS,
     SEEN,
@@ -112,7 +113,7 @@ def judge(bank: Array, ints: Indices, numbers: Array, boost: Array, found: Array
             if group[N_AT] == 0.0:
                 continue
             gained = solve(group, size, numbers[kind], 1.0, m)
-            rate = numbers[kind, LOG_RATE] + math.log(AGES_S[restart // 2])
+            rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
             group[LOG_ODDS] = rate + boost[kind] + gained
             largest = max(largest, group[LOG_ODDS])
             explained = solve(group, size, numbers[kind], _TINY, m)

@@ -187,10 +187,9 @@ class Diagnosis:
         ]
         taken, explains, log_odds = [], bank.explains, bank.log_odds
         for row in alike:
-            of = np.where(explains[row], log_odds[row], -np.inf)
-            restart = int(np.argmax(of))
-            if of[restart] > odds - ALIKE:
-                taken.append(bank.estimated(RESTARTS * row + restart))
+            for restart in range(RESTARTS):
+                if explains[row, restart] and log_odds[row, restart] > odds - ALIKE:
+                    taken.append(bank.estimated(RESTARTS * row + restart))
         weights = np.exp([each.log_odds - odds for each in taken])
         weights /= weights.sum()
         mean = sum(w * each.mean for w, each in zip(weights, taken, strict=True))
