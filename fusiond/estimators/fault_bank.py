@@ -78,16 +78,16 @@ KIND_NUMBERS = 6
 _RESTARTED, _PATH_S, _PATH, _ENTRIES, SENSITIVITIES, HEAD = 0, 4, 5, 8, 9, 16
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
-# A group: L (9), e (3), J, N, how often a measured aid has been seen, onset (s), log odds, weight,
-# what is left unexplained beyond chance.
-L_AT, E_AT, J_AT, N_AT, SEEN, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, GROUP = (
+# A group: L (9), e (3), J, N, onset (s), log odds, weight, what is left unexplained beyond chance,
+# since which epoch (s) it has been likely and explained all, or never.
+L_AT, E_AT, J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY, GROUP = (
     *(0, 9, 12, 13, 14, 15, 16, 17, 18),
     20,
 )
 UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
-FEWEST_SEEN = 2.0
-"""A single epoch accuses whoever is nearest."""
+DECIDED = 7.0
+"""Log odds beyond which a hypothesis is likely: a thousand to one."""
 
 
 class FaultTable(NamedTuple):
@@ -133,7 +133,7 @@ def _begin_group(
     for j in range(GROUP):
         bank[at + j] = 0.0
     bank[at + ONSET] = t_s
-    bank[at + LOG_ODDS] = -np.inf
+    bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
     v = bank[int(bank[SENSITIVITIES]) :]
     size = ints[kind, SIZE]
     for c in range(size):
@@ -336,13 +336,12 @@ def sensitivity_rows(
     return columns
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1], b1, f8[::1])")
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, f8[::1], f8[:, ::1], b1, f8[::1])")
 def account(
     bank: Array,
     ints: Indices,
     n: int,
     width: int,
-    measures: int,
     y: Array,
     g: Array,
     fused: bool,
@@ -354,7 +353,6 @@ def account(
     v = bank[int(bank[SENSITIVITIES]) :]
     blocks = v.shape[0] // (n * width)
     columns = blocks * width
-    counts = 1.0 if measures != NOTHING else 0.0
     square = 0.0
     for a in range(m):
         square += y[a] * y[a]
@@ -371,7 +369,6 @@ def account(
                         group[L_AT + 3 * c + d] += s[c] * s[d]
             group[J_AT] += square
             group[N_AT] += m
-            group[SEEN] += counts
     if fused:
         for b in range(blocks):
             for i in range(n):

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     CLASS,
+    DECIDED,
     E_AT,
-    FEWEST_SEEN,
     FIRST,
     GROUP,
     GROUPS,
@@ -30,13 +30,13 @@ from fusiond.estimators.fault_bank import (
     L_AT,
     LOG_ODDS,
     LEVEL_OF,
+    LIKELY,
     LOG_RATE,
     MEAN,
     N_AT,
     PERIODS_S,
     PRIOR,
     RESTARTS,
-    SEEN,
     SENSITIVITIES,
     SIZE,
     UNEXPLAINED,
@@ -99,9 +99,14 @@ def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> fl
     return gained - 0.5 * logarithm if share == 1.0 else 2.0 * gained
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8[::1])", allocates=True)
-def judge(bank: Array, ints: Indices, numbers: Array, boost: Array, found: Array) -> None:
-    """Write log odds, weight and what is left unexplained of each group, and `found` (5,)."""
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1])", allocates=True)
+def judge(
+    bank: Array, ints: Indices, numbers: Array, boost: Array, epoch_s: float, found: Array
+) -> None:
+    """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
+    epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
+    been likely, and has explained all, since an epoch before.
+    """
     kinds = ints.shape[0]
     m = np.empty(12)
     largest = 0.0
@@ -135,10 +140,15 @@ def judge(bank: Array, ints: Indices, numbers: Array, boost: Array, found: Array
                 group = bank[GROUPS + number * GROUP :]
                 if turn == 0:
                     group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
-                if group[SEEN] < FEWEST_SEEN or group[UNEXPLAINED] > 0.0:
+                if group[UNEXPLAINED] > 0.0:
+                    group[LIKELY] = np.inf
                     continue
                 if turn == 0:
-                    if group[LOG_ODDS] > found[BEST_ODDS]:
+                    if not group[LOG_ODDS] > DECIDED:
+                        group[LIKELY] = np.inf
+                    elif not group[LIKELY] < epoch_s:
+                        group[LIKELY] = epoch_s
+                    if group[LIKELY] < epoch_s and group[LOG_ODDS] > found[BEST_ODDS]:
                         found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
                         of = ints[kind, CLASS]
                     if ints[kind, CLASS] == 0:

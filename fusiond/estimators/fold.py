@@ -103,7 +103,7 @@ def fold_and_account(
     judged = nis
     if nis > threshold:
         judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-    account(bank, ints, n, width, measures, y, g, judged <= threshold, work)
+    account(bank, ints, n, width, y, g, judged <= threshold, work)
     if judged <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)

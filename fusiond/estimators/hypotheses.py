@@ -20,7 +20,6 @@ from fusiond.estimators.fault_bank import (
     PLACES,
     RESTARTS,
     ROLLS,
-    SEEN,
     SENSITIVITIES,
     UNEXPLAINED,
     WEIGHT,
@@ -87,9 +86,10 @@ class Hypotheses:
         """Begin all hypotheses anew at `t_ns`."""
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns)
 
-    def judge(self) -> Array:
-        """Odds of all; what they come to, `found` (5,)."""
-        judge(self.bank, self.table.ints, self.table.numbers, self.boost, self.found)
+    def judge(self, t_ns: int) -> Array:
+        """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""
+        table = self.table
+        judge(self.bank, table.ints, table.numbers, self.boost, t_ns * 1e-9, self.found)
         return self.found
 
     def opened(self) -> Array:
@@ -128,8 +128,9 @@ class Hypotheses:
 
     @property
     def explains(self) -> NDArray[np.bool_]:
-        """(k, restarts): seen more than once, and no more is left than chance leaves."""
-        return (self._groups[:, :, SEEN] >= 2.0) & (self._groups[:, :, UNEXPLAINED] <= 0.0)
+        """(k, restarts): no more is left than chance leaves."""
+        found: NDArray[np.bool_] = self._groups[:, :, UNEXPLAINED] <= 0.0
+        return found
 
     @property
     def weights(self) -> Array:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
-from fusiond.estimators.fault_bank import RESTARTS
+from fusiond.estimators.fault_bank import DECIDED, RESTARTS
 from fusiond.estimators.fault_odds import BEST, BEST_ODDS, RIVAL_ODDS, SENSOR_ODDS
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.integrity.catalogue import OWN, Kind
@@ -35,8 +35,8 @@ from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN
 
 Array = NDArray[np.float64]
 
-DECIDED, APART = 7.0, 4.0
-"""Log odds: a thousand to one; fifty to one between two classes."""
+APART = 4.0
+"""Log odds between two classes: fifty to one."""
 ALIKE = 7.0
 """Kinds of the class that are less likely by more than this count nothing."""
 MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
@@ -153,10 +153,9 @@ class Diagnosis:
     ) -> Correction | None:
         """Take in how an aid ended; what to take out of the filter's state, if anything."""
         bank = estimator.hypotheses
-        found = None
-        if bank is not None and outcome.name in ("fused", "gated"):
-            found = bank.judge()
-        t_ns = aid.t_ns
+        found, t_ns = None, aid.t_ns
+        if bank is not None and not (one.out or aid.constraint):
+            found = bank.judge(t_ns)
         if one.out:
             passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
             one.looked_at(t_ns, passes and one.repeats == 0)
