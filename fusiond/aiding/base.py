@@ -140,23 +140,8 @@ class Aid:
         return self.source
 
     @property
-    def across_sd_m_s(self) -> float:
-        """Sigma of what an aid without slip (`no_slip`) knows of the velocity across; else 0."""
-        return 0.0
-
-    @property
     def rests_s(self) -> float:
         """For how long (s) a vehicle of which it holds is taken to rest."""
-        return 0.0
-
-    def across(self, state: State) -> tuple[float, float]:
-        """The velocity across of such an aid (m/s) as `state` has it, with what is taken for a
-        drift, as seen along the way that the vehicle goes; and one sigma of that drift."""
-        raise NotImplementedError
-
-    def felt_turn(self, state: State) -> float:
-        """The angle (rad) about down that the gyros have felt of a vehicle that is known to stand;
-        0 of an aid that does not ask them."""
         return 0.0
 
     @property

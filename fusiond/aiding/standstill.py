@@ -10,8 +10,8 @@ all that is known may refute (`Rest.doubt`):
     |v^| > v_max,  or  v^T P_vv^-1 v^ > chi2(0.9999)        `moving`    the filter's own velocity
     the mean of measured speeds is not zero, whatever
     drifts, in the run of windows or in this one          `moving`    (fusiond.aiding.witnesses)
-    |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`
-    the same by seven sigma, and the speed is known to be zero        `turns_at_rest`
+    |mean w - b^ - C^T w_ie| > 3 sqrt(P_bb + (s_n^2 + s_r^2) / k)   `turning`    unless the speed is
+                                                                    known to be zero
     the same mean is not zero, if nothing drifts          `moving`
     the ride is smooth, and neither sqrt(P_vv) nor the
     sigma of a mean of measured speeds is below s_v       `quiet_at_speed`
@@ -67,9 +67,7 @@ Array = NDArray[np.float64]
 VELOCITY_PROBABILITY = 1e-4
 # Against the bias's sigma, each axis.
 RATE_SIGMAS = 3.0
-# The same, where it is no chance: on wheels nothing turns on the spot.
-SURE_SIGMAS = 7.0
-TURNING, TURNS_AT_REST = "turning", "turns_at_rest"
+TURNING = "turning"
 # The least turning radius of a car (m), and how long (s) a rate of turn lasts in a car that creeps.
 LEAST_RADIUS_M = 5.0
 CREEP_LASTS_S = 3.0
@@ -143,10 +141,9 @@ class Rest:
         if square > quantile(rows, VELOCITY_PROBABILITY) or surely:
             return "moving"
         known = min(sd, measured.sd) <= self.velocity_sd_m_s
-        turns = self._turns(state, p)
-        if any(square > RATE_SIGMAS**2 * variance for square, variance in turns):
-            sure = known and any(square > SURE_SIGMAS**2 * variance for square, variance in turns)
-            return TURNS_AT_REST if sure else TURNING
+        # Where the speed is known to be zero a turn is the gyros': their rows say so.
+        if not known and self._turns(state, p):
+            return TURNING
         if measured.contradicts or lately.contradicts:
             return "moving"
         if not known and self.witnesses.smooth_ride(w.end_ns):
@@ -171,31 +168,20 @@ class Rest:
         creeps: Array = turns * down
         return creeps
 
-    def felt_turn(self, state: State) -> float:
-        """Of a window in which it was `TURNING`: the angle (rad) about down that the gyros have
-        felt in it, where the speed is known to be zero; else 0."""
-        p = state.covariance
-        if p is None:
-            return 0.0
-        sd = math.sqrt(max(p[3, 3], p[4, 4]))
-        if min(sd, self._measured(self.window.run).sd) > self.velocity_sd_m_s:
-            return 0.0
-        return abs(float(state.dcm[2] @ _rate_error(state, self.window.mean_rate))) * self.window_s
-
-    def _turns(self, state: State, p: Array) -> list[tuple[float, float]]:
-        """Of each axis, the square of what has turned in the window and in the run of windows, and
-        its variance (rad^2/s^2) by bias and noise."""
+    def _turns(self, state: State, p: Array) -> bool:
+        """Whether an axis has turned in the window, or in the run of windows, by more than bias and
+        noise make."""
         w, free = self.window, self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2
         errors = _rate_error(state, np.array((w.mean_rate, w.run_rate))).tolist()
-        found = []
         for axis in range(3):
             slots, variance = state.model.parameters(9 + axis), 0.0
             for i in slots:
                 for j in slots:
                     variance += float(p[i, j])
             for error, count in zip(errors, (1, w.run), strict=True):
-                found.append((error[axis] ** 2, variance + free / count))
-        return found
+                if error[axis] ** 2 > RATE_SIGMAS**2 * (variance + free / count):
+                    return True
+        return False
 
 
 @immutable()
@@ -243,6 +229,3 @@ class ZeroRateAid(Aid):
         rate_columns(h, slice(None), model, np.eye(3))
         z = _rate_error(state, np.array(self.mean_rate))
         return Innovation(z, h, self.sd_rad_s**2 + self.rest.creeps(state))
-
-    def felt_turn(self, state: State) -> float:
-        return self.rest.felt_turn(state)

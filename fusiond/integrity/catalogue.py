@@ -51,7 +51,7 @@ from fusiond.navigation.error_model import FORCE_ERROR, PHI, RATE_ERROR
 DEG = math.degrees(1.0)
 SENSOR, PLACE, MOTION, TIME, OWN = range(5)
 """Classes: between kinds of one class nobody has to choose before something is done."""
-RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 0.1, 1.0
+RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1.0
 LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
 """Delays, each of which stands for those around it, by so much of it at one sigma: a delay that is
 no longer than what the state for it admits is that state's."""
