@@ -88,6 +88,8 @@ UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0
 """Log odds beyond which a hypothesis is likely: a thousand to one."""
+LASTS_S = 1.0
+"""For so long it must have been: a receiver's errors of a second are one error."""
 
 
 class FaultTable(NamedTuple):

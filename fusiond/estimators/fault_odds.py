@@ -28,9 +28,10 @@ from fusiond.estimators.fault_bank import (
     GROUPS,
     J_AT,
     L_AT,
-    LOG_ODDS,
+    LASTS_S,
     LEVEL_OF,
     LIKELY,
+    LOG_ODDS,
     LOG_RATE,
     MEAN,
     N_AT,
@@ -105,7 +106,7 @@ def judge(
 ) -> None:
     """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
     epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
-    been likely, and has explained all, since an epoch before.
+    been likely, and has explained all, for `LASTS_S`.
     """
     kinds = ints.shape[0]
     m = np.empty(12)
@@ -146,9 +147,10 @@ def judge(
                 if turn == 0:
                     if not group[LOG_ODDS] > DECIDED:
                         group[LIKELY] = np.inf
-                    elif not group[LIKELY] < epoch_s:
+                    elif not group[LIKELY] <= epoch_s:
                         group[LIKELY] = epoch_s
-                    if group[LIKELY] < epoch_s and group[LOG_ODDS] > found[BEST_ODDS]:
+                    lasted = epoch_s - group[LIKELY] > LASTS_S - 1e-3
+                    if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
                         found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
                         of = ints[kind, CLASS]
                     if ints[kind, CLASS] == 0:
