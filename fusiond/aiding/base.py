@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.offers import Offer
-from fusiond.aiding.packed import Packed
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -145,23 +144,6 @@ class Aid:
         return 0.0
 
     @property
-    def always(self) -> tuple[object, ...] | None:
-        """Of an aid that is not measured: what it says, whenever it holds; `packed` goes by nothing
-        else. None of one that is."""
-        return None
-
-    @property
-    def white(self) -> bool:
-        """Whether its errors are configured to share nothing from one to the next."""
-        return False
-
-    @property
-    def wanders(self) -> bool:
-        """Whether its errors are known to last for seconds: a position's own sigma is then that of
-        metres that no motion tells from a lateness."""
-        return False
-
-    @property
     def shares(self) -> tuple[str, ...]:
         """Blocks of the model whose states are an error that successive ones share."""
         return ()
@@ -176,18 +158,9 @@ class Aid:
         the aid's instant: itself, unless its corrections depend on the place."""
         return self
 
-    def coarser(self, factor: float) -> Aid:
-        """The same with so many times its sigma; itself where it is no position or velocity."""
-        return self
-
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
         raise NotImplementedError
-
-    def packed(self, model: Model) -> Packed | None:
-        """What it is to a kernel that writes its innovation (fusiond.aiding.rows); None where there
-        is none for it, or where its innovation is not always all that it says."""
-        return None
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
         """How it ended, for a receiver that keeps count of its rows (fusiond.estimators.screening);

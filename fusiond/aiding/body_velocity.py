@@ -38,7 +38,6 @@ from drivers.immutable import immutable
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.felt import add_of_force, turning
 from fusiond.aiding.offers import STEADY, SpeedOffer
-from fusiond.aiding.packed import AMOUNT, NO_SLIP, SPEED, Packed, slots_of
 from fusiond.models.model import Model
 from fusiond.models.vehicle import AXLE_LEVER, MOUNTING, SIDE_DRIFT
 from fusiond.navigation.compiled import compiled
@@ -275,29 +274,6 @@ def no_slip_rows(
         r[1] = sd_down * sd_down
 
 
-@compiled("f8(f8[::1], f8[::1], f8[::1], i8[::1], b1, f8, f8, f8, i8[::1], f8[::1], f8[:, ::1])")
-def across_of(
-    nav: Array,
-    step: Array,
-    xi: Array,
-    column_of: Indices,
-    hold_height: bool,
-    l0: float,
-    l1: float,
-    l2: float,
-    slot: Indices,
-    z: Array,
-    h: Array,
-) -> float:
-    """See `Aid.across`: the velocity. z (1,) and H (1, n) are used up."""
-    _rows(nav, step, xi, column_of, hold_height, l0, l1, l2, slot, RIGHT, z, h)
-    c = dcm_elements(nav[Q0:])
-    # Backward, a heading that has turned goes across to the other side.
-    way = math.copysign(1.0, c[0] * nav[VN] + c[3] * nav[VN + 1] + c[6] * nav[VN + 2])
-    across: float = way * (z[0] + _estimate(xi, slot[DRIFT]))
-    return across
-
-
 @immutable()
 class NonHolonomicAid(Aid):
     """No sideways (sigma `sd_m_s`) or vertical velocity (`sd_down_m_s`) at `lever`, above
@@ -311,22 +287,6 @@ class NonHolonomicAid(Aid):
     min_speed_m_s: float
     lever: Vector3
 
-    @property
-    def across_sd_m_s(self) -> float:
-        return self.sd_m_s
-
-    @property
-    def always(self) -> tuple[object, ...] | None:
-        own = self.sd_m_s, self.across_sd_m_s, self.sd_down_m_s, self.min_speed_m_s
-        return type(self), self.gate, self.robust, self.lever, own
-
-    def across(self, state: State) -> tuple[float, float]:
-        model, slots = state.model, _slots(state.model, SIDE_DRIFT)
-        at = state.nav, state.step, state.xi, model.column_of, model.hold_height
-        z, h, _ = state.rows(1)
-        across, drift = across_of(*at, *self.lever, slots, z, h), slots[DRIFT]
-        return across, float(model.initial[drift]) if drift >= 0 else 0.0
-
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.speed < self.min_speed_m_s:
             return NotApplicable("too_slow")
@@ -335,16 +295,6 @@ class NonHolonomicAid(Aid):
         rows = state.rows(1 if model.hold_height else 2)  # right, down
         no_slip_rows(*at, *self.lever, slots, self.sd_m_s, self.sd_down_m_s, *rows)
         return rows
-
-    def packed(self, model: Model) -> Packed | None:
-        if self.robust or self.across_sd_m_s <= 0.0:
-            return None
-        slots = model.packed_slots.get((NO_SLIP,))
-        if slots is None:
-            rows, own = 1 if model.hold_height else 2, _slots(model, SIDE_DRIFT)
-            slots = model.packed_slots[NO_SLIP,] = slots_of(NO_SLIP, rows, own)
-        holds = self.sd_m_s, self.sd_down_m_s, self.min_speed_m_s, self.across_sd_m_s**2
-        return Packed(slots, np.array((*self.lever, *holds)))
 
 
 @immutable()
@@ -387,19 +337,6 @@ class WheelSpeedAid(Aid):
         rounding = self.shared_step_m_s, model.indices[self.rounding], model.initial
         speed_rows(*at, speed, self.sd_m_s**2, *rounding, *rows)
         return rows
-
-    def packed(self, model: Model) -> Packed | None:
-        if self.robust:
-            return None
-        kept = model.packed_slots
-        kind = SPEED if self.signed else AMOUNT
-        key = kind, self.drift, self.scale, self.latency, self.rounding
-        slots = kept.get(key)
-        if slots is None:
-            own = _slots(model, self.drift, self.scale, self.latency)
-            slots = kept[key] = slots_of(kind, 1, own, model.indices[self.rounding])
-        measured = self.speed_m_s, self.sd_m_s**2, self.shared_step_m_s
-        return Packed(slots, np.array((*self.lever, *measured)))
 
     def offers(self) -> tuple[SpeedOffer, ...]:
         own = self.sd_m_s, self.rounding_sd_m_s, self.drifts

@@ -7,11 +7,11 @@ r"""Position of an antenna: a GNSS fix, with or without height.
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
 ionosphere), s what part of it there is in this one, c one that lasts for seconds, of w metres, down
-as many more as the fix's own sigma is larger there (fusiond.aiding.wander), tau how much later than its stamp the fix is
-valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration, smoothed
-(fusiond.aiding.felt); where the model has states for them they are estimated, true minus estimated
-in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by v s_t, which
-adds (v_i s_t)^2 to the variance of each axis.
+as many more as the fix's own sigma is larger there (fusiond.aiding.wander), tau how much later than
+its stamp the fix is valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration,
+smoothed (fusiond.aiding.felt); where the model has states for them they are estimated, true minus
+estimated in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by
+v s_t, which adds (v_i s_t)^2 to the variance of each axis.
 
 An offset in time multiplies v_a. What a linear filter leaves out of the product of the two errors,
 and of dtau's square, is noise to it, where P is the filter's own:
@@ -36,7 +36,6 @@ section 10.3.2 (second-order terms).
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -47,8 +46,6 @@ from fusiond.aiding.antenna import Matrix, antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
-from fusiond.aiding.packed import POSITION, Packed, slots_of
-from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity, meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_elements
@@ -67,6 +64,12 @@ Indices = NDArray[np.int64]
 
 
 _UNKNOWN = np.zeros((0, 0))
+
+
+def wander_of(axis: int, wander_m: float, sd: Vector3) -> float:
+    """How many metres of an error that lasts for seconds there are along an axis: down as many more
+    as the fix's own sigmas (m) say that its errors are larger there."""
+    return wander_m if axis < 2 else 2.0 * wander_m * sd[2] / (sd[0] + sd[1])
 
 
 @compiled("void(UniTuple(f8, 9), i8[::1], f8[:, :], f8[::1])", forceinline=True, allocates=True)
@@ -200,7 +203,7 @@ class PositionAid(Aid):
     `bias`: the blocks whose states north, east, down are the error that the fixes share, and
     `bias_share` what part of it there is in each axis; `time` that of their offset in time; `rest`
     that of what is left of the lever arm; `wander` that of the error that lasts for seconds, of
-    `wander_m`. `shares_nothing`: there is no such error.
+    `wander_m`.
     """
 
     locates: ClassVar[bool] = True
@@ -215,17 +218,8 @@ class PositionAid(Aid):
     time: str = ""
     rest: str = ""
     bias_share: Vector3 = (1.0, 1.0, 1.0)
-    shares_nothing: bool = False
     wander: str = ""
     wander_m: float = 0.0
-
-    @property
-    def white(self) -> bool:
-        return self.shares_nothing
-
-    @property
-    def wanders(self) -> bool:
-        return bool(self.wander)
 
     @property
     def shares(self) -> tuple[str, ...]:
@@ -240,24 +234,6 @@ class PositionAid(Aid):
         where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
         position_rows(nav, xi, step, *slots, *fix, *where, _UNKNOWN if p is None else p, *rows)
         return rows
-
-    def packed(self, model: Model) -> Packed | None:
-        if self.robust:
-            return None
-        height, at, kept = self.height_m, model.indices, model.packed_slots
-        rows = 2 if height is None or model.hold_height else 3
-        key = POSITION, rows, self.bias, self.time, self.rest, self.wander
-        slots = kept.get(key)
-        if slots is None:
-            lists = at[self.bias], at[self.time], at[self.rest], at[self.wander]
-            slots = kept[key] = slots_of(POSITION, rows, *lists)
-        fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
-        where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m
-        return Packed(slots, np.array((*fix, *where)))
-
-    def coarser(self, factor: float) -> PositionAid:
-        north, east, down = self.sd
-        return replace(self, sd=(factor * north, factor * east, factor * down))
 
     def offers(self) -> tuple[PositionOffer, ...]:
         measured = self.t_ns, self.lat_rad, self.lon_rad, self.height_m, self.sd, self.lever

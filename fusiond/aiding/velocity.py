@@ -25,8 +25,6 @@ from fusiond.aiding.antenna import antenna_velocity
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import VelocityOffer
-from fusiond.aiding.packed import VELOCITY, Packed, slots_of
-from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.rotation import dcm_elements
@@ -135,32 +133,6 @@ class VelocityAid(Aid):
         slots = model.column_of, at[self.time], at[self.rest]
         velocity_rows(nav, xi, step, *slots, *self._measured, *self.lever, self.sd_time_s, *rows)
         return rows
-
-    def packed(self, model: Model) -> Packed | None:
-        if self.robust:
-            return None
-        at, kept = model.indices, model.packed_slots
-        rows = 2 if model.hold_height else len(self.v_ned)
-        key = VELOCITY, rows, self.time, self.rest
-        slots = kept.get(key)
-        if slots is None:
-            slots = kept[key] = slots_of(VELOCITY, rows, at[self.time], at[self.rest])
-        return Packed(slots, np.array((*self._measured, *self.lever, self.sd_time_s)))
-
-    def coarser(self, factor: float) -> VelocityAid:
-        sd = tuple(map(factor.__mul__, self.sd))
-        return VelocityAid(
-            self.source,
-            self.t_ns,
-            self.gate,
-            self.v_ned,
-            sd,
-            self.lever,
-            self.time,
-            self.rest,
-            self.sd_time_s,
-            robust=self.robust,
-        )
 
     def offers(self) -> tuple[VelocityOffer, ...]:
         return (VelocityOffer(self.t_ns, self.v_ned, self.sd, self.lever, self.time, self.rest),)

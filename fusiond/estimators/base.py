@@ -33,7 +33,7 @@ from fusiond.estimators.propagation import (
 from fusiond.estimators.reading import Published, sigmas, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
-from fusiond.estimators.update import Plain, feed_back, normalised_innovation_squared
+from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.chi_square import quantile
@@ -156,9 +156,6 @@ class Estimator(Protocol):
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not; the variances of its rows, up to three, count `noise`
         times (3,)."""
-
-    def plain(self) -> Plain | None:
-        """For kernels that do what `update` does; None where it does something else."""
 
     def look(self, aid: Linearised) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
@@ -298,10 +295,6 @@ class ErrorStateFilter:
         sigmas(self._covs[0], self.nav, self.step, *self.published, out)
         widen(self.wider, out)
         return out
-
-    def plain(self) -> Plain | None:
-        """For kernels that do what `update` does; None where it does something else."""
-        return None
 
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""

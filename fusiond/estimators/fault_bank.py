@@ -46,8 +46,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 PERIODS_S = (0.5, 2.0, 8.0, 32.0)
-"""Time between two restarts of a level. The youngest is half a second: a fault whose onset is missed
-by seconds does not fit any more, and another that does is accused in its place."""
+"""Time between two restarts of a level. The youngest is half a second: a fault whose onset is
+missed by seconds does not fit any more, and another that does is accused in its place."""
 SLOTS_OF = (4, 2, 2, 2)
 """Restarts of a level, in turns: one has always run for at least so many periods less one."""
 RESTARTS = sum(SLOTS_OF)
@@ -55,8 +55,8 @@ LEVEL_OF = tuple(level for level, count in enumerate(SLOTS_OF) for _ in range(co
 BEGINS_AT = tuple(sum(SLOTS_OF[:level]) for level in range(len(SLOTS_OF)))
 PERIODS_NS = tuple(round(period * 1e9) for period in PERIODS_S)
 PROMOTED = 3.0
-"""Log odds by which an onset must be likelier than one of the level above to take its place when its
-own turn to begin anew has come: twenty to one."""
+"""Log odds by which an onset must be likelier than one of the level above to take its place when
+its own turn to begin anew has come: twenty to one."""
 
 STATES, POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, DELAY, SPEED, ROWS = range(8)
 """Signatures: a step of states, of one number in all of them or of as many numbers; an offset of a
@@ -111,7 +111,7 @@ def bank_size(table: FaultTable, n: int, width: int) -> int:
     """Doubles of a bank beside a filter of n states in rows of `width`."""
     if not table.columns:
         return 0
-    groups = RESTARTS * table.ints.shape[0]
+    groups: int = RESTARTS * table.ints.shape[0]
     return GROUPS + groups * GROUP + chunks_of(table.columns, width) * n * width
 
 
@@ -230,8 +230,9 @@ def _past(bank: Array, t_s: float, component: int) -> float:
         if bank[before] <= t_s:
             share = (t_s - bank[before]) / (bank[at] - bank[before])
             a, b = bank[before + 1 + component], bank[at + 1 + component]
-            return a + share * (b - a)
-    return np.nan
+            found: float = a + share * (b - a)
+            return found
+    return math.nan
 
 
 @compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")
@@ -297,7 +298,7 @@ def sensitivity_rows(
     m, kinds = h.shape[0], ints.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
     blocks = v.shape[0] // (n * width)
-    columns = blocks * width
+    columns: int = blocks * width
     t_s = t_ns * 1e-9
     for a in range(m):
         s = work[a * columns : (a + 1) * columns]

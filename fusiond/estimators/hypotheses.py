@@ -67,14 +67,9 @@ class Hypotheses:
         self._nine = np.zeros((9, 9))
         self._of_source: dict[str, tuple[int, int]] = {}
 
-    @property
-    def fixed(self) -> tuple[object, ...]:
-        """What kernels take of it before all else."""
-        return self.bank, self.table.ints, self.table.numbers, self.n, self.width
-
     def of(self, aid: Linearised) -> tuple[int, int]:
-        """What an aid's rows are, as of fusiond.estimators.fault_bank, and the number of its device;
-        -1 where no kind is of it."""
+        """What an aid's rows are, as of fusiond.estimators.fault_bank, and the number of its
+        device; -1 where no kind is of it."""
         known = self._of_source.get(aid.source)
         if known is None:
             devices = self.table.devices
@@ -95,13 +90,13 @@ class Hypotheses:
     def opened(self) -> Array:
         """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
         anew by the next call."""
-        mixture(*self.fixed, self._nine)
+        mixture(self.bank, *self.table[:2], self.n, self.width, self._nine)
         return self._nine
 
     def opened_of_all(self) -> Array:
         """The same of all states (n, n)."""
         out = np.zeros((self.n, self.n))
-        mixture(*self.fixed, out)
+        mixture(self.bank, *self.table[:2], self.n, self.width, out)
         return out
 
     def estimated(self, number: int) -> Estimated:
@@ -109,7 +104,7 @@ class Hypotheses:
         kind = number // RESTARTS
         group = self._groups[kind, number % RESTARTS]
         found, effect = np.zeros(12), np.zeros((1 + self.n, self.n))
-        estimate(*self.fixed, number, found, effect)
+        estimate(self.bank, *self.table[:2], self.n, self.width, number, found, effect)
         p = int(self.table.ints[kind, 2])
         return Estimated(
             kind,

@@ -77,7 +77,6 @@ from fusiond.estimators.invariant_error import (
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.tilt_axes import TiltAxesFilter, keep_down_rows, keep_downward
-from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -227,12 +226,6 @@ class InvariantFilter(TiltAxesFilter):
             if self.hypotheses is not None:  # their effects were of other coordinates
                 self.hypotheses.begin(self.t_ns)
         return outcome
-
-    def plain(self) -> Plain | None:
-        """For kernels that do what `update` does; None where it does something else."""
-        if self.turns:
-            return None
-        return super().plain()
 
     def _update(self, aid: Linearised) -> Outcome:
         rows = aid.innovation(self.state)

@@ -18,7 +18,7 @@ from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Out
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.fold import fold_and_account
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import Plain, fuse, work
+from fusiond.estimators.update import fuse, work
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -36,21 +36,10 @@ class KalmanEstimator(ErrorStateFilter):
     ) -> None:
         super().__init__(model, gap_s, shares, faults)
         self._work = [work(rows, model.width) for rows in range(LENT_ROWS + 1)]
-        none = np.empty(0, dtype=np.int64)
-        self._plain = Plain(
-            *(self.nav, self.xi, self.step, self._cov, self._dx),
-            *(model.column_of, model.initial, model.hold_height),
-            *(none.reshape(2, 0), none, none, none),
-            np.empty(LENT_ROWS * (3 + model.size + model.width)),
-        )
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not; `noise` (3,) times its variances."""
         return self._fold_in(aid, noise)
-
-    def plain(self) -> Plain | None:
-        """For kernels that do what `update` does; None where it does something else."""
-        return None if self._holding else self._plain
 
     def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
         innovation = self._linearise(aid)

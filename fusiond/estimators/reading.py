@@ -18,8 +18,8 @@ the filter's own t, and tau is by how much that clock, the IMU's, is off: nothin
 it is known to `clock_sd_s` and shares nothing with the state. The same sums hold with P_tt =
 clock_sd_s^2 and the rest of P's row zero: v times that sigma is what a position is off by.
 
-What a test has not told yet of a source is added to it: variances (9,) that are no part of P
-(fusiond.integrity.hedge).
+What hypotheses of a fault leave open, as they are weighed, is added to it: variances (9,) that are
+no part of P (fusiond.estimators.fault_odds).
 
 Attitude is that of the nominal axes of the inertial unit that was configured. C_nb is of those that
 its gyros have, out of square by what the data sheet allows, or of a spare's once that has taken
@@ -191,3 +191,21 @@ def widen(wider: Array, out: Array) -> None:
     for i in range(9):
         if wider[i] > 0.0:
             out[i] = math.sqrt(out[i] * out[i] + wider[i])
+
+
+@compiled("void(f8[:, ::1], f8[::1], f8[::1])")
+def opened_variances(opened: Array, step: Array, out: Array) -> None:
+    """Write `out` (9,), as `sigmas` squared, of what is open of attitude, velocity and position (9,
+    9), with C_nb as `step` (28,) holds it."""
+    for i in range(3):
+        out[i], out[3 + i] = opened[6 + i, 6 + i], opened[3 + i, 3 + i]
+    sp = -step[STEP_DCM + 6]
+    cp = math.sqrt(max(1e-12, 1.0 - sp * sp))
+    cy, sy = step[STEP_DCM] / cp, step[STEP_DCM + 3] / cp
+    a, b, d = opened[0, 0], opened[1, 1], opened[0, 1]
+    along = cy * cy * a + sy * sy * b + 2.0 * cy * sy * d
+    tangent = sp / cp
+    out[6] = along / (cp * cp)
+    out[7] = sy * sy * a + cy * cy * b - 2.0 * cy * sy * d
+    across = cy * opened[0, 2] + sy * opened[1, 2]
+    out[8] = tangent * tangent * along + opened[2, 2] + 2.0 * tangent * across

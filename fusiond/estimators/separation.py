@@ -30,7 +30,7 @@ from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
 from fusiond.estimators.federated.options import local_of
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import Plain, fuse, work
+from fusiond.estimators.update import fuse, work
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -73,10 +73,6 @@ class SeparatedEstimator(KalmanEstimator):
         if not held:
             self._take_out()
         return outcome
-
-    def plain(self) -> Plain | None:
-        """None: each aid goes into subsets as well."""
-        return None
 
     def look(self, aid: Linearised) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing that is published

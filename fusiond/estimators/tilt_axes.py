@@ -82,7 +82,6 @@ from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.propagation import TURN_TILT
 from fusiond.estimators.turn_rate import gyro_slots, keep_turn
 from fusiond.estimators.turned_axes import UPRIGHT
-from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
@@ -245,6 +244,26 @@ def carry_over_all(
     return turned
 
 
+@compiled(
+    "void(f8[:, :, ::1], f8[::1], f8[::1], f8[::1], f8, i8[:, ::1], i8[::1], i8[::1], i8[::1])"
+)
+def carry_over_blocks(
+    blocks: Array,
+    before: Array,
+    nav: Array,
+    xi: Array,
+    turned: float,
+    biases: Indices,
+    gyros: Indices,
+    lever: Indices,
+    late: Indices,
+) -> None:
+    """V <- T V for the sensitivities (blocks, n, w) of a bank, as `carry_over_all` does P."""
+    for k in range(blocks.shape[0]):
+        turn_rows(blocks[k], before[Q0:NAV_SIZE], nav[Q0:], biases[0], biases[1])
+        keep_rows(blocks[k], before, nav, xi, turned, gyros, lever, late)
+
+
 class TiltAxesFilter(KalmanEstimator):
     """The centralised filter, in whose P the axes of a tilt turn with the heading, what is known of
     the gyros stays with the turn that it is known of (fusiond.estimators.turn_rate), and the place
@@ -262,14 +281,6 @@ class TiltAxesFilter(KalmanEstimator):
         self._gyros = gyro_slots(model) if known else self._slots
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
-        self._plain = self._plain._replace(
-            biases=self._biases,
-            gyros=self._gyros,
-            lever=self._lever,
-            late=self._late,
-            room=np.empty(self._plain.room.size + ESTIMATE_SIZE),
-        )
-        self._plain_doubted = self._plain._replace(gyros=self._gyros[:0])
         self.undoubted = True
         """Whether what gyros are wrong by is what they were wrong by when the filter started."""
         if known:
@@ -296,12 +307,6 @@ class TiltAxesFilter(KalmanEstimator):
             self._carry_over(before)
         return outcome
 
-    def plain(self) -> Plain | None:
-        """For kernels that do what `update` does; None where it does something else."""
-        if self._holding:
-            return None
-        return self._plain if self._keeps_turn else self._plain_doubted
-
     def release(self) -> None:
         """Feed back what was carried."""
         before = self._estimate()
@@ -321,9 +326,8 @@ class TiltAxesFilter(KalmanEstimator):
         slots = self._biases, *self._kept
         self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
         if self.hypotheses is not None:
-            for v in self.hypotheses.sensitivities:
-                turn_rows(v, before[Q0:NAV_SIZE], self.nav[Q0:], *self._biases)
-                keep_rows(v, before, self.nav, self.xi, self.turned, *self._kept)
+            blocks = self.hypotheses.sensitivities
+            carry_over_blocks(blocks, before, self.nav, self.xi, self.turned, *slots)
 
     @property
     def _keeps_turn(self) -> bool:

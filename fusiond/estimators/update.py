@@ -13,7 +13,6 @@ Source: Bierman, Factorization Methods (1977), section V.2; Groves, 2nd ed., eq.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from fusiond.navigation.rotation import rotate_quaternion
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, Q0, VN
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @compiled("f8(f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
@@ -121,32 +119,6 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
     nav[LAT] -= d[6] / radius_m
     nav[LON] -= d[7] / (radius_n * cos_lat)
     nav[HEIGHT] += d[8]
-
-
-class Plain(NamedTuple):
-    """What a kernel takes of a filter whose next update is `fuse`, and what carries its P over
-    where one turns the axes (fusiond.estimators.tilt_axes).
-
-    nav (10,), xi (n,), step (28,), P (w, w), dx (n,), its model's columns and sigmas at the start
-    (n,), whether the height is held; slots of force biases with their axes (2, k), of the gyros'
-    (0 or 3,), of what is left of a lever arm (0 or 3,) and of its offset in time (0 or 1,); and
-    `room` for an innovation of `LENT_ROWS` rows at most, z, r, y, then H and L^-1 H P, and at its
-    end for the estimate before it.
-    """
-
-    nav: Array
-    xi: Array
-    step: Array
-    cov: Array
-    dx: Array
-    column_of: Indices
-    initial: Array
-    hold_height: bool
-    biases: Indices
-    gyros: Indices
-    lever: Indices
-    late: Indices
-    room: Array
 
 
 def work(rows: int, width: int) -> tuple[Array, Array]:

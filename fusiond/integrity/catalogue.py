@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -128,34 +129,30 @@ def position_kinds(device: str) -> list[Kind]:
     """Of positions: off, or running away. Sizes: a reflection in a street is metres to tens of
     metres off (Groves, 2nd ed., section 9.4.4); what pulls a receiver away does so at a metre a
     second."""
-    of = {"device": device, "moves": False}
+    of = partial(Kind, device=device, moves=False)
     return [
-        Kind(
+        of(
             *("position", f"{device} position is off", "m", POSITION, PLACE),
             *((20.0, 20.0, 20.0), RECEIVER_PER_H),
-            **of,
         ),
-        Kind(
+        of(
             *("position_drift", f"{device} position runs away", "m/s", POSITION_RAMP, PLACE),
             *((1.0, 1.0, 1.0), RECEIVER_PER_H),
-            **of,
         ),
     ]
 
 
 def velocity_kinds(device: str) -> list[Kind]:
     """Of velocities: off, or running away."""
-    of = {"device": device, "locates": False}
+    of = partial(Kind, device=device, locates=False)
     return [
-        Kind(
+        of(
             *("velocity", f"{device} velocity is off", "m/s", VELOCITY, MOTION),
             *((2.0, 2.0, 2.0), RECEIVER_PER_H),
-            **of,
         ),
-        Kind(
+        of(
             *("velocity_drift", f"{device} velocity runs away", "m/s^2", VELOCITY_RAMP, MOTION),
             *((0.2, 0.2, 0.2), RECEIVER_PER_H),
-            **of,
         ),
     ]
 

@@ -37,7 +37,8 @@ MOST = 100.0
 """Of a variance: ten times the sigma. What is beyond is no noise."""
 _ROWS = 3
 # The array of a series: scales (3); how many innovations are learned from and how many wait, since
-# when (s), how many the ring holds; sums of the lags learned and waiting, (3, K + 1) each; the ring.
+# when (s), how many the ring holds; sums of the lags learned and waiting, (3, K + 1) each; the
+# ring.
 _LEARNED, _WAITING, _SINCE, _HELD = 3, 4, 5, 6
 _SUMS = 8
 _NEW = _SUMS + _ROWS * (LAGS + 1)

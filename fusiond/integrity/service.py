@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -37,6 +38,7 @@ from fusiond.integrity.noise import forget_lately, learn, unlearned
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
+REPEATS, DISAGREES = "repeats itself", "disagrees"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2
@@ -109,7 +111,7 @@ class Series:
         """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
         self.failed += 1
         if self.failed >= REFUSED_IN_A_ROW and not explained:
-            self.exclude(t_ns, "disagrees")
+            self.exclude(t_ns, DISAGREES)
         elif self.state is not Service.SUSPECTED:
             self.state, self.since_ns = Service.SUSPECTED, t_ns
 
@@ -134,8 +136,8 @@ class Series:
             self.failed = self.passed = 0
 
     def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
-        """Whether a new value makes so many alike to the bit, of a vehicle that is `moving`, that it
-        is no measurement. What stands may repeat."""
+        """Whether a new value makes so many alike to the bit, of a vehicle that is `moving`, that
+        it is no measurement. What stands may repeat."""
         same = moving and value == self.value
         self.value, self.repeats = value, self.repeats + 1 if same else 0
         if self.locates or self.moves:
@@ -148,7 +150,7 @@ class Series:
         return same and self.repeats >= math.log(CHANCE) / math.log(chance)
 
 
-def value_of(offers: tuple[Offer, ...] | list[Offer]) -> tuple[float, ...] | None:
+def value_of(offers: Sequence[Offer]) -> tuple[float, ...] | None:
     """What a sensor that hangs repeats to the bit."""
     for offer in offers:
         if isinstance(offer, PositionOffer):

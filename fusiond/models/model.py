@@ -141,11 +141,6 @@ class Model:
         return {}
 
     @cached_property
-    def packed_slots(self) -> dict[tuple[object, ...], Indices]:
-        """What aids keep of it for kernels (fusiond.aiding.packed), by what it is the same for."""
-        return {}
-
-    @cached_property
     def packed(self) -> Array:
         """`noise`, `sensor_terms`, `rate_terms` and `active` one after another in whole doubles,
         which a kernel finds in an array with all else."""

@@ -21,7 +21,6 @@ from fusiond.estimators.reading import Published
 from fusiond.estimators.screening import KEPT
 from fusiond.estimators.smoothing.node import Nodes, body_size, links, write_body, write_rows
 from fusiond.estimators.tilt_axes import TiltAxesFilter, turn_rows
-from fusiond.estimators.update import Plain
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
@@ -147,10 +146,6 @@ class TapedKalman(TiltAxesFilter):
             super().propagate(imu, int(imu.times[row]), record)
             self._close()
         super().propagate(imu, target_ns, record)
-
-    def plain(self) -> Plain | None:
-        """None: the tape keeps the rows of each update."""
-        return None
 
     def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
         np.copyto(self._before, self._covs[0])

@@ -26,7 +26,6 @@ from fusiond.estimators.base import AS_STATED, Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.unscented.propagation import propagate_points, turn_attitude
 from fusiond.estimators.unscented.sigma_points import factor, linear_form, spread_states
-from fusiond.estimators.update import Plain
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.strapdown import NAV_SIZE, STEP_SIZE
@@ -57,10 +56,6 @@ class UnscentedEstimator(KalmanEstimator):
         if self.propagation and outcome.name == "fused" and not self._holding:
             turn_attitude(self._covs[0], before, self.nav)
         return outcome
-
-    def plain(self) -> Plain | None:
-        """None: its innovations are those of sigma points."""
-        return None
 
     def release(self) -> None:
         """Feed back what was carried."""

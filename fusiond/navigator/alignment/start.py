@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.offers import HeadingOffer, Offer, PositionOffer, VelocityOffer
+from fusiond.aiding.position import wander_of
 from fusiond.models.model import Model
 from fusiond.navigation.alignment import levelling_jacobian
 from fusiond.navigation.earth import (
@@ -213,7 +214,7 @@ def _by_fix(model: Model, by: Array, fix: PositionOffer, dcm: Array, velocity: A
     for row, slot in enumerate(model.slots_of_all(fix.bias).tolist()):
         by[DR + row, slot] = fix.bias_share[row]
     for row, slot in enumerate(model.slots_of(fix.wander)):
-        by[DR + row, slot] = fix.wander_m
+        by[DR + row, slot] = wander_of(row, fix.wander_m, fix.sd)
     for slot in model.slots_of(fix.time):
         by[DR : DR + 3, slot] = velocity
     for axis, slot in enumerate(model.slots_of(fix.rest)):

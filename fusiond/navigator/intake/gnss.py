@@ -125,7 +125,6 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         receiver.time,
         receiver.lever,
         _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0),
-        o.bias_sd_m == 0.0,
         wander,
         _wandering(m, when, motion, o, sections, sd) if wander else 0.0,
     )

@@ -33,7 +33,6 @@ from scipy.stats import chi2
 from drivers.measurements import PositionFix, WheelSpeed
 from fusiond.configuration.aiding import WheelAiding
 from fusiond.configuration.schema import Config
-FALSE_ALARM = 1e-6
 from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.markov import gauss_markov
@@ -50,6 +49,7 @@ from fusiond.studies.faults.recording import (
 )
 from fusiond.studies.faults.runs import VEHICLE, navigate
 
+FALSE_ALARM = 1e-6
 HOUR_S = 3600.0
 RATE_HZ, GNSS_HZ = 50.0, 1.0
 LIMITS_M = (40.0, 40.0)

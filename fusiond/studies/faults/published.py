@@ -80,7 +80,7 @@ class Published:
     @property
     def beyond(self) -> Bools:
         """Where an error lies beyond five sigma, whatever the mode."""
-        found: Bools = (self.ratios[:, JUDGED] > MOST_SIGMA).any(axis=1)
+        found: Bools = np.asarray((self.ratios[:, JUDGED] > MOST_SIGMA).any(axis=1))
         return found
 
     @property
