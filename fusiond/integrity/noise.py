@@ -10,8 +10,8 @@ and white errors of s times the stated variance have the same sums, which is wha
 looks back further than the errors last makes of them. It counts with max(1, s): a receiver that
 states too little is weighed, not accused, and one that states too much is believed.
 
-What is shown lately may be the beginning of a fault: it counts when `WAITS_NS` have gone by, and
-not if the series has left service meanwhile.
+What is shown lately may be the beginning of a fault: it counts when it is `WAITS_NS` old, and not
+if the series has left service meanwhile.
 
 Source: Bartlett's estimate of a spectrum at zero, as Newey and West, Econometrica 55 (1987), 703;
 Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15 (1970).
@@ -36,13 +36,14 @@ WAITS_NS = 15_000_000_000
 MOST = 100.0
 """Of a variance: ten times the sigma. What is beyond is no noise."""
 _ROWS = 3
-# The array of a series: scales (3); how many innovations are learned from and how many wait, since
-# when (s), how many the ring holds; sums of the lags learned and waiting, (3, K + 1) each; the
-# ring.
-_LEARNED, _WAITING, _SINCE, _HELD = 3, 4, 5, 6
+# The array of a series: scales (3); how many innovations are learned from, wait, and have come since
+# (s), how many the ring holds; sums of the lags of those three, (3, K + 1) each; the ring.
+_LEARNED, _WAITING, _NEW_COUNT, _SINCE, _HELD = 3, 4, 5, 6, 7
 _SUMS = 8
-_NEW = _SUMS + _ROWS * (LAGS + 1)
-_RING = _NEW + _ROWS * (LAGS + 1)
+_LAGS = _ROWS * (LAGS + 1)
+_WAITS = _SUMS + _LAGS
+_NEW = _WAITS + _LAGS
+_RING = _NEW + _LAGS
 SIZE = _RING + _ROWS * LAGS
 
 
@@ -55,15 +56,15 @@ def unlearned() -> Array:
 
 @compiled("void(f8[::1])", forceinline=True)
 def _settle(packed: Array) -> None:
-    """Take in what has waited."""
+    """Take in what has waited; what has come since waits from now on."""
     n = packed[_WAITING]
     learned = packed[_LEARNED]
-    keep = 1.0 if learned + n <= COUNT else max(0.0, COUNT - n) / learned
-    for j in range(_ROWS * (LAGS + 1)):
-        packed[_SUMS + j] = keep * packed[_SUMS + j] + packed[_NEW + j]
-        packed[_NEW + j] = 0.0
+    keep = 1.0 if learned == 0.0 or learned + n <= COUNT else max(0.0, COUNT - n) / learned
+    for j in range(_LAGS):
+        packed[_SUMS + j] = keep * packed[_SUMS + j] + packed[_WAITS + j]
+        packed[_WAITS + j], packed[_NEW + j] = packed[_NEW + j], 0.0
     packed[_LEARNED] = keep * learned + n
-    packed[_WAITING] = 0.0
+    packed[_WAITING], packed[_NEW_COUNT] = packed[_NEW_COUNT], 0.0
     total = packed[_LEARNED] + PRIOR_COUNT
     for i in range(_ROWS):
         at = _SUMS + i * (LAGS + 1)
@@ -76,7 +77,7 @@ def _settle(packed: Array) -> None:
 @compiled("void(f8[::1], f8, f8, f8, f8, i8)")
 def learn(packed: Array, t_s: float, y0: float, y1: float, y2: float, rows: int) -> None:
     """Take in an innovation of so many rows at `t_s`, whitened with the scales as they are."""
-    if packed[_WAITING] == 0.0:
+    if packed[_NEW_COUNT] == 0.0:
         packed[_SINCE] = t_s
     elif t_s - packed[_SINCE] >= WAITS_NS * 1e-9:
         _settle(packed)
@@ -92,12 +93,12 @@ def learn(packed: Array, t_s: float, y0: float, y1: float, y2: float, rows: int)
     for i in range(rows):
         packed[_RING + _ROWS * (held % LAGS) + i] = y[i] * np.sqrt(packed[i])
     packed[_HELD] = held + 1.0
-    packed[_WAITING] += 1.0
+    packed[_NEW_COUNT] += 1.0
 
 
 @compiled("void(f8[::1])")
 def forget_lately(packed: Array) -> None:
     """What waits was of a fault."""
-    for j in range(_ROWS * (LAGS + 1)):
-        packed[_NEW + j] = 0.0
-    packed[_WAITING] = packed[_HELD] = 0.0
+    for j in range(_LAGS):
+        packed[_WAITS + j] = packed[_NEW + j] = 0.0
+    packed[_WAITING] = packed[_NEW_COUNT] = packed[_HELD] = 0.0

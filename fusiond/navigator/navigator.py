@@ -19,7 +19,7 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
-from fusiond.integrity.catalogue import Kind
+from fusiond.integrity.catalogue import SENSOR, Kind
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.alignment.afterwards import Afterwards
@@ -271,7 +271,7 @@ class Navigator:
         e, start = self.estimator, self._afterwards
         if start is None:
             return False
-        doubted = bool(self.timeline.diagnosis.findings)
+        doubted = any(f.kind.of == SENSOR for f in self.timeline.diagnosis.findings)
         wrong = start.refuted(e.t_ns, e.nav, e.covariance, self._constraints.witnesses, doubted)
         if wrong is None:
             return False

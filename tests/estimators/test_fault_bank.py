@@ -1,0 +1,262 @@
+"""The bank: its sensitivities are those of the filter, its evidence is chi-square, a rewind keeps
+its bits."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.fault_bank import E_AT, GROUP, GROUPS, L_AT, LEVEL_OF, N_AT, RESTARTS
+from fusiond.estimators.fault_odds import solve
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.integrity.catalogue import Kind, kinds_of, table_of
+from fusiond.models.catalogue import make_model
+from fusiond.navigation.imu_buffer import ImuBuffer
+from tests import runs
+
+Array = NDArray[np.float64]
+
+IMU = Imu(rate_hz=50.0)
+MODEL = make_model("ins15", imu_noise(IMU))
+KINDS = kinds_of(MODEL, {"gnss": "gnss"}, slips=False)
+FIRST_NS, LAST_NS = 16 * runs.SECOND, 19 * runs.SECOND
+"""An onset at which the second level begins anew, and an instant before it does again."""
+RESTART = LEVEL_OF.index(1)
+SD_M, SD_M_S = 1.5, 0.1
+INITIAL = runs.initial_sd(MODEL, np.radians([0.5, 0.5, 2.0]), 0.3, 2.0)
+
+
+def row_of(name: str) -> int:
+    return next(row for row, kind in enumerate(KINDS) if kind.name == name)
+
+
+@lru_cache(maxsize=1)
+def drive() -> tuple[Array, Array, Array]:
+    """Instants, samples without errors of the unit, and the true start."""
+    truth = runs.town_truth(30.0, IMU.rate_hz)
+    samples = np.hstack([truth.gyro, truth.accel])
+    return runs.sample_times(truth), samples, runs.true_nav(truth, np.zeros(1))[0]
+
+
+def buffer_of(samples: Array) -> ImuBuffer:
+    return runs.filled_buffer(IMU, drive()[0], samples)
+
+
+def aids(t_ns: int, rng: np.random.Generator, fault: str, b: Array) -> list[PositionAid | VelocityAid]:
+    """A fix and its velocity, with a fault of that size from `FIRST_NS` on."""
+    truth = runs.town_truth(30.0, IMU.rate_hz)
+    states = truth.at(np.array([t_ns * 1e-9]))
+    since_s = (t_ns - FIRST_NS) * 1e-9 if t_ns >= FIRST_NS else -1.0
+    place, speed = rng.standard_normal(3) * SD_M, rng.standard_normal(3) * SD_M_S
+    if since_s >= 0.0:
+        place += b * {"position": 1.0, "position_drift": since_s}.get(fault, 0.0)
+        speed += b * {"velocity": 1.0, "velocity_drift": since_s}.get(fault, 0.0)
+    lat, lon, up = states.position[0] + np.array([1.0, 1.0, -1.0]) * place * np.abs(
+        1.0 / runs.metres(states.position[0, 0], states.position[0, 2])
+    )
+    v = tuple((states.v_ned[0] + speed).tolist())
+    lever, gate = (0.0, 0.0, 0.0), 1.0 - 1e-12
+    return [
+        PositionAid("gnss", t_ns, gate, lat, lon, up, (SD_M,) * 3, lever),
+        VelocityAid("gnss_velocity", t_ns, gate, v, (SD_M_S,) * 3, lever),
+    ]
+
+
+def run(
+    fault: str = "", b: Array | None = None, seed: int = 1, until_ns: int = LAST_NS
+) -> KalmanEstimator:
+    """The filter, with its bank, after that."""
+    times, samples, start = drive()
+    size = np.zeros(3) if b is None else b
+    samples = samples.copy()
+    columns = {"gyro": slice(0, 3), "accelerometer": slice(3, 6)}.get(fault)
+    if columns is not None:
+        samples[times > FIRST_NS, columns] += size
+    rng = np.random.default_rng(seed)
+    noise = imu_noise(IMU)
+    densities = (noise.rate_noise, noise.force_noise)
+    for half, density in enumerate(densities):
+        spread = density * math.sqrt(IMU.rate_hz)
+        samples[:, 3 * half : 3 * half + 3] += spread * rng.standard_normal((len(samples), 3))
+    buffer = buffer_of(samples)
+    made = KalmanEstimator(MODEL, IMU.gap_s, faults=table_of(KINDS))
+    draw = INITIAL[:9] * rng.standard_normal(9)
+    p = np.diag(INITIAL**2)
+    p[9:, 9:] = 1e-16 * np.eye(MODEL.size - 9)  # biases are known
+    made.initialise(0, 0, runs.with_error(start, draw), np.zeros(MODEL.size), p)
+    for second in range(1, until_ns // runs.SECOND + 1):
+        t_ns = second * runs.SECOND
+        made.propagate(buffer, t_ns)
+        for aid in aids(t_ns, rng, fault, size):
+            assert made.update(aid).name in ("fused", "gated")
+    return made
+
+
+def error_of(one: KalmanEstimator, other: KalmanEstimator) -> Array:
+    """Of the first against the second, in the error state's navigation slots."""
+    return runs.nav_error(one.nav, other.nav)
+
+
+@pytest.mark.parametrize(
+    ("fault", "size"),
+    [
+        ("gyro", (1e-4, -2e-4, 3e-4)),
+        ("accelerometer", (2e-3, 1e-3, -3e-3)),
+        ("position", (0.03, -0.02, 0.04)),
+        ("position_drift", (0.01, 0.02, -0.01)),
+        ("velocity", (0.002, -0.003, 0.001)),
+        ("velocity_drift", (0.001, 0.002, -0.001)),
+    ],
+)
+def test_the_filter_is_off_by_v_b(fault: str, size: tuple[float, ...]) -> None:
+    """Against the same run without the fault."""
+    b = np.array(size)
+    faulty, sound = run(fault, b), run()
+    bank = sound.hypotheses
+    assert bank is not None
+    row = row_of(fault)
+    first = int(bank.table.ints[row, 3]) + RESTART * 3
+    columns = [divmod(first + c, MODEL.width) for c in range(3)]
+    v = np.array([bank.sensitivities[block, :, j] for block, j in columns]).T
+    expected = (v @ b)[:9]
+    found = error_of(faulty, sound)
+    assert np.abs(expected).max() > 1e-6
+    for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
+        scale = max(np.abs(expected[part]).max(), 1e-9)
+        assert np.abs(found[part] - expected[part]).max() < 0.02 * scale + 1e-9, part
+
+
+def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
+    """Of each kind of three numbers, over 60 runs: mean within 4.5 of its own sigmas."""
+    names = ("gyro", "accelerometer", "position", "velocity", "velocity_drift")
+    found: dict[str, list[float]] = {name: [] for name in names}
+    m = np.empty(12)
+    for seed in range(60):
+        made = run(seed=100 + seed)
+        bank = made.hypotheses
+        assert bank is not None
+        for name in names:
+            at = GROUPS + (RESTARTS * row_of(name) + RESTART) * GROUP
+            group = bank.bank[at : at + GROUP]
+            assert group[N_AT] == 24.0  # four epochs of six rows
+            found[name].append(solve(group, 3, bank.table.numbers[row_of(name)], 1e-9, m))
+            assert group[E_AT : E_AT + 3].any()
+            assert group[L_AT] > 0.0
+    for name, values in found.items():
+        sigma = math.sqrt(2.0 * 3.0 / len(values))
+        assert abs(np.mean(values) - 3.0) < 4.5 * sigma, (name, np.mean(values))
+
+
+@pytest.mark.parametrize(
+    ("fault", "size"),
+    [
+        ("gyro", (math.radians(1.0), 0.0, 0.0)),
+        ("accelerometer", (0.5, 0.0, 0.0)),
+        ("position", (20.0, 0.0, 0.0)),
+        ("velocity", (0.0, 2.0, 0.0)),
+    ],
+)
+def test_a_fault_is_found_with_its_size(fault: str, size: tuple[float, ...]) -> None:
+    """By odds, three seconds after its onset, which is a restart's."""
+    made = run(fault, np.array(size))
+    bank = made.hypotheses
+    assert bank is not None
+    bank.judge(LAST_NS)
+    odds = np.where(bank.explains, bank.log_odds, -np.inf)
+    row, restart = np.unravel_index(int(np.argmax(odds)), odds.shape)
+    # Kinds of one class are taken together.
+    assert KINDS[row].of == KINDS[row_of(fault)].of, KINDS[row].name
+    best = bank.estimated(RESTARTS * row_of(fault) + RESTART)
+    apart = (best.size - np.array(size)) / np.sqrt(np.diagonal(best.covariance))
+    assert np.abs(apart).max() < 4.0
+    assert odds[row, restart] > 7.0
+
+
+def test_weights_are_a_distribution() -> None:
+    made = run("velocity", np.array([0.3, 0.0, 0.0]))
+    bank = made.hypotheses
+    assert bank is not None
+    bank.judge(LAST_NS)
+    weights = bank.weights
+    assert (weights >= 0.0).all()
+    assert 0.0 < weights.sum() <= 1.0
+    opened = bank.opened()
+    assert np.allclose(opened, opened.T)
+    assert np.linalg.eigvalsh(opened).min() > -1e-12
+
+
+def test_a_snapshot_keeps_the_bank_to_the_bit() -> None:
+    """Going on from a snapshot is going on."""
+    times, samples, start = drive()
+    buffer = buffer_of(samples)
+    rng = np.random.default_rng(7)
+    made = KalmanEstimator(MODEL, IMU.gap_s, faults=table_of(KINDS))
+    made.initialise(0, 0, start.copy(), np.zeros(MODEL.size), np.diag(INITIAL**2))
+    given = {second: aids(second * runs.SECOND, rng, "", np.zeros(3)) for second in range(1, 21)}
+
+    def go(first: int, last: int) -> Array:
+        for second in range(first, last + 1):
+            made.propagate(buffer, second * runs.SECOND)
+            for aid in given[second]:
+                made.update(aid)
+        bank = made.hypotheses
+        assert bank is not None
+        bank.judge(made.t_ns)
+        return bank.bank.copy()
+
+    go(1, 12)
+    kept = made.snapshot()
+    once = go(13, 20)
+    made.restore(kept)
+    assert np.array_equal(go(13, 20), once, equal_nan=True)
+
+
+def test_a_look_in_passing_leaves_the_bank_as_it_is() -> None:
+    """What is asked between two aids changes nothing of what comes later."""
+    times, samples, start = drive()
+    buffer = buffer_of(samples)
+    found = []
+    for asked in (False, True):
+        rng = np.random.default_rng(8)
+        made = KalmanEstimator(MODEL, IMU.gap_s, faults=table_of(KINDS))
+        made.initialise(0, 0, start.copy(), np.zeros(MODEL.size), np.diag(INITIAL**2))
+        for second in range(1, 13):
+            t_ns = second * runs.SECOND
+            if asked:
+                made.propagate(buffer, t_ns - 340_000_000, passing=True)
+                made.sigmas()
+            made.propagate(buffer, t_ns)
+            for aid in aids(t_ns, rng, "", np.zeros(3)):
+                made.update(aid)
+        assert made.hypotheses is not None
+        found.append(made.hypotheses.bank.copy())
+    assert np.array_equal(*found, equal_nan=True)
+
+
+def test_each_kind_says_what_it_is() -> None:
+    """Names, units and priors of the whole catalogue."""
+    everything = {
+        "a": "gnss",
+        "b": "rdss",
+        "c": "wheel",
+        "d": "compass",
+        "e": "height",
+    }
+    kinds: list[Kind] = kinds_of(MODEL, everything, slips=True)
+    assert len({(k.name, k.device, k.lag_s) for k in kinds}) == len(kinds)
+    for kind in kinds:
+        assert kind.text
+        assert kind.unit
+        assert 0 < kind.size <= 3
+        assert min(kind.sd) > 0.0
+        assert kind.per_hour > 0.0
+    table = table_of(kinds)
+    assert table.columns == RESTARTS * sum(kind.size for kind in kinds)

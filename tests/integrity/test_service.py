@@ -1,0 +1,128 @@
+"""The table of service, transition by transition, and what repeats."""
+
+from __future__ import annotations
+
+import pytest
+
+from fusiond.aiding.position import PositionAid
+from fusiond.aiding.velocity import VelocityAid
+from fusiond.integrity.agreement import Agreement
+from fusiond.integrity.service import (
+    DISAGREES,
+    FORGET_NS,
+    READMIT_COUNT,
+    REFUSED_IN_A_ROW,
+    Series,
+    Service,
+)
+from fusiond.navigation.earth import meridian_radius
+
+S = 1_000_000_000
+GATE = 0.9999
+
+
+def series() -> Series:
+    return Series.of(position(0, 0.0))
+
+
+def position(t_s: float, north_m: float) -> PositionAid:
+    lat = 0.5 + north_m / meridian_radius(0.5)
+    return PositionAid("gnss", round(t_s * S), GATE, lat, 2.0, 50.0, (1.5,) * 3, (0.0,) * 3)
+
+
+def velocity(t_s: float, north_m_s: float) -> VelocityAid:
+    at = round(t_s * S)
+    return VelocityAid("gnss_velocity", at, GATE, (north_m_s, 0.0, 0.0), (0.1,) * 3, (0.0,) * 3)
+
+
+def test_one_failure_is_a_suspicion_that_a_pass_ends() -> None:
+    one = series()
+    one.gated(S, explained=False)
+    assert one.state is Service.SUSPECTED
+    one.fused(2 * S, (0.1, 0.1, 0.1))
+    assert one.state is Service.NOMINAL
+
+
+def test_three_failures_in_a_row_that_nothing_explains_end_service() -> None:
+    one = series()
+    for k in range(REFUSED_IN_A_ROW):
+        assert not one.out
+        one.gated(k * S, explained=False)
+    assert one.out
+    assert one.reason == DISAGREES
+    assert one.since_ns == (REFUSED_IN_A_ROW - 1) * S
+
+
+def test_failures_that_a_fault_of_the_unit_explains_do_not() -> None:
+    one = series()
+    for k in range(10):
+        one.gated(k * S, explained=True)
+    assert one.state is Service.SUSPECTED
+
+
+def test_it_is_back_after_five_that_pass_in_a_row_and_proves_itself() -> None:
+    one = series()
+    one.exclude(10 * S, "gnss position is off")
+    for k in range(READMIT_COUNT - 1):
+        one.looked_at((11 + k) * S, passes=True)
+    one.looked_at(15 * S, passes=False)
+    assert one.out
+    for k in range(READMIT_COUNT):
+        assert one.out
+        one.looked_at((20 + k) * S, passes=True)
+    assert one.state is Service.PROBATION
+    assert one.was_out_ns == 14 * S
+    one.fused(38 * S, ())
+    assert one.state is Service.PROBATION
+    one.fused(39 * S, ())
+    assert one.state is Service.NOMINAL
+    assert not one.reason
+
+
+def test_time_alone_readmits_nothing() -> None:
+    one = series()
+    one.exclude(0, "gnss position is off")
+    one.hear(3600 * S)
+    assert one.out
+
+
+def test_what_was_not_heard_of_for_long_is_judged_anew() -> None:
+    one = series()
+    one.hear(S)
+    one.gated(S, explained=False)
+    one.gated(2 * S, explained=False)
+    one.hear(2 * S + FORGET_NS)
+    assert one.state is Service.NOMINAL
+    one.gated(2 * S + FORGET_NS, explained=False)
+    assert not one.out
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_what_stands_may_repeat(moving: bool) -> None:
+    one, place = series(), (0.5, 2.0)
+    found = [one.repeats_itself(place, moving) for _ in range(5)]
+    assert any(found) is moving
+
+
+def test_a_copy_is_its_own() -> None:
+    one = series()
+    other = one.copied()
+    other.noise[0] = 9.0
+    other.gated(S, explained=False)
+    assert one.noise[0] == 1.0
+    assert one.state is Service.NOMINAL
+
+
+def test_a_device_that_goes_the_way_it_says_fits_itself() -> None:
+    agreement = Agreement()
+    for second in range(8):
+        agreement = agreement.with_aid(position(second, 10.0 * second))
+        agreement = agreement.with_aid(velocity(second, 10.0))
+    assert agreement.lasted_ns == 7 * S
+
+
+def test_one_that_stands_and_says_that_it_moves_does_not() -> None:
+    agreement = Agreement()
+    for second in range(8):
+        agreement = agreement.with_aid(position(second, 0.0)).with_aid(velocity(second, 10.0))
+    assert agreement.lasted_ns == 0
