@@ -52,6 +52,7 @@ def doubts(config: Config) -> list[str]:
         *_lever_arms(config),
         *_files(config),
         *_start(config),
+        *_filter(config),
         *_outputs(config),
     ]
 
@@ -114,6 +115,15 @@ def _aiding(config: Config) -> Iterator[str]:
         yield (
             f"aiding.{name}.kind = {section.kind!r}: driver {source.driver} gives "
             f"{' or '.join(kinds)}: nothing of it will be used as {section.kind}"
+        )
+
+
+def _filter(config: Config) -> Iterator[str]:
+    name = config.estimator.filter
+    if name != "kalman":
+        yield (
+            f"estimator.filter = {name!r} has no bank of fault hypotheses: what is wrong of a "
+            "sensor is not named, and the inertial unit's faults are not corrected (docs/diagnosis.md)"
         )
 
 

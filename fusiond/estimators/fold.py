@@ -110,3 +110,31 @@ def fold_and_account(
         feed_back(nav, xi, dx)
         dx[:] = 0.0
     return judged
+
+
+@compiled(
+    "void(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1], f8[:, ::1],"
+    "i8, i8, i8, i8, f8[::1])"
+)
+def account_for(
+    nav: Array,
+    h: Array,
+    r: Array,
+    y: Array,
+    g: Array,
+    fused: bool,
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    width: int,
+    t_ns: int,
+    measures: int,
+    device: int,
+    work: Array,
+) -> None:
+    """What the bank makes of rows that were `fused` or not, as `whiten` has left y (m,) and g (m,
+    w): of a filter that keeps its estimate."""
+    n = h.shape[1]
+    restart_due(bank, ints, n, width, t_ns)
+    sensitivity_rows(bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work)
+    account(bank, ints, n, width, y, g, fused, work)

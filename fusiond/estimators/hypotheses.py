@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusiond.aiding.base import Linearised
+from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
     GROUP,
     GROUPS,
@@ -57,7 +57,8 @@ class Hypotheses:
         """Log odds (k,) that a kind has beyond its rate."""
         self.found = np.full(FOUND, -np.inf)
         """What the last `judge` has found."""
-        self.work = np.zeros(4 * chunks_of(table.columns, model.width) * model.width)
+        self.columns = chunks_of(table.columns, model.width) * model.width
+        self.work = np.zeros(LENT_ROWS * self.columns)
         self._groups = bank[GROUPS : GROUPS + RESTARTS * kinds * GROUP].reshape(
             kinds, RESTARTS, GROUP
         )

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import LENT_ROWS, Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, THRESHOLDS, ErrorStateFilter, Outcome
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
-from fusiond.estimators.fold import fold_and_account
+from fusiond.estimators.fold import account_for, fold_and_account
 from fusiond.estimators.screening import KEPT
-from fusiond.estimators.update import fuse, work
+from fusiond.estimators.update import fuse, whiten, work
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -55,11 +55,18 @@ class KalmanEstimator(ErrorStateFilter):
         y, g = self._work[degrees] if degrees <= LENT_ROWS else work(degrees, self.model.width)
         nav, xi, cov, dx = self.nav, self.xi, self._cov, self._dx
         bank = self.hypotheses
-        if bank is None or self._holding or degrees > LENT_ROWS:
+        if bank is None or degrees > LENT_ROWS:
             nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
         else:
-            of = bank.bank, bank.table.ints, bank.table.numbers, aid.t_ns, *bank.of(aid), bank.work
-            nis = fold_and_account(nav, xi, cov, dx, z, h, r, threshold, y, g, *of)
+            of, table = bank.of(aid), bank.table
+            if not self._holding:
+                told = bank.bank, *table[:2], aid.t_ns, *of, bank.work
+                nis = fold_and_account(nav, xi, cov, dx, z, h, r, threshold, y, g, *told)
+            else:
+                nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
+                if nis < math.inf:
+                    told = bank.bank, *table[:2], bank.width, aid.t_ns, *of, bank.work
+                    account_for(nav, h, r, y, g, bool(nis <= threshold), *told)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
@@ -74,12 +81,25 @@ class KalmanEstimator(ErrorStateFilter):
         kept = codes.count(KEPT)
         if not kept:
             return Outcome("gated", s.nis, 0, (), codes)
+        if self.hypotheses is not None:
+            self._account_for(aid, rows, s.codes == KEPT)
         cov[:] = s.cov
         dx[:] = s.dx
         if not self._holding:
             self._feed_back(dx)
             dx[:] = 0.0
         return Outcome("fused", s.nis, kept, tuple(s.y.tolist()), codes)
+
+    def _account_for(self, aid: Linearised, rows: Innovation, kept: NDArray[np.bool_]) -> None:
+        """What the bank makes of those rows of a screened aid that are about to be folded in."""
+        bank, count = self.hypotheses, int(kept.sum())
+        assert bank is not None
+        z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
+        y, g = work(count, self.model.width)
+        if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
+            told = bank.bank, *bank.table[:2], bank.width, aid.t_ns, *bank.of(aid)
+            space = np.empty(count * bank.columns)
+            account_for(self.nav, h, r, y, g, True, *told, space)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable
 from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
+from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.federated.options import local_of
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.screening import KEPT
@@ -42,10 +43,16 @@ class SeparatedEstimator(KalmanEstimator):
     """The centralised filter with a subset for each of `devices`: sources of position, by the name
     that their aids begin with. What is published is, to rounding, the filter's without subsets."""
 
-    def __init__(self, model: Model, gap_s: float, devices: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        model: Model,
+        gap_s: float,
+        devices: tuple[str, ...],
+        faults: FaultTable = NO_FAULTS,
+    ) -> None:
         if not devices:
             raise ValueError("solution separation needs at least one device")
-        super().__init__(model, gap_s, (1.0,) * (1 + len(devices)))
+        super().__init__(model, gap_s, (1.0,) * (1 + len(devices)), faults)
         self.devices = devices
         self._carrying = True
         self._device_of: dict[str, int | None] = {}

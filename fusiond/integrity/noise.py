@@ -36,8 +36,8 @@ WAITS_NS = 15_000_000_000
 MOST = 100.0
 """Of a variance: ten times the sigma. What is beyond is no noise."""
 _ROWS = 3
-# The array of a series: scales (3); how many innovations are learned from, wait, and have come since
-# (s), how many the ring holds; sums of the lags of those three, (3, K + 1) each; the ring.
+# The array of a series: scales (3); how many innovations are learned from, wait, and have come
+# since (s), how many the ring holds; sums of the lags of those three, (3, K + 1) each; the ring.
 _LEARNED, _WAITING, _NEW_COUNT, _SINCE, _HELD = 3, 4, 5, 6, 7
 _SUMS = 8
 _LAGS = _ROWS * (LAGS + 1)

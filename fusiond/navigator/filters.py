@@ -75,7 +75,8 @@ def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Es
     match config.estimator.filter:
         case "kalman":
             if config.integrity.watched:
-                return SeparatedEstimator(model, config.imu.gap_s, config.positioning)
+                devices, gap_s = config.positioning, config.imu.gap_s
+                return SeparatedEstimator(model, gap_s, devices, table_of(kinds))
             return InvariantFilter(model, config.imu.gap_s, faults=table_of(kinds))
         case "multiscale":
             from fusiond.estimators.multiscale.filter import MultiscaleEstimator  # noqa: PLC0415
