@@ -60,8 +60,8 @@ class KalmanEstimator(ErrorStateFilter):
         else:
             of, table = bank.of(aid), bank.table
             if not self._holding:
-                told = bank.bank, *table[:2], aid.t_ns, *of, bank.work
-                nis = fold_and_account(nav, xi, cov, dx, z, h, r, threshold, y, g, *told)
+                now = bank.bank, *table[:2], aid.t_ns, *of, bank.work
+                nis = fold_and_account(nav, xi, cov, dx, z, h, r, threshold, y, g, *now)
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
