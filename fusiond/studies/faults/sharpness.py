@@ -131,12 +131,13 @@ def phases_of(run: Published, recording: Recording) -> dict[str, Bools]:
 
 
 def moments(run: Published, where: Bools) -> dict[str, dict[str, float | None]]:
-    """Of each quantity in a phase: `nees`, `error2` and `sigma2`, means over instants and axes;
-    None where there is nothing, or no number."""
+    """Of each quantity in a phase: `nees`, `error2` and `sigma2`, means over instants and those of
+    its axes that are compared at all; None where there is none, or no number."""
     found = {}
     for name, axes in AXES.items():
-        e2 = run.errors[where][:, axes] ** 2
-        s2 = run.sigmas[where][:, axes] ** 2
+        there = [axis for axis in axes if not np.isnan(run.errors[where, axis]).all()]
+        e2 = run.errors[where][:, there] ** 2
+        s2 = run.sigmas[where][:, there] ** 2
         with np.errstate(invalid="ignore", divide="ignore"):
             parts = {"nees": e2 / s2, "error2": e2, "sigma2": s2}
         means = {key: float(part.mean()) if part.size else math.nan for key, part in parts.items()}

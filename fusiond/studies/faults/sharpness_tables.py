@@ -1,5 +1,5 @@
 """What `sharpness` found, as Markdown: how many cells are right, sums by what they share, and a
-line a cell and phase."""
+line a cell and phase; and what `real` did, a line a drive."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from fusiond.studies.faults.markdown import table
+from fusiond.studies.faults.markdown import number, table
 from fusiond.studies.faults.published import AXES
+from fusiond.studies.faults.real import PHASE as COMPARED
 from fusiond.studies.faults.sharpness import PHASES, figures, outside
 
 Row = dict[str, Any]
@@ -18,6 +19,17 @@ Rows = list[Row]
 SUMS = ("cells", "phase", "runs", *AXES)
 LINES = ("IMU", "receiver", "Hz", "lever arm", "phase", *AXES)
 COUNTS = ("told", "phase", *AXES)
+REAL = (
+    "drive",
+    "outages",
+    "seconds",
+    "not `navigating`, s",
+    "isolated",
+    "told",
+    "published over own, 99 %",
+    *AXES,
+    "largest, m",
+)
 TOLD = {"all": "all", "class": "the class alone"}
 _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("all told", lambda r: True),
@@ -97,3 +109,31 @@ def _counts(found: Rows) -> list[tuple[str, ...]]:
             if cells:
                 lines.append((name, phase, *columns))
     return lines
+
+
+def real(found: Rows) -> str:
+    """A line a drive as it is, and one of all its sets of outages."""
+    lines = []
+    for name in dict.fromkeys(row["drive"] for row in found):
+        those = [row for row in found if row["drive"] == name]
+        quiet = [row for row in those if row["outages"] is None]
+        held = [row for row in those if row["outages"] is not None]
+        lines += [_of_drive(name, *each) for each in (("none", quiet), ("sets", held)) if each[1]]
+    crashes = sum(row["crash"] is not None for row in found)
+    return f"{table(REAL, lines)}\n\n{len(found)} runs; {crashes} ended the navigator.\n"
+
+
+def _of_drive(name: str, outages: str, rows: Rows) -> tuple[str, ...]:
+    told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
+    own = [row["own"]["most_99"] for row in rows if row["own"]["most_99"] is not None]
+    return (
+        name,
+        outages if outages == "none" else f"{len(rows)} {outages}",
+        f"{sum(row['seconds'] for row in rows):.0f}",
+        f"{sum(row['not_navigating_s'] for row in rows):g}",
+        str(sum(row["isolated"] for row in rows)),
+        ", ".join(f"{what} x{n}" if n > 1 else what for what, n in told.items()) or "-",
+        number(max(own, default=None), "-"),
+        *_entries(rows, COMPARED),
+        number(max(row["largest_m"] for row in rows), "-"),
+    )
