@@ -44,6 +44,7 @@ _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("consumer", lambda r: r["imu"] == "consumer"),
     ("mems", lambda r: r["imu"] == "mems"),
     ("tactical", lambda r: r["imu"] == "tactical"),
+    ("data sheet", lambda r: r["imu"] == "data sheet"),
 )
 
 
@@ -86,13 +87,13 @@ def _entries(rows: Rows, phase: str) -> tuple[str, ...]:
     return tuple(_entry(*figures(rows, phase, name)) for name in AXES)
 
 
-def _entry(nees: float, spread: float, ratio: float) -> str:
+def _entry(nees: float, half: float, ratio: float) -> str:
     """NEES, marked where it is not right, and sigma over RMS."""
     if math.isnan(nees):
         return "-"
     text = f"{nees:.2f}"
     mark = {"right": text, "perhaps": f"{text}?", "outside": f"**{text}**"}
-    return f"{mark[outside(nees, spread)]} ({ratio:.2f})"
+    return f"{mark[outside(nees, half)]} ({ratio:.2f})"
 
 
 def _counts(found: Rows) -> list[tuple[str, ...]]:
