@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -160,10 +161,22 @@ def real_run(job: RealJob) -> dict[str, Any]:
         "own": own.shares(),
         "compared": int(compared.sum()),
         "phases": {PHASE: moments(run, compared)},
-        "largest_m": float(run.horizontal_m[compared].max(initial=0.0)),
+        "largest_m": [
+            float(
+                run.horizontal_m[compared & (states.t_s >= a) & (states.t_s < b)].max(initial=0.0)
+            )
+            for a, b in _parts(windows, float(states.t_s[-1]))
+        ]
+        if compared.any()
+        else [],
         "beyond_s": longest_s(run.beyond_in(AXES["position"]) & compared),
         "crash": run.crash,
     }
+
+
+def _parts(windows: Sequence[tuple[float, float]], duration_s: float) -> list[tuple[float, float]]:
+    """Begin and end of each outage, of the whole where there is none."""
+    return [(at_s, at_s + length_s) for at_s, length_s in windows] or [(0.0, duration_s)]
 
 
 @dataclass(slots=True)

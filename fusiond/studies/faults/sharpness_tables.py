@@ -28,7 +28,8 @@ REAL = (
     "told",
     "published over own, 99 %",
     *AXES,
-    "largest, m",
+    "largest of each, RMS, m",
+    "of all",
 )
 TOLD = {"all": "all", "class": "the class alone"}
 _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
@@ -126,6 +127,7 @@ def real(found: Rows) -> str:
 
 def _of_drive(name: str, outages: str, rows: Rows) -> tuple[str, ...]:
     told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
+    largest = [value for row in rows for value in row["largest_m"]]
     own = [row["own"]["most_99"] for row in rows if row["own"]["most_99"] is not None]
     return (
         name,
@@ -136,5 +138,6 @@ def _of_drive(name: str, outages: str, rows: Rows) -> tuple[str, ...]:
         ", ".join(f"{what} x{n}" if n > 1 else what for what, n in told.items()) or "-",
         number(max(own, default=None), "-"),
         *_entries(rows, COMPARED),
-        number(max(row["largest_m"] for row in rows), "-"),
+        number(math.sqrt(sum(x * x for x in largest) / len(largest)) if largest else None, "-"),
+        number(max(largest, default=None), "-"),
     )
