@@ -66,7 +66,7 @@ _RTK: dict[str, Any] = {
     "alignment": {"heading": ("gnss_course",)},
 }
 _EVERY_45_S = tuple(
-    tuple((175.0 + shift_s + 45.0 * k, 15.0) for k in range(8)) for shift_s in (0, 9, 18, 27, 36)
+    tuple((171.645 + shift_s + 45.0 * k, 15.0) for k in range(8)) for shift_s in (0, 9, 18, 27, 36)
 )
 """Of README of the data: eight of 15 s, and four sets between them."""
 DRIVES: dict[str, Drive] = {
@@ -80,7 +80,7 @@ DRIVES: dict[str, Drive] = {
             "constraints": SLIPLESS,
             "alignment": {"heading": ("gnss_course",)},
         },
-        (tuple((582.0 + 150.0 * k, 60.0) for k in range(12)),),
+        (tuple((582.33 + 150.0 * k, 60.0) for k in range(12)),),
         wheels=True,
     ),
     "walk_0827": Drive(
