@@ -111,7 +111,7 @@ picture: $(STAMP) ## docs/house.svg, from the imports
 bench: $(RUNTIME) ## what the kernels cost; ARGS="--json F.json" keeps the figures
 	$(BIN)/fusiond bench $(ARGS)
 
-faults: $(RUNTIME) ## fault matrix as a table; ARGS="--only step_500m --phase coasting"
+faults: $(RUNTIME) ## fault matrix as a table; ARGS="--only step_500m", "--service 3", "--sharpness 4"
 	$(BIN)/python -m fusiond.studies.faults $(ARGS)
 
 wires: $(STAMP) test-packages ## faults of wires, clocks and the host; ARGS="--only gnss_late_3s"

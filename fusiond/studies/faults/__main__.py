@@ -1,5 +1,6 @@
 """Run the fault matrix or rows of it, how well faults are detected, how often none is one, what
-becomes of those that happen now and then, how long they cost service, or how sharp sigma is."""
+becomes of those that happen now and then, how long they cost service, how sharp sigma is, or what
+is told of recorded drives."""
 
 from __future__ import annotations
 
@@ -17,6 +18,8 @@ from fusiond.studies.faults.hours import hour_of
 from fusiond.studies.faults.library import ALL, FAULTS
 from fusiond.studies.faults.more import EVERY
 from fusiond.studies.faults.power import jobs, power_run
+from fusiond.studies.faults.real import jobs as real_jobs
+from fusiond.studies.faults.real import real_run
 from fusiond.studies.faults.recorded import Place, recorded_rows, run_recorded, smooth
 from fusiond.studies.faults.runs import rows, run_row
 from fusiond.studies.faults.scenes import SHARES
@@ -27,6 +30,8 @@ from fusiond.studies.faults.sharpness import sharpness_run
 from fusiond.studies.faults.tables import TABLES, put_into
 from fusiond.studies.monte_carlo import over, runs_on, step_counter
 from fusiond.workers.pool import Pool, processors
+
+Row = dict[str, Any]
 
 
 def main() -> int:
@@ -39,7 +44,10 @@ def main() -> int:
     parser.add_argument("--faulty", type=int, metavar="HOURS", help="hours with faults in them")
     parser.add_argument("--service", type=int, metavar="DRIVES", help="time without service")
     parser.add_argument("--sharpness", type=int, metavar="DRIVES", help="sigma, so many a cell")
-    parser.add_argument("--seeds", choices=SHARES, default=SHARES[0], help="of the last two")
+    parser.add_argument("--real", type=Path, metavar="DATA", help="recorded drives, none wrong")
+    parser.add_argument(
+        "--seeds", choices=SHARES, default=SHARES[0], help="drives of sharpness, service"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=int, metavar="N", help="a drawn drive, not the town")
     parser.add_argument("--recording", type=Path, metavar="P", help="tables or a CAN log, instead")
@@ -56,23 +64,13 @@ def main() -> int:
         if asked.config is None or not asked.at:
             parser.error("--recording needs --config and --at")
         kind, found = "recorded", _recorded(asked)
-    elif asked.power is not None:
-        kind = "power"
-        found = _run(power_run, jobs(asked.power, asked.seed), asked.workers)
-    elif asked.alarms is not None:
-        kind = "alarms"
-        found = _run(hour_of, range(asked.seed, asked.seed + asked.alarms), asked.workers)
-    elif asked.faulty is not None:
-        kind = "faulty"
-        found = _run(faulty_hour_of, range(asked.seed, asked.seed + asked.faulty), asked.workers)
-    elif asked.service is not None:
-        kind = "service"
-        one = partial(service_run, share=asked.seeds)
-        found = _run(one, service_jobs(asked.service), asked.workers)
-    elif asked.sharpness is not None:
-        kind = "sharpness"
-        cells = partial(sharpness_run, share=asked.seeds)
-        found = _run(cells, sharpness_jobs(asked.sharpness), asked.workers)
+    elif (study := next((k for k in STUDIES if getattr(asked, k) is not None), None)) is not None:
+        kind = study
+        try:
+            one, those = STUDIES[study](getattr(asked, study), asked)
+        except ValueError as error:
+            parser.error(str(error))
+        found = _run(one, those, asked.workers)
     else:
         kind, wanted = "matrix", rows(asked.only, asked.phase)
         if asked.only not in {None, *FAULTS}:
@@ -90,6 +88,24 @@ def main() -> int:
         put_into(asked.page, kind, text)
     print(text, end="")
     return 0
+
+
+STUDIES: dict[str, Callable[[Any, argparse.Namespace], tuple[Callable[[Any], Row], Sequence[Any]]]]
+STUDIES = {
+    "power": lambda runs, asked: (power_run, jobs(runs, asked.seed)),
+    "alarms": lambda hours, asked: (hour_of, range(asked.seed, asked.seed + hours)),
+    "faulty": lambda hours, asked: (faulty_hour_of, range(asked.seed, asked.seed + hours)),
+    "service": lambda drives, asked: (
+        partial(service_run, share=asked.seeds),
+        service_jobs(drives),
+    ),
+    "sharpness": lambda drives, asked: (
+        partial(sharpness_run, share=asked.seeds),
+        sharpness_jobs(drives),
+    ),
+    "real": lambda data, _: (real_run, real_jobs(data)),
+}
+"""By option: what makes a row, and of what."""
 
 
 def _recorded(asked: argparse.Namespace) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ and `invalid`, too.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusiond.configuration.schema import Config
 from fusiond.navigation.solution import Mode, Solution
+from fusiond.navigator.navigator import Navigator
 from fusiond.simulation.imu_truth import States, Truth, metres_to_geodetic
 from fusiond.studies.faults.judge import MOST_SIGMA, NAVIGATING, Event, Sample
 from fusiond.studies.faults.recording import Recording
@@ -80,7 +82,11 @@ class Published:
     @property
     def beyond(self) -> Bools:
         """Where an error lies beyond five sigma, whatever the mode."""
-        found: Bools = np.asarray((self.ratios[:, JUDGED] > MOST_SIGMA).any(axis=1))
+        return self.beyond_in(JUDGED)
+
+    def beyond_in(self, axes: tuple[int, ...]) -> Bools:
+        """The same of some columns."""
+        found: Bools = np.any(self.ratios[:, axes] > MOST_SIGMA, axis=1)
         return found
 
     @property
@@ -105,8 +111,10 @@ def against(
     recording: Recording,
     true: States,
     true_sd: Array | None = None,
+    watch: Callable[[Navigator], None] | None = None,
 ) -> Published:
-    """The same against states at 10 Hz from 0.1 s on, known to `true_sd` (n, 9)."""
+    """The same against states at 10 Hz from 0.1 s on, known to `true_sd` (n, 9); `watch` may look
+    at the navigator then."""
     n = len(true.t_s)
     rows, modes = np.full((n, _FIGURES), math.nan), np.full(n, "", dtype="<U12")
 
@@ -119,7 +127,7 @@ def against(
         )
         return Sample(solution.t_ns * 1e-9, str(solution.mode))
 
-    course = driven(config, recording, n * STEP_S, look, every_ticks=1)
+    course = driven(config, recording, n * STEP_S, look, watch, every_ticks=1)
     unit = metres_to_geodetic(true.position[:, 0], true.position[:, 2], np.ones((n, 3)))
     apart = rows[:, :3] - true.position
     apart[:, 1] = _wrapped(apart[:, 1])

@@ -14,7 +14,9 @@ car neither slides nor is its unit askew, and stamps are exact. What of this the
 is `Told`:
 
     all       noise of the IMU and of the receiver, of which `[aiding.gnss]` says what is shared and
-              each fix what is white; the car as it is (`KNOWN`)
+              each fix what is white; stamps that are exact. The filter has no constraint of a
+              noise that a car which never slides does not have: told in millimetres a second, it
+              asks for more than a linear filter can do, and told wider it is wrong
     noise     the same, but for the car and the stamps, which may be as wrong as by default
     class     the IMU's class, and nothing else: the unit on board is a typical one of it
               (`TYPICAL`), and fixes state the sum of their errors
@@ -106,12 +108,11 @@ class Vehicle:
     def config(self) -> Config:
         """What the navigator gets."""
         gnss: dict[str, Any] = {"lever_arm_m": ANTENNA_M} if self.lever_given else {}
-        slip: dict[str, Any] = {"enabled": True, "lever_arm_m": AXLE_M}
+        slip = {"enabled": self.told != "all", "lever_arm_m": AXLE_M}
         if self.told != "class":
             gnss |= self.receiver.section
         if self.told == "all":
             gnss |= {"time_offset_sd_s": 0.0}
-            slip |= KNOWN
         own: dict[str, Any] = {"sensor_class": self.sensor}
         if self.sensor == "data sheet":
             own = VEHICLE.imu.model_dump(exclude_unset=True)
@@ -135,17 +136,6 @@ class Vehicle:
             for key, value in CLASSES[self.sensor].items()
         }
         return config.model_copy(update={"imu": config.imu.model_copy(update=own)})
-
-
-KNOWN: dict[str, Any] = {
-    "sd_m_s": 0.005,
-    "sd_down_m_s": 0.005,
-    "drift_sd_m_s": 0.0,
-    "mounting_sd_deg": 0.0,
-    "lever_arm_sd_m": 0.0,
-}
-"""`[constraints.non_holonomic]` of a car that does not slide, whose IMU is mounted as measured: an
-error of nothing, up to what rounding and integration leave."""
 
 
 @dataclass(frozen=True, slots=True)

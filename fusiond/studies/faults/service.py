@@ -28,7 +28,7 @@ from drivers.measurements import PositionFix
 from fusiond.configuration.settings import DEG
 from fusiond.studies.faults import aid_faults as aid
 from fusiond.studies.faults import imu_faults as imu
-from fusiond.studies.faults.judge import LIE_S, MOST_SIGMA
+from fusiond.studies.faults.judge import LIE_S
 from fusiond.studies.faults.published import (
     AXES,
     JUDGED,
@@ -179,7 +179,7 @@ def figures(run: Published, steady: Published, begin_s: float, end_s: float) -> 
     out, beyond = ~run.navigating & since, run.beyond & since
     ratios = run.ratios
     by_quantity = {
-        name: longest_s((ratios[:, axes] > MOST_SIGMA).any(axis=1) & since)
+        name: longest_s(run.beyond_in(axes) & since)
         for name, axes in AXES.items()
         if name != "velocity"
     }

@@ -13,7 +13,8 @@ outage         from the first fix that is missing until one comes
 after          30 s from there on
 steady         all else
 
-Errors last: a yaw's for minutes. `NEES` of a cell has the standard error of its drives' means.
+Errors last: a yaw's for minutes. NEES of a cell has the interval (Student's t, `CONFIDENCE`) of its
+drives' means.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.stats import t
 
 from fusiond.configuration.sensor_class import CLASSES
 from fusiond.studies.faults.published import AXES, STEP_S, Bools, Published, longest_s, published
@@ -46,23 +48,28 @@ FIRST_S, AFTER_S = 60.0, 30.0
 PHASES = ("steady", "first minute", "outage", "after")
 RIGHT = (0.7, 1.4)
 """NEES a degree that is called right; sigma over RMS lies in its roots then."""
+RECEIVERS = (CODE, SHARING, RTK, SHARING_RTK)
 RATES_HZ = (1.0, 10.0)
 MOST_DRIVES = 100
+CONFIDENCE = 0.95
 
 
 def _cells() -> tuple[Vehicle, ...]:
-    """Those of which all is told, and those of which the class alone is."""
+    """Those of which all is told, those of which the class alone is, and those of a unit whose axes
+    are square, by its data sheet."""
     told = [
         Vehicle(sensor, replace(receiver, rate_hz=rate), given)
-        for sensor, receiver, rate, given in product(
-            CLASSES, (CODE, SHARING, RTK, SHARING_RTK), RATES_HZ, (True, False)
-        )
+        for sensor, receiver, rate, given in product(CLASSES, RECEIVERS, RATES_HZ, (True, False))
     ]
     by_class = [
         Vehicle(sensor, replace(receiver, rate_hz=rate), told="class")
         for sensor, receiver, rate in product(CLASSES, (CODE, RTK), RATES_HZ)
     ]
-    return (*told, *by_class)
+    square = [
+        Vehicle("data sheet", replace(receiver, rate_hz=rate))
+        for receiver, rate in product(RECEIVERS, RATES_HZ)
+    ]
+    return (*told, *by_class, *square)
 
 
 CELLS = _cells()
@@ -131,12 +138,13 @@ def phases_of(run: Published, recording: Recording) -> dict[str, Bools]:
 
 
 def moments(run: Published, where: Bools) -> dict[str, dict[str, float | None]]:
-    """Of each quantity in a phase: `nees`, `error2` and `sigma2`, means over instants and axes;
-    None where there is nothing, or no number."""
+    """Of each quantity in a phase: `nees`, `error2` and `sigma2`, means over instants and those of
+    its axes that are compared at all; None where there is none, or no number."""
     found = {}
     for name, axes in AXES.items():
-        e2 = run.errors[where][:, axes] ** 2
-        s2 = run.sigmas[where][:, axes] ** 2
+        there = [axis for axis in axes if not np.isnan(run.errors[where, axis]).all()]
+        e2 = run.errors[where][:, there] ** 2
+        s2 = run.sigmas[where][:, there] ** 2
         with np.errstate(invalid="ignore", divide="ignore"):
             parts = {"nees": e2 / s2, "error2": e2, "sigma2": s2}
         means = {key: float(part.mean()) if part.size else math.nan for key, part in parts.items()}
@@ -145,21 +153,24 @@ def moments(run: Published, where: Bools) -> dict[str, dict[str, float | None]]:
 
 
 def figures(rows: Iterable[Mapping[str, Any]], phase: str, name: str) -> tuple[float, float, float]:
-    """NEES a degree, its standard error, and sigma over RMS of a quantity in a phase of runs, which
+    """NEES a degree, half its interval, and sigma over RMS of a quantity in a phase of runs, which
     count alike; not a number where there is none."""
     those = [row["phases"][phase][name] for row in rows]
     if not those or any(part is None for each in those for part in each.values()):
         return math.nan, math.nan, math.nan
     nees = [each["nees"] for each in those]
     error2, sigma2 = (sum(each[key] for each in those) for key in ("error2", "sigma2"))
-    spread = float(np.std(nees, ddof=1)) / math.sqrt(len(nees)) if len(nees) > 1 else math.nan
-    return float(np.mean(nees)), spread, math.sqrt(sigma2 / error2)
+    half, n = math.inf, len(nees)
+    if n > 1:
+        times = float(t.ppf(0.5 + 0.5 * CONFIDENCE, n - 1))
+        half = times * float(np.std(nees, ddof=1)) / math.sqrt(n)
+    return float(np.mean(nees)), half, math.sqrt(sigma2 / error2)
 
 
-def outside(nees: float, spread: float) -> str:
-    """`right`; `outside` of `RIGHT` by more than two standard errors; or `perhaps`."""
+def outside(nees: float, half: float) -> str:
+    """`right`; `outside` of `RIGHT` with its whole interval; or `perhaps`."""
     low, high = RIGHT
     if low <= nees <= high:
         return "right"
     by = low - nees if nees < low else nees - high
-    return "perhaps" if by <= 2.0 * spread else "outside"
+    return "perhaps" if by <= half else "outside"

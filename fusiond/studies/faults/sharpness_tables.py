@@ -1,5 +1,5 @@
 """What `sharpness` found, as Markdown: how many cells are right, sums by what they share, and a
-line a cell and phase."""
+line a cell and phase; and what `real` did, a line a drive."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from fusiond.studies.faults.markdown import table
+from fusiond.studies.faults.markdown import number, table
 from fusiond.studies.faults.published import AXES
+from fusiond.studies.faults.real import PHASE as COMPARED
 from fusiond.studies.faults.sharpness import PHASES, figures, outside
 
 Row = dict[str, Any]
@@ -18,6 +19,18 @@ Rows = list[Row]
 SUMS = ("cells", "phase", "runs", *AXES)
 LINES = ("IMU", "receiver", "Hz", "lever arm", "phase", *AXES)
 COUNTS = ("told", "phase", *AXES)
+REAL = (
+    "drive",
+    "outages",
+    "seconds",
+    "not `navigating`, s",
+    "isolated",
+    "told",
+    "published over own, 99 %",
+    *AXES,
+    "largest of each, RMS, m",
+    "of all",
+)
 TOLD = {"all": "all", "class": "the class alone"}
 _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("all told", lambda r: True),
@@ -32,6 +45,7 @@ _ALL: tuple[tuple[str, Callable[[Row], bool]], ...] = (
     ("consumer", lambda r: r["imu"] == "consumer"),
     ("mems", lambda r: r["imu"] == "mems"),
     ("tactical", lambda r: r["imu"] == "tactical"),
+    ("data sheet", lambda r: r["imu"] == "data sheet"),
 )
 
 
@@ -74,13 +88,13 @@ def _entries(rows: Rows, phase: str) -> tuple[str, ...]:
     return tuple(_entry(*figures(rows, phase, name)) for name in AXES)
 
 
-def _entry(nees: float, spread: float, ratio: float) -> str:
+def _entry(nees: float, half: float, ratio: float) -> str:
     """NEES, marked where it is not right, and sigma over RMS."""
     if math.isnan(nees):
         return "-"
     text = f"{nees:.2f}"
     mark = {"right": text, "perhaps": f"{text}?", "outside": f"**{text}**"}
-    return f"{mark[outside(nees, spread)]} ({ratio:.2f})"
+    return f"{mark[outside(nees, half)]} ({ratio:.2f})"
 
 
 def _counts(found: Rows) -> list[tuple[str, ...]]:
@@ -97,3 +111,33 @@ def _counts(found: Rows) -> list[tuple[str, ...]]:
             if cells:
                 lines.append((name, phase, *columns))
     return lines
+
+
+def real(found: Rows) -> str:
+    """A line a drive as it is, and one of all its sets of outages."""
+    lines = []
+    for name in dict.fromkeys(row["drive"] for row in found):
+        those = [row for row in found if row["drive"] == name]
+        quiet = [row for row in those if row["outages"] is None]
+        held = [row for row in those if row["outages"] is not None]
+        lines += [_of_drive(name, *each) for each in (("none", quiet), ("sets", held)) if each[1]]
+    crashes = sum(row["crash"] is not None for row in found)
+    return f"{table(REAL, lines)}\n\n{len(found)} runs; {crashes} ended the navigator.\n"
+
+
+def _of_drive(name: str, outages: str, rows: Rows) -> tuple[str, ...]:
+    told: Counter[str] = sum((Counter(row["told"]) for row in rows), Counter())
+    largest = [value for row in rows for value in row["largest_m"]]
+    own = [row["own"]["most_99"] for row in rows if row["own"]["most_99"] is not None]
+    return (
+        name,
+        outages if outages == "none" else f"{len(rows)} {outages}",
+        f"{sum(row['seconds'] for row in rows):.0f}",
+        f"{sum(row['not_navigating_s'] for row in rows):g}",
+        str(sum(row["isolated"] for row in rows)),
+        ", ".join(f"{what} x{n}" if n > 1 else what for what, n in told.items()) or "-",
+        number(max(own, default=None), "-"),
+        *_entries(rows, COMPARED),
+        number(math.sqrt(sum(x * x for x in largest) / len(largest)) if largest else None, "-"),
+        number(max(largest, default=None), "-"),
+    )

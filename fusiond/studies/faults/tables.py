@@ -12,7 +12,7 @@ from fusiond.studies.faults.hours import rates
 from fusiond.studies.faults.markdown import number, table
 from fusiond.studies.faults.power import powers
 from fusiond.studies.faults.service_tables import service
-from fusiond.studies.faults.sharpness_tables import sharpness
+from fusiond.studies.faults.sharpness_tables import real, sharpness
 
 Rows = list[dict[str, Any]]
 
@@ -194,6 +194,7 @@ TABLES: Mapping[str, Callable[[Rows], str]] = {
     "recorded": recorded,
     "service": service,
     "sharpness": sharpness,
+    "real": real,
 }
 
 
