@@ -52,7 +52,7 @@ def frame(payload: bytes, opcode: int = 1) -> bytes:
 
 
 def subscribe(first: int, count: int) -> bytes:
-    wanted = [{"id": first + k, "channelId": 1 + (first + k) % 13} for k in range(count)]
+    wanted = [{"id": first + k, "channelId": 1 + (first + k) % 11} for k in range(count)]
     return frame(json.dumps({"op": "subscribe", "subscriptions": wanted}).encode())
 
 
