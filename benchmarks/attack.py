@@ -1,6 +1,7 @@
 """The daemon while guests attack its servers, a row for each attack:
 
-    python benchmarks/attack.py [--seconds S] [--rest S] [--only NAME ...] [--json F.json]
+    python benchmarks/attack.py [--seconds S] [--rest S] [--ahead] [--only NAME ...] [--json F]
+    python benchmarks/attack.py --kill TIMES [--ahead] [--json F]
 
 The daemon's own process, all its servers on, records a simulated vehicle in another: IMU 200 Hz,
 raw GNSS 10 Hz (UBX, fused tightly), RDSS; ticks and `nav` 100 Hz, to a Mosquitto that one client
@@ -17,10 +18,13 @@ listens to. One daemon takes all attacks (`benchmarks/attackers.py`) one after a
 * `log`: lines of the cause that has most of them, a minute; all causes that have more than one
   line are in the JSON.
 
+With `--kill` the daemon is killed (SIGKILL) so many times while three attacks go on, and a row says
+what its recording lacks.
+
 The attackers yield the processor (nice 19): each has its own in truth. The daemon, the broker, the
 vehicle and this process have nice -10, as the unit gives it to the daemon, where that is allowed
 (root). On a computer that others use as well the gaps are also those of the computer: compare with
-`peace`.
+`peace`, or take `--ahead`, by which all but the attackers run at SCHED_FIFO, before all others.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ import contextlib
 import json
 import multiprocessing
 import os
+import random
 import re
 import subprocess
 import sys
@@ -50,6 +55,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.attackers import ATTACKS, Ports
 from benchmarks.daemon_load import CONFIG, RECORDING, resident_mb, simulate
+from fusiond.recording.reader import Log
 from tests.broker import Broker, free_port, listening
 from tests.hil.heard import Heard
 from tests.hil.processes import SIM_IMU, DaemonProcess
@@ -182,7 +188,11 @@ async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
         *map(str, (name, seconds, *ports)),
         stdout=asyncio.subprocess.PIPE,
     )
-    told, _ = await process.communicate()
+    try:
+        told, _ = await process.communicate()
+    finally:
+        if process.returncode is None:
+            process.kill()
     found: dict[str, Any] = json.loads(told.splitlines()[-1])
     return found
 
@@ -225,6 +235,61 @@ async def _row(
 
 async def measure(folder: Path, args: Any) -> list[dict[str, Any]]:
     """Run the attacks; their rows, told as they come."""
+    rows: list[dict[str, Any]] = []
+    async with _bench(folder) as (config, broker, ports), DaemonProcess(config) as daemon:
+        await daemon.start()
+        await daemon.ready()
+        async with listening(broker, "fusiond/load/+") as (listener, _):
+            heard = Heard(listener, "load")
+            await heard.until("nav", lambda m: m["mode"] == "navigating")
+            await asyncio.sleep(SETTLE_S)
+            for name in args.only or ("peace", *ATTACKS):
+                row = await _row(name, daemon, heard, broker.port, ports, args)
+                if not rows:
+                    print("".join(title.rjust(width) for title, _, width in COLUMNS))
+                print("".join(str(row[key]).rjust(width) for _, key, width in COLUMNS))
+                sys.stdout.flush()
+                rows.append(row)
+        await daemon.terminate()
+    return rows
+
+
+async def kill(folder: Path, args: Any) -> list[dict[str, Any]]:
+    """Kill the daemon (SIGKILL) so many times while three attacks go on; a row a kill: how much of
+    what its broker's client had heard is not in the recording, and what is wrong with that."""
+    dice, rows = random.Random(1), []
+    async with _bench(folder) as (config, broker, ports):
+        attacks = [
+            asyncio.create_task(_attack(name, 3600.0, ports))
+            for name in ("poll_8_unread", "deaf_1100", "subscribe_138000")
+        ]
+        for number in range(args.kill):
+            watch = Watch()
+            listening_ = asyncio.create_task(_hear_nav(broker.port, watch))
+            async with DaemonProcess(config) as daemon:
+                await daemon.start()
+                await daemon.ready()
+                await asyncio.sleep(dice.uniform(1.0, 3.0))
+            await asyncio.sleep(0.2)
+            listening_.cancel()
+            log = Log([_newest(folder)])
+            kept_ms = [m.json()["t_ms"] for m in log.messages("/nav")]
+            lost_s = (watch.nav_ms[-1] - max(kept_ms, default=watch.nav_ms[0])) * 1e-3
+            rows.append({"lost_s": round(lost_s, 3), "kept": len(kept_ms), "log": log.problems})
+            print(number, rows[-1], flush=True)
+        for attack in attacks:
+            attack.cancel()
+        await asyncio.gather(*attacks, return_exceptions=True)
+    return rows
+
+
+def _newest(folder: Path) -> Path:
+    return max(folder.glob("logs/*"), key=lambda path: path.stat().st_mtime)
+
+
+@asynccontextmanager
+async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
+    """A vehicle under way and a broker; the configuration of a daemon for them."""
     bus = bus_here(0)
     ports = Ports(*(free_port() for _ in Ports._fields))
     # Else Mosquitto waits for the client's delayed acknowledgement, 40 ms.
@@ -242,28 +307,12 @@ async def measure(folder: Path, args: Any) -> list[dict[str, Any]]:
     vehicle = multiprocessing.get_context("spawn").Process(
         target=simulate, args=(str(folder), bus["interface"], bus["channel"], True), daemon=True
     )
-    rows: list[dict[str, Any]] = []
     try:
         with broker:
-            async with DaemonProcess(config) as daemon:
-                await daemon.start()
-                vehicle.start()
-                await daemon.ready()
-                async with listening(broker, "fusiond/load/+") as (listener, _):
-                    heard = Heard(listener, "load")
-                    await heard.until("nav", lambda m: m["mode"] == "navigating")
-                    await asyncio.sleep(SETTLE_S)
-                    for name in args.only or ("peace", *ATTACKS):
-                        row = await _row(name, daemon, heard, broker.port, ports, args)
-                        if not rows:
-                            print("".join(title.rjust(width) for title, _, width in COLUMNS))
-                        print("".join(str(row[key]).rjust(width) for _, key, width in COLUMNS))
-                        sys.stdout.flush()
-                        rows.append(row)
-                await daemon.terminate()
+            vehicle.start()
+            yield config, broker, ports
     finally:
         vehicle.kill()
-    return rows
 
 
 def main() -> None:
@@ -271,14 +320,18 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rest", type=float, default=5.0)
     parser.add_argument("--only", nargs="*", choices=("peace", *ATTACKS))
+    parser.add_argument("--kill", type=int, default=0)
+    parser.add_argument("--ahead", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     with contextlib.suppress(PermissionError):
+        if args.ahead:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
         os.setpriority(os.PRIO_PROCESS, 0, -10)
     network_of_its_own()
     subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
     with tempfile.TemporaryDirectory(prefix="fusiond-attack-") as folder:
-        rows = asyncio.run(measure(Path(folder), args))
+        rows = asyncio.run((kill if args.kill else measure)(Path(folder), args))
     if args.json is not None:
         args.json.write_text(json.dumps(rows, indent=2) + "\n")
 

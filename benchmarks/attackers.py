@@ -213,6 +213,7 @@ def main() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.setpriority(os.PRIO_PROCESS, 0, 19)
     print("attacking", flush=True)
     print(json.dumps(attack(name, float(seconds), Ports(*map(int, ports)))))
