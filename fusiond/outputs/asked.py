@@ -9,6 +9,7 @@ Source: RFC 8259, sections 8.2 and 9 (a parser may limit the depth).
 from __future__ import annotations
 
 import json
+from math import isfinite
 from typing import Any, NoReturn
 
 DEEPEST = 16
@@ -22,7 +23,7 @@ class NotUnderstoodError(ValueError):
 def parsed(text: str | bytes) -> Any:
     """The value of a JSON text. Raises `NotUnderstoodError`."""
     try:
-        value = json.loads(text, parse_constant=_refuse_constant)
+        value = json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
     except RecursionError:
         raise NotUnderstoodError("nested too deep") from None
     except NotUnderstoodError:
@@ -59,6 +60,11 @@ def _look_at(text: str) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise NotUnderstoodError("half a surrogate pair") from None
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    return value if isfinite(value) else _refuse_constant(text[:20])
 
 
 def _refuse_constant(name: str) -> NoReturn:

@@ -9,7 +9,7 @@ import os
 import resource
 import socket
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from fusiond.outputs.allowance import BYTES, MESSAGES, Bucket, Rate
 from fusiond.outputs.asked import DEEPEST, NotUnderstoodError, parsed
 from fusiond.outputs.foxglove.channels import CHANNELS
 from fusiond.outputs.foxglove.server import FoxgloveServer
-from fusiond.outputs.foxglove.viewer import MOST_SUBSCRIPTIONS, PROTOCOLS, loopback
+from fusiond.outputs.foxglove.viewer import MOST_SUBSCRIPTIONS, PROTOCOLS, Data, Viewer, loopback
 from fusiond.outputs.gpsd.server import GpsdServer
 from fusiond.outputs.guests import BUDGET_NS, WINDOW_NS, Guests
 from fusiond.outputs.nmea import NmeaServer
@@ -339,6 +339,7 @@ HOSTILE = (
     '{"op": ["\\udc00"]}',
     "NaN",
     '{"id": Infinity}',
+    '{"id": 1e999}',
     "9" * 5000,
     "",
     "{",
@@ -439,6 +440,66 @@ async def test_a_message_is_encoded_once_for_all(monkeypatch: pytest.MonkeyPatch
         got = [await viewer.recv() for viewer in (one, two) for _ in range(5)]
         assert len({bytes(data)[13:] for data in got if isinstance(data, bytes)}) == 1
         assert made == 1
+
+
+class FakeClient:
+    """The connection of a viewer that is given bytes without one."""
+
+    waiting_bytes = 0
+    request_due = True
+    on_room: Callable[[], None] | None = None
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+        self.finished = False
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+
+    def finish(self) -> None:
+        self.finished = True
+
+    def charge(self) -> bool:
+        return True
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> bytes:
+    """Frames of a client, most of them as they should be, and what is none."""
+    if draw(st.integers(0, 9)) == 0:
+        return draw(st.binary(max_size=20))
+    payload = draw(
+        st.sampled_from([text.encode("utf-8", "replace")[:125] for text in HOSTILE])
+        | st.binary(max_size=40)
+        | st.just(b'{"op":"subscribe","subscriptions":[{"id":1,"channelId":1}]}')
+        | st.just(b'{"op":"subscribe","subscriptions":[{"id":1e999,"channelId":[]}]}')
+        | st.just(b'{"op":"unsubscribe","subscriptionIds":[[],1]}')
+    )
+    first = draw(st.sampled_from([0x81, 0x82, 0x01, 0x80, 0x88, 0x89, 0x8A, 0xF1, 0x83]))
+    return bytes([first, 0x80 | len(payload)]) + bytes(4) + payload
+
+
+@given(st.lists(frames(), max_size=12), st.booleans(), st.integers(1, 1024))
+@settings(max_examples=200, deadline=None)
+def test_a_viewer_survives_everything(sent: list[bytes], upgraded: bool, piece: int) -> None:
+    server = FoxgloveServer(Foxglove(port=1), Around().surroundings)
+    server.take(NAV, nav())
+    server.greeting = b""  # 0.05 s
+    client = FakeClient()
+    viewer = Viewer(server, client)  # type: ignore[arg-type]
+    data = (UPGRADE if upgraded else b"") + b"".join(sent)
+    for begin in range(0, len(data), piece):
+        if not client.finished:
+            viewer.receive(data[begin : begin + piece])
+        viewer.put(CHANNELS[0], Data(1, b"{}"))
+    assert len(viewer.channels) <= 1
+
+
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: foxglove.sdk.v1\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
 
 
 @pytest.mark.parametrize("send", ["pings", "messages"])

@@ -101,14 +101,16 @@ class Viewer:
             self._pass_on()
 
     def _tell(self, text: str) -> None:
-        self._socket.send_text(text.encode())
+        if self._socket.state is OPEN:  # not after a frame that has ended it, in the same piece
+            self._socket.send_text(text.encode())
 
     def _pass_on(self) -> None:
         """What the WebSocket has to send."""
-        data = b"".join(self._socket.data_to_send())
+        parts = self._socket.data_to_send()
+        data = b"".join(parts)
         if data:
             self._client.send(data)
-        if self._socket.close_expected():
+        if b"" in parts or self._socket.close_expected():  # its mark of the end
             self._client.finish()
 
     # ------------------------------------------------------------------ from the viewer
