@@ -226,6 +226,7 @@ async def _row(
         "log_lines_a_minute": round(most * 60.0 / max(60.0, args.seconds)),
         "log_causes": causes,
         "cpu_percent": after["cpu_percent"],
+        "gc_max_ms": after["gc_max_ms"],
         "mode_after": mode,
         "outputs": {n: after["outputs"][n]["counters"] for n in Ports._fields},
         "recording": after["outputs"]["recording"]["state"],
