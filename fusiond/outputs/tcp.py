@@ -40,6 +40,8 @@ HASTY_S = 1.0
 """When all places are taken, who has asked nothing for so long makes room for one who comes."""
 PAUSE_S = 1.0
 """Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
+SHORT_TOLD_S = 60.0
+"""Between two events about that."""
 _READ_BYTES = 1024
 """One piece of work: 50 requests of gpsd's at most."""
 _BACKLOG = 128
@@ -278,7 +280,7 @@ class TcpServer:
         self._most = most
         self.counters: Counter[str] = Counter()
         self.clients: dict[Client, None] = {}
-        self._short = False
+        self._short_told_ns: int | None = None
 
     async def run(self) -> None:
         """Listen until cancelled; a port that is taken is tried again."""
@@ -331,7 +333,6 @@ class TcpServer:
             if error.errno in _SHORT:
                 self._pause(listening, error)
             return  # else who came has gone again
-        self._short = False
         self._make_room()
         if len(self.clients) >= self._most or self.guests.full:
             self.counters["clients_refused"] += 1
@@ -359,9 +360,11 @@ class TcpServer:
                 return
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """No descriptor is left: said once, and tried again later."""
-        if not self._short:
-            self._short = True
+        """No descriptor is left: said once a minute at most, and tried again later."""
+        now_ns = time.perf_counter_ns()
+        told_ns = self._short_told_ns
+        if told_ns is None or now_ns - told_ns > SHORT_TOLD_S * _SECOND_NS:
+            self._short_told_ns = now_ns
             self.port.report("clients_refused", f"none for now: {error.strerror}")
         self.guests.forget(listening.fileno())
         asyncio.get_running_loop().call_later(PAUSE_S, self._watch, listening)
