@@ -20,7 +20,7 @@ COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load man deb docs lock clean \
+.PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load attack man deb docs lock clean \
 	collected dashboard-check kernels systemd test-packages
 
 help: ## this list
@@ -125,6 +125,9 @@ soak: $(STAMP) test-packages ## the daemon for HOURS of real time, with faults n
 
 load: $(STAMP) test-packages ## CPU and memory of the daemon under load, as JSON
 	$(BIN)/python benchmarks/daemon_load.py $(ARGS)
+
+attack: $(STAMP) test-packages ## the daemon while guests attack its servers; ARGS="--seconds 100 --rest 60 --only poll_1"
+	$(BIN)/python benchmarks/attack.py $(ARGS)
 
 dashboard-check: $(STAMP) ## the dashboard in Debian's Chromium beside the daemon; ARGS="--minutes 60"
 	@PYTHON="$(PYTHON)" tools/debian-packages.sh look

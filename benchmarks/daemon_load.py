@@ -105,7 +105,7 @@ COMMANDS = """commands = ["start_recording", "stop_recording"]
 TURN_S, SKIPPED_S = 10.0, 1.0
 
 
-def _vehicle(folder: str, interface: str, channel: str, raw: bool) -> None:
+def simulate(folder: str, interface: str, channel: str, raw: bool) -> None:
     scenario = SCENARIOS["drive"]
     vehicle = SimulatedVehicle(
         replace(
@@ -136,7 +136,7 @@ def _running_s(pid: int) -> float:
     return sum(int(task.read_text().split()[0]) for task in tasks) * 1e-9
 
 
-def _resident_mb(pid: int) -> float:
+def resident_mb(pid: int) -> float:
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
@@ -229,7 +229,7 @@ async def measure(
         + (OUTPUTS.format(gpsd=gpsd, nmea=nmea) if clients else "")
     )
     vehicle = multiprocessing.get_context("spawn").Process(
-        target=_vehicle, args=(str(folder), interface, channel, raw), daemon=True
+        target=simulate, args=(str(folder), interface, channel, raw), daemon=True
     )
     try:
         with broker:
@@ -256,7 +256,7 @@ async def measure(
                         else:
                             await asyncio.sleep(seconds)
                         elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
-                        resident_mb = _resident_mb(daemon.pid)
+                        memory_mb = resident_mb(daemon.pid)
                         after = await heard.until("health")
                         nav = len(heard.all("nav", since))
                 await daemon.terminate()
@@ -269,7 +269,7 @@ async def measure(
         "recording_percent": _difference(shares) if shares else None,
         "recording_and_not_percent": [round(share, 1) for share in shares],
         "cpu_percent": round(100.0 * used_s / elapsed_s, 1),
-        "resident_mb": round(resident_mb, 1),
+        "resident_mb": round(memory_mb, 1),
         "first_tick_s": round(first_tick_s, 2),
         "seconds": round(elapsed_s, 1),
         "interface": interface,

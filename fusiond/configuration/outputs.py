@@ -66,6 +66,9 @@ class Foxglove(Served):
     """As Foxglove proposes it."""
     rate_hz: Rate = 10.0
     """Of position and attitude."""
+    origins: tuple[Annotated[str, Field(pattern=r"^https?://[^/\s]+$")], ...] = ()
+    """Sites whose pages may connect, as a browser names them: `https://app.foxglove.dev`. Pages of
+    the same computer and programs that are no browser always may."""
 
 
 class HomeAssistant(Section):

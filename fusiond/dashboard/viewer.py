@@ -18,6 +18,7 @@ from typing import Any
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from fusiond.dashboard.hub import Hub
+from fusiond.outputs.asked import NotUnderstoodError, parsed
 
 FRAME_S = 0.1
 BEAT_S = 1.0
@@ -122,8 +123,8 @@ class Viewer:
         while True:
             text = await self._socket.receive_text()
             try:
-                asked = json.loads(text) if len(text) <= LARGEST_REQUEST else None
-            except ValueError:
+                asked = parsed(text) if len(text) <= LARGEST_REQUEST else None
+            except NotUnderstoodError:
                 asked = None
             if not isinstance(asked, dict):
                 self._answer(False, "not understood")

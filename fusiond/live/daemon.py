@@ -46,6 +46,7 @@ from fusiond.outputs.commands import (
     StartRecording,
     StopRecording,
 )
+from fusiond.outputs.guests import Guests
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
@@ -95,6 +96,7 @@ class Daemon:
             on_time=self.service.feed_watchdog,
         )
         self._serving = Serving(self._events.report)
+        self._guests = Guests()
         self.outputs = self._make_outputs(config, {})
         self._publishing = Publishing(
             config,
@@ -119,6 +121,7 @@ class Daemon:
             on_event=self._events.report,
             on_command=self._carry_out,
             clock=self.clock,
+            guests=self._guests,
             kept=kept,
         )
         if config.recording.directory is not None:

@@ -1,4 +1,4 @@
-"""What is logged, with level, source and code as fields of the journal.
+"""What is logged, with level, source and code as fields of the journal, and how much of it.
 
     journalctl -u fusiond -p warning
     journalctl -u fusiond FUSIOND_SOURCE=gnss FUSIOND_CODE=device_absent
@@ -15,6 +15,8 @@ import struct
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+
+from fusiond.live.log_limit import LogLimit
 
 SOCKET = Path("/run/systemd/journal/socket")
 PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
@@ -68,7 +70,13 @@ def _field(name: str, value: str) -> bytes:
 
 def handler(environ: Mapping[str, str] = os.environ) -> logging.Handler:
     """For the journal where standard error goes there (JOURNAL_STREAM, systemd.exec(5)), else for
-    standard error."""
+    standard error; of one cause it takes a few lines a minute."""
+    found = _handler(environ)
+    found.addFilter(LogLimit())
+    return found
+
+
+def _handler(environ: Mapping[str, str]) -> logging.Handler:
     try:
         err = os.fstat(sys.stderr.fileno())
         journal = environ.get("JOURNAL_STREAM") == f"{err.st_dev}:{err.st_ino}" and SOCKET.exists()

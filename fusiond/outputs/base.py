@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from drivers.base import DriverStatus
 from fusiond.clock.clock import Clock
+from fusiond.outputs.guests import Guests
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import Topic
@@ -50,6 +51,8 @@ class Surroundings:
     """Names of the devices."""
     mqtt: MqttPublisher | None = None
     clock: Clock | None = None
+    guests: Guests = field(default_factory=Guests)
+    """The door of all servers."""
 
     def broker(self) -> MqttPublisher:
         """For outputs that go out by MQTT; the configuration has seen to it that there is one."""

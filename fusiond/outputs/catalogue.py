@@ -13,6 +13,7 @@ from fusiond.outputs.base import Output, Surroundings
 from fusiond.outputs.chrony import ChronySocket
 from fusiond.outputs.commands import Handler
 from fusiond.outputs.gpsd.server import GpsdServer
+from fusiond.outputs.guests import Guests
 from fusiond.outputs.home_assistant import HomeAssistantDiscovery
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.nmea import NmeaServer
@@ -45,10 +46,12 @@ def make_outputs(
     on_event: Callable[[str, str, str], None],
     on_command: Handler,
     clock: Clock,
+    guests: Guests,
     kept: Mapping[str, Output] = MappingProxyType({}),
 ) -> dict[str, Output]:
     """Those that are configured, by name, MQTT first. `on_event(source, code, text)` hears them.
-    `kept` are there already, those that go out by MQTT with its own among them.
+    Servers share the door `guests`. `kept` are there already, those that go out by MQTT with its
+    own among them.
 
     Raises `ConfigError` for one that cannot be as it is configured.
     """
@@ -75,6 +78,7 @@ def make_outputs(
             tuple(config.sources),
             mqtt,
             clock,
+            guests,
         )
         made[name] = MAKERS[name](section, around)
     return made

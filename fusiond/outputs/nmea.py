@@ -25,7 +25,8 @@ from fusiond.outputs.figures import known, motion, usable
 from fusiond.outputs.latest import Latest
 from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.nav import NavMessage
-from fusiond.outputs.tcp import Client, TcpServer
+from fusiond.outputs.port import Port
+from fusiond.outputs.tcp import TcpServer, Unheard
 from fusiond.outputs.topics import NAV, Topic
 
 SATELLITES = "04"
@@ -36,7 +37,6 @@ KNOT_M_S = 1852.0 / 3600.0
 KMH_M_S = 1.0 / 3.6
 _MODE = {Mode.NAVIGATING: "A", Mode.COASTING: "E"}
 _QUALITY = {Mode.NAVIGATING: "1", Mode.COASTING: "6"}
-_READ_BYTES = 4096
 
 
 class NmeaServer:
@@ -51,7 +51,8 @@ class NmeaServer:
         self._kinds = section.sentences
         self._geoid_m = around.geoid_separation_m
         self._nav: Latest[NavMessage] = Latest()
-        self.server = TcpServer(self.name, section.host, section.port, self._serve, around.on_event)
+        port = Port(self.name, section.host, section.port, around.on_event)
+        self.server = TcpServer(self.name, port, around.guests, lambda _: Unheard())
         self.counters = self.server.counters
 
     @property
@@ -70,11 +71,7 @@ class NmeaServer:
     async def _send(self) -> None:
         while True:
             epoch = sentences(await self._nav.next(), self._kinds, self._geoid_m)
-            await self.server.send(lambda _, epoch=epoch: epoch)  # type: ignore[misc]
-
-    async def _serve(self, client: Client) -> None:
-        while await client.reader.read(_READ_BYTES):
-            pass
+            self.server.send(lambda _, epoch=epoch: epoch)  # type: ignore[misc]
 
 
 def sentences(nav: NavMessage, kinds: Sequence[str], geoid_separation_m: float | None) -> bytes:

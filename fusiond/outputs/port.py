@@ -11,7 +11,7 @@ from drivers.base import Backoff, DriverStatus
 
 
 class Listening(Protocol):
-    """A server of asyncio's or of a library's."""
+    """What listens."""
 
     @property
     def sockets(self) -> Iterable[socket.socket]: ...
@@ -41,7 +41,7 @@ class Port:
             except OSError as error:
                 text = f"{self.address[0]}:{self.address[1]}: {error.strerror or error}"
                 if self.status.state != "absent":
-                    self._on_event(f"{self._name}_absent", text)
+                    self.report("absent", text)
                 self.status = DriverStatus("absent", text)
                 await asyncio.sleep(backoff.next())
                 continue
@@ -49,6 +49,10 @@ class Port:
             self.address = (bound[0], bound[1])
             self.serves(0)
             return server
+
+    def report(self, code: str, text: str) -> None:
+        """An event `<name>_<code>`."""
+        self._on_event(f"{self._name}_{code}", text)
 
     def serves(self, clients: int) -> None:
         """So many are connected."""

@@ -1,7 +1,7 @@
 """Prometheus: the state of the daemon as metrics, at `/metrics`.
 
-Answers from the latest messages, so that a scrape costs no tick anything. Units are Prometheus's
-base units: seconds, metres, radians, bytes.
+Answers from the latest messages, with a text that is made once a second at most, so that scrapes
+cost no tick anything. Units are Prometheus's base units: seconds, metres, radians, bytes.
 
 Source: Prometheus text exposition format 0.0.4; OpenMetrics 1.0 for state sets (a series a state,
 1 for the one that holds).
@@ -9,11 +9,10 @@ Source: Prometheus text exposition format 0.0.4; OpenMetrics 1.0 for state sets 
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from math import isinf, isnan, radians
+from math import inf, isinf, isnan, radians
 from typing import Any, Literal, NamedTuple, get_args
 
 from drivers.base import DriverStatus, State
@@ -27,12 +26,17 @@ from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.status import StatusMessage
+from fusiond.outputs.port import Port
 from fusiond.outputs.tcp import Client, TcpServer
 from fusiond.outputs.topics import Topic
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-_REQUEST_S = 10.0
-"""Longest wait for a request's end: the scrape_timeout that Prometheus has by default."""
+MOST_SCRAPERS = 32
+"""At once; Prometheus opens one, and keeps none."""
+_KEPT_S = 1.0
+"""How long a text is given again: `health` comes once a second."""
+_MOST_HEAD_BYTES = 8192
+"""Of a request's line and headers, as HTTP servers have it."""
 
 Labels = tuple[tuple[str, str], ...]
 
@@ -59,7 +63,9 @@ class PrometheusEndpoint:
         self._latest: dict[type[Message], Message] = {}
         self._events: Counter[tuple[str, str, str]] = Counter()
         self._nav_s: float | None = None
-        self.server = TcpServer(self.name, section.host, section.port, self._serve, around.on_event)
+        self._text, self._text_s = b"", -inf
+        port = Port(self.name, section.host, section.port, around.on_event)
+        self.server = TcpServer(self.name, port, around.guests, self._greet, MOST_SCRAPERS)
         self.counters = self.server.counters
 
     @property
@@ -77,23 +83,26 @@ class PrometheusEndpoint:
     async def run(self) -> None:
         await self.server.run()
 
-    async def _serve(self, client: Client) -> None:
-        try:
-            async with asyncio.timeout(_REQUEST_S):
-                head = await client.reader.readuntil(b"\r\n\r\n")
-        except (TimeoutError, asyncio.LimitOverrunError):
-            self.counters["malformed"] += 1
-            return
+    def _greet(self, client: Client) -> _Scrape:
+        client.request_due = True
+        return _Scrape(self, client)
+
+    def answer(self, head: bytes) -> bytes:
+        """To a request of which that is the head."""
         method, path, *_ = [*head.split(b"\r\n", 1)[0].split(), b"", b""]
         if method not in (b"GET", b"HEAD"):
             self.counters["malformed"] += 1
-            await client.finish(_response("405 Method Not Allowed", b"GET or HEAD\n", head=False))
-        elif path.split(b"?")[0] != b"/metrics":
-            await client.finish(_response("404 Not Found", b"/metrics\n", head=method == b"HEAD"))
-        else:
-            self.counters["scrapes"] += 1
-            text = exposition(self.families()).encode()
-            await client.finish(_response("200 OK", text, head=method == b"HEAD"))
+            return _response("405 Method Not Allowed", b"GET or HEAD\n", head=False)
+        if path.split(b"?")[0] != b"/metrics":
+            return _response("404 Not Found", b"/metrics\n", head=method == b"HEAD")
+        self.counters["scrapes"] += 1
+        return _response("200 OK", self._metrics(), head=method == b"HEAD")
+
+    def _metrics(self) -> bytes:
+        now_s = time.monotonic()
+        if now_s - self._text_s >= _KEPT_S:
+            self._text, self._text_s = exposition(self.families()).encode(), now_s
+        return self._text
 
     # ------------------------------------------------------------------ metrics
 
@@ -121,6 +130,25 @@ class PrometheusEndpoint:
         text = "Processor time that the daemon has used."
         found.append(Family("process_cpu_seconds_total", "counter", text, (("", (), cpu_s),)))
         return [family for family in found if family.samples]
+
+
+class _Scrape:
+    """One connection: a request, an answer, the end."""
+
+    def __init__(self, endpoint: PrometheusEndpoint, client: Client) -> None:
+        self._endpoint, self._client = endpoint, client
+        self._head = bytearray()
+
+    def receive(self, data: bytes) -> None:
+        self._head += data
+        if b"\r\n\r\n" in self._head:
+            self._client.request_due = False
+            self._client.finish(self._endpoint.answer(bytes(self._head)))
+        elif len(self._head) > _MOST_HEAD_BYTES:
+            self._client.drop("malformed")
+
+    def end(self) -> None:
+        pass
 
 
 def _gauge(name: str, text: str, value: float | None) -> Family:

@@ -1,18 +1,28 @@
 """A TCP port and its clients, none of whom holds up another, or a tick.
 
-What a client has not read waits in its connection: 16 KiB in the process and as much again in the
-kernel. While that is full its epochs are skipped; who skips thirty in a row is dropped.
+Whatever a client causes is done in a turn of the door (`fusiond.outputs.guests`) and charged to its
+allowance: who sends too much is read more slowly, who asks too often is dropped. What a client has
+not read waits in its connection: 16 KiB in the process and as much again in the kernel. While that
+is full its epochs are skipped; who skips thirty in a row, or takes nothing for half a minute, is
+dropped. A connection counts until its descriptor is closed.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import errno
+import logging
+import select
 import socket
-from collections import Counter
-from collections.abc import Awaitable, Callable
+import struct
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Protocol
 
 from fusiond.outputs.activation import activated
+from fusiond.outputs.allowance import Allowance
+from fusiond.outputs.guests import Guests
 from fusiond.outputs.port import Port
 
 MOST_CLIENTS = 256
@@ -21,117 +31,372 @@ MOST_WAITING_BYTES = 16384
 """Some ten epochs of gpsd's JSON, 1 to 1.5 kB each: a second at 10 Hz. What is older is no use."""
 MOST_SKIPPED = 30
 """Epochs in a row: 3 s at 10 Hz, half a minute at 1 Hz, the time that gpsd's clients wait."""
-_TURN = 16
-"""Clients written to before the loop may run a tick."""
+STUCK_S = 30.0
+"""Something waits for the client and it takes nothing: as long as thirty epochs at 1 Hz."""
+REQUEST_S = 10.0
+"""Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
+by default."""
+HASTY_S = 1.0
+"""When all places are taken, who has asked nothing for so long makes room for one who comes."""
+PAUSE_S = 1.0
+"""Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
+SHORT_TOLD_S = 60.0
+"""Between two events about that."""
+_READ_BYTES = 1024
+"""One piece of work: 50 requests of gpsd's at most."""
+_BACKLOG = 128
+_SHORT = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+_GONE = select.EPOLLHUP | select.EPOLLERR
+_LINGER_NOT = struct.pack("ii", 1, 0)
+_SECOND_NS = 1_000_000_000
+
+log = logging.getLogger("fusiond")
+
+
+class Session(Protocol):
+    """What a server knows of one client."""
+
+    def receive(self, data: bytes) -> None:
+        """Some bytes came; at most a KiB at once."""
+
+    def end(self) -> None:
+        """The connection is no more."""
+
+
+class Unheard:
+    """A session of who has nothing to say: what comes is read, so that its end is noticed."""
+
+    def receive(self, data: bytes) -> None:
+        pass
+
+    def end(self) -> None:
+        pass
 
 
 class Client:
-    """One connection."""
+    """One connection; closed, it is nothing more than its number of descriptor was."""
 
-    def __init__(
-        self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        counters: Counter[str],
-    ) -> None:
-        self.reader = reader
-        self._writer = writer
-        self._counters = counters
+    def __init__(self, sock: socket.socket, server: TcpServer) -> None:
+        self._socket = sock
+        self._server = server
+        self._guests = server.guests
+        self._fd = sock.fileno()
+        self._counters = server.counters
+        self._out: deque[bytes | memoryview] = deque()
+        self._out_bytes = 0
         self._skipped = 0
+        now_ns = time.perf_counter_ns()
+        self.since_ns = now_ns
+        self._allowance = Allowance(now_ns)
+        self._moved_ns = now_ns
+        self.request_due = False
+        """Whether it has yet to ask what its connection is for; it has `REQUEST_S` for that."""
+        self._flushing = self._slowed = self._finishing = self.closed = False
+        self.session: Session | None = None
+        self.on_room: Callable[[], None] | None = None
+        """Called when all that was sent is out."""
+        self._wanted = select.EPOLLIN
+        self._guests.watch(self._fd, self._wanted, self._ready)
+        self._guests.came(self)
+
+    # ------------------------------------------------------------------ for the server
 
     def send(self, data: bytes) -> None:
         """Send all of `data` or nothing of it; does not wait."""
-        transport = self._writer.transport
-        if transport.is_closing():
+        if self.closed or self._finishing:
             return
-        if transport.get_write_buffer_size() > MOST_WAITING_BYTES:
+        if self._out_bytes > MOST_WAITING_BYTES:
             self._counters["skipped"] += 1
             self._skipped += 1
             if self._skipped >= MOST_SKIPPED:
-                self._counters["clients_dropped"] += 1
-                self.drop()
+                self.drop("clients_dropped")
             return
         self._skipped = 0
-        self._writer.write(data)
-        self._counters["sent"] += 1
+        self._put(data)
 
-    async def finish(self, data: bytes) -> None:
-        """Send `data`, wait until it is out, and close."""
-        self._writer.write(data)
-        self._counters["sent"] += 1
-        await self._writer.drain()
-        self._writer.close()
+    def finish(self, data: bytes = b"") -> None:
+        """Send `data` and close when it is out."""
+        if self.closed or self._finishing:
+            return
+        self._finishing = True
+        if data:
+            self._put(data)
+        elif not self._out:
+            self.close()
 
-    def drop(self) -> None:
-        self._writer.transport.abort()
+    def charge(self) -> bool:
+        """One request; False, and the client is dropped, if it was one too many."""
+        now_ns = time.perf_counter_ns()
+        self._allowance.messages.spend(1.0, now_ns)
+        if not self._allowance.messages.empty(now_ns):
+            return True
+        self.drop("clients_flooding")
+        return False
+
+    @property
+    def waiting_bytes(self) -> int:
+        return self._out_bytes
+
+    def drop(self, reason: str) -> None:
+        """Close at once, whatever waits for it; counted as `reason`."""
+        if not self.closed:
+            self._counters[reason] += 1
+            # Reset: the kernel would keep for a minute what nobody reads.
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)
+            self.close()
+
+    def close(self) -> None:
+        if self.closed:
+            return
+        self.closed = True
+        self._guests.forget(self._fd)
+        self._guests.left(self)
+        self._socket.close()
+        self._out.clear()
+        self._server.ended(self)
+
+    # ------------------------------------------------------------------ pieces of work
+
+    def look(self, now_ns: int) -> None:
+        if self._slowed and not self._allowance.must_wait(now_ns):
+            self._slowed = False
+            self._wait_for(self._wanted | select.EPOLLIN)
+        if self._out and now_ns - self._moved_ns > STUCK_S * _SECOND_NS:
+            self.drop("clients_dropped")
+        elif self.request_due and now_ns - self.since_ns > REQUEST_S * _SECOND_NS:
+            self.drop("malformed")
+
+    def _ready(self, events: int) -> None:
+        if events & select.EPOLLOUT:
+            self._flush()
+        if not self.closed and events & (select.EPOLLIN | _GONE):
+            self._read()
+
+    def _read(self) -> None:
+        start_ns = time.perf_counter_ns()
+        try:
+            data = self._socket.recv(_READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            self.close()
+            return
+        if not data:
+            self._hung_up()
+            return
+        try:
+            if self.session is not None and not self._finishing:
+                self.session.receive(data)
+        except Exception:
+            log.exception("%s: a client's request failed", self._server.name)
+            self.drop("clients_faulty")
+        if self.closed:
+            return
+        now_ns = time.perf_counter_ns()
+        self._allowance.bytes.spend(len(data), now_ns)
+        self._allowance.microseconds.spend((now_ns - start_ns) * 1e-3, now_ns)
+        if self._allowance.must_wait(now_ns):
+            self._slowed = True
+            self._counters["slowed"] += 1
+            self._wait_for(self._wanted & ~select.EPOLLIN)
+
+    def _hung_up(self) -> None:
+        """It sends no more; what it has asked for it still gets."""
+        self._wait_for(self._wanted & ~select.EPOLLIN)
+        self.finish()
+
+    def _put(self, data: bytes) -> None:
+        if not self._out:
+            self._moved_ns = time.perf_counter_ns()
+        self._out.append(data)
+        self._out_bytes += len(data)
+        self._counters["sent"] += 1
+        if not self._flushing:
+            self._flushing = True
+            self._guests.do(self._flush)
+
+    def _flush(self) -> None:
+        self._flushing = False
+        try:
+            while self._out:
+                data = self._out[0]
+                sent = self._socket.send(data)
+                self._moved_ns = time.perf_counter_ns()
+                self._out_bytes -= sent
+                if sent < len(data):
+                    self._out[0] = memoryview(data)[sent:]
+                    break
+                self._out.popleft()
+        except BlockingIOError:
+            pass
+        except OSError:
+            self.close()
+            return
+        if self._out:
+            self._flushing = True
+            self._wait_for(self._wanted | select.EPOLLOUT)
+            return
+        self._wait_for(self._wanted & ~select.EPOLLOUT)
+        if self._finishing:
+            self.close()
+        elif self.on_room is not None:
+            self.on_room()
+
+    def _wait_for(self, events: int) -> None:
+        if events != self._wanted and not self.closed:
+            self._wanted = events
+            self._guests.change(self._fd, events)
+
+
+class _Listener:
+    """The sockets of a port at the door."""
+
+    def __init__(self, sockets: list[socket.socket]) -> None:
+        self.sockets = sockets
 
 
 class TcpServer:
     """Listens at `host:port`, or at the socket that the service manager holds as `name`.
 
-    `serve(client)` is called for each connection, which ends with it. `counters`: `clients` (since
-    the start), `clients_refused` (too many at once), `clients_dropped` (did not read), `sent`,
-    `skipped` (epochs that a client was too slow for). `port` says how it stands.
+    `greet(client)` gives the session of a connection. `counters`: `clients` (since the start),
+    `clients_refused` (too many at once), `clients_dropped` (did not read), `clients_flooding`
+    (asked too often), `clients_faulty` (a fault of ours), `slowed` (read later, for what it sent),
+    `malformed`, `sent`, `skipped` (epochs that a client was too slow for). `port` says how it
+    stands.
     """
 
     def __init__(
         self,
         name: str,
-        host: str,
-        port: int,
-        serve: Callable[[Client], Awaitable[None]],
-        on_event: Callable[[str, str], None],
+        port: Port,
+        guests: Guests,
+        greet: Callable[[Client], Session],
+        most: int = MOST_CLIENTS,
     ) -> None:
-        self._name = name
-        self._serve = serve
+        self.name = name
+        self.guests = guests
+        self.port = port
+        self._greet = greet
+        self._most = most
         self.counters: Counter[str] = Counter()
-        self.port = Port(name, host, port, on_event)
-        self.clients: set[Client] = set()
+        self.clients: dict[Client, None] = {}
+        self._short_told_ns: int | None = None
 
     async def run(self) -> None:
         """Listen until cancelled; a port that is taken is tried again."""
-        server = await self.port.open(self._listening)
+        listener = await self.port.open(self._listening)
+        for sock in listener.sockets:
+            self._watch(sock)
         try:
             await asyncio.get_running_loop().create_future()
         finally:
-            server.close()
+            for sock in listener.sockets:
+                self.guests.forget(sock.fileno())
+                sock.close()
             for client in tuple(self.clients):
-                client.drop()
+                client.close()
 
-    async def send(self, data: Callable[[Client], bytes]) -> None:
+    def send(self, data: Callable[[Client], bytes]) -> None:
         """Send each client what `data` makes for it, if anything."""
-        for turn, client in enumerate(tuple(self.clients)):
-            if turn % _TURN == _TURN - 1:
-                await asyncio.sleep(0)
+        for client in tuple(self.clients):
             payload = data(client)
             if payload:
                 client.send(payload)
 
-    async def _listening(self, host: str, port: int) -> asyncio.Server:
-        held = activated(self._name)
-        server = (
-            await asyncio.start_server(self._connected, host, port)
-            if held is None
-            else await asyncio.start_server(self._connected, sock=held)
-        )
-        for sock in server.sockets:
+    def ended(self, client: Client) -> None:
+        """A connection is closed."""
+        del self.clients[client]
+        self.port.serves(len(self.clients))
+        if client.session is not None:
+            client.session.end()
+
+    # ------------------------------------------------------------------ who comes
+
+    async def _listening(self, host: str, port: int) -> _Listener:
+        held = activated(self.name)
+        sockets = await _bound(host, port) if held is None else [held]
+        for sock in sockets:
+            sock.setblocking(False)
             # Inherited by each connection: the kernel would keep megabytes for who does not read.
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_WAITING_BYTES // 2)
-        return server
+            sock.listen(_BACKLOG)
+        return _Listener(sockets)
 
-    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        client = Client(reader, writer, self.counters)
-        if len(self.clients) >= MOST_CLIENTS:
+    def _watch(self, listening: socket.socket) -> None:
+        if listening.fileno() >= 0:  # else it was closed during a pause
+            self.guests.watch(listening.fileno(), select.EPOLLIN, lambda _: self._accept(listening))
+
+    def _accept(self, listening: socket.socket) -> None:
+        try:
+            sock, _ = listening.accept()
+        except OSError as error:
+            if error.errno in _SHORT:
+                self._pause(listening, error)
+            return  # else who came has gone again
+        self._make_room()
+        if len(self.clients) >= self._most or self.guests.full:
             self.counters["clients_refused"] += 1
-            client.drop()
+            sock.close()
+            return
+        try:
+            _tune(sock)
+        except OSError:
+            sock.close()
             return
         self.counters["clients"] += 1
-        self.clients.add(client)
+        client = Client(sock, self)
+        self.clients[client] = None
         self.port.serves(len(self.clients))
-        try:
-            with contextlib.suppress(OSError, asyncio.IncompleteReadError):
-                await self._serve(client)
-        finally:
-            self.clients.discard(client)
-            self.port.serves(len(self.clients))
-            writer.close()
+        client.session = self._greet(client)
+
+    def _make_room(self) -> None:
+        """Where all places are taken: who has been longest without a request goes."""
+        if len(self.clients) < self._most:
+            return
+        now_ns = time.perf_counter_ns()
+        for client in self.clients:
+            if client.request_due and now_ns - client.since_ns > HASTY_S * _SECOND_NS:
+                client.drop("malformed")
+                return
+
+    def _pause(self, listening: socket.socket, error: OSError) -> None:
+        """No descriptor is left: said once a minute at most, and tried again later."""
+        now_ns = time.perf_counter_ns()
+        told_ns = self._short_told_ns
+        if told_ns is None or now_ns - told_ns > SHORT_TOLD_S * _SECOND_NS:
+            self._short_told_ns = now_ns
+            self.port.report("clients_refused", f"none for now: {error.strerror}")
+        self.guests.forget(listening.fileno())
+        asyncio.get_running_loop().call_later(PAUSE_S, self._watch, listening)
+
+
+async def _bound(host: str, port: int) -> list[socket.socket]:
+    """Sockets at every address of `host`. Raises `OSError`."""
+    loop = asyncio.get_running_loop()
+    found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    sockets: list[socket.socket] = []
+    try:
+        for family, kind, proto, _, address in dict.fromkeys(found):
+            sock = socket.socket(family, kind, proto)
+            sockets.append(sock)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            sock.bind(address)
+    except OSError:
+        for sock in sockets:
+            sock.close()
+        raise
+    return sockets
+
+
+def _tune(sock: socket.socket) -> None:
+    """A far end that is gone without a word is noticed within STUCK_S: after 20 s of silence it is
+    asked, twice 5 s apart; what it should have confirmed is waited for as long."""
+    sock.setblocking(False)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 2)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STUCK_S))

@@ -53,8 +53,8 @@ class LogWriter:
     """Writes one recording into files `STEM_0000.mcap`, ... of `folder` until it is closed.
 
     `about()` describes it; it is called in the thread, since it reads files.
-    `on_stop(why)` is called from the thread when it has to stop by itself. The other attributes may
-    be read at any time: `path` of the file under way, `dropped` messages, `free_mb` of the disk.
+    The attributes may be read at any time: `path` of the file under way, whether any was `synced`,
+    `stopped`, why it had to stop by itself, `dropped` messages, `free_mb` of the disk.
     """
 
     def __init__(
@@ -65,18 +65,18 @@ class LogWriter:
         about: Callable[[], About],
         options: Recording,
         t_log_ns: int,
-        on_stop: Callable[[str], None],
     ) -> None:
         self._folder, self._stem, self._vehicle = folder, stem, vehicle
         self._describe = about
         self._options = options
-        self._on_stop = on_stop
         self._queue: deque[Item] = deque()
         self._closing = threading.Event()
         self._t_log_ns = t_log_ns
         self._looked_ns = 0
         self._file: LogFile | None = None
         self.parts = 0
+        self.synced = False
+        self.stopped: str | None = None
         self.dropped = 0
         self.free_mb: float | None = None
         self.path = self._part_path()
@@ -113,6 +113,7 @@ class LogWriter:
             while not self._closing.wait(WRITE_S):
                 self._write_waiting()
                 self._file.sync()
+                self.synced = True
                 self._look_at_the_disk()
                 self._keep_newest()
             self._write_waiting()
@@ -122,6 +123,9 @@ class LogWriter:
         except _DiskFullError as error:
             self._finish_full()
             self._stop(str(error))
+        except Exception as error:
+            log.exception("recording failed")
+            self._stop(repr(error))
 
     def _finish_full(self) -> None:
         if self._file is not None:
@@ -184,7 +188,7 @@ class LogWriter:
         log.warning("recording stops: %s", why)
         if self._file is not None:
             self._file.abandon()
-        self._on_stop(why)
+        self.stopped = why
 
 
 class _DiskFullError(Exception):

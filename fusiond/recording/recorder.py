@@ -31,6 +31,7 @@ from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.status import RecordingState, RecordingStatus
 from fusiond.outputs.topics import INNOVATIONS, Topic
 from fusiond.recording.about import about_run
+from fusiond.recording.again import Again
 from fusiond.recording.channels import INNOVATION, INPUT, STATE, innovation
 from fusiond.recording.log_writer import Item, LogWriter, log_stem
 from fusiond.recording.records import (
@@ -58,7 +59,8 @@ class RecordingRefusedError(Exception):
 class Recorder:
     """Recordings of one daemon: an output as any other (`fusiond.outputs.base`), and more.
 
-    `on_event(code, text)` hears `recording_started`, `recording_stopped` and `recording_failed`.
+    `on_event(code, text)` hears `recording_started`, `recording_stopped` and `recording_failed`;
+    a recording that failed takes up again by itself (`fusiond.recording.again`).
     `begin` and `end` may be called whenever; `listen` connects the drivers.
     """
 
@@ -80,7 +82,7 @@ class Recorder:
         """`waiting`: the last seconds are kept in memory until an event comes."""
         self._writer: LogWriter | None = None
         self._closing: list[LogWriter] = []
-        self._stopped_by: str | None = None
+        self._again = Again()
         self._ring: deque[Item] = deque()
         self._until_ns: int | None = None
         self._begun: Record | None = None
@@ -119,7 +121,10 @@ class Recorder:
         """
         if self.state == "recording":
             raise RecordingRefusedError(f"recording already, into {self._path().name}")
-        writer = self._open()
+        self._again.give_up()
+        return self._record_into(self._open(), loaded)
+
+    def _record_into(self, writer: LogWriter, loaded: Mapping[str, Any] | None) -> str:
         if self.state != "waiting":
             self._attach(loaded)
         self._writer = writer
@@ -132,6 +137,10 @@ class Recorder:
 
     def end(self, why: str) -> str:
         """Stop recording and finish the file. Raises `RecordingRefusedError`."""
+        if self._writer is None and self.state == "failed":
+            self._again.give_up()
+            self.state = "off"
+            return "nothing more, since it had failed"
         if self._writer is None:
             raise RecordingRefusedError("nothing is being recorded")
         path = self._path()
@@ -141,8 +150,8 @@ class Recorder:
         writer.close()
         self._closing = [w for w in (*self._closing, writer) if w.busy]
         self._until_ns = None
-        if self._stopped_by is not None:
-            why = self._stopped_by
+        if writer.stopped is not None:
+            why = writer.stopped
             self.state = "failed"
             self._event("recording_failed", f"{path}: {why}")
         else:
@@ -156,6 +165,7 @@ class Recorder:
 
     def close(self) -> None:
         """The daemon ends: returns when everything is on the disk. Call it from a thread."""
+        self._again.give_up()
         if self._writer is not None:
             self.end("the daemon ends")
         for writer in self._closing:
@@ -223,15 +233,15 @@ class Recorder:
 
     def tick_begins(self, t_ns: int) -> None:
         """The tick with this deadline begins."""
+        if self.state == "failed":
+            self._take_up_again(t_ns)
         if self.active:
             self._begin(Record(Kind.TICK, NO_SOURCE, t_ns, b""))
 
     def tick_ended(self, t_ns: int, late_ns: int, overruns: int, digest: bytes) -> None:
         """And has ended; what follows until the next input is still its own."""
-        if self._stopped_by is not None:
-            if self._writer is not None:
-                self.end(self._stopped_by)
-            self._stopped_by = None
+        if self._writer is not None and self._writer.stopped is not None:
+            self.end(self._writer.stopped)
         if self._begun is None or self._begun.kind is not Kind.TICK:
             return
         payload = tick_payload(Tick(self._count, overruns, late_ns, digest))
@@ -258,6 +268,19 @@ class Recorder:
         self._put(Item(STATE, t_ns + self._epoch_ns, kept))
 
     # ------------------------------------------------------------------ inside
+
+    def _take_up_again(self, t_ns: int) -> None:
+        """Record what it did before it failed; with `when = "event"`, wait for the next."""
+        writer = self._again.ready(t_ns, self._open)
+        if writer is None:
+            return
+        if self._options.when != "event":
+            self._record_into(writer, None)
+            return
+        writer.close()
+        self._closing.append(writer)
+        self._attach(None)
+        self.state = "waiting"
 
     def _look_at(self, message: EventMessage, t_ns: int) -> None:
         if self._options.when != "event" or not self.active:
@@ -286,11 +309,7 @@ class Recorder:
         vehicle = self._config.vehicle
         about = partial(about_run, self._config, run, self._epoch_ns, list(self._numbers))
         stem = log_stem(vehicle, t_log_ns, run)
-        return LogWriter(folder, stem, vehicle, about, self._options, t_log_ns, self._stop)
-
-    def _stop(self, why: str) -> None:
-        """From the writer's thread: the next tick notices."""
-        self._stopped_by = why
+        return LogWriter(folder, stem, vehicle, about, self._options, t_log_ns)
 
     def _path(self) -> Path:
         assert self._writer is not None

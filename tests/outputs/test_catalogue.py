@@ -10,6 +10,7 @@ from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.schema import ClockOptions, Config
 from fusiond.outputs.base import Output
 from fusiond.outputs.catalogue import MAKERS, make_outputs
+from fusiond.outputs.guests import Guests
 
 
 def made(config: Config) -> dict[str, Output]:
@@ -18,6 +19,7 @@ def made(config: Config) -> dict[str, Output]:
         on_event=lambda source, code, text: None,
         on_command=lambda command: "done",
         clock=Clock(ClockOptions()),
+        guests=Guests(),
     )
 
 

@@ -18,12 +18,13 @@ from websockets.exceptions import InvalidStatus
 from fusiond.configuration.outputs import Foxglove
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.foxglove.channels import CHANNELS, frame_transforms, location_fix
-from fusiond.outputs.foxglove.server import PROTOCOLS, FoxgloveServer
+from fusiond.outputs.foxglove.server import FoxgloveServer
+from fusiond.outputs.foxglove.viewer import PROTOCOLS
 from fusiond.outputs.topics import EVENT, HEALTH, NAV
 from tests.broker import free_port
 from tests.outputs.messages_examples import EXAMPLES
 from tests.outputs.serving import Around, at_work, nav
-from tests.patience import PATIENCE_S
+from tests.patience import PATIENCE_S, until
 
 IDS = {channel.name: channel.id for channel in CHANNELS}
 
@@ -163,4 +164,4 @@ async def test_another_protocol_is_sent_away() -> None:
             with pytest.raises(InvalidStatus):
                 async with connect(url, subprotocols=offered):
                     pass
-        assert server.counters["clients"] == 0
+        await until(lambda: not server.server.clients)

@@ -222,6 +222,82 @@ async def test_where_nothing_can_be_written_it_says_why(
     assert bench.inputs.heard is None
 
 
+async def test_a_recording_that_failed_takes_up_again_by_itself(
+    make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the disk takes nothing it is tried again and again, and nobody hears of that."""
+    sync, broken, tried = LogFile.sync, threading.Event(), 0
+
+    def perhaps(self: LogFile) -> None:
+        nonlocal tried
+        if broken.is_set():
+            tried += 1
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        sync(self)
+
+    monkeypatch.setattr(LogFile, "sync", perhaps)
+    monkeypatch.setattr(log_writer, "WRITE_S", 0.01)
+    bench = make()
+    bench.recorder.arm({})
+    bench.tick(10)
+    broken.set()
+
+    def ticked(done: Callable[[], bool]) -> Callable[[], bool]:
+        def look() -> bool:
+            bench.tick(20)
+            return done()
+
+        return look
+
+    await until(ticked(lambda: tried >= 4))
+    assert bench.recorder.recording.state == "failed"
+    broken.clear()
+    await until(ticked(lambda: bench.recorder.recording.state == "recording"))
+    codes = [code for code, _ in bench.events]
+    assert codes == ["recording_started", "recording_failed", "recording_started"]
+    bench.tick(10)
+    bench.recorder.close()
+    again = Log([bench.files[-1]])
+    assert sum(1 for r in again.records() if r.kind is Kind.TICK) >= 10
+    assert again.problems == []
+
+
+async def test_a_recording_that_failed_can_be_ended(
+    make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = make(min_free_mb=1e9)
+    bench.recorder.arm({})
+
+    def failed() -> bool:
+        bench.tick()
+        return bench.recorder.recording.state == "failed"
+
+    await until(failed)
+    assert bench.recorder.end("an operator said so").startswith("nothing")
+    bench.tick(2000)
+    assert bench.recorder.recording.state == "off"
+
+
+async def test_after_a_failure_it_waits_for_the_next_event(
+    make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free_mb = 0.0
+    monkeypatch.setattr(log_writer, "_free_mb", lambda folder: free_mb)
+    bench = make(when="event", events=("diverged",), min_free_mb=1.0)
+    bench.recorder.arm({})
+    bench.event("diverged")
+
+    def ticked(state: str) -> bool:
+        bench.tick(20)
+        return bench.recorder.recording.state == state
+
+    await until(lambda: ticked("failed"))
+    free_mb = 1e6
+    await until(lambda: ticked("waiting"))
+    bench.event("diverged")
+    assert bench.recorder.recording.state == "recording"
+
+
 async def test_a_slow_disk_costs_messages_and_no_tick(
     make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:

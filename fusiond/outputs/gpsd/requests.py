@@ -1,17 +1,19 @@
 """Requests of gpsd's clients: bytes in, requests out; no I/O.
 
 A request is `?NAME;` or `?NAME={...};`. Clients end it with the semicolon, with a line end, with
-both, or, after an object, with neither: an object ends where its brackets close.
+both, or, after an object, with neither: an object ends where its brackets close. Each byte is
+looked at once, in pieces of any size.
 
 Source: gpsd_json(5) of gpsd 3.22, "Core protocol commands"; what its clients really send.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+
+from fusiond.outputs.asked import NotUnderstoodError, parsed
 
 MOST_BYTES = 10240
 """Longest line of the protocol (GPS_JSON_RESPONSE_MAX of gpsd 3.22)."""
@@ -37,46 +39,48 @@ class RequestReader:
     """Takes what a client has sent, in pieces of any size."""
 
     def __init__(self) -> None:
-        self._waiting = b""
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._waiting = bytearray()
+        self._depth = 0
+        self._quoted = self._escaped = False
 
     def feed(self, data: bytes) -> Iterator[Request | Malformed]:
         """The requests that are complete now."""
-        self._waiting += data
-        while self._waiting:
-            end = _end(self._waiting)
-            if end is None:
-                if len(self._waiting) > MOST_BYTES:
-                    self._waiting = b""
-                    yield Malformed("request too long")
-                return
-            text, self._waiting = self._waiting[:end], self._waiting[end:]
-            found = text.strip(b"; \t\r\n")
-            if found:
-                yield _parsed(found.decode("utf-8", "replace"))
+        begin = 0
+        for index, byte in enumerate(data):
+            if not self._ends(byte):
+                continue
+            text = (bytes(self._waiting) + data[begin : index + 1]).strip(b"; \t\r\n")
+            begin = index + 1
+            self._begin_anew()
+            if text:
+                yield _parsed(text.decode("utf-8", "replace"))
+        self._waiting += data[begin:]
+        if len(self._waiting) > MOST_BYTES:
+            self._begin_anew()
+            yield Malformed("request too long")
 
-
-def _end(data: bytes) -> int | None:
-    """Where the first request ends; None if it goes on."""
-    depth, quoted, escaped = 0, False, False
-    for index, byte in enumerate(data):
-        if quoted:
-            if escaped:
-                escaped = False
+    def _ends(self, byte: int) -> bool:
+        """Whether a request ends with this byte."""
+        if self._quoted:
+            if self._escaped:
+                self._escaped = False
             elif byte == ord("\\"):
-                escaped = True
+                self._escaped = True
             elif byte == ord('"'):
-                quoted = False
-        elif byte == ord('"') and depth:
-            quoted = True
+                self._quoted = False
+        elif byte == ord('"') and self._depth:
+            self._quoted = True
         elif byte == ord("{"):
-            depth += 1
-        elif byte == ord("}") and depth:
-            depth -= 1
-            if not depth:
-                return index + 1
-        elif byte in _ENDS and not depth:
-            return index + 1
-    return None
+            self._depth += 1
+        elif byte == ord("}") and self._depth:
+            self._depth -= 1
+            return not self._depth
+        else:
+            return byte in _ENDS and not self._depth
+        return False
 
 
 def _parsed(text: str) -> Request | Malformed:
@@ -86,9 +90,9 @@ def _parsed(text: str) -> Request | Malformed:
     if not equals:
         return Request(name[1:])
     try:
-        argument = json.loads(rest)
-    except ValueError:
-        argument = None
+        argument = parsed(rest)
+    except NotUnderstoodError as error:
+        return Malformed(f"Invalid {name[1:20]}: {error}")
     if not isinstance(argument, dict):
-        return Malformed(f"Invalid {name[1:]}: '{rest[:80]}'")
+        return Malformed(f"Invalid {name[1:20]}: '{rest[:80]}'")
     return Request(name[1:], argument)

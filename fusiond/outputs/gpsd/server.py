@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import chain
 from typing import Any
@@ -20,10 +20,9 @@ from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.health import HealthMessage, SkyHealth
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.nmea import DEFAULT, sentences
+from fusiond.outputs.port import Port
 from fusiond.outputs.tcp import Client, TcpServer
 from fusiond.outputs.topics import HEALTH, NAV, Topic
-
-_READ_BYTES = 4096
 
 
 @dataclass(slots=True)
@@ -58,12 +57,22 @@ class Watch:
         return {"class": "WATCH"} | {key: getattr(self, key) for key in self.__slots__}
 
 
-@dataclass(slots=True)
-class _Asked:
+class _Asking:
     """A client's own state."""
 
-    watch: Watch = field(default_factory=Watch)
-    requests: RequestReader = field(default_factory=RequestReader)
+    def __init__(self, server: GpsdServer, client: Client) -> None:
+        self.watch = Watch()
+        self._server, self._client = server, client
+        self._requests = RequestReader()
+
+    def receive(self, data: bytes) -> None:
+        for request in self._requests.feed(data):
+            if not self._client.charge():
+                return
+            self._client.send(self._server.answer(self.watch, request))
+
+    def end(self) -> None:
+        pass
 
 
 class GpsdServer:
@@ -83,8 +92,9 @@ class GpsdServer:
         self._activated: str | None = None
         self._nav: Latest[NavMessage] = Latest()
         self._sky = SkyHealth()
-        self._asked: dict[Client, _Asked] = {}
-        self.server = TcpServer(self.name, section.host, section.port, self._serve, around.on_event)
+        self._epoch: _Epoch | None = None
+        port = Port(self.name, section.host, section.port, around.on_event)
+        self.server = TcpServer(self.name, port, around.guests, self._greet)
         self.counters = self.server.counters
 
     @property
@@ -94,6 +104,7 @@ class GpsdServer:
     def take(self, topic: Topic, message: Message) -> None:
         if topic is NAV and isinstance(message, NavMessage):
             self._activated = self._activated or message.t_utc
+            self._epoch = _Epoch(message, self)
             self._nav.put(message)
         elif topic is HEALTH and isinstance(message, HealthMessage):
             seen = [s.sky for s in message.sources.values() if s.sky is not None]
@@ -106,12 +117,13 @@ class GpsdServer:
 
     async def _report(self) -> None:
         while True:
-            epoch = _Epoch(await self._nav.next(), self)
-            await self.server.send(epoch.wanted)
+            await self._nav.next()
+            assert self._epoch is not None, "made of the same message"
+            self.server.send(self._epoch.wanted)
 
     def wanted(self, client: Client) -> Watch:
         """What a client watches."""
-        return self._asked[client].watch if client in self._asked else Watch()
+        return client.session.watch if isinstance(client.session, _Asking) else Watch()
 
     def reports(self, nav: NavMessage) -> dict[str, Report]:
         """The reports of an epoch, by class in small letters."""
@@ -128,15 +140,16 @@ class GpsdServer:
 
     # ------------------------------------------------------------------ requests
 
-    async def _serve(self, client: Client) -> None:
+    def _greet(self, client: Client) -> _Asking:
         client.send(encoded(reports.version(self._release)))
-        asked = self._asked[client] = _Asked()
-        try:
-            while data := await client.reader.read(_READ_BYTES):
-                for request in asked.requests.feed(data):
-                    client.send(b"".join(map(encoded, self._answers(asked.watch, request))))
-        finally:
-            del self._asked[client]
+        return _Asking(self, client)
+
+    def answer(self, watch: Watch, request: Request | Malformed) -> bytes:
+        """To one request; `watch` is what its client watches from now on."""
+        if isinstance(request, Request) and request.name == "POLL":
+            self.counters["requests"] += 1
+            return self._epoch.polled() if self._epoch is not None else encoded(_poll(None, {}))
+        return b"".join(map(encoded, self._answers(watch, request)))
 
     def _answers(self, watch: Watch, request: Request | Malformed) -> list[Report]:
         if isinstance(request, Malformed):
@@ -148,7 +161,6 @@ class GpsdServer:
             "DEVICES": lambda: [self._devices()],
             "DEVICE": lambda: [reports.device(self.device, self._activated)],
             "WATCH": lambda: self._watching(watch, request.argument or {}, request.argument),
-            "POLL": lambda: [self._poll()],
         }
         if request.name not in answers:
             self.counters["malformed"] += 1
@@ -164,7 +176,7 @@ class GpsdServer:
         path = wanted.get("device")
         wrong = None
         if path is not None and path != self.device:
-            wrong = f"no such device as {path!r}"
+            wrong = f"no such device as {str(path)[:80]!r}"
         elif given is not None:
             wrong = watch.ask(wanted)
         if wrong is not None:
@@ -172,18 +184,17 @@ class GpsdServer:
             return [reports.error(f"Invalid WATCH: {wrong}")]
         return [self._devices(), watch.report()]
 
-    def _poll(self) -> Report:
-        nav = self._nav.last
-        report: Report = {"class": "POLL", "time": None if nav is None else nav.t_utc}
-        report["active"] = 1
-        made = {} if nav is None else self.reports(nav)
-        for name in ("tpv", "gst", "att", "sky"):
-            report[name] = [reports.known_only(made[name])] if name in made else []
-        return report
+
+def _poll(t_utc: str | None, made: dict[str, Report]) -> Report:
+    report: Report = {"class": "POLL", "time": t_utc, "active": 1}
+    for name in ("tpv", "gst", "att", "sky"):
+        report[name] = [reports.known_only(made[name])] if name in made else []
+    return report
 
 
 class _Epoch:
-    """What one `nav` comes to, made once for all clients, and only if one wants it."""
+    """What one `nav` comes to, with the satellites of that time: made once for all clients, and
+    only if one wants it."""
 
     def __init__(self, nav: NavMessage, server: GpsdServer) -> None:
         self._nav, self._server = nav, server
@@ -196,11 +207,19 @@ class _Epoch:
         formats = chain(["nmea"] if watch.nmea else [], ["json"] if watch.json else [])
         return b"".join(map(self._in, formats))
 
+    def polled(self) -> bytes:
+        """The answer to POLL."""
+        return self._in("poll")
+
     def _in(self, form: str) -> bytes:
         if form not in self._made:
-            if form == "nmea":
-                made = self._server.nmea(self._nav)
-            else:
-                made = b"".join(map(encoded, self._server.reports(self._nav).values()))
-            self._made[form] = made
+            self._made[form] = self._make(form)
         return self._made[form]
+
+    def _make(self, form: str) -> bytes:
+        if form == "nmea":
+            return self._server.nmea(self._nav)
+        made = self._server.reports(self._nav)
+        if form == "poll":
+            return encoded(_poll(self._nav.t_utc, made))
+        return b"".join(map(encoded, made.values()))

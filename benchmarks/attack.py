@@ -1,0 +1,341 @@
+"""The daemon while guests attack its servers, a row for each attack:
+
+    python benchmarks/attack.py [--seconds S] [--rest S] [--ahead] [--only NAME ...] [--json F]
+    python benchmarks/attack.py --kill TIMES [--ahead] [--json F]
+
+The daemon's own process, all its servers on, records a simulated vehicle in another: IMU 200 Hz,
+raw GNSS 10 Hz (UBX, fused tightly), RDSS; ticks and `nav` 100 Hz, to a Mosquitto that one client
+listens to. One daemon takes all attacks (`benchmarks/attackers.py`) one after another, each for
+`--seconds`; `peace` is as long without one. Columns:
+
+* `ticks`, `overruns`: of the scheduler meanwhile;
+* `nav_ms`: largest gap between two `nav` at the broker's client; `tick_ms`: between the instants
+  they are of, which no client, broker or network adds to;
+* `guest_ms`: largest gap between two epochs (10 Hz) at a client of gpsd's that reads all the while;
+  `scrape_ms`: longest answer to a scrape, of one a second;
+* `before`, `most`, `after`: resident memory, MB; `after` is `--rest` seconds later;
+* `fds`: descriptors before, at most and after;
+* `log`: lines of the cause that has most of them, a minute; all causes that have more than one
+  line are in the JSON.
+
+With `--kill` the daemon is killed (SIGKILL) so many times while three attacks go on, and a row says
+what its recording lacks.
+
+The attackers yield the processor (nice 19): each has its own in truth. The daemon, the broker, the
+vehicle and this process have nice -10, as the unit gives it to the daemon, where that is allowed
+(root). On a computer that others use as well the gaps are also those of the computer: compare with
+`peace`, or take `--ahead`, by which all but the attackers run at SCHED_FIFO, before all others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import multiprocessing
+import os
+import random
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.attackers import ATTACKS, Ports
+from benchmarks.daemon_load import CONFIG, RECORDING, resident_mb, simulate
+from fusiond.recording.reader import Log
+from tests.broker import Broker, free_port, listening
+from tests.hil.heard import Heard
+from tests.hil.processes import SIM_IMU, DaemonProcess
+from tests.live.rig import bus_here, network_of_its_own
+
+SETTLE_S = 5.0
+OUTPUTS = """
+[outputs.gpsd]
+port = {gpsd}
+rate_hz = 10.0
+[outputs.nmea]
+port = {nmea}
+rate_hz = 10.0
+[outputs.prometheus]
+port = {prometheus}
+[outputs.foxglove]
+port = {foxglove}
+[outputs.home_assistant]
+[outputs.owntracks]
+"""
+COLUMNS = (
+    ("attack", "attack", 18), ("ticks", "ticks", 6), ("overruns", "overruns", 9),
+    ("nav_ms", "nav_ms", 8), ("tick_ms", "tick_ms", 8), ("guest_ms", "guest_ms", 9),
+    ("scrape_ms", "scrape_ms", 10), ("before", "before_mb", 7), ("most", "most_mb", 7),
+    ("after", "after_mb", 7), ("fds", "fds", 14), ("log", "log_lines_a_minute", 6),
+)  # fmt: skip
+
+
+@dataclass
+class Watch:
+    """What is seen from outside while it lasts."""
+
+    nav_s: list[float] = field(default_factory=list)
+    nav_ms: list[int] = field(default_factory=list)
+    guest_s: list[float] = field(default_factory=list)
+    scrape_s: list[float] = field(default_factory=list)
+    memory_mb: list[float] = field(default_factory=list)
+    descriptors: list[int] = field(default_factory=list)
+
+
+def _gap_ms(times_s: list[float]) -> float:
+    gaps = [b - a for a, b in pairwise(times_s)]
+    return round(1000.0 * max(gaps, default=float("inf")), 1)
+
+
+async def _hear_nav(port: int, watch: Watch) -> None:
+    async with aiomqtt.Client("127.0.0.1", port) as client:
+        await client.subscribe("fusiond/load/nav")
+        async for message in client.messages:
+            watch.nav_s.append(time.monotonic())
+            watch.nav_ms.append(json.loads(bytes(message.payload))["t_ms"])
+
+
+async def _read_gpsd(port: int, watch: Watch) -> None:
+    """A guest as it should be; it comes back when it is sent away."""
+    while True:
+        with contextlib.suppress(OSError):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(b'?WATCH={"enable":true,"json":true};\n')
+            try:
+                while line := await reader.readline():
+                    if b'"TPV"' in line:
+                        watch.guest_s.append(time.monotonic())
+            finally:
+                writer.close()
+        await asyncio.sleep(0.1)
+
+
+async def _scrape(port: int, watch: Watch) -> None:
+    while True:
+        start_s = time.monotonic()
+        with contextlib.suppress(OSError, TimeoutError):
+            async with asyncio.timeout(10.0):
+                body = b""
+                while b"fusiond_mode" not in body:
+                    with contextlib.suppress(OSError):
+                        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                        writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+                        body = await reader.read()
+                        writer.close()
+                    await asyncio.sleep(0.01)
+        watch.scrape_s.append(time.monotonic() - start_s)
+        await asyncio.sleep(1.0)
+
+
+def _descriptors(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+async def _sample(pid: int, watch: Watch) -> None:
+    while True:
+        watch.memory_mb.append(resident_mb(pid))
+        watch.descriptors.append(_descriptors(pid))
+        await asyncio.sleep(0.1)
+
+
+@asynccontextmanager
+async def _watching(pid: int, broker: int, ports: Ports) -> AsyncIterator[Watch]:
+    watch = Watch()
+    tasks = [
+        asyncio.create_task(_hear_nav(broker, watch)),
+        asyncio.create_task(_read_gpsd(ports.gpsd, watch)),
+        asyncio.create_task(_scrape(ports.prometheus, watch)),
+        asyncio.create_task(_sample(pid, watch)),
+    ]
+    try:
+        await asyncio.sleep(1.0)
+        yield watch
+        for task in tasks:
+            if task.done():
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _causes(log: str) -> dict[str, int]:
+    """Lines by their text without figures; the lines of a traceback by themselves."""
+    lines = (re.sub(r"[\d.]+", "#", line)[:100] for line in log.splitlines())
+    return {line: count for line, count in Counter(lines).most_common(20) if count > 1}
+
+
+async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
+    if name == "peace":
+        await asyncio.sleep(seconds)
+        return {}
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, str(Path(__file__).with_name("attackers.py"))),
+        *map(str, (name, seconds, *ports)),
+        stdout=asyncio.subprocess.PIPE,
+    )
+    try:
+        told, _ = await process.communicate()
+    finally:
+        if process.returncode is None:
+            process.kill()
+    found: dict[str, Any] = json.loads(told.splitlines()[-1])
+    return found
+
+
+async def _row(
+    name: str, daemon: DaemonProcess, heard: Heard, broker: int, ports: Ports, args: Any
+) -> dict[str, Any]:
+    async with _watching(daemon.pid, broker, ports) as watch:
+        before = await heard.until("health")
+        log_at = len(daemon.log)
+        memory_mb, descriptors = watch.memory_mb[-1], watch.descriptors[-1]
+        came = await _attack(name, args.seconds, ports)
+        after = await heard.until("health")
+        log = daemon.log[log_at:]
+    await asyncio.sleep(args.rest)
+    causes = _causes(log)
+    most = max(causes.values(), default=min(1, len(log)))
+    mode = (await heard.until("status"))["mode"]
+    return {
+        "attack": name,
+        "ticks": after["ticks"] - before["ticks"],
+        "overruns": after["overruns"] - before["overruns"],
+        "nav_ms": _gap_ms(watch.nav_s),
+        "tick_ms": _gap_ms([t * 1e-3 for t in watch.nav_ms]),
+        "guest_ms": _gap_ms(watch.guest_s),
+        "scrape_ms": round(1000.0 * max(watch.scrape_s, default=float("inf")), 1),
+        "before_mb": round(memory_mb, 1),
+        "most_mb": round(max(watch.memory_mb), 1),
+        "after_mb": round(resident_mb(daemon.pid), 1),
+        "fds": f"{descriptors}/{max(watch.descriptors)}/{_descriptors(daemon.pid)}",
+        "log_lines_a_minute": round(most * 60.0 / max(60.0, args.seconds)),
+        "log_causes": causes,
+        "cpu_percent": after["cpu_percent"],
+        "gc_max_ms": after["gc_max_ms"],
+        "mode_after": mode,
+        "outputs": {n: after["outputs"][n]["counters"] for n in Ports._fields},
+        "recording": after["outputs"]["recording"]["state"],
+        **came,
+    }
+
+
+async def measure(folder: Path, args: Any) -> list[dict[str, Any]]:
+    """Run the attacks; their rows, told as they come."""
+    rows: list[dict[str, Any]] = []
+    async with _bench(folder) as (config, broker, ports), DaemonProcess(config) as daemon:
+        await daemon.start()
+        await daemon.ready()
+        async with listening(broker, "fusiond/load/+") as (listener, _):
+            heard = Heard(listener, "load")
+            await heard.until("nav", lambda m: m["mode"] == "navigating")
+            await asyncio.sleep(SETTLE_S)
+            for name in args.only or ("peace", *ATTACKS):
+                row = await _row(name, daemon, heard, broker.port, ports, args)
+                if not rows:
+                    print("".join(title.rjust(width) for title, _, width in COLUMNS))
+                print("".join(str(row[key]).rjust(width) for _, key, width in COLUMNS))
+                sys.stdout.flush()
+                rows.append(row)
+        await daemon.terminate()
+    return rows
+
+
+async def kill(folder: Path, args: Any) -> list[dict[str, Any]]:
+    """Kill the daemon (SIGKILL) so many times while three attacks go on; a row a kill: how much of
+    what its broker's client had heard is not in the recording, and what is wrong with that."""
+    dice, rows = random.Random(1), []
+    async with _bench(folder) as (config, broker, ports):
+        attacks = [
+            asyncio.create_task(_attack(name, 3600.0, ports))
+            for name in ("poll_8_unread", "deaf_1100", "subscribe_138000")
+        ]
+        for number in range(args.kill):
+            watch = Watch()
+            listening_ = asyncio.create_task(_hear_nav(broker.port, watch))
+            async with DaemonProcess(config) as daemon:
+                await daemon.start()
+                await daemon.ready()
+                await asyncio.sleep(dice.uniform(1.0, 3.0))
+            await asyncio.sleep(0.2)
+            listening_.cancel()
+            log = Log([_newest(folder)])
+            kept_ms = [m.json()["t_ms"] for m in log.messages("/nav")]
+            lost_s = (watch.nav_ms[-1] - max(kept_ms, default=watch.nav_ms[0])) * 1e-3
+            rows.append({"lost_s": round(lost_s, 3), "kept": len(kept_ms), "log": log.problems})
+            print(number, rows[-1], flush=True)
+        for attack in attacks:
+            attack.cancel()
+        await asyncio.gather(*attacks, return_exceptions=True)
+    return rows
+
+
+def _newest(folder: Path) -> Path:
+    return max(folder.glob("logs/*"), key=lambda path: path.stat().st_mtime)
+
+
+@asynccontextmanager
+async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
+    """A vehicle under way and a broker; the configuration of a daemon for them."""
+    bus = bus_here(0)
+    ports = Ports(*(free_port() for _ in Ports._fields))
+    # Else Mosquitto waits for the client's delayed acknowledgement, 40 ms.
+    broker = Broker(folder, "allow_anonymous true", "set_tcp_nodelay true")
+    config = folder / "load.toml"
+    config.write_text(
+        CONFIG.format(
+            imu=SIM_IMU.format(interface=bus["interface"], channel=bus["channel"]),
+            imu_hz=200.0, tick_hz=100.0, nav_hz=100.0, folder=folder, port=broker.port,
+            filter="kalman", kind="raw",
+        )
+        + RECORDING.format(folder=folder)
+        + OUTPUTS.format(**ports._asdict())
+    )  # fmt: skip
+    vehicle = multiprocessing.get_context("spawn").Process(
+        target=simulate, args=(str(folder), bus["interface"], bus["channel"], True), daemon=True
+    )
+    try:
+        with broker:
+            vehicle.start()
+            yield config, broker, ports
+    finally:
+        vehicle.kill()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rest", type=float, default=5.0)
+    parser.add_argument("--only", nargs="*", choices=("peace", *ATTACKS))
+    parser.add_argument("--kill", type=int, default=0)
+    parser.add_argument("--ahead", action="store_true")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    with contextlib.suppress(PermissionError):
+        if args.ahead:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+        os.setpriority(os.PRIO_PROCESS, 0, -10)
+    network_of_its_own()
+    subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
+    with tempfile.TemporaryDirectory(prefix="fusiond-attack-") as folder:
+        rows = asyncio.run((kill if args.kill else measure)(Path(folder), args))
+    if args.json is not None:
+        args.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

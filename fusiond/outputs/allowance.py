@@ -1,0 +1,71 @@
+"""What one guest may cost: bytes, messages and microseconds, each a bucket that fills by itself.
+
+    left(t) = min(burst, left(t0) + rate (t - t0))
+
+What is spent may take a bucket below nothing, by one piece of work at most; then the guest waits
+until it is full enough again, or is a flood. Time is `time.perf_counter_ns`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """So much a second, and so much at once."""
+
+    per_s: float
+    burst: float
+
+
+BYTES = Rate(65_536.0, 65_536.0)
+"""Of what a guest sends. Requests have 10 to 1000 bytes; a plotter that sends the sentences of a
+whole vessel at 38400 baud (NMEA 0183-HS) has 4 kB/s."""
+MESSAGES = Rate(25.0, 50.0)
+"""Requests. gpsd's clients poll once a report, receivers report at 20 Hz at most; a viewer of
+Foxglove sends one for each of its panels when it opens a layout."""
+MICROSECONDS = Rate(20_000.0, 20_000.0)
+"""For reading what a guest sends: 2 % of a core, a fifth of what all guests have together."""
+
+
+class Bucket:
+    """What is left of a rate."""
+
+    __slots__ = ("_at_ns", "_left", "_rate")
+
+    def __init__(self, rate: Rate, now_ns: int) -> None:
+        self._rate = rate
+        self._left = rate.burst
+        self._at_ns = now_ns
+
+    def spend(self, amount: float, now_ns: int) -> None:
+        self._fill(now_ns)
+        self._left -= amount
+
+    def empty(self, now_ns: int) -> bool:
+        """Whether more was spent than there was."""
+        self._fill(now_ns)
+        return self._left < 0.0
+
+    def _fill(self, now_ns: int) -> None:
+        gained = self._rate.per_s * (now_ns - self._at_ns) / _SECOND_NS
+        self._left = min(self._rate.burst, self._left + gained)
+        self._at_ns = now_ns
+
+
+class Allowance:
+    """The three buckets of one guest."""
+
+    __slots__ = ("bytes", "messages", "microseconds")
+
+    def __init__(self, now_ns: int) -> None:
+        self.bytes = Bucket(BYTES, now_ns)
+        self.messages = Bucket(MESSAGES, now_ns)
+        self.microseconds = Bucket(MICROSECONDS, now_ns)
+
+    def must_wait(self, now_ns: int) -> bool:
+        """Whether nothing more is to be read of it for now."""
+        return self.bytes.empty(now_ns) or self.microseconds.empty(now_ns)

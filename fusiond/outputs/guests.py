@@ -1,0 +1,190 @@
+"""The door for guests: sockets of all servers, served in turns that cost a tick little.
+
+All listeners and connections are in one epoll set, of which the event loop sees a single
+descriptor. When something is there the loop gives a turn: pieces of work, sending and receiving by
+turns, until none is left or the budget of the window is spent; what is left waits for the next
+window. A piece of work is one `accept`, one `recv` with what it holds, or what one guest is sent.
+
+    spent in any window of 10 ms <= 1 ms + one piece of work
+
+Whoever has been served goes to the end of the queue (epoll does so with level-triggered
+descriptors): with n guests at the door each has a turn once in n.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import select
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+WINDOW_NS = 10_000_000
+"""A tick at 100 Hz, the rate by default."""
+BUDGET_NS = 1_000_000
+"""A tenth of it: a tick that falls due in the middle of a turn starts 1 ms late, as it does by
+asyncio's own rounding; and all guests together cost a tenth of a core. 200 clients at 10 Hz, which
+docs/outputs.md promises, cost a third of that."""
+RESERVED_DESCRIPTORS = 256
+"""For the daemon's own: some 40 in peace with all outputs; the rest for files of a recording, of
+the state and of libraries. Half of them where the process has fewer than twice as many."""
+LOOK_S = 0.25
+"""Between two looks at who waits too long."""
+_AT_ONCE = 16
+"""Events asked of the kernel in one go."""
+
+Work = Callable[[], None]
+Handler = Callable[[int], None]
+"""Is told the events of epoll(7)."""
+
+
+class Guest(Protocol):
+    """One connection."""
+
+    def look(self, now_ns: int) -> None:
+        """Wake up, or give up: called four times a second."""
+
+
+class Guests:
+    """One door for all servers of a daemon; `most` connections may be open at it.
+
+    It needs a running event loop while something is watched, and is never called from outside it.
+    `postponed` counts windows whose budget was spent.
+    """
+
+    def __init__(self) -> None:
+        soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self.most = max(soft // 2, soft - RESERVED_DESCRIPTORS)
+        self.postponed = 0
+        self._open: set[Guest] = set()
+        self._handlers: dict[int, Handler] = {}
+        self._events: deque[tuple[int, int, Handler]] = deque()
+        self._work: deque[Work] = deque()
+        self._epoll: select.epoll | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._window_ns = self._left_ns = 0
+        self._paused: asyncio.TimerHandle | None = None
+        self._due: asyncio.Handle | None = None
+        self._looking: asyncio.TimerHandle | None = None
+
+    # ------------------------------------------------------------------ who is there
+
+    @property
+    def full(self) -> bool:
+        """Whether one more would take a descriptor of the daemon's own."""
+        return len(self._open) >= self.most
+
+    def came(self, guest: Guest) -> None:
+        self._open.add(guest)
+
+    def left(self, guest: Guest) -> None:
+        self._open.discard(guest)
+
+    # ------------------------------------------------------------------ what is to be done
+
+    def watch(self, fd: int, events: int, handler: Handler) -> None:
+        """Call `handler(events)` in a turn while `events` hold for `fd`."""
+        if self._epoll is None:
+            self._begin()
+        assert self._epoll is not None
+        self._epoll.register(fd, events)
+        self._handlers[fd] = handler
+
+    def change(self, fd: int, events: int) -> None:
+        """Wait for other events of an `fd` that is watched."""
+        if self._epoll is not None:
+            self._epoll.modify(fd, events)
+
+    def forget(self, fd: int) -> None:
+        """Before it is closed."""
+        if self._handlers.pop(fd, None) is None or self._epoll is None:
+            return
+        self._epoll.unregister(fd)
+        if not self._handlers:
+            self._end()
+
+    def do(self, work: Work) -> None:
+        """Call `work` in a turn."""
+        self._work.append(work)
+        if self._paused is None and self._due is None:
+            self._due = asyncio.get_running_loop().call_soon(self._turn)
+
+    # ------------------------------------------------------------------ turns
+
+    def _begin(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._epoll = select.epoll()
+        self._loop.add_reader(self._epoll.fileno(), self._turn)
+        self._looking = self._loop.call_later(LOOK_S, self._look)
+
+    def _end(self) -> None:
+        assert self._loop is not None
+        assert self._epoll is not None
+        for handle in (self._paused, self._due, self._looking):
+            if handle is not None:
+                handle.cancel()
+        self._paused = self._due = self._looking = None
+        self._loop.remove_reader(self._epoll.fileno())
+        self._epoll.close()
+        self._epoll = self._loop = None
+        self._events.clear()
+        self._work.clear()
+
+    def _turn(self) -> None:
+        self._due = None
+        if self._paused is not None or self._epoll is None:
+            return
+        start_ns = now_ns = time.perf_counter_ns()
+        if start_ns >= self._window_ns:
+            self._window_ns, self._left_ns = start_ns + WINDOW_NS, BUDGET_NS
+        end_ns = start_ns + self._left_ns
+        more = True
+        while more and now_ns < end_ns:
+            more = self._send_one() | self._hear_one()
+            now_ns = time.perf_counter_ns()
+        self._left_ns -= now_ns - start_ns
+        if more and self._epoll is not None:
+            self._pause(now_ns)
+
+    def _send_one(self) -> bool:
+        if not self._work:
+            return False
+        self._work.popleft()()
+        return True
+
+    def _hear_one(self) -> bool:
+        if not self._events and self._epoll is not None:
+            for fd, events in self._epoll.poll(0, _AT_ONCE):
+                self._events.append((fd, events, self._handlers[fd]))
+        if not self._events:
+            return False
+        fd, events, handler = self._events.popleft()
+        # It may have gone meanwhile, and its number may be another's.
+        if self._handlers.get(fd) is handler:
+            handler(events)
+        return True
+
+    def _pause(self, now_ns: int) -> None:
+        """The budget is spent: the door opens again with the next window."""
+        assert self._loop is not None
+        assert self._epoll is not None
+        self.postponed += 1
+        self._loop.remove_reader(self._epoll.fileno())
+        wait_s = max(0, self._window_ns - now_ns) * 1e-9
+        self._paused = self._loop.call_later(wait_s, self._resume)
+
+    def _resume(self) -> None:
+        self._paused = None
+        if self._epoll is not None and self._loop is not None:
+            self._loop.add_reader(self._epoll.fileno(), self._turn)
+            self._turn()
+
+    def _look(self) -> None:
+        assert self._loop is not None
+        now_ns = time.perf_counter_ns()
+        for guest in tuple(self._open):
+            guest.look(now_ns)
+        if self._loop is not None:
+            self._looking = self._loop.call_later(LOOK_S, self._look)

@@ -1,0 +1,55 @@
+"""A recording that failed is tried again: at first soon, then once a minute, until it writes.
+
+An attempt is a log that holds nothing yet; once the disk has taken it the recording goes on.
+What happens meanwhile is not kept, since nobody knows whether it could be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drivers.base import Backoff
+from fusiond.clock.host import SECOND_NS
+from fusiond.recording.log_writer import LogWriter
+
+FIRST_S = 5.0
+"""A disk that was plugged in again is mounted within some seconds."""
+LONGEST_S = 60.0
+"""Also how long it has to write until a failure is a new one."""
+
+
+class Again:
+    """The attempts of one recorder; time is the tick's."""
+
+    def __init__(self) -> None:
+        self._backoff = Backoff(FIRST_S, LONGEST_S)
+        self._due_ns: int | None = None
+        self._since_ns: int | None = None
+        self._attempt: LogWriter | None = None
+
+    def ready(self, t_ns: int, open_log: Callable[[], LogWriter]) -> LogWriter | None:
+        """A log that the disk has taken, once there is one; called every tick until then."""
+        if self._due_ns is None:
+            self._wait(t_ns)
+        elif self._attempt is None and t_ns >= self._due_ns:
+            self._attempt = open_log()
+        elif self._attempt is not None and self._attempt.stopped is not None:
+            self._attempt = None
+            self._wait(t_ns)
+        elif self._attempt is not None and self._attempt.synced:
+            writer, self._attempt = self._attempt, None
+            self._due_ns, self._since_ns = None, t_ns
+            return writer
+        return None
+
+    def give_up(self) -> None:
+        """Nothing is to be tried any more."""
+        if self._attempt is not None:
+            self._attempt.close()
+        self._attempt = self._due_ns = None
+
+    def _wait(self, t_ns: int) -> None:
+        if self._since_ns is not None and t_ns - self._since_ns > LONGEST_S * SECOND_NS:
+            self._backoff.reset()
+        self._since_ns = None
+        self._due_ns = t_ns + round(self._backoff.next() * SECOND_NS)
