@@ -1,4 +1,4 @@
-"""What is fuzzed besides streams: commands, files of state, tables.
+"""What is fuzzed besides streams: commands, messages to the dashboard, files of state, tables.
 
 Each is read, or refused by the one exception that says why. The first byte of an input chooses
 which of several readers has it.
@@ -7,6 +7,7 @@ which of several readers has it.
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,6 +16,9 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from fusiond.dashboard.hub import REFUSALS, Hub
+from fusiond.dashboard.schemas import topics
+from fusiond.dashboard.vehicle import SHOWN
 from fusiond.files import tables
 from fusiond.files.csv_tables import TableError
 from fusiond.live.warm_keeper import KEPT_STATE
@@ -48,6 +52,33 @@ def commands(data: bytes) -> None:
         numbers = [value for value in command.model_dump().values() if isinstance(value, float)]
         assert all(map(math.isfinite, numbers))
     assert request_id is None or len(request_id) <= 64
+
+
+_TOPICS = ("online", *SHOWN)
+_VIEWED = ("received", "other_topic", *REFUSALS)
+
+
+def hub(data: bytes) -> None:
+    """Messages to the dashboard, a line each: every one is counted by one name, and what browsers
+    are sent is JSON without NaN, of the published schemas. Of the choice four bits are the topic of
+    the first, and the high one says that the broker had kept them."""
+    choice, text = input_of(data)
+    payloads = text.split(b"\n")[:8]
+    now_s = 100.0
+    taking = Hub(lambda: now_s, "fuzz")
+    for place, payload in enumerate(payloads):
+        now_s += 0.4
+        topic = _TOPICS[((choice & 0xF) + place) % len(_TOPICS)]
+        taking.take(f"v{choice >> 4 & 1 & place}", topic, payload, kept=bool(choice & 0x80))
+    assert sum(taking.counters[name] for name in _VIEWED) == len(payloads)
+    assert taking.counters.total() == len(payloads)
+    frame: dict[str, Any] = {"refused": taking.refused}
+    for vehicle in taking.vehicles.values():
+        frame[vehicle.name] = new = vehicle.since(0)
+        for topic, heard in new["messages"].items():
+            if topic in SHOWN:
+                assert topics()[topic](heard["said"]) == heard["said"]
+    json.dumps(frame, allow_nan=False)
 
 
 STATES: tuple[TypeAdapter[Any], ...] = (

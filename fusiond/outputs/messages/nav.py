@@ -7,35 +7,35 @@ from math import degrees
 from pydantic import Field
 
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.outputs.messages.base import Message, Number, stamp
+from fusiond.outputs.messages.base import HalfTurn, Message, Number, QuarterTurn, Sigma, Turn, stamp
 
 
 class NavMessage(Message):
     """The solution of the body origin: WGS 84, north-east-down, one sigma each."""
 
     mode: Mode
-    lat_deg: Number
-    lon_deg: Number
+    lat_deg: QuarterTurn
+    lon_deg: HalfTurn
     height_m: Number = Field(description="above the ellipsoid")
     v_n_m_s: Number
     v_e_m_s: Number
     v_d_m_s: Number
-    roll_deg: Number
-    pitch_deg: Number
-    yaw_deg: Number = Field(description="true heading, 0 to 360, clockwise from north")
-    sd_n_m: Number
-    sd_e_m: Number
-    sd_d_m: Number
-    sd_vn_m_s: Number
-    sd_ve_m_s: Number
-    sd_vd_m_s: Number
-    sd_roll_deg: Number
-    sd_pitch_deg: Number
-    sd_yaw_deg: Number
-    protection_horizontal_m: Number = Field(
+    roll_deg: HalfTurn
+    pitch_deg: QuarterTurn
+    yaw_deg: Turn = Field(description="true heading, 0 to 360, clockwise from north")
+    sd_n_m: Sigma
+    sd_e_m: Sigma
+    sd_d_m: Sigma
+    sd_vn_m_s: Sigma
+    sd_ve_m_s: Sigma
+    sd_vd_m_s: Sigma
+    sd_roll_deg: Sigma
+    sd_pitch_deg: Sigma
+    sd_yaw_deg: Sigma
+    protection_horizontal_m: Sigma = Field(
         description="bound of the horizontal error at the configured integrity risk"
     )
-    protection_vertical_m: Number = Field(description="bound of the vertical error")
+    protection_vertical_m: Sigma = Field(description="bound of the vertical error")
 
 
 def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
