@@ -65,7 +65,6 @@ def topics() -> dict[str, Read]:
 def _later(shared: Mapping[str, Read], name: str) -> Read:
     """A schema that another names before it is made."""
 
-
     def later(said: Any) -> Any:
         return shared[name](said)
 

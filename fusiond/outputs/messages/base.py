@@ -25,16 +25,14 @@ Milliseconds = Annotated[
 """POSIX, from 1970 to the end of 9999: what `t_utc` can write with four digits of a year."""
 
 
-# Degrees of an angle; a standard deviation, or a bound of an error.
-def _within(low: float, high: float | None) -> WithJsonSchema:
-    bounds = {"minimum": low} if high is None else {"minimum": low, "maximum": high}
-    return WithJsonSchema({"type": "number", **bounds})
+def _within(low: float, high: float) -> WithJsonSchema:
+    return WithJsonSchema({"type": "number", "minimum": low, "maximum": high})
 
 
 QuarterTurn = Annotated[float, _within(-90.0, 90.0)] | None
+"""Degrees, as those that follow: a latitude, a pitch."""
 HalfTurn = Annotated[float, _within(-180.0, 180.0)] | None
 Turn = Annotated[float, _within(0.0, 360.0)] | None
-Sigma = Annotated[float, _within(0.0, None)] | None
 
 
 class Message(BaseModel):

@@ -7,7 +7,7 @@ from math import degrees
 from pydantic import Field
 
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.outputs.messages.base import HalfTurn, Message, Number, QuarterTurn, Sigma, Turn, stamp
+from fusiond.outputs.messages.base import HalfTurn, Message, Number, QuarterTurn, Turn, stamp
 
 
 class NavMessage(Message):
@@ -23,19 +23,19 @@ class NavMessage(Message):
     roll_deg: HalfTurn
     pitch_deg: QuarterTurn
     yaw_deg: Turn = Field(description="true heading, 0 to 360, clockwise from north")
-    sd_n_m: Sigma
-    sd_e_m: Sigma
-    sd_d_m: Sigma
-    sd_vn_m_s: Sigma
-    sd_ve_m_s: Sigma
-    sd_vd_m_s: Sigma
-    sd_roll_deg: Sigma
-    sd_pitch_deg: Sigma
-    sd_yaw_deg: Sigma
-    protection_horizontal_m: Sigma = Field(
+    sd_n_m: Number
+    sd_e_m: Number
+    sd_d_m: Number
+    sd_vn_m_s: Number
+    sd_ve_m_s: Number
+    sd_vd_m_s: Number
+    sd_roll_deg: Number
+    sd_pitch_deg: Number
+    sd_yaw_deg: Number
+    protection_horizontal_m: Number = Field(
         description="bound of the horizontal error at the configured integrity risk"
     )
-    protection_vertical_m: Sigma = Field(description="bound of the vertical error")
+    protection_vertical_m: Number = Field(description="bound of the vertical error")
 
 
 def nav_message(solution: Solution, utc_ns: int | None) -> NavMessage:
