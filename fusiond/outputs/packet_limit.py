@@ -13,7 +13,7 @@ import aiomqtt
 
 LONGEST_TOPIC = 65_535 + 8
 """What stands before the payload: topic, its length, packet identifier."""
-PIECE = 16_384
+PIECE = 4096
 """Bytes of a read; paho makes a hundred in one turn of the loop."""
 
 
