@@ -32,4 +32,4 @@ def limit(client: aiomqtt.Client, most_payload: int) -> None:
             del held[most:]
         return read(min(wanted, PIECE))
 
-    paho._sock_recv = read_and_cut  # type: ignore[method-assign]
+    paho._sock_recv = read_and_cut  # type: ignore[assignment, method-assign]
