@@ -14,10 +14,14 @@ from typing import Any
 from pydantic import TypeAdapter
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
-from fusiond.dashboard.vehicle import SHOWN
 from fusiond.outputs.topics import TOPICS
 from fusiond.recording.channels import InnovationMessage
 
+SHOWN = (
+    *("nav", "status", "health", "consistency", "calibration"),
+    *("innovation", "innovations", "event", "events", "reply"),
+)
+"""What `fusiond.dashboard.vehicle` takes, beside `online`; `innovation` is a recording's."""
 FILE = Path("fusiond/dashboard/topics.json")
 _MODE: JsonSchemaMode = "serialization"
 

@@ -30,7 +30,11 @@ MAX_UBX_PAYLOAD = 8192
 SLICE = 4096
 """Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
 
-_UBX_LENGTH = rb"(?:.[\x00-\x1f]|\x00\x20)"  # little-endian, up to MAX_UBX_PAYLOAD
+# Little-endian, up to the greatest, whose low byte is zero.
+_UBX_LENGTH = rb"(?:.[\x00-\x%02x]|\x00\x%02x)" % (
+    (MAX_UBX_PAYLOAD >> 8) - 1,
+    MAX_UBX_PAYLOAD >> 8,
+)
 # The 12 bits behind the length, 1001 to 1300 or from 4001: what RTCM 10403.3 has given out.
 _RTCM_NUMBER = rb"(?:\x3e[\x90-\xff]|[\x3f-\x50].|\x51[\x00-\x4f]|\xfa[\x10-\xff]|[\xfb-\xff].)"
 _START = re.compile(

@@ -35,8 +35,6 @@ KINDS = {"nav": "ddo" + 10 * "d", "nis": "doddd", "delay": "dod", "event": "do"}
 MOST_INNOVATIONS = 12000
 """20 a second for ten minutes: position and velocity of a receiver at 10 Hz."""
 CARRIED = ("nav", "status", "health", "consistency", "calibration")
-SHOWN = (*CARRIED, "innovation", "innovations", "event", "events", "reply")
-"""Topics that are read, each by its schema; `innovation` is a recording's. And `online`."""
 
 
 @dataclass

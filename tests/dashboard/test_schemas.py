@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fusiond.dashboard.schemas import RefusedError, reader, topics
-from fusiond.dashboard.vehicle import SHOWN
 from tests.dashboard.serving import said
 from tests.outputs.messages_examples import EXAMPLES
 from tests.places import REPOSITORY
 from tools import topic_schemas
+from tools.topic_schemas import SHOWN
 
 INNOVATION = {"t_ns": 5, "source": "gnss", "outcome": "fused", "nis": 1.5, "degrees": 3}
 

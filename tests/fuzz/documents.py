@@ -18,7 +18,6 @@ from pydantic import TypeAdapter
 
 from fusiond.dashboard.hub import REFUSALS, Hub
 from fusiond.dashboard.schemas import topics
-from fusiond.dashboard.vehicle import SHOWN
 from fusiond.files import tables
 from fusiond.files.csv_tables import TableError
 from fusiond.live.warm_keeper import KEPT_STATE
@@ -26,6 +25,7 @@ from fusiond.navigator.saved_calibration import SavedCalibration
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.state_file import DamagedStateError, read_state, write_state
 from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
+from tools.topic_schemas import SHOWN
 
 _MEMORY = Path("/dev/shm")
 _SCRATCH = tempfile.TemporaryDirectory(prefix="fuzz-", dir=_MEMORY if _MEMORY.is_dir() else None)
