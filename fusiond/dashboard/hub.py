@@ -15,6 +15,9 @@ from fusiond.dashboard.vehicle import Vehicle
 LARGEST_BYTES = 65536
 """`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
 MOST_VEHICLES = 32
+GIVES_WAY_S = 60.0
+"""When there are so many, one that was silent for so long gives way to one that speaks: a daemon
+says its status every second. Names of no vehicles that a broker has kept shut nobody out."""
 MOST_NAME = 64
 """Letters of a vehicle's name, as the configuration has it."""
 
@@ -89,13 +92,23 @@ class Hub:
         if len(vehicle) > MOST_NAME:
             raise _NotTakenError("too_large", f"a name of more than {MOST_NAME} letters")
         said = self._read(topic, payload)
+        now_s = self.now_s()
         one = self.vehicles.get(vehicle)
         if one is None:
             if len(self.vehicles) >= MOST_VEHICLES:
-                raise _NotTakenError("too_many_vehicles", f"there are {MOST_VEHICLES} already")
+                self._make_room(now_s, kept)
             one = self.vehicles[vehicle] = Vehicle(vehicle)
         self.counters["received"] += 1
-        one.take(topic, said, self.now_s(), kept)
+        if not kept:
+            one.heard_s = now_s
+        one.take(topic, said, now_s, kept)
+
+    def _make_room(self, now_s: float, kept: bool) -> None:
+        """For a vehicle that speaks, in place of the one that was silent longest."""
+        silent = min(self.vehicles.values(), key=lambda one: one.heard_s)
+        if kept or now_s - silent.heard_s < GIVES_WAY_S:
+            raise _NotTakenError("too_many_vehicles", f"there are {MOST_VEHICLES} already")
+        del self.vehicles[silent.name]
 
     def _read(self, topic: str, payload: bytes) -> Any:
         """What it says, by the schema of its topic."""

@@ -15,7 +15,7 @@ import pytest
 
 from fusiond.dashboard import viewer
 from fusiond.dashboard.broker import Access, Broker
-from fusiond.dashboard.hub import LARGEST_BYTES, MOST_VEHICLES, Hub
+from fusiond.dashboard.hub import GIVES_WAY_S, LARGEST_BYTES, MOST_VEHICLES, Hub
 from fusiond.dashboard.player import Player
 from tests.broker import Broker as Mosquitto
 from tests.broker import listening
@@ -279,6 +279,29 @@ def test_what_cannot_be_read_is_counted_and_left() -> None:
     last = f"v{MOST_VEHICLES + 2}/online: there are {MOST_VEHICLES} already"
     kinds = {**refused, "too_many_vehicles": 3}
     assert hub.refused == {"count": 13, "kinds": kinds, "last": last}
+
+
+def test_names_that_a_broker_has_kept_shut_out_nobody_who_speaks() -> None:
+    hub = make_hub()
+    clock = hub.now_s
+    assert isinstance(clock, Clock)
+    for k in range(MOST_VEHICLES + 100):
+        hub.take(f"junk{k}", "online", b"online", kept=True)
+    assert len(hub.vehicles) == MOST_VEHICLES
+    hub.take("truck", "online", b"online", kept=True)
+    assert "truck" not in hub.vehicles
+    hub.take("truck", "status", payload("status"))
+    assert "truck" in hub.vehicles
+    for k in range(MOST_VEHICLES - 1):  # who speaks, too, but does not push out who speaks
+        hub.take(f"talking{k}", "online", b"online")
+    hub.take("van", "status", payload("status"))
+    assert "van" not in hub.vehicles
+    clock.s += GIVES_WAY_S - 1.0
+    hub.take("truck", "status", payload("status"))
+    clock.s += 1.0
+    hub.take("van", "status", payload("status"))
+    assert {"truck", "van"} < set(hub.vehicles)
+    assert len(hub.vehicles) == MOST_VEHICLES
 
 
 # Each ended the dashboard, or what it sent to browsers.

@@ -102,7 +102,7 @@ def lines_of(feed: Feed, data: bytes, size: int) -> int:
 
 @pytest.mark.parametrize("kind", STREAMS, ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
 @given(unit=UNITS, size=st.sampled_from([1, 7, 255, 1024]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_work_goes_with_bytes(kind: type, unit: bytes, size: int) -> None:
     data = (unit * (LENGTH // len(unit) + 1))[:LENGTH]
     pieces = -(-LENGTH // size)
@@ -117,7 +117,7 @@ def test_one_byte_again_and_again(kind: type, byte: int) -> None:
 
 
 @given(unit=UNITS, size=st.sampled_from([1, 7, 1024]))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_checks_sum_no_byte_often(unit: bytes, size: int) -> None:
     splitter = StreamSplitter()
     data = (unit * (LENGTH // len(unit) + 1))[:LENGTH]
