@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, BinaryIO, NamedTuple, cast
 
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
@@ -24,7 +24,7 @@ from mcap.stream_reader import StreamReader
 
 from fusiond.recording.channels import INPUT
 from fusiond.recording.log_file import FORMAT, METADATA
-from fusiond.recording.records import DamagedRecordError, Record, unpack
+from fusiond.recording.records import DamagedRecordError, Record, check, unpack
 
 RECORD_LIMIT = 1 << 26
 """A damaged length must not ask for all the memory: a chunk has 128 KiB, an attachment a few MB."""
@@ -36,6 +36,10 @@ RATIO_LIMIT, RATIO_FREE = 100, 1 << 18
 5 times as long, one of nothing but 0xD3 from a line 188. A small file is no large recording."""
 WINDOW_LIMIT = 1 << 23
 """What a decompressor of zstd must be ready to hold of the past (RFC 8878, section 3.1.1.1.2)."""
+LATEST_NS = 253_402_300_800 * 1_000_000_000
+"""The end of 9999, POSIX: what is told of a log has four digits for a year."""
+MOST_PROBLEMS = 100
+"""Sentences on what is wrong with a log; a file can be wrong in as many ways as it has bytes."""
 _DAMAGED = (EOFError, struct.error, McapError, ValueError, zstandard.ZstdError, RuntimeError)
 
 
@@ -116,20 +120,33 @@ class Log:
             yield from _messages(path, wanted, self._problem)
 
     def records(self) -> Iterator[Record]:
-        """The input, record by record; a gap in it ends up in `problems`."""
-        last = 0
+        """The input, record by record; a gap in it ends up in `problems`, and so does a record that
+        none of this log's is, which is left out."""
+        last, sources = 0, len(self.about.sources)
+        first_ns, end_ns = -self.about.epoch_ns, LATEST_NS - self.about.epoch_ns
         for message in self.messages(INPUT):
             if last and message.sequence != last + 1:
                 lost = message.sequence - last - 1
                 self._problem(f"{lost} messages of input are missing after message {last}")
             last = message.sequence
-            try:
-                yield from unpack(message.data)
-            except DamagedRecordError as error:
-                self._problem(f"message {message.sequence} of input: {error}")
+            found = unpack(message.data)
+            while True:
+                try:
+                    record = next(found)
+                    check(record, sources)
+                    if not first_ns <= record.t_ns < end_ns or not all(
+                        first_ns <= t_ns < end_ns for _, t_ns, _ in record.readings
+                    ):
+                        raise DamagedRecordError("a time that cannot be")
+                except StopIteration:
+                    break
+                except DamagedRecordError as error:
+                    self._problem(f"message {message.sequence} of input: {error}")
+                    continue
+                yield record
 
     def _problem(self, text: str) -> None:
-        if text not in self.problems:
+        if text not in self.problems and len(self.problems) < MOST_PROBLEMS:
             self.problems.append(text)
 
     @property
@@ -238,6 +255,19 @@ def _decompressed(chunk: Chunk) -> bytes:
     return data
 
 
+class _Bounded:
+    """A file of which no more is asked at once than a record may have: a length inside a record is
+    believed by mcap, which looks at the record's own alone."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def read(self, count: int) -> bytes:
+        if count > RECORD_LIMIT:
+            raise EndOfFile
+        return self._file.read(count)
+
+
 class _Unindexed(StreamReader):
     """Passes over the indices behind each chunk, a pair of numbers a message: nobody seeks here."""
 
@@ -248,7 +278,8 @@ class _Unindexed(StreamReader):
 def _records(path: Path, problem: Callable[[str], None]) -> Iterator[McapRecord]:
     """Records up to the summary, chunks unopened; what is cut off goes to `problem`."""
     with path.open("rb") as file:
-        records = _Unindexed(file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        bounded = cast(IO[bytes], _Bounded(file))
+        records = _Unindexed(bounded, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
         try:
             first = next(records, None)
         except _DAMAGED as error:

@@ -1,4 +1,4 @@
-"""What is fuzzed besides streams: commands, messages to the dashboard, files of state, tables.
+"""What is fuzzed besides streams: commands, messages to the dashboard, files of state, logs, CSV.
 
 Each is read, or refused by the one exception that says why. The first byte of an input chooses
 which of several readers has it.
@@ -6,6 +6,7 @@ which of several readers has it.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -25,6 +26,12 @@ from fusiond.navigator.saved_calibration import SavedCalibration
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.state_file import DamagedStateError, read_state, write_state
 from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
+from fusiond.recording.channels import CHANNELS
+from fusiond.recording.info import info
+from fusiond.recording.log_file import About, LogFile
+from fusiond.recording.reader import MOST_PROBLEMS, Log, LogError
+from fusiond.recording.records import NO_SOURCE, Kind, Record, pack
+from fusiond.recording.records import input_of as kind_of_input
 from tools.topic_schemas import SHOWN
 
 _MEMORY = Path("/dev/shm")
@@ -79,6 +86,49 @@ def hub(data: bytes) -> None:
             if topic in SHOWN:
                 assert topics()[topic](heard["said"]) == heard["said"]
     json.dumps(frame, allow_nan=False)
+
+
+def _head(more: bytes) -> bytes:
+    """A log's beginning that describes it, then records of MCAP."""
+    path = INPUT_FILE.with_suffix(".mcap")
+    path.unlink(missing_ok=True)
+    about = {"format": "1", "run": "r", "part": "0", "vehicle": "v", "epoch_ns": "1000"}
+    file = LogFile(path, About({**about, "sources": '["a", "b"]'}), 1)
+    file.write(CHANNELS["/fusiond/input"], 1, more)
+    file.write(CHANNELS["/event"], 1, b"{}")
+    file.sync()
+    file.abandon()
+    return path.read_bytes()
+
+
+_HEAD = _head(pack(Record(Kind.TICK, NO_SOURCE, 5, bytes(32))))
+
+
+def log(data: bytes) -> None:
+    """A file that may be a log is read, told of and cut, or LogError says why not. Of the choice:
+    as it is, behind a sound head, or as the input of a log that is sound otherwise."""
+    choice, stream = input_of(data)
+    path = INPUT_FILE.with_suffix(".mcap")
+    match choice % 3:
+        case 0:
+            path.write_bytes(stream)
+        case 1:
+            path.write_bytes(_HEAD + stream)
+        case _:
+            _head(stream)
+    try:
+        found = Log([path])
+        told = info(found)
+        for record in found.records():
+            if record.kind not in (Kind.START, Kind.TICK, Kind.COMMAND):
+                kind_of_input(record)
+    except LogError:
+        return
+    json.dumps(told)
+    assert len(told["problems"]) <= MOST_PROBLEMS
+    for message in found.messages("/event"):
+        with contextlib.suppress(ValueError):
+            message.json()
 
 
 STATES: tuple[TypeAdapter[Any], ...] = (

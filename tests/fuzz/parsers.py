@@ -29,6 +29,7 @@ PARSERS = {
     "ntrip": Parser(("drivers.ntrip.reply",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),
     "hub": Parser(tuple(f"fusiond.dashboard.{module}" for module in _HUB), 512),
+    "log": Parser(tuple(f"fusiond.recording.{m}" for m in ("info", "reader", "records")), 400),
     "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
     "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
 }

@@ -12,9 +12,11 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from fusiond.recording.channels import CHANNELS
+from fusiond.recording.channels import CHANNELS, INPUT
+from fusiond.recording.info import info
 from fusiond.recording.log_file import FORMAT, About, LogFile
-from fusiond.recording.reader import CHUNK_LIMIT, RATIO_FREE, Log, LogError
+from fusiond.recording.reader import CHUNK_LIMIT, MOST_PROBLEMS, RATIO_FREE, Log, LogError
+from fusiond.recording.records import NO_SOURCE, Kind, Record, pack
 
 ABOUT = {
     **{"format": FORMAT, "run": "r", "part": "0", "vehicle": "truck", "epoch_ns": "5"},
@@ -128,3 +130,62 @@ def test_what_a_message_says_may_be_nested_too_deep(tmp_path: Path) -> None:
         last.json()
     with pytest.raises(json.JSONDecodeError):
         first._replace(data=b"{").json()
+
+
+def input_log(path: Path, *records: bytes) -> Log:
+    file = LogFile(path, About(ABOUT), 1)
+    for sequence, record in enumerate(records, start=1):
+        file.write(CHANNELS[INPUT], 1, record, sequence)
+    file.finish()
+    return Log([path])
+
+
+SOUND = pack(Record(Kind.TICK, NO_SOURCE, 1, bytes(32)))
+OTHERS = {
+    "a source that the log has not": pack(Record(Kind.READ, 1, 2, b"a")),
+    "a tick of a source": pack(Record(Kind.TICK, 0, 2, bytes(32))),
+    "a read of nobody": pack(Record(Kind.READ, NO_SOURCE, 2, b"a")),
+    "a tick that is short": pack(Record(Kind.TICK, NO_SOURCE, 2, b"a")),
+    "a frame that is short": pack(Record(Kind.FRAME, 0, 2, b"a")),
+    "a command that is a list": pack(Record(Kind.COMMAND, NO_SOURCE, 2, b"[1]")),
+    "a command of depth": pack(Record(Kind.COMMAND, NO_SOURCE, 2, b"[" * 100_000)),
+    "a start of no JSON": pack(Record(Kind.START, NO_SOURCE, 2, b"{")),
+    "a reason in no alphabet": pack(Record(Kind.CLOSE, 0, 2, b"\xff")),
+    "a time before 1970": pack(Record(Kind.OPEN, 0, -6, b"")),
+    "a reading before 1970": pack(Record(Kind.OPEN, 0, 2, b"", [(0, -6, 0)])),
+}
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_a_record_that_nobody_writes_is_left_out_and_named(case: str, tmp_path: Path) -> None:
+    log = input_log(tmp_path / "a.mcap", SOUND, OTHERS[case] + SOUND, SOUND)
+    told = info(log)
+    assert told["ticks"] == 3
+    assert len(told["problems"]) == 1
+    assert told["problems"][0].startswith("message 2 of input: ")
+
+
+def test_times_beyond_four_digits_of_a_year_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    file = LogFile(path, About({**ABOUT, "epoch_ns": str(300_000_000_000 * 10**9)}), 1)
+    file.write(CHANNELS[INPUT], 1, SOUND, 1)
+    file.finish()
+    told = info(Log([path]))
+    assert told["ticks"] == 0
+    assert len(told["problems"]) == 1
+
+
+def test_a_length_inside_a_record_asks_for_no_memory(tmp_path: Path) -> None:
+    """Of a chunk of 60 bytes that says that its data have 100 GB."""
+    record = bytearray(chunk(2, b"ab", b""))
+    record[9 + 32 : 9 + 40] = struct.pack("<Q", 100_000_000_000)
+    log = Log([log_with(tmp_path / "a.mcap", bytes(record))])
+    assert [message.topic for message in log.messages()] == ["/event"]
+    assert any("cut off" in text for text in log.problems)
+
+
+def test_what_is_wrong_is_told_a_hundred_times(tmp_path: Path) -> None:
+    wrong = [pack(Record(Kind.READ, 1, 2, b"a")) for _ in range(500)]
+    log = input_log(tmp_path / "a.mcap", *wrong)
+    assert list(log.records()) == []
+    assert len(log.problems) == MOST_PROBLEMS
