@@ -1,6 +1,7 @@
 """A line under asyncio that is there when the device is, and comes back when it comes back.
 
-Every read is bounded, stamped, and an end is seen as what it is.
+Every read is bounded, stamped, and an end is seen as what it is. A piece is handed over in a turn
+of the loop, and bytes no faster than a line can be (drivers.byte_budget).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from functools import partial
 
 from drivers.aside import aside
 from drivers.base import Backoff, Now, monotonic_ns
+from drivers.byte_budget import ByteBudget
 from drivers.port import OPEN_ERRORS, READ_BYTES, OpenPort, Port, open_serial
 
 __all__ = ["PENDING_WRITE_BYTES", "READ_BYTES", "SerialLine"]
@@ -26,7 +28,8 @@ class SerialLine:
     """One port, reopened with `backoff` for ever: a serial one, but for another `open_port`.
 
     `counters`: `opened`, `closed`, `open_failed`, `bytes_in`, `bytes_out`, `write_refused`,
-    `baud_refused`. `detail` is the last trouble in words; empty once bytes arrive.
+    `baud_refused`, `paused` (more came than a line brings). `detail` is the last trouble in words;
+    empty once bytes arrive.
     """
 
     def __init__(
@@ -47,6 +50,10 @@ class SerialLine:
         self._opened: Port | None = None
         self._gone: asyncio.Future[str] | None = None
         self._pending = bytearray()
+        self._budget = ByteBudget(baud)
+        self._unread: tuple[bytes, int] = b"", 0
+        """What is left of a read, and when it was found."""
+        self._resume: asyncio.Handle | None = None
 
     @property
     def is_open(self) -> bool:
@@ -107,6 +114,7 @@ class SerialLine:
     def set_baud(self, baud: int) -> None:
         """Change the rate, at once when the line is open, and for every later opening."""
         self.baud = baud
+        self._budget = ByteBudget(baud)
         if self._opened is None:
             return
         try:
@@ -155,12 +163,45 @@ class SerialLine:
         self.counters["bytes_in"] += len(data)
         self._backoff.reset()
         self.detail = ""
+        self._unread = data, t_seen_ns  # a datagram comes as a whole
+        self._hand_over(port, gone, on_bytes)
+
+    def _hand_over(
+        self,
+        port: Port,
+        gone: asyncio.Future[str],
+        on_bytes: Callable[[bytes, int], None],
+    ) -> None:
+        """Hand a piece over; the next comes in a turn of its own, when a line could bring it."""
+        data, t_seen_ns = self._unread
+        self._unread = data[READ_BYTES:], t_seen_ns
         try:
-            for at in range(0, len(data), READ_BYTES):  # a datagram comes as a whole
-                on_bytes(data[at : at + READ_BYTES], t_seen_ns)
+            on_bytes(data[:READ_BYTES], t_seen_ns)
         except Exception as error:
             if not gone.done():
                 gone.set_exception(error)
+            return
+        wait_s = self._budget.spend(min(len(data), READ_BYTES))
+        if wait_s > 0.0:
+            self.counters["paused"] += 1
+        if (wait_s > 0.0 or self._unread[0]) and not gone.done():
+            loop = gone.get_loop()
+            loop.remove_reader(port.fileno())
+            self._resume = loop.call_later(wait_s, self._go_on, port, gone, on_bytes)
+
+    def _go_on(
+        self,
+        port: Port,
+        gone: asyncio.Future[str],
+        on_bytes: Callable[[bytes, int], None],
+    ) -> None:
+        self._resume = None
+        if gone.done():
+            return
+        if self._unread[0]:
+            self._hand_over(port, gone, on_bytes)
+        if self._resume is None and not gone.done():
+            gone.get_loop().add_reader(port.fileno(), self._read, port, gone, on_bytes)
 
     def _flush(self, port: Port, gone: asyncio.Future[str]) -> None:
         try:
@@ -185,6 +226,9 @@ class SerialLine:
         fd = port.fileno()
         loop.remove_reader(fd)
         loop.remove_writer(fd)
+        if self._resume is not None:
+            self._resume.cancel()
+        self._unread = b"", 0
         port.close()
         self._opened = None
         self._gone = None

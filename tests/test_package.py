@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.places import REPOSITORY
+from tools import debian_package, licences
 
 CONFIG = REPOSITORY / "config"
 PAGE = "fusiond/report/assets"
@@ -34,7 +35,7 @@ def _run(*command: str | Path, folder: Path) -> str:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built from a copy of what `systemd/README.md` copies: a build leaves folders behind."""
     folder = tmp_path_factory.mktemp("wheel")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE", licences.FILE.name):
         shutil.copy(REPOSITORY / name, folder)
     for name in ("fusiond", "drivers", "config"):
         shutil.copytree(
@@ -85,6 +86,36 @@ def test_the_wheel_holds_every_shipped_file(wheel: Path) -> None:
     assert held == shipped
     assert {"drivers/config/vehicle.toml", "drivers/config/dbc/xsens_mti600.dbc"} < set(held)
     assert {f"{DASHBOARD}/index.html", f"{PLOTS}/uPlot.iife.min.js", f"{PLOTS}/LICENSE"} < set(held)
+
+
+def test_the_terms_of_others_travel_with_the_wheel(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        held = {n.rpartition("/")[2]: n for n in archive.namelist() if "/licenses/" in n}
+        assert set(held) == {"LICENSE", licences.FILE.name}
+        assert archive.read(held[licences.FILE.name]) == licences.FILE.read_bytes()
+
+
+def test_every_locked_package_has_terms_that_were_looked_at_and_their_text() -> None:
+    assert licences.FILE.read_text() == licences.text(), "run python -m tools.licences"
+    names = licences.locked(REPOSITORY / "requirements.lock")
+    found = licences.packages(Path(sysconfig.get_path("purelib")), names)
+    assert {package.name for package in found} == names
+    assert licences.faults(found) == []
+    assert ("python-can", "LGPL-3.0-only", True) in [(p.name, p.licence, p.has_text) for p in found]
+    strange = licences.Package("new", "1", "AGPL-3.0-only", False)
+    assert licences.faults([strange]) == [
+        "new: nobody has looked at 'AGPL-3.0-only'",
+        "new: the text of its licence is nowhere",
+    ]
+
+
+def test_the_debian_package_states_the_terms_of_python_can() -> None:
+    text = debian_package.COPYRIGHT.format(third_party=licences.FILE.name)
+    stanzas = text.split("\n\n")
+    (python_can,) = [one for one in stanzas if "site-packages/can/" in one]
+    for words in ("LGPL-3.0-only", "common-licenses/LGPL-3", "common-licenses/GPL-3"):
+        assert words in python_can
+    assert licences.FILE.name in debian_package.SOURCES
 
 
 def test_shipped_files_are_the_installed_ones(installed: Path, tmp_path: Path) -> None:

@@ -18,12 +18,15 @@ import sys
 from email.utils import formatdate
 from pathlib import Path
 
-from tools import man_pages
+from tools import licences, man_pages
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 HOME = "opt/fusiond"
 VENV = f"{HOME}/.venv"
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "fusiond", "drivers", "config")
+SOURCES = (
+    *("pyproject.toml", "README.md", "LICENSE", licences.FILE.name),
+    *("fusiond", "drivers", "config"),
+)
 # As Debian's own tools ask; a package that is given away wants an address that is read.
 MAINTAINER = "{} <{}>".format(
     os.environ.get("DEBFULLNAME", "The fusiond authors"),
@@ -96,7 +99,15 @@ License: Apache-2.0
 Files: opt/fusiond/.venv/lib/*
 Copyright: their authors
 License: as-stated
- Each package below /opt/fusiond/.venv has its licence in its .dist-info folder.
+ Each package below /opt/fusiond/.venv is on the terms that
+ /usr/share/doc/fusiond/{third_party}.gz names; their texts are in the package's
+ .dist-info folder or in that file.
+
+Files: opt/fusiond/.venv/lib/python*/site-packages/can/*
+Copyright: the authors of python-can
+License: LGPL-3.0-only
+ On Debian systems the text is in /usr/share/common-licenses/LGPL-3, that of the
+ GNU General Public License, version 3, in /usr/share/common-licenses/GPL-3.
 
 License: Apache-2.0
  On Debian systems the text is in /usr/share/common-licenses/Apache-2.0.
@@ -179,6 +190,8 @@ def environment(tree: Tree, python: str, requirements: Path, work: Path) -> None
     run(*install, "--no-deps", next(wheels.glob("*.whl")))
     shutil.rmtree(venv / "include", ignore_errors=True)
     lighten(venv)
+    if found := licences.faults(licences.packages(next(venv.glob("lib/python*/site-packages")))):
+        sys.exit("\n".join(found))
     _settle(venv, str(tree.root))
     stage = ("-s", tree.root, "-p", "/")
     run(venv / "bin/python", "-m", "compileall", "-q", *stage, venv / "lib")
@@ -226,7 +239,9 @@ def system_files(tree: Tree, version: str) -> None:
     doc = "usr/share/doc/fusiond"
     tree.copy("systemd/80-can0.network", f"{doc}/examples/80-can0.network")
     tree.copy("config/tactical.toml", f"{doc}/examples/tactical.toml")
-    tree.write(f"{doc}/copyright", COPYRIGHT)
+    third_party = licences.FILE.name
+    tree.write(f"{doc}/copyright", COPYRIGHT.format(third_party=third_party))
+    tree.packed(f"{doc}/{third_party}", licences.FILE.read_text(encoding="utf-8"))
     entry = f"fusiond ({version}-1) unstable; urgency=medium\n\n  * See CHANGELOG.md.\n\n"
     epoch_s = int(os.environ.get("SOURCE_DATE_EPOCH", _last_commit_s()))
     when = formatdate(epoch_s, usegmt=True).replace("GMT", "+0000")

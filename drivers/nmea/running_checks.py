@@ -14,6 +14,7 @@ Fletcher); RTCM 10403.3 section 4.2 (CRC-24Q, polynomial 1864CFB hex).
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import accumulate
 
 GENERATOR = 0x1864CFB
@@ -64,6 +65,24 @@ def _product(a: int, b: int) -> int:
         a <<= 1
         if a & 0x1000000:
             a ^= GENERATOR
+    return result
+
+
+_X24 = tuple(_product(four_bits, GENERATOR & 0xFFFFFF) for four_bits in range(16))
+"""Four bits times x^24, modulo the generator."""
+
+
+@cache
+def _multiples(count: int) -> tuple[int, ...]:
+    """Four bits times x^(8 `count`), modulo the generator."""
+    return tuple(_product(_X8[count], four_bits) for four_bits in range(16))
+
+
+def _shifted(crc: int, count: int) -> int:
+    """`crc` times x^(8 `count`): four bits at a time, a false header costs a microsecond here."""
+    multiples, result = _multiples(count), 0
+    for place in (20, 16, 12, 8, 4, 0):
+        result = (result << 4) & 0xFFFFFF ^ _X24[result >> 20] ^ multiples[crc >> place & 15]
     return result
 
 
@@ -128,7 +147,7 @@ class RunningCrc24q:
             more = accumulate(buffer[known:end], _next_crc, initial=self._crc[-1])
             self._crc += list(more)[1:]
             self.taken += end - known
-        return self._crc[end] == _product(self._crc[start], _X8[end - start])
+        return self._crc[end] == _shifted(self._crc[start], end - start)
 
     def drop(self, count: int) -> None:
         """The first `count` bytes leave the buffer."""

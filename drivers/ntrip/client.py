@@ -19,9 +19,11 @@ from pydantic import Field, field_validator, model_validator
 
 from drivers.aside import aside
 from drivers.base import Backoff, DriverOptions
+from drivers.byte_budget import ByteBudget
 from drivers.network_port import connect
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.ntrip.reply import CasterRefusedError, CasterReply, request
+from drivers.port import READ_BYTES
 
 PASSWORD_VARIABLE = "FUSIOND_NTRIP_PASSWORD"
 DEFAULT_PORT = 2101
@@ -32,7 +34,6 @@ CFG-NAVSPG-CONSTR_DGNSSTO): time for two more attempts before RTK is lost."""
 GGA_S = 10.0
 """Network casters ask for a position every 5 to 60 s; ten seconds at 30 m/s are 300 m of a
 network's 30 km."""
-READ_BYTES = 4096
 FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0
 """Casters lock out whom they see too often: most allow an attempt a minute for ever."""
 
@@ -191,7 +192,7 @@ class NtripClient:
             writer.transport.abort()  # nothing of ours is worth waiting for
 
     async def _read(self, reader: asyncio.StreamReader) -> None:
-        reply, stream = CasterReply(), _Frames(self._counters)
+        reply, stream, budget = CasterReply(), _Frames(self._counters), ByteBudget()
         loop = asyncio.get_running_loop()
         began_s: float | None = None
         try:
@@ -210,6 +211,8 @@ class NtripClient:
                         self._counters["ntrip_write_refused"] += not self._write(frame)
                     if reply.over is not None:
                         raise reply.over
+                    # Without a wait a reader that has more gives nobody else a turn.
+                    await asyncio.sleep(budget.spend(len(data)))
                 raise EOFError
         except TimeoutError:
             if not silence.expired():

@@ -33,6 +33,8 @@ _SETTLE_S = 0.3
 """For the broker to hand over what it keeps of every vehicle, before the answer of one is taken
 for all that there is."""
 _LOOK_EVERY_S = 0.05
+_MOST_BYTES = 65_536
+"""`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
 _ASKED = ("status", "nav", "health")
 """What a daemon that works has said within a second."""
 
@@ -116,6 +118,8 @@ async def ask(
 
     import aiomqtt  # noqa: PLC0415
 
+    from fusiond.outputs import packet_limit  # noqa: PLC0415
+
     vehicles: dict[str, Heard] = {}
     loop = asyncio.get_running_loop()
     until_s = loop.time() + wait_s
@@ -124,7 +128,7 @@ async def ask(
         await client.subscribe(f"fusiond/{vehicle or '+'}/+", 1)
         async for message in client.messages:
             name, _, topic = message.topic.value.removeprefix("fusiond/").rpartition("/")
-            if isinstance(message.payload, bytes):
+            if isinstance(message.payload, bytes) and len(message.payload) <= _MOST_BYTES:
                 _take(vehicles.setdefault(name, Heard()), topic, message.payload, message.retain)
 
     credentials: dict[str, Any] = {}
@@ -137,7 +141,9 @@ async def ask(
             "tls_context": broker_access.tls_context(access),
         }
     try:
-        async with aiomqtt.Client(host, port, timeout=_CONNECT_S, **credentials) as client:
+        asking = aiomqtt.Client(host, port, timeout=_CONNECT_S, **credentials)
+        packet_limit.limit(asking, _MOST_BYTES)
+        async with asking as client:
             listening = asyncio.create_task(listen(client))
             await asyncio.wait({listening}, timeout=min(_SETTLE_S, wait_s))
             while loop.time() < until_s and not (
@@ -159,7 +165,7 @@ def _take(heard: Heard, topic: str, payload: bytes, retained: bool) -> None:
     if topic == "online":
         heard.online = payload.decode(errors="replace")
         return
-    with suppress(ValueError):  # another program's message below our topic
+    with suppress(ValueError, RecursionError):  # another program's message below our topic
         heard.topics[topic] = json.loads(payload)
         heard.live |= topic in _ASKED and not retained
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import aiomqtt
 
-from fusiond.dashboard.hub import Hub
+from fusiond.dashboard.hub import LARGEST_BYTES, Hub
+from fusiond.outputs.packet_limit import limit
 
 BASE = "fusiond"
 RETRY_S = 1.0
@@ -65,7 +66,7 @@ class Broker:
 
     def _client(self) -> aiomqtt.Client:
         access = self._access
-        return aiomqtt.Client(
+        client = aiomqtt.Client(
             access.host,
             access.port,
             username=access.username,
@@ -75,6 +76,8 @@ class Broker:
             max_queued_incoming_messages=MOST_WAITING,
             logger=_LOG,
         )
+        limit(client, LARGEST_BYTES)
+        return client
 
     async def _serve(self, client: aiomqtt.Client) -> None:
         """Until the connection fails; both tasks end with it."""

@@ -9,16 +9,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from fusiond.dashboard.schemas import RefusedError, topics
 from fusiond.dashboard.vehicle import Vehicle
 
 LARGEST_BYTES = 65536
 """`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
 MOST_VEHICLES = 32
+GIVES_WAY_S = 60.0
+"""When there are so many, one that was silent for so long gives way to one that speaks: a daemon
+says its status every second. Names of no vehicles that a broker has kept shut nobody out."""
 MOST_NAME = 64
 """Letters of a vehicle's name, as the configuration has it."""
 
-DEEPEST = 16
-"""Levels of a message; ours have five. What can just be read could not be written in a frame."""
+LARGEST_INTEGER = 2**63 - 1
+"""Nanoseconds of a recording's clock; what a browser is sent has closer bounds in its schema."""
+MOST_REASON = 160
+"""Letters of the reason that is shown: two lines of the page."""
+
+REFUSALS = ("too_large", "malformed", "not_as_published", "too_many_vehicles")
 
 LinkState = Literal["connecting", "up", "lost", "ended"]
 
@@ -36,7 +44,11 @@ class Hub:
     """Takes payloads in by topic. `now_s` is the clock of all that is shown: the host's, or that of
     the log that is played, `speed` times as fast as the host's.
 
-    Counters: `received`; refused `too_large`, `malformed`, `too_many_vehicles`.
+    A message is used when it is what its topic carries by the published schemas, and refused as a
+    whole when it is not: the last that was shown stays, and grows old.
+
+    Counters: `received`, `other_topic` (none that is shown); refused `too_large`, `malformed`
+    (no JSON), `not_as_published`, `too_many_vehicles`.
     """
 
     def __init__(self, now_s: Callable[[], float], origin: str, speed: float = 1.0) -> None:
@@ -46,6 +58,8 @@ class Hub:
         self.link = Link("connecting", "", now_s())
         self.vehicles: dict[str, Vehicle] = {}
         self.counters: Counter[str] = Counter()
+        self._topics = topics()
+        self._refused_last = ""
         self.send_command: Callable[[str, str, str], None] | None = None
         """Puts a command (vehicle, name, id) on its way; None where none is possible."""
 
@@ -54,46 +68,93 @@ class Hub:
         since_s = self.link.since_s if state == self.link.state else self.now_s()
         self.link = Link(state, text, since_s)
 
+    @property
+    def refused(self) -> dict[str, Any]:
+        """What the page says of refused messages: how many of each kind, and why the last was."""
+        kinds = {kind: n for kind in REFUSALS if (n := self.counters[kind])}
+        return {"count": sum(kinds.values()), "kinds": kinds, "last": self._refused_last}
+
     def take(self, vehicle: str, topic: str, payload: bytes, kept: bool = False) -> None:
-        """A message of `topic` below a vehicle's base; what cannot be read is counted."""
-        if len(payload) > LARGEST_BYTES or len(vehicle) > MOST_NAME:
-            self.counters["too_large"] += 1
+        """A message of `topic` below a vehicle's base; what cannot be used is counted."""
+        if topic not in self._topics and topic != "online":
+            self.counters["other_topic"] += 1
             return
         try:
-            said = payload.decode() if topic == "online" else _parsed(payload)
-        except (ValueError, RecursionError):
-            self.counters["malformed"] += 1
-            return
+            self._take(vehicle, topic, payload, kept)
+        except _NotTakenError as refused:
+            self.counters[refused.kind] += 1
+            where = f"{vehicle[:MOST_NAME]}/{topic}"
+            self._refused_last = f"{where}: {refused}"[:MOST_REASON]
+
+    def _take(self, vehicle: str, topic: str, payload: bytes, kept: bool) -> None:
+        if len(payload) > LARGEST_BYTES:
+            raise _NotTakenError("too_large", f"more than {LARGEST_BYTES} bytes")
+        if len(vehicle) > MOST_NAME:
+            raise _NotTakenError("too_large", f"a name of more than {MOST_NAME} letters")
+        said = self._read(topic, payload)
+        now_s = self.now_s()
         one = self.vehicles.get(vehicle)
         if one is None:
             if len(self.vehicles) >= MOST_VEHICLES:
-                self.counters["too_many_vehicles"] += 1
-                return
+                self._make_room(now_s, kept)
             one = self.vehicles[vehicle] = Vehicle(vehicle)
         self.counters["received"] += 1
-        one.take(topic, said, self.now_s(), kept)
+        if not kept:
+            one.heard_s = now_s
+        one.take(topic, said, now_s, kept)
+
+    def _make_room(self, now_s: float, kept: bool) -> None:
+        """For a vehicle that speaks, in place of the one that was silent longest."""
+        silent = min(self.vehicles.values(), key=lambda one: one.heard_s)
+        if kept or now_s - silent.heard_s < GIVES_WAY_S:
+            raise _NotTakenError("too_many_vehicles", f"there are {MOST_VEHICLES} already")
+        del self.vehicles[silent.name]
+
+    def _read(self, topic: str, payload: bytes) -> Any:
+        """What it says, by the schema of its topic."""
+        if topic == "online":
+            if payload not in (b"online", b"offline"):
+                raise _NotTakenError("not_as_published", "neither online nor offline")
+            return payload.decode()
+        try:
+            said = _parsed(payload)
+        except (ValueError, RecursionError) as error:
+            raise _NotTakenError("malformed", f"no JSON: {error}") from None
+        try:
+            return self._topics[topic](said)
+        except RefusedError as error:
+            raise _NotTakenError("not_as_published", str(error)) from None
+
+
+class _NotTakenError(Exception):
+    """Why a message is not used; `kind` is its counter."""
+
+    def __init__(self, kind: str, why: str) -> None:
+        super().__init__(why)
+        self.kind = kind
 
 
 def _parsed(payload: bytes) -> Any:
     """JSON that can be written again for a browser: no NaN, nothing infinite, which 1e999 would be
-    read as. Raises ValueError, and RecursionError where it is far too deep."""
+    read as, no integer without end. Raises ValueError, and RecursionError where it
+    is far too deep."""
 
     def refuse(name: str) -> None:
         raise ValueError(name)
 
-    said = json.loads(payload, parse_constant=refuse, parse_float=_finite)
-    if _deeper(said, DEEPEST):
-        raise ValueError(f"nested deeper than {DEEPEST}")
-    return said
+    return json.loads(payload, parse_constant=refuse, parse_float=_finite, parse_int=_exact)
 
 
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text}: too large")
+        raise ValueError(f"{text[:MOST_NAME]}: too large")
     return value
 
 
-def _deeper(said: Any, levels: int) -> bool:
-    inside = said.values() if isinstance(said, dict) else said if isinstance(said, list) else ()
-    return any(levels == 0 or _deeper(each, levels - 1) for each in inside)
+def _exact(text: str) -> int:
+    # A longer one is refused unread: Python's time goes with the square of the digits.
+    value = int(text) if len(text) <= len(str(-LARGEST_INTEGER)) else LARGEST_INTEGER + 1
+    if abs(value) > LARGEST_INTEGER:
+        raise ValueError(f"{text[:MOST_NAME]}: too large")
+    return value

@@ -53,6 +53,8 @@ class Vehicle:
     def __init__(self, name: str) -> None:
         self.name = name
         self.count = 0
+        self.heard_s = float("-inf")
+        """When it last spoke; what the broker had kept is no sign of it."""
         self._latest: dict[str, Heard] = {}
         self._rows = {kind: Ring(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
         self._innovations = Keyed(MOST_INNOVATIONS, "doodd")

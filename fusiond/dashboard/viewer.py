@@ -114,6 +114,7 @@ class Viewer:
             "link": asdict(hub.link),
             "vehicle": name,
             "vehicles": names,
+            "refused": hub.refused,
             **new,
         }
 

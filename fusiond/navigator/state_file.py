@@ -83,7 +83,10 @@ def write_state(path: Path, text: bytes, durable: bool) -> None:
     """
     temporary = path.with_name(path.name + ".new")
     with contextlib.suppress(FileNotFoundError):
-        temporary.unlink()
+        try:
+            temporary.unlink()  # a link itself, never what it names
+        except IsADirectoryError:
+            temporary.rmdir()
     with temporary.open("xb") as file:
         file.write(CHECK % zlib.crc32(text) + text[1:])
         if durable:

@@ -4,12 +4,17 @@ The rate is bounded by a token bucket: it holds `BURST` tokens, gains `RATE_HZ` 
 command takes one. A command without a token is not read; the first of a row is answered, the row
 ends when the bucket is full again. Every command and every reply costs the tick's own loop time, so
 a client that has run wild costs an addition and a comparison each.
+
+A command is carried out once. MQTT's QoS 1 delivers at least once, a bridge or a script repeats:
+what comes again under a name and an id that were carried out is refused. A broker delivers a
+retained command at each subscription, and marks it: it is refused by that mark, whatever it says.
+To a client that is subscribed already it comes unmarked, is carried out, and refused from then on.
 """
 
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 
 from fusiond.outputs.commands import (
@@ -18,6 +23,7 @@ from fusiond.outputs.commands import (
     CommandRefusedError,
     Handler,
     parse,
+    request_id,
 )
 from fusiond.outputs.messages.base import stamp
 from fusiond.outputs.messages.reply import ReplyMessage
@@ -25,6 +31,8 @@ from fusiond.outputs.messages.reply import ReplyMessage
 # What a person means: a few clicks a second, and a script that sends a screenful at once.
 RATE_HZ = 5.0
 BURST = 20.0
+REMEMBERED = 1000
+"""Commands whose ids are kept: 200 s of them at the greatest rate; 100 kB."""
 # The longest command name is 13 characters; of what is none so much is repeated.
 _NAME_SHOWN = 40
 
@@ -32,7 +40,8 @@ _NAME_SHOWN = 40
 class CommandIntake:
     """Answers commands; `allowed` are those that the configuration lists.
 
-    `counters`: `mqtt_commands`, `mqtt_commands_refused`, `mqtt_commands_limited`. `on_event` hears
+    `counters`: `mqtt_commands`, `mqtt_commands_limited`, `mqtt_commands_refused`, and of these
+    `mqtt_commands_repeated` and `mqtt_commands_retained`. `on_event` hears
     `mqtt_command_failed`, `now` is monotonic, s.
     """
 
@@ -53,6 +62,7 @@ class CommandIntake:
         self._now = now
         self._tokens, self._filled_s = BURST, now()
         self._limiting = False
+        self._done: OrderedDict[tuple[str, str], None] = OrderedDict()
 
     def answer(self, name: str, payload: bytes, retained: bool) -> ReplyMessage | None:
         """Carry the command out; the reply, None for one of too many that is not answered."""
@@ -71,32 +81,42 @@ class CommandIntake:
         return self._reply(name, None, False, text)
 
     def _answer(self, name: str, payload: bytes, retained: bool) -> ReplyMessage:
-        request_id: str | None = None
+        sent_id: str | None = None
         ok = False
         try:
             if name not in COMMANDS:
                 raise BadCommandError(f"no such command; there are {', '.join(COMMANDS)}")
+            if retained:
+                self._counters["mqtt_commands_retained"] += 1
+                raise BadCommandError("commands must not be retained", request_id(payload))
             command = parse(name, payload)
-            request_id = command.id
+            sent_id = command.id
             if name not in self._allowed:
                 raise CommandRefusedError("not listed in mqtt.commands of the configuration")
-            if retained:
-                # It would be carried out again at every connection.
-                raise CommandRefusedError("commands must not be retained")
+            if (name, sent_id) in self._done:
+                self._counters["mqtt_commands_repeated"] += 1
+                text = "carried out already under this id: nothing done; a new command has a new id"
+                raise CommandRefusedError(text)
             text = self._handler(command)
             ok = True
+            self._remember(name, sent_id)
         except BadCommandError as error:
-            request_id, text = error.id, str(error)
+            sent_id, text = error.id, str(error)
         except CommandRefusedError as error:
             text = str(error)
         except Exception as error:  # a fault of ours must not cost the connection
             text = f"failed: {error!r}"
             self._on_event("mqtt_command_failed", f"{name}: {error!r}")
         self._counters["mqtt_commands" if ok else "mqtt_commands_refused"] += 1
-        return self._reply(name, request_id, ok, text)
+        return self._reply(name, sent_id, ok, text)
 
-    def _reply(self, name: str, request_id: str | None, ok: bool, text: str) -> ReplyMessage:
+    def _remember(self, name: str, sent_id: str) -> None:
+        self._done[name, sent_id] = None
+        if len(self._done) > REMEMBERED:
+            self._done.popitem(last=False)
+
+    def _reply(self, name: str, sent_id: str | None, ok: bool, text: str) -> ReplyMessage:
         t_utc, t_ms = stamp(self._utc_now())
         return ReplyMessage(
-            t_utc=t_utc, t_ms=t_ms, id=request_id, command=name[:_NAME_SHOWN], ok=ok, text=text
+            t_utc=t_utc, t_ms=t_ms, id=sent_id, command=name[:_NAME_SHOWN], ok=ok, text=text
         )

@@ -120,15 +120,23 @@ class _Id(BaseModel):
 def parse(name: str, payload: bytes) -> Command:
     """The command `name` of a JSON payload. Raises `BadCommandError` for anything else."""
     if len(payload) > MAX_PAYLOAD_BYTES:
-        raise BadCommandError(f"{len(payload)} bytes, at most {MAX_PAYLOAD_BYTES} are read")
+        # Of a packet that is far too long the end was never kept (outputs.packet_limit).
+        text = f"{len(payload)} bytes or more, at most {MAX_PAYLOAD_BYTES} are read"
+        raise BadCommandError(text)
     try:
         return COMMANDS[name].model_validate_json(payload)
     except ValidationError as error:
         text = "; ".join(
             f"{'.'.join(map(str, e['loc'])) or 'payload'}: {e['msg']}" for e in error.errors()[:5]
         )
+    raise BadCommandError(text, request_id(payload))
+
+
+def request_id(payload: bytes) -> str | None:
+    """The request's `id` where it can be read, whatever else the payload is."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        return None
     try:
-        request_id = _Id.model_validate_json(payload).id
+        return _Id.model_validate_json(payload).id
     except ValidationError:
-        request_id = None
-    raise BadCommandError(text, request_id)
+        return None

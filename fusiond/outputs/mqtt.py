@@ -21,9 +21,9 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access
+from fusiond.outputs import broker_access, packet_limit
 from fusiond.outputs.command_intake import CommandIntake
-from fusiond.outputs.commands import Handler
+from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.events import MOST_KEPT, events_message
 from fusiond.outputs.reconnecting import Reconnecting
@@ -189,7 +189,7 @@ class MqttPublisher:
 
     def _client(self) -> aiomqtt.Client:
         options = self._options
-        return aiomqtt.Client(
+        client = aiomqtt.Client(
             options.host,
             options.port,
             username=options.username,
@@ -202,6 +202,8 @@ class MqttPublisher:
             logger=_LOG,
             tls_context=self._tls,
         )
+        packet_limit.limit(client, MAX_PAYLOAD_BYTES)
+        return client
 
     async def _serve(self, client: aiomqtt.Client) -> str:
         """Send and receive until the connection fails; the reason it did."""

@@ -217,9 +217,14 @@ def log_stem(vehicle: str, utc_ns: int, run: str) -> str:
 
 
 def logs_of(folder: Path, vehicle: str) -> list[Path]:
-    """The logs of one vehicle in a folder: those alone are ever removed."""
+    """The logs of one vehicle in a folder: those alone are ever counted and removed, and no link
+    or folder of such a name, which is none that was written here."""
     named = re.compile(rf"{re.escape(vehicle)}_\d{{8}}T\d{{6}}Z_[0-9a-f]{{8}}_\d{{4}}{SUFFIX}")
-    return [path for path in folder.iterdir() if named.fullmatch(path.name)]
+    return [
+        path
+        for path in folder.iterdir()
+        if named.fullmatch(path.name) and path.is_file() and not path.is_symlink()
+    ]
 
 
 def _age(path: Path) -> tuple[int, str]:

@@ -1,30 +1,45 @@
 """Reading logs: whole, cut off, damaged, and several parts of one recording as one.
 
 A file is read from its beginning and needs no index: what a power cut has left of it is read up to
-its last whole chunk. A chunk that is damaged is passed over. `problems` says what was wrong.
+its last whole chunk. A chunk that is damaged is passed over, and one that would become more than a
+chunk of ours can be: 57 kB of such a file were 3.3 GB. `problems` says what was wrong.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import struct
+import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, BinaryIO, NamedTuple, cast
 
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import StreamReader
 
 from fusiond.recording.channels import INPUT
 from fusiond.recording.log_file import FORMAT, METADATA
-from fusiond.recording.records import DamagedRecordError, Record, unpack
+from fusiond.recording.records import DamagedRecordError, Record, check, unpack
 
-RECORD_LIMIT = 1 << 30
+RECORD_LIMIT = 1 << 26
 """A damaged length must not ask for all the memory: a chunk has 128 KiB, an attachment a few MB."""
+CHUNK_LIMIT = 1 << 24
+"""Bytes of a chunk, decompressed: ours have 128 KiB and a message more; other writers, by whom logs
+were merged, make 4 MiB (the tool `mcap`)."""
+RATIO_LIMIT, RATIO_FREE = 100, 1 << 18
+"""A chunk may become so many times as long, and two chunks of ours more: those of a drive are 4 to
+5 times as long, one of nothing but 0xD3 from a line 188. A small file is no large recording."""
+WINDOW_LIMIT = 1 << 23
+"""What a decompressor of zstd must be ready to hold of the past (RFC 8878, section 3.1.1.1.2)."""
+LATEST_NS = 253_402_300_800 * 1_000_000_000
+"""The end of 9999, POSIX: what is told of a log has four digits for a year."""
+MOST_PROBLEMS = 100
+"""Sentences on what is wrong with a log; a file can be wrong in as many ways as it has bytes."""
 _DAMAGED = (EOFError, struct.error, McapError, ValueError, zstandard.ZstdError, RuntimeError)
 
 
@@ -49,8 +64,11 @@ class LogMessage(NamedTuple):
     sequence: int
 
     def json(self) -> Any:
-        """What it says, of a channel other than the input."""
-        return json.loads(self.data)
+        """What it says, of a channel other than the input. Raises ValueError."""
+        try:
+            return json.loads(self.data)
+        except RecursionError:
+            raise ValueError("JSON that is nested too deep") from None
 
 
 @dataclass
@@ -102,20 +120,33 @@ class Log:
             yield from _messages(path, wanted, self._problem)
 
     def records(self) -> Iterator[Record]:
-        """The input, record by record; a gap in it ends up in `problems`."""
-        last = 0
+        """The input, record by record; a gap in it ends up in `problems`, and so does a record that
+        none of this log's is, which is left out."""
+        last, sources = 0, len(self.about.sources)
+        first_ns, end_ns = -self.about.epoch_ns, LATEST_NS - self.about.epoch_ns
         for message in self.messages(INPUT):
             if last and message.sequence != last + 1:
                 lost = message.sequence - last - 1
                 self._problem(f"{lost} messages of input are missing after message {last}")
             last = message.sequence
-            try:
-                yield from unpack(message.data)
-            except DamagedRecordError as error:
-                self._problem(f"message {message.sequence} of input: {error}")
+            found = unpack(message.data)
+            while True:
+                try:
+                    record = next(found)
+                    check(record, sources)
+                    if not first_ns <= record.t_ns < end_ns or not all(
+                        first_ns <= t_ns < end_ns for _, t_ns, _ in record.readings
+                    ):
+                        raise DamagedRecordError("a time that cannot be")
+                except StopIteration:
+                    break
+                except DamagedRecordError as error:
+                    self._problem(f"message {message.sequence} of input: {error}")
+                    continue
+                yield record
 
     def _problem(self, text: str) -> None:
-        if text not in self.problems:
+        if text not in self.problems and len(self.problems) < MOST_PROBLEMS:
             self.problems.append(text)
 
     @property
@@ -139,6 +170,11 @@ def described_by(path: Path) -> About:
     if about.metadata.get("format") != FORMAT:
         found = about.metadata.get("format")
         raise LogError(f"{path}: format {found}; this version reads {FORMAT}")
+    try:
+        _ = about.metadata["run"], about.metadata["vehicle"], int(about.metadata["part"])
+        _ = about.epoch_ns, [name.encode() for name in about.sources]
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise LogError(f"{path}: its metadata {METADATA!r} are damaged: {error!r}") from None
     return about
 
 
@@ -154,7 +190,7 @@ def _messages(
     for record in _records(path, problem):
         if isinstance(record, Chunk):
             try:
-                yield from _opened(record, topics, name)
+                yield from _opened(_decompressed(record), topics, name)
             except _DAMAGED as error:
                 problem(f"{path.name}: a damaged chunk is left out: {error}")
         elif isinstance(record, Channel):
@@ -164,16 +200,14 @@ def _messages(
 
 
 def _opened(
-    chunk: Chunk, topics: Mapping[int, str | None], name: Callable[[int, str], None]
-) -> list[LogMessage]:
+    data: bytes, topics: Mapping[int, str | None], name: Callable[[int, str], None]
+) -> Iterator[LogMessage]:
     """The messages of a chunk whose channel has a topic; `name` is told its channels.
 
     A chunk is read by its bytes: an object of each message, of which most are of no interest, costs
     more than all else of reading a log. Raises one of `_DAMAGED`.
     """
-    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    data = stream.read(length)
-    found: list[LogMessage] = []
+    length = len(data)
     at = 0
     while at < length:
         opcode, size = _RECORD.unpack_from(data, at)
@@ -185,12 +219,53 @@ def _opened(
             channel, sequence, log_time = _MESSAGE.unpack_from(data, at)
             topic = topics.get(channel)
             if topic is not None:
-                found.append(LogMessage(topic, log_time, data[at + _MESSAGE.size : end], sequence))
+                yield LogMessage(topic, log_time, data[at + _MESSAGE.size : end], sequence)
         elif opcode == Opcode.CHANNEL:
             channel, _, count = _CHANNEL.unpack_from(data, at)
             name(channel, data[at + _CHANNEL.size : at + _CHANNEL.size + count].decode())
         at = end
-    return found
+
+
+def _decompressed(chunk: Chunk) -> bytes:
+    """A chunk's bytes, of which it has said truly how many they are. Raises one of `_DAMAGED`.
+
+    Neither that number nor what a frame says of itself is believed before it is looked at: no more
+    is decompressed than a chunk may have.
+    """
+    said = chunk.uncompressed_size
+    most = min(CHUNK_LIMIT, RATIO_FREE + RATIO_LIMIT * len(chunk.data))
+    if said > most:
+        raise ValueError(f"{said} bytes when decompressed, at most {most} are read")
+    match chunk.compression:
+        case "":
+            data = chunk.data
+        case "zstd":
+            unzipping = zstandard.ZstdDecompressor(max_window_size=WINDOW_LIMIT)
+            with unzipping.stream_reader(chunk.data) as stream:
+                data = stream.read(said + 1)
+        case "lz4":
+            lz4 = importlib.import_module("lz4.frame")
+            data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=said + 1)
+        case other:
+            raise ValueError(f"compressed by {other!r}, which is not read")
+    if len(data) != said:
+        raise ValueError(f"{len(data)} bytes when decompressed, not {said}")
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("its checksum is wrong")
+    return data
+
+
+class _Bounded:
+    """A file of which no more is asked at once than a record may have: a length inside a record is
+    believed by mcap, which looks at the record's own alone."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def read(self, count: int) -> bytes:
+        if count > RECORD_LIMIT:
+            raise EndOfFile
+        return self._file.read(count)
 
 
 class _Unindexed(StreamReader):
@@ -203,7 +278,8 @@ class _Unindexed(StreamReader):
 def _records(path: Path, problem: Callable[[str], None]) -> Iterator[McapRecord]:
     """Records up to the summary, chunks unopened; what is cut off goes to `problem`."""
     with path.open("rb") as file:
-        records = _Unindexed(file, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
+        bounded = cast(IO[bytes], _Bounded(file))
+        records = _Unindexed(bounded, emit_chunks=True, record_size_limit=RECORD_LIMIT).records
         try:
             first = next(records, None)
         except _DAMAGED as error:

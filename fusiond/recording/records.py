@@ -26,6 +26,7 @@ Records stand in the order in which the daemon handled them: a log is played by 
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
@@ -63,6 +64,9 @@ class Kind(IntEnum):
 
 
 _KINDS = {int(kind): kind for kind in Kind}
+_OF_DAEMON = frozenset({Kind.START, Kind.TICK, Kind.COMMAND})
+_OF_JSON = frozenset({Kind.START, Kind.COMMAND})
+_OF_TEXT = frozenset({Kind.CLOSE, Kind.CONTROLLER, Kind.TIMER})
 
 
 class Record(NamedTuple):
@@ -121,6 +125,40 @@ def unpack(data: bytes) -> Iterator[Record]:
             yield Record(_KINDS[kind], source, t_ns, payload, readings)
     except (struct.error, KeyError) as error:
         raise DamagedRecordError(str(error)) from error
+
+
+def check(record: Record, sources: int) -> None:
+    """Raise `DamagedRecordError` for a record that nobody writes who has so many sources."""
+    kind, source, _, payload, _ = record
+    if kind in _OF_DAEMON:
+        if source != NO_SOURCE:
+            raise DamagedRecordError(f"a {kind.name.lower()} of source {source}")
+    elif source >= sources:
+        raise DamagedRecordError(f"source {source} of {sources}")
+    if kind is Kind.READ:  # most of all
+        return
+    if kind is Kind.FRAME:
+        if len(payload) < _FRAME.size:
+            raise DamagedRecordError("a frame that is cut")
+    elif kind is Kind.TICK:
+        if len(payload) != _TICK.size:
+            raise DamagedRecordError("a tick of another length")
+    elif kind in _OF_JSON:
+        _object(payload)
+    elif kind in _OF_TEXT:
+        try:
+            payload.decode()
+        except UnicodeDecodeError as error:
+            raise DamagedRecordError(str(error)) from None
+
+
+def _object(payload: bytes) -> None:
+    try:
+        said = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise DamagedRecordError(f"no JSON: {error}") from None
+    if not isinstance(said, dict):
+        raise DamagedRecordError("no JSON object")
 
 
 def frame_payload(frame: CanFrame) -> bytes:

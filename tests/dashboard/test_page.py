@@ -15,7 +15,7 @@ import pytest
 
 from fusiond.dashboard import viewer
 from fusiond.dashboard.broker import Access, Broker
-from fusiond.dashboard.hub import LARGEST_BYTES, MOST_VEHICLES, Hub
+from fusiond.dashboard.hub import GIVES_WAY_S, LARGEST_BYTES, MOST_VEHICLES, Hub
 from fusiond.dashboard.player import Player
 from tests.broker import Broker as Mosquitto
 from tests.broker import listening
@@ -261,17 +261,77 @@ async def test_every_file_of_the_page_is_served_and_asks_nobody_else() -> None:
 
 def test_what_cannot_be_read_is_counted_and_left() -> None:
     hub = make_hub()
-    too_deep = (b"[" * 60_000, b'{"a": ' + b"[" * 17 + b"]" * 17 + b"}")
-    for bad in (b"{", b"\xff", b'{"lat_deg": NaN}', b"", b'{"lat_deg": -1e999}', *too_deep):
+    for bad in (b"{", b"\xff", b'{"lat_deg": NaN}', b"", b'{"lat_deg": -1e999}', b"[" * 60_000):
         hub.take("truck", "nav", bad)
+    digits = b'{"t_ms": ' + b"9" * 400 + b"}"
+    hub.take("truck", "nav", digits)
     hub.take("truck", "nav", b" " * (LARGEST_BYTES + 1))
     hub.take("t" * 65, "nav", b"{}")
-    assert hub.counters == {"malformed": 7, "too_large": 2}
+    hub.take("truck", "online", b"maybe")
+    hub.take("truck", "tracker", b"{")
+    refused = {"malformed": 7, "too_large": 2, "not_as_published": 1}
+    assert hub.counters == {**refused, "other_topic": 1}
     assert not hub.vehicles
     for k in range(MOST_VEHICLES + 3):
         hub.take(f"v{k}", "online", b"online")
     assert len(hub.vehicles) == MOST_VEHICLES
     assert hub.counters["too_many_vehicles"] == 3
+    last = f"v{MOST_VEHICLES + 2}/online: there are {MOST_VEHICLES} already"
+    kinds = {**refused, "too_many_vehicles": 3}
+    assert hub.refused == {"count": 13, "kinds": kinds, "last": last}
+
+
+def test_names_that_a_broker_has_kept_shut_out_nobody_who_speaks() -> None:
+    hub = make_hub()
+    clock = hub.now_s
+    assert isinstance(clock, Clock)
+    for k in range(MOST_VEHICLES + 100):
+        hub.take(f"junk{k}", "online", b"online", kept=True)
+    assert len(hub.vehicles) == MOST_VEHICLES
+    hub.take("truck", "online", b"online", kept=True)
+    assert "truck" not in hub.vehicles
+    hub.take("truck", "status", payload("status"))
+    assert "truck" in hub.vehicles
+    for k in range(MOST_VEHICLES - 1):  # who speaks, too, but does not push out who speaks
+        hub.take(f"talking{k}", "online", b"online")
+    hub.take("van", "status", payload("status"))
+    assert "van" not in hub.vehicles
+    clock.s += GIVES_WAY_S - 1.0
+    hub.take("truck", "status", payload("status"))
+    clock.s += 1.0
+    hub.take("van", "status", payload("status"))
+    assert {"truck", "van"} < set(hub.vehicles)
+    assert len(hub.vehicles) == MOST_VEHICLES
+
+
+# Each ended the dashboard, or what it sent to browsers.
+ATTACKS = {
+    "status": b'{"injected": 5}',
+    "health": b'{"sources": {"a": {"verdict": []}}}',
+    "innovations": b'{"t_ms": 1, "innovations": [{"source": "a", "outcome": "b", "t_ms": '
+    + b"1"
+    + b"0" * 400
+    + b"}]}",
+    "nav": b'{"t_ms": 1e308, "lat_deg": 1e308}',
+}
+
+
+async def test_no_message_ends_the_page_and_it_says_what_was_refused(tmp_path: Path) -> None:
+    blind = b'{"t_ms": 1e308, "innovations": [{"source": "a", "outcome": "b", "t_ms": -1.7e308}]}'
+    with Mosquitto(tmp_path) as mosquitto:
+        async with listening(mosquitto) as (_, daemon):
+            for topic, attack in ATTACKS.items():  # retained: they meet each start
+                await daemon.publish(f"{BASE}/{topic}", attack, qos=1, retain=True)
+            hub = Hub(asyncio.get_running_loop().time, "test")
+            broker = Broker(Access("127.0.0.1", mosquitto.port), hub)
+            async with at_work(hub, broker.run) as address, browsing(address) as page:
+                await page.until(lambda p: p.last.get("refused", {}).get("count") == len(ATTACKS))
+                assert page.last["vehicles"] == []
+                await daemon.publish(f"{BASE}/innovations", blind, qos=1)
+                await daemon.publish(f"{BASE}/status", payload("status"), qos=1)
+                await page.until(lambda p: "status" in p.heard)
+                assert page.last["refused"]["last"] == "truck/innovations: t_ms: no integer"
+                assert page.last["refused"]["kinds"] == {"malformed": 1, "not_as_published": 4}
 
 
 # ------------------------------------------------------------------ a recording

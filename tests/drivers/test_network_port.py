@@ -194,9 +194,23 @@ async def test_datagrams_of_the_first_sender_alone() -> None:
 
 
 async def test_a_datagram_is_read_whole_and_answered_to_who_sent_it() -> None:
-    port, received = free_port(), list[bytes]()
+    port, received, turns, stamps = free_port(), list[bytes](), set[int](), set[int]()
+    turn = 0
+
+    def take(data: bytes, t_ns: int) -> None:
+        received.append(data)
+        turns.add(turn)
+        stamps.add(t_ns)
+
+    async def others() -> None:
+        nonlocal turn
+        while True:
+            turn += 1
+            await asyncio.sleep(0)
+
     line = SerialLine(f"udp://127.0.0.1:{port}", 9600, open_port=open_port)
-    task = asyncio.create_task(line.run(lambda data, t_ns: received.append(data)))
+    task = asyncio.create_task(line.run(take))
+    beside = asyncio.create_task(others())
     await until(lambda: line.is_open)
     assert not line.write(b"to whom?")
     with sender() as out:
@@ -206,6 +220,9 @@ async def test_a_datagram_is_read_whole_and_answered_to_who_sent_it() -> None:
         await until(lambda: sum(map(len, received)) == len(datagram))
         assert b"".join(received) == datagram
         assert max(map(len, received)) == READ_BYTES
+        assert len(turns) == len(received) == 4  # others had a turn between any two pieces
+        assert len(stamps) == 1
+        beside.cancel()
         assert line.write(b"corrections")
         assert await asyncio.get_running_loop().sock_recv(out, 100) == b"corrections"
     task.cancel()

@@ -12,10 +12,13 @@ from pathlib import Path
 import pytest
 
 from drivers.base import Backoff
+from drivers.byte_budget import BURST, LINE_BYTES_S
 from drivers.serial_line import PENDING_WRITE_BYTES, READ_BYTES, SerialLine
 from tests.drivers.at_work import at_work
 from tests.patience import until
 from tests.pty_device import Device
+
+FLOOD = 200_000
 
 
 class Host:
@@ -168,15 +171,20 @@ async def test_flood_leaves_the_loop_its_turns(device: Device, host: Host) -> No
     thread = threading.Thread(target=flood, daemon=True)
     async with running(host):
         await until(lambda: host.line.is_open)
+        began_s = asyncio.get_running_loop().time()
         thread.start()
         turns = 0
-        while host.line.counters["bytes_in"] < 2_000_000:
+        while host.line.counters["bytes_in"] < FLOOD:
             await asyncio.sleep(0)
             turns += 1
+        read = host.line.counters["bytes_in"]
+        took_s = asyncio.get_running_loop().time() - began_s
         stop.set()
         await until(lambda: not thread.is_alive())
     assert max(size for size, _ in host.reads) <= READ_BYTES
-    assert turns >= 2_000_000 // READ_BYTES  # other work had a turn between any two reads
+    assert turns >= FLOOD // READ_BYTES  # other work had a turn between any two reads
+    assert host.line.counters["paused"] > 0
+    assert read <= BURST + LINE_BYTES_S * took_s + 2 * READ_BYTES
 
 
 async def test_stamps_come_from_the_given_clock(device: Device, tmp_path: Path) -> None:

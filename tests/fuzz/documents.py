@@ -1,4 +1,4 @@
-"""What is fuzzed besides streams: commands, files of state, tables.
+"""What is fuzzed besides streams: commands, messages to the dashboard, files of state, logs, CSV.
 
 Each is read, or refused by the one exception that says why. The first byte of an input chooses
 which of several readers has it.
@@ -6,7 +6,9 @@ which of several readers has it.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,6 +17,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from fusiond.dashboard.hub import REFUSALS, Hub
+from fusiond.dashboard.schemas import topics
 from fusiond.files import tables
 from fusiond.files.csv_tables import TableError
 from fusiond.live.warm_keeper import KEPT_STATE
@@ -22,6 +26,13 @@ from fusiond.navigator.saved_calibration import SavedCalibration
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.state_file import DamagedStateError, read_state, write_state
 from fusiond.outputs.commands import COMMANDS, BadCommandError, parse
+from fusiond.recording.channels import CHANNELS
+from fusiond.recording.info import info
+from fusiond.recording.log_file import About, LogFile
+from fusiond.recording.reader import MOST_PROBLEMS, Log, LogError
+from fusiond.recording.records import NO_SOURCE, Kind, Record, pack
+from fusiond.recording.records import input_of as kind_of_input
+from tools.topic_schemas import SHOWN
 
 _MEMORY = Path("/dev/shm")
 _SCRATCH = tempfile.TemporaryDirectory(prefix="fuzz-", dir=_MEMORY if _MEMORY.is_dir() else None)
@@ -48,6 +59,76 @@ def commands(data: bytes) -> None:
         numbers = [value for value in command.model_dump().values() if isinstance(value, float)]
         assert all(map(math.isfinite, numbers))
     assert request_id is None or len(request_id) <= 64
+
+
+_TOPICS = ("online", *SHOWN)
+_VIEWED = ("received", "other_topic", *REFUSALS)
+
+
+def hub(data: bytes) -> None:
+    """Messages to the dashboard, a line each: every one is counted by one name, and what browsers
+    are sent is JSON without NaN, of the published schemas. Of the choice four bits are the topic of
+    the first, and the high one says that the broker had kept them."""
+    choice, text = input_of(data)
+    payloads = text.split(b"\n")[:8]
+    now_s = 100.0
+    taking = Hub(lambda: now_s, "fuzz")
+    for place, payload in enumerate(payloads):
+        now_s += 0.4
+        topic = _TOPICS[((choice & 0xF) + place) % len(_TOPICS)]
+        taking.take(f"v{choice >> 4 & 1 & place}", topic, payload, kept=bool(choice & 0x80))
+    assert sum(taking.counters[name] for name in _VIEWED) == len(payloads)
+    assert taking.counters.total() == len(payloads)
+    frame: dict[str, Any] = {"refused": taking.refused}
+    for vehicle in taking.vehicles.values():
+        frame[vehicle.name] = new = vehicle.since(0)
+        for topic, heard in new["messages"].items():
+            if topic in SHOWN:
+                assert topics()[topic](heard["said"]) == heard["said"]
+    json.dumps(frame, allow_nan=False)
+
+
+def _head(more: bytes) -> bytes:
+    """A log's beginning that describes it, then records of MCAP."""
+    path = INPUT_FILE.with_suffix(".mcap")
+    path.unlink(missing_ok=True)
+    about = {"format": "1", "run": "r", "part": "0", "vehicle": "v", "epoch_ns": "1000"}
+    file = LogFile(path, About({**about, "sources": '["a", "b"]'}), 1)
+    file.write(CHANNELS["/fusiond/input"], 1, more)
+    file.write(CHANNELS["/event"], 1, b"{}")
+    file.sync()
+    file.abandon()
+    return path.read_bytes()
+
+
+_HEAD = _head(pack(Record(Kind.TICK, NO_SOURCE, 5, bytes(32))))
+
+
+def log(data: bytes) -> None:
+    """A file that may be a log is read, told of and cut, or LogError says why not. Of the choice:
+    as it is, behind a sound head, or as the input of a log that is sound otherwise."""
+    choice, stream = input_of(data)
+    path = INPUT_FILE.with_suffix(".mcap")
+    match choice % 3:
+        case 0:
+            path.write_bytes(stream)
+        case 1:
+            path.write_bytes(_HEAD + stream)
+        case _:
+            _head(stream)
+    try:
+        found = Log([path])
+        told = info(found)
+        for record in found.records():
+            if record.kind not in (Kind.START, Kind.TICK, Kind.COMMAND):
+                kind_of_input(record)
+    except LogError:
+        return
+    json.dumps(told)
+    assert len(told["problems"]) <= MOST_PROBLEMS
+    for message in found.messages("/event"):
+        with contextlib.suppress(ValueError):
+            message.json()
 
 
 STATES: tuple[TypeAdapter[Any], ...] = (

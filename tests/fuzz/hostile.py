@@ -165,6 +165,8 @@ _FALSE = {
     "RTCM of 1023": b"\xd3\x03\xff\x46\x70",
     "RTCM of 19": b"\xd3\x00\x13\x3e\xd0",
     "UBX and RTCM": b"\xb5\x62\x02\x15\x00\x20\xd3\x03\xff\x46\x70",
+    "0xD3": b"\xd3",
+    "0xB5": b"\xb5",
     "dollars": b"$",
     "no checksum": b"$GPGGA,",
     "bad checksums": b"$GPGGA,1*00",

@@ -16,6 +16,7 @@ class Parser(NamedTuple):
 _NMEA = ("decoder", "epochs", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
 _WORDS = ("beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes", "weeks")
+_HUB = ("advice", "history", "hub", "schemas", "vehicle")
 
 PARSERS = {
     "splitter": Parser(("drivers.nmea.framing",), 128),
@@ -27,6 +28,8 @@ PARSERS = {
     "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 162),
     "ntrip": Parser(("drivers.ntrip.reply",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),
+    "hub": Parser(tuple(f"fusiond.dashboard.{module}" for module in _HUB), 512),
+    "log": Parser(tuple(f"fusiond.recording.{m}" for m in ("info", "reader", "records")), 400),
     "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
     "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
 }

@@ -32,7 +32,7 @@ from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
 from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, ubx
-from tests.fuzz.documents import commands, csv, input_of, state
+from tests.fuzz.documents import commands, csv, hub, input_of, log, state
 
 EARLIEST = date(2014, 1, 1)
 
@@ -361,5 +361,5 @@ def can(data: bytes) -> None:
 
 _STREAMS = (splitter, nmea, raw, words, rdss_binary, rdss_text, can, ntrip)
 TARGETS: dict[str, Callable[[bytes], None]] = {
-    one.__name__: one for one in (*_STREAMS, commands, state, csv)
+    one.__name__: one for one in (*_STREAMS, commands, hub, log, state, csv)
 }

@@ -33,6 +33,7 @@ from fusiond.navigator.saved_state import (
     save_state,
 )
 from fusiond.navigator.state_file import MOST_BYTES, DamagedStateError
+from tests.unprivileged import as_a_user_without_rights
 
 S = 1_000_000_000
 NAVIGATING = Solution(
@@ -147,6 +148,77 @@ async def test_a_disk_that_fails_is_told_and_costs_nothing(
     await kept.tick(0.0, 0.0)
     await kept.keeper.close(kept.at(0.0), confirmed=True)
     assert [r.getMessage().partition(":")[0] for r in caplog.records] == ["state not saved"] * 2
+
+
+async def test_a_user_who_may_not_write_there_is_told_and_navigates(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.WARNING, logger="fusiond")
+    with as_a_user_without_rights() as folder:
+        path = folder / "state.json"
+        save_state(path, SavedState(time.time(), (0.53, 1.99, 38.0), 3.0, 0.7, 0.05))
+        before = path.read_bytes()
+        folder.chmod(0o555)
+        kept = Kept(path)
+        assert kept.keeper.load() is not None
+        await kept.tick(0.0, 0.0)
+        await kept.tick(0.01, 2.0 * FORGET_SPEED_M_S)
+        assert path.read_bytes() == before
+        words = [r.getMessage() for r in caplog.records]
+        assert [text.partition(":")[0] for text in words] == [
+            "state not saved",
+            "state not removed",
+        ]
+        assert all("Permission denied" in text for text in words)
+        path.chmod(0o000)
+        locked = Kept(path)
+        assert locked.keeper.load() is None
+        [(code, text)] = locked.events
+        assert code == "saved_state_damaged"
+        assert "it stays: Permission denied" in text
+
+
+async def test_a_link_in_its_place_is_read_and_replaced_and_what_it_names_is_left(
+    kept: Kept, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere" / "state.json"
+    elsewhere.parent.mkdir()
+    save_state(elsewhere, SavedState(time.time(), (0.53, 1.99, 38.0), 3.0, 0.1, 0.05))
+    before = elsewhere.read_bytes()
+    kept.path.symlink_to(elsewhere)
+    state = kept.keeper.load()
+    assert state is not None
+    assert state.yaw_rad == 0.1
+    kept.path.with_name("state.json.new").symlink_to(elsewhere)  # what is written first
+    await kept.tick(0.0, 0.0)
+    assert elsewhere.read_bytes() == before
+    assert not kept.path.is_symlink()
+    state = Kept(kept.path).keeper.load()
+    assert state is not None
+    assert state.yaw_rad == NAVIGATING.rpy_rad[2]
+
+
+async def test_a_link_that_leads_nowhere_is_no_state_and_gives_way(
+    kept: Kept, tmp_path: Path
+) -> None:
+    kept.path.symlink_to(tmp_path / "unplugged" / "state.json")
+    assert kept.keeper.load() is None
+    assert kept.events == []
+    await kept.tick(0.0, 0.0)
+    assert not kept.path.is_symlink()
+    assert Kept(kept.path).keeper.load() is not None
+
+
+async def test_what_stands_where_it_is_written_first_gives_way(kept: Kept) -> None:
+    """Left by a power cut, or put there: a folder, a pipe that nobody reads, half a state."""
+    new = kept.path.with_name("state.json.new")
+    for put in (Path.mkdir, os.mkfifo, Path.touch):
+        put(new)
+        again = Kept(kept.path)
+        await again.tick(0.0, 0.0)
+        assert again.keeper.load() is not None
+        assert not new.exists()
+        kept.path.unlink()
 
 
 def never(code: str, text: str) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import sys
+import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fusiond.outputs.command_intake import BURST, CommandIntake
+from fusiond.outputs.command_intake import BURST, REMEMBERED, CommandIntake
 from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
 from fusiond.outputs.topics import EVENT, NAV
 from tests.broker import Broker, Listener, listening
@@ -125,8 +127,9 @@ async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(tmp_path
             await listener.until(heard("event"))
             # Commands and replies keep their order: whoever has the reply to a later one has all of
             # the flood's. One of too many is not answered, so it is asked for until it is.
-            while "later" not in [r["id"] for r in replies(listener)]:
-                await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"later"}', qos=1)
+            while not any(r["id"] and r["id"].startswith("later") for r in replies(listener)):
+                again = json.dumps({"id": f"later{sent}"})
+                await client.publish(f"{BASE}/cmd/reset_filter", again, qos=1)
                 it.publisher.take(NAV, nav(float(sent)))
                 sent += 1
                 await listener.until(lambda li, n=sent: len(heard("nav")(li)) >= n)
@@ -136,7 +139,8 @@ async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(tmp_path
     assert it.publisher.counters["mqtt_commands_limited"] > 0
     assert len(carried_out) >= BURST
     # With QoS 1 a reply may come twice, where the host was too busy to confirm it in time.
-    assert {r["id"] for r in answers if r["ok"]} - {"later"} == carried_out
+    answered = {r["id"] for r in answers if r["ok"]}
+    assert {one for one in answered if one.startswith("flood")} == carried_out
     assert len(refused) < 5
     assert all("too many commands" in r["text"] for r in refused)
 
@@ -165,8 +169,10 @@ def test_the_bucket_fills_at_its_rate_and_the_first_of_a_row_is_answered() -> No
         lambda: now_s,
     )
 
+    ids = itertools.count()
+
     def ask() -> bool | None:
-        reply = intake.answer("reset_filter", b'{"id":"1"}', False)
+        reply = intake.answer("reset_filter", b'{"id":"%d"}' % next(ids), False)
         return None if reply is None else reply.ok
 
     assert [ask() for _ in range(23)] == [True] * 20 + [False, None, None]
@@ -175,3 +181,110 @@ def test_the_bucket_fills_at_its_rate_and_the_first_of_a_row_is_answered() -> No
     now_s += 10.0
     assert [ask() for _ in range(22)] == [True] * 20 + [False, None]
     assert counters == {"mqtt_commands": 45, "mqtt_commands_limited": 7}
+
+
+def intake_of(taken: list[Command], counters: Counter[str]) -> CommandIntake:
+    """Everything is allowed, and the bucket is always full."""
+    ticks = itertools.count(step=10.0)
+    names = ("reset_filter", "request_fix")
+    return CommandIntake(
+        names, handler(taken), counters, lambda *_: None, lambda: UTC_NS, lambda: next(ticks)
+    )
+
+
+def test_a_command_that_comes_again_is_carried_out_once() -> None:
+    taken: list[Command] = []
+    counters: Counter[str] = Counter()
+    intake = intake_of(taken, counters)
+
+    def ok(name: str, request: str) -> bool:
+        reply = intake.answer(name, json.dumps({"id": request}).encode(), False)
+        assert reply is not None
+        assert reply.id == request
+        return reply.ok
+
+    assert ok("reset_filter", "a")
+    assert not ok("reset_filter", "a")
+    assert ok("request_fix", "a")  # another command
+    assert not ok("reset_filter", "no")  # refused: nothing was done, it may be asked again
+    assert not ok("reset_filter", "no")
+    assert counters == {
+        "mqtt_commands": 2,
+        "mqtt_commands_refused": 3,
+        "mqtt_commands_repeated": 1,
+    }
+    for k in range(REMEMBERED):
+        assert ok("reset_filter", f"b{k}")
+    assert not ok("reset_filter", "b0")
+    assert ok("reset_filter", "a")  # so long ago that nobody repeats it
+
+
+def test_a_retained_command_is_refused_by_its_mark_whatever_it_says() -> None:
+    taken: list[Command] = []
+    counters: Counter[str] = Counter()
+    intake = intake_of(taken, counters)
+    for payload, sent_id in ((b'{"id":"a"}', "a"), (b"{", None), (b'{"id":"b","more":1}', "b")):
+        reply = intake.answer("reset_filter", payload, True)
+        assert reply is not None
+        assert (reply.id, reply.ok) == (sent_id, False)
+        assert "retained" in reply.text
+    assert not taken
+    assert counters == {"mqtt_commands_refused": 3, "mqtt_commands_retained": 3}
+
+
+async def test_a_retained_command_is_carried_out_once_over_reconnections(tmp_path: Path) -> None:
+    """The broker delivers it unmarked to who is there, and marked to who comes later."""
+    taken: list[Command] = []
+    with Broker(tmp_path) as broker:
+        enabled = options(broker, commands=("reset_filter",))
+        async with listening(broker) as (listener, client):
+            async with running(enabled, on_command=handler(taken)):
+                await listener.until(heard("online"))
+                await asyncio.sleep(0.2)  # to subscribe
+                command = f"{BASE}/cmd/reset_filter"
+                await client.publish(command, b'{"id":"kept"}', qos=1, retain=True)
+                await listener.until(lambda li: len(heard("reply")(li)) == 1)
+            async with running(enabled, on_command=handler(taken)):
+                raw = await listener.until(lambda li: len(r := heard("reply")(li)) == 2 and r)
+            assert [json.loads(reply)["ok"] for reply in raw] == [True, False]
+            await client.publish(command, b"", qos=1, retain=True)
+    assert len(taken) == 1
+
+
+HUGE = """
+import sys
+import paho.mqtt.client as mqtt
+client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+client.connect("127.0.0.1", int(sys.argv[1]))
+client.loop_start()
+for name in ("cmd/reset_filter", "cmd/" + "n" * 60_000):
+    sent = client.publish("fusiond/truck/" + name, b" " * int(sys.argv[2]), qos=1, retain=True)
+    sent.wait_for_publish()
+"""
+
+
+async def test_a_message_of_megabytes_is_not_held_and_the_connection_goes_on(
+    tmp_path: Path,
+) -> None:
+    taken: list[Command] = []
+    size = 20_000_000
+    with Broker(tmp_path) as broker:
+        enabled = options(broker, commands=("reset_filter",), keepalive_s=60)
+        async with listening(broker, f"{BASE}/reply") as (listener, client):
+            async with running(enabled, on_command=handler(taken)) as it:
+                await it.until(lambda r: r.publisher.counters["mqtt_published"])
+                tracemalloc.start()
+                sender = await asyncio.create_subprocess_exec(
+                    *(sys.executable, "-c", HUGE, str(broker.port), str(size))
+                )
+                await sender.wait()
+                raw = await listener.until(lambda li: len(r := heard("reply")(li)) == 2 and r)
+                most = tracemalloc.get_traced_memory()[1]
+                tracemalloc.stop()
+                assert "at most 4096 are read" in json.loads(raw[0])["text"]
+                assert "no such command" in json.loads(raw[1])["text"]
+                await client.publish(f"{BASE}/cmd/reset_filter", b'{"id":"after"}', qos=1)
+                await listener.until(lambda li: len(heard("reply")(li)) == 3)
+                assert it.publisher.counters["mqtt_reconnects"] == 0
+            assert [command.id for command in taken] == ["after"]
+            assert most < 2_000_000

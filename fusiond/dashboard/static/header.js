@@ -1,6 +1,6 @@
 // One word for the state, why, since when, what to do; and the banner of a lost link.
 import { linkFault } from "./age.js";
-import { byId, element, hypot, known, mark, put, sigma, stretch, utc } from "./text.js";
+import { byId, element, hypot, known, mark, put, sigma, stretch, utc, whole } from "./text.js";
 
 const banner = byId("banner"),
   header = byId("state"),
@@ -59,6 +59,16 @@ function showVehicle(store) {
   if (several && document.activeElement !== choice) choice.value = store.vehicle;
 }
 
+// Messages that were not what their topic carries: how many, of which kind, why the last.
+function showRefused(store) {
+  const { count, kinds, last } = store.refused,
+    note = byId("refused");
+  note.hidden = count === 0;
+  put(note, `${whole(count)} ${count === 1 ? "message" : "messages"} refused`);
+  const parts = Object.entries(kinds).map(([kind, n]) => `${n} ${kind.replaceAll("_", " ")}`);
+  note.title = `${parts.join(", ")}; the last: ${last}`;
+}
+
 export function showHeader(store) {
   const fault = showBanner(store),
     lost = fault !== null && fault.kind !== "ended";
@@ -81,6 +91,7 @@ export function showHeader(store) {
   mark(byId("accuracy"), "old", lost || store.old("nav"));
   showAdvice(store);
   showVehicle(store);
+  showRefused(store);
   put(byId("utc"), `${utc(store.utcMs)} UTC`);
   mark(byId("utc"), "old", lost);
   const origin = store.hello ? store.hello.origin : "";

@@ -17,6 +17,7 @@ export class Store {
     this.vehicle = null;
     this.vehicles = [];
     this.answers = [];
+    this.refused = { count: 0, kinds: {}, last: "" };
   }
 
   clear() {
@@ -34,6 +35,7 @@ export class Store {
     this.frame = { now: frame.now, arrived: here(), speed };
     this.link = frame.link;
     this.vehicles = frame.vehicles;
+    this.refused = frame.refused;
     if (frame.vehicle !== this.vehicle || frame.first) this.clear();
     this.vehicle = frame.vehicle;
     Object.assign(this.heard, frame.messages);

@@ -1,6 +1,7 @@
 """What every message has: the instant that it speaks of, null while the daemon knows no UTC.
 
-A quantity that is not known is `null` (NaN here).
+A quantity that is not known is `null` (NaN here). The bounds of quantities stand in the published
+schemas alone: the daemon makes its messages of what it has itself, and a NaN is within no bound.
 """
 
 from __future__ import annotations
@@ -8,10 +9,30 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 Number = float | None
-Count = Annotated[int, Field(ge=0)]
+LARGEST_INTEGER = 2**53 - 1
+"""What every reader of JSON takes as it was written (RFC 8259, section 6)."""
+Count = Annotated[
+    int,
+    Field(ge=0),
+    WithJsonSchema({"type": "integer", "minimum": 0, "maximum": LARGEST_INTEGER}),
+]
+Milliseconds = Annotated[
+    int, WithJsonSchema({"type": "integer", "minimum": 0, "maximum": 253_402_300_799_999})
+]
+"""POSIX, from 1970 to the end of 9999: what `t_utc` can write with four digits of a year."""
+
+
+def _within(low: float, high: float) -> WithJsonSchema:
+    return WithJsonSchema({"type": "number", "minimum": low, "maximum": high})
+
+
+QuarterTurn = Annotated[float, _within(-90.0, 90.0)] | None
+"""Degrees, as those that follow: a latitude, a pitch."""
+HalfTurn = Annotated[float, _within(-180.0, 180.0)] | None
+Turn = Annotated[float, _within(0.0, 360.0)] | None
 
 
 class Message(BaseModel):
@@ -20,7 +41,7 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     t_utc: str | None = Field(description="ISO 8601 with milliseconds, UTC")
-    t_ms: int | None = Field(description="POSIX milliseconds, UTC")
+    t_ms: Milliseconds | None = Field(description="POSIX milliseconds, UTC")
 
 
 def stamp(utc_ns: int | None) -> tuple[str | None, int | None]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from fusiond.outputs.messages.base import Count, Message, Number, stamp
+from fusiond.outputs.messages.base import Count, Message, Milliseconds, Number, stamp
 
 
 class Innovation(BaseModel):
@@ -16,7 +16,7 @@ class Innovation(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: str
-    t_ms: int | None = Field(description="of validity, POSIX milliseconds, UTC")
+    t_ms: Milliseconds | None = Field(description="of validity, POSIX milliseconds, UTC")
     outcome: str = Field(description="`fused`, `gated`, ... as `health` counts them")
     nis: Number = Field(description="nu^T S^-1 nu; null where there was none")
     degrees: Count = Field(description="of freedom: what `nis` is expected to be")

@@ -7,22 +7,22 @@ from math import degrees
 from pydantic import Field
 
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.outputs.messages.base import Message, Number, stamp
+from fusiond.outputs.messages.base import HalfTurn, Message, Number, QuarterTurn, Turn, stamp
 
 
 class NavMessage(Message):
     """The solution of the body origin: WGS 84, north-east-down, one sigma each."""
 
     mode: Mode
-    lat_deg: Number
-    lon_deg: Number
+    lat_deg: QuarterTurn
+    lon_deg: HalfTurn
     height_m: Number = Field(description="above the ellipsoid")
     v_n_m_s: Number
     v_e_m_s: Number
     v_d_m_s: Number
-    roll_deg: Number
-    pitch_deg: Number
-    yaw_deg: Number = Field(description="true heading, 0 to 360, clockwise from north")
+    roll_deg: HalfTurn
+    pitch_deg: QuarterTurn
+    yaw_deg: Turn = Field(description="true heading, 0 to 360, clockwise from north")
     sd_n_m: Number
     sd_e_m: Number
     sd_d_m: Number

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field
 
 from fusiond.navigation.solution import BoundState, Mode, Solution
-from fusiond.outputs.messages.base import Count, Message, Number, stamp
+from fusiond.outputs.messages.base import Count, Message, Milliseconds, Number, stamp
 from fusiond.outputs.messages.health import SchedulerStatus
 
 RecordingState = Literal["off", "waiting", "recording", "failed"]
@@ -34,7 +34,7 @@ class StatusMessage(Message):
     imu: str | None = Field(description="the source whose samples are used")
     calibrated: bool = Field(description="all of `calibration` has settled")
     since_utc: str | None
-    since_ms: int | None
+    since_ms: Milliseconds | None
     version: str
     config_digest: str
     uptime_s: float

@@ -1,0 +1,35 @@
+"""Packets of a broker that are longer than anything of ours: read to their end, and not kept.
+
+MQTT lets a message have 256 MB. A client of MQTT 5 may tell its broker what it takes at most; ours
+is one of MQTT 3.1.1, for the brokers that speak no other. So the length is looked at here, before
+anything is decoded: of a packet that is too long the first bytes are kept, enough for its topic and
+for whoever takes it to see that it is too long; the rest is read from the socket and forgotten. The
+connection goes on: to close it would meet the same retained message again, and again.
+"""
+
+from __future__ import annotations
+
+import aiomqtt
+
+LONGEST_TOPIC = 65_535 + 8
+"""What stands before the payload: topic, its length, packet identifier."""
+PIECE = 4096
+"""Bytes of a read; paho makes a hundred in one turn of the loop."""
+
+
+def limit(client: aiomqtt.Client, most_payload: int) -> None:
+    """Let no more of a payload be held than shows that it has more than `most_payload` bytes.
+
+    paho has no such limit, so its reads are cut where it makes them; aiomqtt keeps it as `_client`.
+    """
+    paho = client._client
+    read = paho._sock_recv
+    most = most_payload + LONGEST_TOPIC
+
+    def read_and_cut(wanted: int) -> bytes:
+        held = paho._in_packet["packet"]
+        if len(held) > most:
+            del held[most:]
+        return read(min(wanted, PIECE))
+
+    paho._sock_recv = read_and_cut  # type: ignore[assignment, method-assign]

@@ -1,0 +1,142 @@
+"""Disks and folders that are not as they should be: full in the middle of a chunk, read-only, with
+links in them. A recording ends by its own name, and what was synced reads back."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fusiond.recording.edit import recover
+from fusiond.recording.log_writer import logs_of
+from fusiond.recording.reader import Log
+from tests.patience import until
+from tests.recording.test_hostile_logs import ABOUT
+from tests.recording.test_recorder import Bench
+from tests.unprivileged import as_a_user_without_rights
+
+FULL = """
+import json, random, resource, sys
+from pathlib import Path
+from fusiond.recording.channels import CHANNELS
+from fusiond.recording.log_file import About, LogFile
+
+folder, about = Path(sys.argv[1]), json.loads(sys.argv[2])
+told = {}
+for number, most in enumerate(json.loads(sys.argv[3])):
+    random.seed(1)
+    path = folder / f"{most}.mcap"
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+    synced = why = 0
+    try:
+        file = LogFile(path, About(about), 1)
+        for k in range(10_000):
+            data = json.dumps({"k": k, "text": random.randbytes(400).hex()}).encode()
+            file.write(CHANNELS["/event"], k, data)
+            if k % 25 == 24:
+                file.sync()
+                synced = k + 1
+    except OSError as error:
+        why = error.strerror
+        file.abandon()
+    told[path.name] = [synced, why]
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+print(json.dumps(told))
+"""
+LIMITS = [*range(30_000, 60_000, 1_777), 150_000, 200_001, 400_000, 1_200_000]
+"""Bytes a file may have, at all places of a chunk of 25 messages (11 kB) and beyond the buffer."""
+
+
+def test_a_file_that_may_grow_no_more_is_read_up_to_what_was_synced(tmp_path: Path) -> None:
+    """The limit of a file's size fails a write as a full disk does: in part, then with an error."""
+    command = (sys.executable, "-c", FULL, tmp_path, json.dumps(ABOUT), json.dumps(LIMITS))
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = json.loads(done.stdout)
+    cut = 0
+    for name, (synced, why) in told.items():
+        assert why == "File too large"
+        assert synced > 0
+        log = Log([tmp_path / name])
+        found = [message.json()["k"] for message in log.messages()]
+        assert found == list(range(len(found)))
+        assert len(found) >= synced
+        cut += any("cut off" in text for text in log.problems)
+        recover(tmp_path / name, tmp_path / "mended.mcap")
+        mended = Log([tmp_path / "mended.mcap"])
+        assert [m.json()["k"] for m in mended.messages()] == found
+        assert mended.problems == []
+        (tmp_path / "mended.mcap").unlink()
+    assert cut > len(LIMITS) / 2  # in the middle of something
+
+
+async def test_a_user_who_may_not_write_there_records_nothing_and_says_why() -> None:
+    with as_a_user_without_rights() as folder:
+        logs = folder / "logs"
+        logs.mkdir()
+        logs.chmod(0o555)
+        bench = Bench(logs)
+        bench.recorder.arm({})
+
+        def failed() -> bool:
+            bench.tick()
+            return bench.recorder.recording.state == "failed"
+
+        await until(failed)
+        codes = [code for code, _ in bench.events]
+        assert codes[-1] == "recording_failed"
+        assert "Permission denied" in bench.events[-1][1]
+        assert list(logs.iterdir()) == []
+        bench.recorder.close()
+
+
+@pytest.mark.parametrize("what", ["a link", "a folder"])
+async def test_what_is_no_file_of_ours_is_neither_counted_nor_removed(
+    tmp_path: Path, what: str
+) -> None:
+    """By the form of its name a log, and the oldest of all: a link to somebody's gigabytes."""
+    elsewhere = tmp_path / "somebodys.mcap"
+    elsewhere.write_bytes(bytes(5_000_000))
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    named = logs / "test_20200101T000000Z_0123abcd_0000.mcap"
+    if what == "a link":
+        named.symlink_to(elsewhere)
+    else:
+        named.mkdir()
+    bench = Bench(logs, keep_mb=1.0, split_mb=1.0)
+    bench.recorder.arm({})
+    bench.tick(100)
+    bench.recorder.close()
+    (kept,) = logs_of(logs, "test")
+    assert kept != named
+    assert named.is_symlink() == (what == "a link")
+    assert named.exists()
+    assert elsewhere.stat().st_size == 5_000_000
+
+
+async def test_a_link_to_the_folder_is_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "logs").symlink_to(tmp_path / "disk")
+    bench = Bench(tmp_path / "logs")
+    bench.recorder.arm({})
+    bench.tick(10)
+    bench.recorder.close()
+    assert [path.parent for path in (tmp_path / "disk").iterdir()] == [tmp_path / "disk"]
+    assert len(bench.ticks()) == 10
+
+
+async def test_a_link_that_leads_nowhere_is_told(tmp_path: Path) -> None:
+    (tmp_path / "logs").symlink_to(tmp_path / "unplugged")
+    bench = Bench(tmp_path / "logs")
+    bench.recorder.arm({})
+
+    def failed() -> bool:
+        bench.tick()
+        return bench.recorder.recording.state == "failed"
+
+    await until(failed)
+    assert "File exists" in bench.events[-1][1]
+    bench.recorder.close()
