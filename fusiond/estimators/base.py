@@ -257,7 +257,7 @@ class ErrorStateFilter:
         self._memory.sums[:], self._memory.head[AHEAD], self.passing = 0.0, 0, False
         self.step[:] = step_before(nav)
         if self.hypotheses is not None:
-            self.hypotheses.begin(t_ns)
+            self.hypotheses.begin(t_ns, nav, self.step)
 
     def propagate(
         self, imu: ImuBuffer, target_ns: int, record: bool = False, passing: bool = False
@@ -347,7 +347,7 @@ class ErrorStateFilter:
         self._cov[:n, :n] += spread
         self.wider[:] = 0.0
         if self.hypotheses is not None:
-            self.hypotheses.begin(self.t_ns)
+            self.hypotheses.begin(self.t_ns, self.nav, self.step)
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""

@@ -40,7 +40,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.strapdown import VN
+from fusiond.navigation.earth import gravity
+from fusiond.navigation.strapdown import (
+    HEIGHT,
+    LAT,
+    STEP_DCM,
+    STEP_RATE_B,
+    STEP_SMOOTH_N,
+    VN,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -58,17 +66,21 @@ PROMOTED = 3.0
 """Log odds by which an onset must be likelier than one of the level above to take its place when
 its own turn to begin anew has come: twenty to one."""
 
-STATES, POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, DELAY, SPEED, ROWS = range(8)
-"""Signatures: a step of states, of one number in all of them or of as many numbers; an offset of a
-position, one that grows with time, the same of a velocity; a delay; a share of the speed; an offset
-of each of an aid's rows."""
+STATES, TURNED, SHIFTED = range(3)
+"""Signatures that are a step of states: of one number in all of them or of as many numbers; of the
+attitude, about body axes, and of the mounting; of all that moves, as if it were another instant."""
+POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(3, 11)
+"""Signatures in rows: an offset of a position, one that grows with time, the same of a velocity;
+positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's
+rows."""
 PLACES, MOVES, ROLLS, OTHER, NOTHING = range(5)
 """What an aid's rows are: a position, a velocity, a speed, something of its own, nothing that can
 be at fault."""
 
-# Columns of the table of kinds: signature, device, size p, first column, slots of a step, class.
-SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS = 0, 1, 2, 3, 4, 7
-KIND_INTS = 8
+# Columns of the table of kinds: signature, device, size p, first column, slots of a step, class,
+# whether it is in its device's positions and in its velocities.
+SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS, LOCATES, MOVES_TOO = 0, 1, 2, 3, 4, 7, 8, 9
+KIND_INTS = 10
 # And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean.
 PRIOR, LOG_RATE, LAG, MEAN = 0, 3, 4, 5
 KIND_NUMBERS = 6
@@ -93,7 +105,7 @@ LASTS_S = 1.0
 
 
 class FaultTable(NamedTuple):
-    """Kinds of faults as the kernels read them, `ints` (k, 8) and `numbers` (k, 6), how many
+    """Kinds of faults as the kernels read them, `ints` (k, 10) and `numbers` (k, 6), how many
     columns they have in all, and the devices whose numbers they name."""
 
     ints: Indices
@@ -126,11 +138,19 @@ def begin_bank(bank: Array, table: FaultTable) -> None:
         bank[SENSITIVITIES] = GROUPS + RESTARTS * table.ints.shape[0] * GROUP
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8)")
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8, f8[::1], f8[::1])")
 def _begin_group(
-    bank: Array, ints: Indices, n: int, width: int, kind: int, restart: int, t_s: float
+    bank: Array,
+    ints: Indices,
+    n: int,
+    width: int,
+    kind: int,
+    restart: int,
+    t_s: float,
+    nav: Array,
+    step: Array,
 ) -> None:
-    """Begin one kind's restart anew, with its onset now."""
+    """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`."""
     at = GROUPS + (RESTARTS * kind + restart) * GROUP
     for j in range(GROUP):
         bank[at + j] = 0.0
@@ -143,18 +163,42 @@ def _begin_group(
         first = column // width * n * width + column % width
         for i in range(n):
             v[first + i * width] = 0.0
-        if ints[kind, SIGNATURE] == STATES:
+        of, slots = ints[kind, SIGNATURE], ints[kind, SLOTS : SLOTS + 3]
+        if of == STATES:
             for j in range(3):
-                if (j == c or size == 1) and ints[kind, SLOTS + j] >= 0:
-                    v[first + ints[kind, SLOTS + j] * width] = 1.0
+                if (j == c or size == 1) and slots[j] >= 0:
+                    v[first + slots[j] * width] = 1.0
+        elif of == TURNED:
+            for i in range(3):
+                v[first + i * width] = step[STEP_DCM + 3 * i + c]
+            if slots[c] >= 0:
+                v[first + slots[c] * width] = 1.0
+        elif of == SHIFTED:
+            # What is computed lags by tau: p - v tau, v - a tau, C turned back; fixes are stamped
+            # by as much too late, and fit it.
+            for i in range(3):
+                turn = 0.0
+                for j in range(3):
+                    turn += step[STEP_DCM + 3 * i + j] * step[STEP_RATE_B + j]
+                force = step[STEP_SMOOTH_N + i]
+                if i == 2:
+                    force += gravity(nav[LAT], nav[HEIGHT])
+                v[first + i * width] = turn
+                v[first + (3 + i) * width] = -force
+                v[first + (6 + i) * width] = -nav[VN + i]
+            for j in range(3):
+                if slots[j] >= 0:
+                    v[first + slots[j] * width] = -1.0
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
-def begin_all(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> None:
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
+def begin_all(
+    bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
+) -> None:
     """Begin all hypotheses anew; what the path was remains."""
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
-            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9)
+            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step)
     for level in range(len(PERIODS_NS)):
         bank[_RESTARTED + level] = t_ns // PERIODS_NS[level]
 
@@ -186,8 +230,10 @@ def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart:
             v[second + i * width] = v[first + i * width]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
-def restart_due(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> None:
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
+def restart_due(
+    bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
+) -> None:
     """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
     one that has just been handed on is not the next to begin."""
     for back in range(len(PERIODS_NS)):
@@ -198,7 +244,7 @@ def restart_due(bank: Array, ints: Indices, n: int, width: int, t_ns: int) -> No
             slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
             for kind in range(ints.shape[0]):
                 _promote(bank, ints, n, width, kind, slot)
-                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9)
+                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step)
 
 
 @compiled("void(f8[::1], f8[::1], f8, f8)")
@@ -251,7 +297,11 @@ def _signature(
 ) -> float:
     """D of a row for a component of a kind that has run for `age_s`."""
     of, d = ints[kind, SIGNATURE], 0.0
-    if of == STATES or ints[kind, DEVICE] != device:
+    if of <= SHIFTED or ints[kind, DEVICE] != device:
+        return 0.0
+    if measures == PLACES and not ints[kind, LOCATES]:
+        return 0.0
+    if measures == MOVES and not ints[kind, MOVES_TOO]:
         return 0.0
     if of == DELAY:
         lag = numbers[kind, LAG]
@@ -265,10 +315,16 @@ def _signature(
         return -math.hypot(nav[VN], nav[VN + 1]) if measures == ROLLS else 0.0
     if row != component:
         return 0.0
-    if measures == PLACES and of in (POSITION, POSITION_RAMP):
-        d = -age_s if of == POSITION_RAMP else -1.0
-    elif measures == MOVES and of in (VELOCITY, VELOCITY_RAMP):
-        d = -age_s if of == VELOCITY_RAMP else -1.0
+    if measures == PLACES:
+        if of == POSITION:
+            d = -1.0
+        elif of in (POSITION_RAMP, CARRIED):
+            d = -age_s
+    elif measures == MOVES:
+        if of in (VELOCITY, CARRIED):
+            d = -1.0
+        elif of == VELOCITY_RAMP:
+            d = -age_s
     elif measures == OTHER and of == ROWS:
         d = -1.0
     return d
@@ -319,7 +375,7 @@ def sensitivity_rows(
                     for j in range(width):
                         part[j] += c * rows[j]
         for kind in range(kinds):
-            if ints[kind, SIGNATURE] == STATES or ints[kind, DEVICE] != device:
+            if ints[kind, SIGNATURE] <= SHIFTED or ints[kind, DEVICE] != device:
                 continue
             size = ints[kind, SIZE]
             for restart in range(RESTARTS):

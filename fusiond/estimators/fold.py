@@ -64,12 +64,13 @@ def nis_if_sensors_fail(
 
 
 @compiled(
-    "f8(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, f8[::1],"
+    "f8(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, f8[::1],"
     "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1])"
 )
 def fold_and_account(
     nav: Array,
     xi: Array,
+    step: Array,
     cov: Array,
     dx: Array,
     z: Array,
@@ -96,7 +97,7 @@ def fold_and_account(
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
-    restart_due(bank, ints, n, width, t_ns)
+    restart_due(bank, ints, n, width, t_ns, nav, step)
     columns = sensitivity_rows(
         bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work
     )
@@ -113,11 +114,12 @@ def fold_and_account(
 
 
 @compiled(
-    "void(f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1], f8[:, ::1],"
-    "i8, i8, i8, i8, f8[::1])"
+    "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1],"
+    "f8[:, ::1], i8, i8, i8, i8, f8[::1])"
 )
 def account_for(
     nav: Array,
+    step: Array,
     h: Array,
     r: Array,
     y: Array,
@@ -135,6 +137,6 @@ def account_for(
     """What the bank makes of rows that were `fused` or not, as `whiten` has left y (m,) and g (m,
     w): of a filter that keeps its estimate."""
     n = h.shape[1]
-    restart_due(bank, ints, n, width, t_ns)
+    restart_due(bank, ints, n, width, t_ns, nav, step)
     sensitivity_rows(bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work)
     account(bank, ints, n, width, y, g, fused, work)

@@ -75,12 +75,12 @@ class Hypotheses:
         if known is None:
             devices = self.table.devices
             device = devices.index(aid.device) if aid.device in devices else -1
-            known = self._of_source[aid.source] = _measures(aid), device
+            known = self._of_source[aid.source] = _measures(aid, device >= 0), device
         return known
 
-    def begin(self, t_ns: int) -> None:
-        """Begin all hypotheses anew at `t_ns`."""
-        begin_all(self.bank, self.table.ints, self.n, self.width, t_ns)
+    def begin(self, t_ns: int, nav: Array, step: Array) -> None:
+        """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
+        begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
     def judge(self, t_ns: int) -> Array:
         """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""
@@ -134,8 +134,8 @@ class Hypotheses:
         return self._groups[:, :, WEIGHT]
 
 
-def _measures(aid: Linearised) -> int:
-    if aid.constraint and not aid.no_slip:
+def _measures(aid: Linearised, known: bool) -> int:
+    if aid.constraint and not (aid.no_slip or known):
         return NOTHING
     if aid.screened:  # its rows are ranges
         return OTHER

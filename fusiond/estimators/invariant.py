@@ -224,7 +224,7 @@ class InvariantFilter(TiltAxesFilter):
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = False
             if self.hypotheses is not None:  # their effects were of other coordinates
-                self.hypotheses.begin(self.t_ns)
+                self.hypotheses.begin(self.t_ns, self.nav, self.step)
         return outcome
 
     def _update(self, aid: Linearised) -> Outcome:

@@ -61,12 +61,12 @@ class KalmanEstimator(ErrorStateFilter):
             of, table = bank.of(aid), bank.table
             if not self._holding:
                 now = bank.bank, *table[:2], aid.t_ns, *of, bank.work
-                nis = fold_and_account(nav, xi, cov, dx, z, h, r, threshold, y, g, *now)
+                nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *now)
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
                     told = bank.bank, *table[:2], bank.width, aid.t_ns, *of, bank.work
-                    account_for(nav, h, r, y, g, bool(nis <= threshold), *told)
+                    account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *told)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
         if not math.isfinite(nis):
@@ -99,7 +99,7 @@ class KalmanEstimator(ErrorStateFilter):
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
             told = bank.bank, *bank.table[:2], bank.width, aid.t_ns, *bank.of(aid)
             space = np.empty(count * bank.columns)
-            account_for(self.nav, h, r, y, g, True, *told, space)
+            account_for(self.nav, self.step, h, r, y, g, True, *told, space)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""

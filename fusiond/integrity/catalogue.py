@@ -22,6 +22,7 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.estimators.fault_bank import (
+    CARRIED,
     CLASS,
     DELAY,
     DEVICE,
@@ -29,30 +30,37 @@ from fusiond.estimators.fault_bank import (
     KIND_INTS,
     KIND_NUMBERS,
     LAG,
+    LOCATES,
     LOG_RATE,
     MEAN,
+    MOVES_TOO,
     POSITION,
     POSITION_RAMP,
     PRIOR,
     RESTARTS,
     ROWS,
+    SHIFTED,
     SIGNATURE,
     SIZE,
     SLOTS,
     SPEED,
     STATES,
+    TURNED,
     VELOCITY,
     VELOCITY_RAMP,
     FaultTable,
 )
 from fusiond.models.model import Model
-from fusiond.models.vehicle import FIX_TIME, VELOCITY_TIME
-from fusiond.navigation.error_model import FORCE_ERROR, PHI, RATE_ERROR
+from fusiond.models.vehicle import FIX_TIME, MOUNTING, VELOCITY_TIME
+from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 
 DEG = math.degrees(1.0)
+BODY = ("x", "y", "z")
 SENSOR, PLACE, MOTION, TIME, OWN = range(5)
 """Classes: between kinds of one class nobody has to choose before something is done."""
 RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1.0
+LAGGED_S = 0.5
+"""One sigma of a lag that nobody knows of."""
 LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
 """Delays, each of which stands for those around it, by so much of it at one sigma: a delay that is
 no longer than what the state for it admits is that state's."""
@@ -88,14 +96,13 @@ class Kind:
     @property
     def corrected(self) -> bool:
         """Whether the filter goes on without it: it is one of its states."""
-        return self.signature == STATES
+        return self.signature in (STATES, TURNED, SHIFTED)
 
 
 def sensor_kinds(model: Model) -> list[Kind]:
     """Of the inertial unit, as steps of those states that the model has for it."""
     rates = [model.parameters(RATE_ERROR + axis) for axis in range(3)]
     forces = [model.parameters(FORCE_ERROR + axis) for axis in range(3)]
-    body = ("x", "y", "z")
     found = []
     if all(rates):
         # A damaged or loose gyro: a degree a second, a hundred times the bias of a data sheet.
@@ -104,7 +111,7 @@ def sensor_kinds(model: Model) -> list[Kind]:
                 *("gyro", "the gyros have stepped", "deg/s", STATES, SENSOR),
                 *((1.0 / DEG,) * 3, SENSOR_PER_H, DEG),
                 slots=tuple(slots[0] for slots in rates),
-                axes=body,
+                axes=BODY,
             )
         )
     if all(forces):
@@ -113,14 +120,16 @@ def sensor_kinds(model: Model) -> list[Kind]:
                 *("accelerometer", "the accelerometers have stepped", "m/s^2", STATES, SENSOR),
                 *((0.5,) * 3, SENSOR_PER_H),
                 slots=tuple(slots[0] for slots in forces),
-                axes=body,
+                axes=BODY,
             )
         )
-    # A unit that slips in its mount does so by degrees.
+    # A unit that slips in its mount does so by degrees, and sits otherwise on the vehicle then.
+    sits = model.slots_of(MOUNTING) or [-1, -1]
     attitude = Kind(
-        *("mount", "the inertial unit has turned", "deg", STATES, SENSOR),
+        *("mount", "the inertial unit has turned", "deg", TURNED, SENSOR),
         *((10.0 / DEG,) * 3, SENSOR_PER_H, DEG),
-        slots=(PHI, PHI + 1, PHI + 2),
+        slots=(-1, *sits),
+        axes=BODY,
     )
     return [*found, attitude]
 
@@ -157,16 +166,32 @@ def velocity_kinds(device: str) -> list[Kind]:
     ]
 
 
+def carried_kinds(device: str) -> list[Kind]:
+    """Of a device whose positions are carried off at the velocity that it adds: what is spoofed."""
+    of = Kind(
+        *("carried_off", f"{device} is carried off", "m/s", CARRIED, TIME),
+        *((1.0, 1.0, 1.0), LATE_PER_H),
+        device=device,
+    )
+    return [of]
+
+
 def delay_kinds(device: str) -> list[Kind]:
-    """Of a device: late by about so much. The amount is one of the lag: its share of it is told."""
+    """Of a device, or of its velocities alone: late by about so much. The amount is one of the lag:
+    its share of it is told."""
     return [
         Kind(
-            *("delay", f"{device} is late", "s", DELAY, TIME),
+            *(name, text, "s", DELAY, of),
             *((LAG_SPREAD,), LATE_PER_H, lag_s),
             device=device,
             lag_s=lag_s,
             mean=1.0,
             axes=("",),
+            locates=locates,
+        )
+        for name, text, of, locates in (
+            ("delay", f"{device} is late", TIME, True),
+            ("velocity_delay", f"{device} velocity is late", MOTION, False),
         )
         for lag_s in LAGS_S
     ]
@@ -185,7 +210,15 @@ def time_kinds(device: str, model: Model) -> list[Kind]:
         slots=tuple(slots),
         axes=("",),
     )
-    return [step]
+    # From the start on, so that the filter itself lags: as long as a line may delay a fix.
+    shifted = Kind(
+        *("late", f"{device} is late, and the solution with it,", "s", SHIFTED, TIME),
+        *((LAGGED_S,), LATE_PER_H),
+        device=device,
+        slots=tuple(slots),
+        axes=("",),
+    )
+    return [step, shifted]
 
 
 def _times(device: str) -> tuple[str, ...]:
@@ -225,6 +258,7 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
         if kind == "gnss":
             found += [*position_kinds(device), *velocity_kinds(device)]
             found += [*time_kinds(device, model), *delay_kinds(device)]
+            found += carried_kinds(device)
         elif kind == "rdss":
             found += position_kinds(device)[:1]
         elif kind == "wheel":
@@ -235,6 +269,8 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
             found += row_kinds(device, "height is off", "m", (20.0,), 1.0, ("",))
     if slips:
         found += row_kinds("non_holonomic", "the vehicle slips", "m/s", (0.5,), 1.0, ("",))
+    # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
+    found += row_kinds("zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY)
     return found
 
 
@@ -246,6 +282,7 @@ def table_of(kinds: Sequence[Kind]) -> FaultTable:
     columns = 0
     for row, kind in enumerate(kinds):
         ints[row, SIGNATURE], ints[row, CLASS] = kind.signature, kind.of
+        ints[row, LOCATES], ints[row, MOVES_TOO] = kind.locates, kind.moves
         ints[row, DEVICE] = devices.index(kind.device) if kind.device else -2
         ints[row, SIZE], ints[row, FIRST] = kind.size, columns
         ints[row, SLOTS : SLOTS + 3] = (*kind.slots, -1, -1, -1)[:3]

@@ -242,7 +242,7 @@ class Navigator:
             return
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
-        failure = self.calibrating.turned or self._status.failure(self.timeline.diagnosis)
+        failure = self._status.failure(self.timeline.diagnosis)
         if failure is not None:
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
