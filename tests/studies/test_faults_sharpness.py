@@ -119,7 +119,7 @@ def test_a_cell_is_run_and_told() -> None:
         assert 0.1 < ratio < 10.0
     text = TABLES["sharpness"](found)
     assert "| tactical | code | 1 | given | outage |" in text
-    assert "2 runs, 2 a cell; 0 ended the navigator." in text
+    assert "2 runs, at most 2 a cell; 0 ended the navigator." in text
     assert "the class alone" not in text
 
 

@@ -75,7 +75,7 @@ def sharpness(found: Rows) -> str:
     drives = len({row["drive"] for row in found})
     return (
         f"{table(COUNTS, _counts(found))}\n\n{table(SUMS, sums)}\n\n{table(LINES, lines)}\n\n"
-        f"{len(found)} runs, {drives} a cell; {crashes} ended the navigator.\n"
+        f"{len(found)} runs, at most {drives} a cell; {crashes} ended the navigator.\n"
     )
 
 
