@@ -65,13 +65,15 @@ def gate_threshold(probability: float, degrees: int) -> float:
 class Outcome(NamedTuple):
     """How an aid ended: its name, and the innovation that led to it (NIS, dimension, and L^-1 nu
     with S = L L^T). `rows`: of a screened aid, what became of each row
-    (fusiond.estimators.screening); `whitened` is then 0 where a row was left out."""
+    (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `lasting`: of one
+    that is out, the NIS if the fault for which it is out lasts."""
 
     name: str
     nis: float = float("nan")
     degrees: int = 0
     whitened: tuple[float, ...] = ()
     rows: tuple[int, ...] = ()
+    lasting: float = float("nan")
 
 
 class Snapshot(NamedTuple):
@@ -157,8 +159,9 @@ class Estimator(Protocol):
         """Fold one aid in, or name why not; the variances of its rows, up to three, count `noise`
         times (3,)."""
 
-    def look(self, aid: Linearised) -> Outcome:
-        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
+    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
+        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in.
+        `lasting` (3,): what a fault adds to it, if it lasts."""
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -323,8 +326,9 @@ class ErrorStateFilter:
                 return Screened(codes, y, nis, cov_out, dx_out)
             renew = True
 
-    def look(self, aid: Linearised) -> Outcome:
-        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in."""
+    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
+        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in.
+        `lasting` (3,): what a fault adds to it, if it lasts."""
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
@@ -338,7 +342,11 @@ class ErrorStateFilter:
             return Outcome("isolated", s.nis, codes.count(KEPT), (), codes)
         y = np.zeros(z.shape[0])
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
-        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
+        if lasting is None:
+            return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
+        left = z - h @ dx - lasting[: z.shape[0]]
+        lasts = normalised_innovation_squared(cov, left, h, r, np.zeros(z.shape[0]))
+        return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts)
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""

@@ -80,6 +80,8 @@ be at fault."""
 # Columns of the table of kinds: signature, device, size p, first column, slots of a step, class,
 # whether it is in its device's positions and in its velocities.
 SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS, LOCATES, MOVES_TOO = 0, 1, 2, 3, 4, 7, 8, 9
+ANY = -3
+"""In the place of a device: all that send positions or velocities."""
 KIND_INTS = 10
 # And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean.
 PRIOR, LOG_RATE, LAG, MEAN = 0, 3, 4, 5
@@ -281,6 +283,14 @@ def _past(bank: Array, t_s: float, component: int) -> float:
     return math.nan
 
 
+@compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
+def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
+    """Whether a kind is of a device, or of any and this one locates or moves."""
+    if ints[kind, DEVICE] == ANY:
+        return measures <= MOVES
+    return ints[kind, DEVICE] == device
+
+
 @compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")
 def _signature(
     bank: Array,
@@ -297,7 +307,7 @@ def _signature(
 ) -> float:
     """D of a row for a component of a kind that has run for `age_s`."""
     of, d = ints[kind, SIGNATURE], 0.0
-    if of <= SHIFTED or ints[kind, DEVICE] != device:
+    if of <= SHIFTED or not concerns(ints, kind, measures, device):
         return 0.0
     if measures == PLACES and not ints[kind, LOCATES]:
         return 0.0
@@ -375,7 +385,7 @@ def sensitivity_rows(
                     for j in range(width):
                         part[j] += c * rows[j]
         for kind in range(kinds):
-            if ints[kind, SIGNATURE] <= SHIFTED or ints[kind, DEVICE] != device:
+            if ints[kind, SIGNATURE] <= SHIFTED or not concerns(ints, kind, measures, device):
                 continue
             size = ints[kind, SIZE]
             for restart in range(RESTARTS):

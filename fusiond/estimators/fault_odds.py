@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from fusiond.estimators.fault_bank import (
     CLASS,
     DECIDED,
+    DEVICE,
     E_AT,
     FIRST,
     GROUP,
@@ -133,7 +134,7 @@ def judge(
             total += math.exp(bank[at + LOG_ODDS] - largest)
     found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
     found[BEST_ODDS] = found[RIVAL_ODDS] = found[SENSOR_ODDS] = -np.inf
-    of = -1
+    of, device = -1, -1
     for turn in range(2):
         for kind in range(kinds):
             for restart in range(RESTARTS):
@@ -152,10 +153,10 @@ def judge(
                     lasted = epoch_s - group[LIKELY] > LASTS_S - 1e-3
                     if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
                         found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
-                        of = ints[kind, CLASS]
+                        of, device = ints[kind, CLASS], ints[kind, DEVICE]
                     if ints[kind, CLASS] == 0:
                         found[SENSOR_ODDS] = max(found[SENSOR_ODDS], group[LOG_ODDS])
-                elif ints[kind, CLASS] != of:
+                elif ints[kind, CLASS] != of or ints[kind, DEVICE] != device:
                     found[RIVAL_ODDS] = max(found[RIVAL_ODDS], group[LOG_ODDS])
 
 

@@ -81,10 +81,10 @@ class SeparatedEstimator(KalmanEstimator):
             self._take_out()
         return outcome
 
-    def look(self, aid: Linearised) -> Outcome:
+    def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing that is published
         changes. The subsets judge for themselves: there the aid may be the sound one."""
-        outcome = super().look(aid)
+        outcome = super().look(aid, lasting)
         innovation = self._linearise(aid)
         if not isinstance(innovation, NotApplicable):
             self._fold_into_subsets(aid, innovation)

@@ -22,6 +22,7 @@ import numpy as np
 
 from drivers.immutable import immutable
 from fusiond.estimators.fault_bank import (
+    ANY,
     CARRIED,
     CLASS,
     DELAY,
@@ -59,6 +60,8 @@ BODY = ("x", "y", "z")
 SENSOR, PLACE, MOTION, TIME, OWN = range(5)
 """Classes: between kinds of one class nobody has to choose before something is done."""
 RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1.0
+TOGETHER = "all receivers"
+"""The device of a kind that is of all of them."""
 LAGGED_S = 0.5
 """One sigma of a lag that nobody knows of."""
 LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
@@ -269,6 +272,9 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
             found += row_kinds(device, "height is off", "m", (20.0,), 1.0, ("",))
     if slips:
         found += row_kinds("non_holonomic", "the vehicle slips", "m/s", (0.5,), 1.0, ("",))
+    receivers = [device for device, kind in aiding.items() if kind == "gnss"]
+    if len(receivers) > 1:
+        found += carried_kinds(TOGETHER)
     # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
     found += row_kinds("zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY)
     return found
@@ -284,6 +290,8 @@ def table_of(kinds: Sequence[Kind]) -> FaultTable:
         ints[row, SIGNATURE], ints[row, CLASS] = kind.signature, kind.of
         ints[row, LOCATES], ints[row, MOVES_TOO] = kind.locates, kind.moves
         ints[row, DEVICE] = devices.index(kind.device) if kind.device else -2
+        if kind.device == TOGETHER:
+            ints[row, DEVICE] = ANY
         ints[row, SIZE], ints[row, FIRST] = kind.size, columns
         ints[row, SLOTS : SLOTS + 3] = (*kind.slots, -1, -1, -1)[:3]
         numbers[row, PRIOR : PRIOR + kind.size] = kind.sd

@@ -31,13 +31,22 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
-from fusiond.estimators.fault_bank import DECIDED, RESTARTS
+from fusiond.estimators.fault_bank import (
+    CARRIED,
+    DECIDED,
+    POSITION,
+    POSITION_RAMP,
+    RESTARTS,
+    VELOCITY,
+    VELOCITY_RAMP,
+)
 from fusiond.estimators.fault_odds import BEST, BEST_ODDS, RIVAL_ODDS, SENSOR_ODDS
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
-from fusiond.integrity.catalogue import OWN, Kind
+from fusiond.integrity.catalogue import OWN, TOGETHER, Kind
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
+from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN
 
 Array = NDArray[np.float64]
@@ -46,6 +55,16 @@ APART = 4.0
 """Log odds between two classes: fifty to one."""
 ALIKE = 7.0
 """Hypotheses of the class that are less likely by more than this count nothing."""
+GROWS: dict[int, tuple[int | None, int | None]] = {
+    POSITION: (0, None),
+    POSITION_RAMP: (1, None),
+    VELOCITY: (None, 0),
+    VELOCITY_RAMP: (None, 1),
+    CARRIED: (1, 0),
+}
+"""With which power of its age a fault grows in positions and in velocities."""
+RARE = 10.83
+"""Chi-square of one that chance exceeds in one vehicle of a thousand."""
 MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
 """A vehicle moves whose speed is beyond both."""
 FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
@@ -92,6 +111,7 @@ class Memory(NamedTuple):
     series: dict[str, Series]
     findings: tuple[Finding, ...]
     agreement: Mapping[str, Agreement]
+    lasting: Mapping[str, Finding]
 
 
 class Diagnosis:
@@ -104,23 +124,26 @@ class Diagnosis:
         """Series that a checkpoint has too: copied before they are changed."""
         self._agreement: Mapping[str, Agreement] = {}
         """By device that is out; replaced, never changed."""
+        self._lasting: Mapping[str, Finding] = {}
+        """By series, why it left service last; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
         """What has been identified since the start, the last of each kind and device."""
 
     def snapshot(self) -> Memory:
         """A copy of everything."""
         self._shared = set(self._series)
-        return Memory(self._series.copy(), self.findings, self._agreement)
+        return Memory(self._series.copy(), self.findings, self._agreement, self._lasting)
 
     def restore(self, memory: Memory) -> None:
         """Back to a snapshot."""
         self._series, self.findings = memory.series.copy(), memory.findings
         self._shared, self._agreement = set(self._series), memory.agreement
+        self._lasting = memory.lasting
 
     def reset(self) -> None:
         """The filter starts anew."""
         self._series, self._shared, self.findings = {}, set(), ()
-        self._agreement = {}
+        self._agreement = self._lasting = {}
 
     # ------------------------------------------------------------------ what others ask
 
@@ -182,7 +205,7 @@ class Diagnosis:
         bank, t_ns, correction, explained = estimator.hypotheses, aid.t_ns, None, False
         if one.out:
             passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-            one.looked_at(t_ns, passes and one.repeats == 0)
+            one.looked_at(t_ns, passes and one.repeats == 0, outcome.lasting - outcome.nis)
             self._agrees(aid, one)
         else:
             if bank is not None and not aid.constraint:
@@ -196,6 +219,7 @@ class Diagnosis:
                 one.gated(t_ns, explained)
         if correction is None and bank is not None:
             opened_variances(bank.opened(), estimator.step, estimator.wider)
+            _open_by_mounting(estimator)
         return correction
 
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
@@ -221,7 +245,22 @@ class Diagnosis:
         self.findings = (*others, finding)
         if not kind.corrected:
             self._exclude(t_ns, finding.text, lambda s: _spoils(kind, s))
+            of = {n: finding for n, s in self._series.items() if s.out and _spoils(kind, s)}
+            self._lasting = {**self._lasting, **of}
         return Correction(mean, spread)
+
+    def lasting(self, aid: Aid, one: Series) -> Array | None:
+        """What the fault for which a series is out adds to its innovation (3,), if it lasts; None
+        where none is known."""
+        finding = self._lasting.get(one.source)
+        if finding is None:
+            return None
+        kind, b = finding.kind, np.array(finding.size) / finding.kind.per_unit
+        age_s = aid.t_ns * 1e-9 - finding.since_s
+        if len(b) != 3 or kind.signature not in GROWS:
+            return None
+        grows = GROWS[kind.signature][0 if one.locates else 1]
+        return None if grows is None else -b * age_s**grows
 
     def _alike(self, bank: Hypotheses, kind: Kind, odds: float) -> list[Estimated]:
         """Those of the class and device of a kind that explain it nearly as well."""
@@ -251,9 +290,19 @@ class Diagnosis:
 
 
 def _spoils(kind: Kind, one: Series) -> bool:
-    if one.device != kind.device:
+    if kind.device != TOGETHER and one.device != kind.device:
         return False
     return kind.of == OWN or (kind.locates and one.locates) or (kind.moves and one.moves)
+
+
+def _open_by_mounting(estimator: Estimator) -> None:
+    """The attitude is that of the axes that were configured, and the vehicle's as far as the unit
+    sits on it so: pitch and yaw are open by what the mounting has beyond chance."""
+    model, wider = estimator.model, estimator.wider
+    for row, slot in zip((7, 8), model.slots_of(MOUNTING), strict=False):
+        beyond = estimator.xi.item(slot) ** 2 - RARE * model.initial.item(slot) ** 2
+        if beyond > 0.0:
+            wider[row] += beyond
 
 
 def _moves(estimator: Estimator) -> bool:

@@ -38,6 +38,9 @@ from fusiond.integrity.noise import forget_lately, learn, unlearned
 Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
+LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
+"""A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven to
+one; and the most (chi-square) that one measurement tells of that."""
 REPEATS, DISAGREES = "repeats itself", "disagrees"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
@@ -73,6 +76,8 @@ class Series:
     failed: int = 0
     passed: int = 0
     was_out_ns: int = 0
+    over: float = 0.0
+    """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: tuple[float, ...] | None = None
     repeats: int = 0
     noise: Array = field(default_factory=unlearned)
@@ -127,9 +132,19 @@ class Series:
         elif self.state is Service.PROBATION and t_ns - self.since_ns > self.was_out_ns:
             self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
-    def looked_at(self, t_ns: int, passes: bool) -> None:
-        """One that is out was compared with what is published."""
+    def looked_at(self, t_ns: int, passes: bool, lasting: float = math.nan) -> None:
+        """One that is out was compared with what is published. `lasting`: by how much more chi-square
+        its innovation is if the fault for which it is out lasts; not a number where none is known.
+
+        A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
+        """
         self.passed = self.passed + 1 if passes else 0
+        if math.isfinite(lasting):
+            self.over += 0.5 * max(-MOST_TOLD, min(lasting, MOST_TOLD))
+            self.over = max(self.over, -MOST_TOLD)
+            prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
+            if self.over + prior < RETURNS:
+                return
         if self.passed >= READMIT_COUNT:
             self.was_out_ns = t_ns - self.since_ns
             self.state, self.since_ns = Service.PROBATION, t_ns
