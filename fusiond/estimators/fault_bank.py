@@ -287,8 +287,9 @@ def _past(bank: Array, t_s: float, component: int) -> float:
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
     """Whether a kind is of a device, or of any and this one locates or moves."""
     if ints[kind, DEVICE] == ANY:
-        return measures <= MOVES
-    return ints[kind, DEVICE] == device
+        return bool(measures <= MOVES)
+    of_this: bool = ints[kind, DEVICE] == device
+    return of_this
 
 
 @compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")

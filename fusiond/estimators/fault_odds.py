@@ -55,8 +55,8 @@ _TINY = 1e-9
 LEAST_WEIGHT = 1e-7
 """What is as unlikely opens nothing: of a kilometre a third of a metre."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, the
-# largest of another class, the largest of class 0, and the weight of all.
-BEST, BEST_ODDS, RIVAL_ODDS, SENSOR_ODDS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
+# largest of another class or device, the largest of any that explains, and the weight of all.
+BEST, BEST_ODDS, RIVAL_ODDS, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
 
 
 @compiled("f8(f8[::1], i8, f8[::1], f8, f8[::1])", allocates=True)
@@ -133,7 +133,7 @@ def judge(
             at = GROUPS + (RESTARTS * kind + restart) * GROUP
             total += math.exp(bank[at + LOG_ODDS] - largest)
     found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
-    found[BEST_ODDS] = found[RIVAL_ODDS] = found[SENSOR_ODDS] = -np.inf
+    found[BEST_ODDS] = found[RIVAL_ODDS] = found[EXPLAINS] = -np.inf
     of, device = -1, -1
     for turn in range(2):
         for kind in range(kinds):
@@ -154,8 +154,7 @@ def judge(
                     if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
                         found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
                         of, device = ints[kind, CLASS], ints[kind, DEVICE]
-                    if ints[kind, CLASS] == 0:
-                        found[SENSOR_ODDS] = max(found[SENSOR_ODDS], group[LOG_ODDS])
+                    found[EXPLAINS] = max(found[EXPLAINS], group[LOG_ODDS])
                 elif ints[kind, CLASS] != of or ints[kind, DEVICE] != device:
                     found[RIVAL_ODDS] = max(found[RIVAL_ODDS], group[LOG_ODDS])
 

@@ -40,7 +40,7 @@ from fusiond.estimators.fault_bank import (
     VELOCITY,
     VELOCITY_RAMP,
 )
-from fusiond.estimators.fault_odds import BEST, BEST_ODDS, RIVAL_ODDS, SENSOR_ODDS
+from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, RIVAL_ODDS
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
@@ -143,7 +143,7 @@ class Diagnosis:
     def reset(self) -> None:
         """The filter starts anew."""
         self._series, self._shared, self.findings = {}, set(), ()
-        self._agreement = self._lasting = {}
+        self._agreement, self._lasting = {}, {}
 
     # ------------------------------------------------------------------ what others ask
 
@@ -211,7 +211,7 @@ class Diagnosis:
             if bank is not None and not aid.constraint:
                 found = bank.judge(t_ns)
                 correction = self._decide(t_ns, bank, found)
-                explained = found.item(SENSOR_ODDS) > DECIDED - APART
+                explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
             if outcome.name == "fused":
                 one.fused(t_ns, () if aid.constraint else outcome.whitened)
@@ -290,7 +290,7 @@ class Diagnosis:
 
 
 def _spoils(kind: Kind, one: Series) -> bool:
-    if kind.device != TOGETHER and one.device != kind.device:
+    if kind.device not in (TOGETHER, one.device):
         return False
     return kind.of == OWN or (kind.locates and one.locates) or (kind.moves and one.moves)
 

@@ -14,7 +14,8 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
                                        explains it
     any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
                                        itself to the bit while the vehicle moves
-    out                   probation    `READMIT_COUNT` in a row pass against what is published
+    out                   probation    `READMIT_COUNT` in a row pass against what is published, and
+                                       the fault for which it is out is likelier over than not
     probation             nominal      it has been in service for as long as it was out
 
 Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
@@ -39,8 +40,8 @@ Array = NDArray[np.float64]
 
 REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
 LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
-"""A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven to
-one; and the most (chi-square) that one measurement tells of that."""
+"""A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
+to one; and the most (chi-square) that one measurement tells of that."""
 REPEATS, DISAGREES = "repeats itself", "disagrees"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
@@ -133,8 +134,9 @@ class Series:
             self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
     def looked_at(self, t_ns: int, passes: bool, lasting: float = math.nan) -> None:
-        """One that is out was compared with what is published. `lasting`: by how much more chi-square
-        its innovation is if the fault for which it is out lasts; not a number where none is known.
+        """One that is out was compared with what is published. `lasting`: by how much more
+        chi-square its innovation is if the fault for which it is out lasts; not a number where none
+        is known.
 
         A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
         """
