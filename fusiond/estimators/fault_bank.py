@@ -45,7 +45,6 @@ from fusiond.navigation.strapdown import (
     HEIGHT,
     LAT,
     STEP_DCM,
-    STEP_RATE_B,
     STEP_SMOOTH_N,
     VN,
 )
@@ -68,7 +67,8 @@ its own turn to begin anew has come: twenty to one."""
 
 STATES, TURNED, SHIFTED = range(3)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
-attitude, about body axes, and of the mounting; of all that moves, as if it were another instant."""
+attitude, about body axes, and of the mounting; of all that moves, as if it were another instant,
+from the start on."""
 POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(3, 11)
 """Signatures in rows: an offset of a position, one that grows with time, the same of a velocity;
 positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's
@@ -176,16 +176,11 @@ def _begin_group(
             if slots[c] >= 0:
                 v[first + slots[c] * width] = 1.0
         elif of == SHIFTED:
-            # What is computed lags by tau: p - v tau, v - a tau, C turned back; fixes are stamped
-            # by as much too late, and fit it.
+            # It began at fixes that were stamped by tau too late: p - v tau, v - a tau.
             for i in range(3):
-                turn = 0.0
-                for j in range(3):
-                    turn += step[STEP_DCM + 3 * i + j] * step[STEP_RATE_B + j]
                 force = step[STEP_SMOOTH_N + i]
                 if i == 2:
                     force += gravity(nav[LAT], nav[HEIGHT])
-                v[first + i * width] = turn
                 v[first + (3 + i) * width] = -force
                 v[first + (6 + i) * width] = -nav[VN + i]
             for j in range(3):
@@ -245,6 +240,8 @@ def restart_due(
             bank[_RESTARTED + level] = turn
             slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
             for kind in range(ints.shape[0]):
+                if ints[kind, SIGNATURE] == SHIFTED:  # it is so from the start on
+                    continue
                 _promote(bank, ints, n, width, kind, slot)
                 _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step)
 

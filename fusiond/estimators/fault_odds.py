@@ -1,7 +1,8 @@
 r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
 
     log odds            log(rate T) + boost + e^T M e / 2 - log det(I + S L) / 2
-    weight              w_f = odds_f / (1 + sum of all odds): the posterior probability
+    weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
+                        a hypothesis does not explain what has come
     left unexplained    J - l against N - p by chi-square's mean and variance
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
@@ -52,6 +53,8 @@ Indices = NDArray[np.int64]
 
 _TINY = 1e-9
 """A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
+MOST_OFF = 3.0
+"""Sigmas of its prior by which the amount of a kind that has one of its own may differ."""
 LEAST_WEIGHT = 1e-7
 """What is as unlikely opens nothing: of a kilometre a third of a metre."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, the
@@ -122,16 +125,21 @@ def judge(
             gained = solve(group, size, numbers[kind], 1.0, m)
             rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
             group[LOG_ODDS] = rate + boost[kind] + gained
-            largest = max(largest, group[LOG_ODDS])
+            off = (m[9] - numbers[kind, MEAN]) / numbers[kind, PRIOR]
             explained = solve(group, size, numbers[kind], _TINY, m)
             degrees = max(group[N_AT] - size, 1.0)
             most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
             group[UNEXPLAINED] = group[J_AT] - explained - most
+            if numbers[kind, MEAN] != 0.0 and abs(off) > MOST_OFF:
+                group[UNEXPLAINED] = np.inf  # it is of another amount than this kind has
+            if group[UNEXPLAINED] <= 0.0:
+                largest = max(largest, group[LOG_ODDS])
     total = math.exp(-largest)
     for kind in range(kinds):
         for restart in range(RESTARTS):
             at = GROUPS + (RESTARTS * kind + restart) * GROUP
-            total += math.exp(bank[at + LOG_ODDS] - largest)
+            if bank[at + UNEXPLAINED] <= 0.0:
+                total += math.exp(bank[at + LOG_ODDS] - largest)
     found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
     found[BEST_ODDS] = found[RIVAL_ODDS] = found[EXPLAINS] = -np.inf
     of, device = -1, -1
@@ -140,7 +148,7 @@ def judge(
             for restart in range(RESTARTS):
                 number = RESTARTS * kind + restart
                 group = bank[GROUPS + number * GROUP :]
-                if turn == 0:
+                if turn == 0 and group[UNEXPLAINED] <= 0.0:
                     group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
                 if group[UNEXPLAINED] > 0.0:
                     group[LIKELY] = np.inf

@@ -4,12 +4,11 @@ Each names its size in the unit in which people are told, the prior of that size
 a fault begins, each with its source; by which signature it enters the motion or the measurements
 (fusiond.estimators.fault_bank); and which measurements it spoils.
 
-Rates are an engineer's, of devices on vehicles in streets, where no standard counts them: a
-receiver errs beyond its sigma for itself ten times in an hour of town (multipath, reflections), is
-late or stuck once in ten hours (its line, its firmware); an inertial unit breaks, slips or turns in
-its mount once in a thousand hours. Ten times the rate is what half of a chi-square of 4.6 is: it
-moves no decision by an epoch. Sizes are one sigma of a normal prior: a fault of four times that is
-told as soon.
+Rates are an engineer's, of devices on vehicles in streets, where no standard counts them, and the
+same for all kinds for that reason: one an hour; but a device that is late by whole seconds from an
+instant on is one in a thousand hours. Ten times the rate is what a chi-square of 4.6 is: it moves
+no decision by an epoch. Sizes are one sigma of a normal prior: a fault of four times that is told
+as soon.
 """
 
 from __future__ import annotations
@@ -208,7 +207,7 @@ def time_kinds(device: str, model: Model) -> list[Kind]:
         return []
     step = Kind(
         *("time_offset", f"{device} stamps have stepped", "s", STATES, TIME),
-        *((max(float(model.initial[slot]) for slot in slots),), LATE_PER_H),
+        *((max(float(model.initial[slot]) for slot in slots),), RECEIVER_PER_H),
         device=device,
         slots=tuple(slots),
         axes=("",),
@@ -216,7 +215,7 @@ def time_kinds(device: str, model: Model) -> list[Kind]:
     # From the start on, so that the filter itself lags: as long as a line may delay a fix.
     shifted = Kind(
         *("late", f"{device} is late, and the solution with it,", "s", SHIFTED, TIME),
-        *((LAGGED_S,), LATE_PER_H),
+        *((LAGGED_S,), RECEIVER_PER_H),
         device=device,
         slots=tuple(slots),
         axes=("",),

@@ -40,7 +40,7 @@ from fusiond.estimators.fault_bank import (
     VELOCITY,
     VELOCITY_RAMP,
 )
-from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, RIVAL_ODDS
+from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, FAULTY, RIVAL_ODDS
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
@@ -53,6 +53,8 @@ Array = NDArray[np.float64]
 
 APART = 4.0
 """Log odds between two classes: fifty to one."""
+COUNTS = 1e-3
+"""Probability of any fault below which what is open is not computed between two measurements."""
 ALIKE = 7.0
 """Hypotheses of the class that are less likely by more than this count nothing."""
 GROWS: dict[int, tuple[int | None, int | None]] = {
@@ -217,10 +219,16 @@ class Diagnosis:
                 one.fused(t_ns, () if aid.constraint else outcome.whitened)
             elif outcome.name == "gated" and not one.out and (not aid.constraint or aid.no_slip):
                 one.gated(t_ns, explained)
-        if correction is None and bank is not None:
+        if correction is None and bank is not None and self._widens(aid, bank):
             opened_variances(bank.opened(), estimator.step, estimator.wider)
             _open_by_mounting(estimator)
         return correction
+
+    @staticmethod
+    def _widens(aid: Aid, bank: Hypotheses) -> bool:
+        """Whether what is published may be wider by now: at each measurement, and between two while
+        a fault is likely enough to count."""
+        return not aid.constraint or bank.found.item(FAULTY) > COUNTS
 
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
         best, odds, rival = found.item(BEST), found.item(BEST_ODDS), found.item(RIVAL_ODDS)

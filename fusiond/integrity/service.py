@@ -9,7 +9,7 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
 
     from                  to           when
     nominal, probation    suspected    `gate`: a measurement fails
-    suspected             nominal      one passes
+    suspected             nominal, probation   one passes
     suspected             out          the third in a row fails, and no fault of the inertial unit
                                        explains it
     any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
@@ -76,7 +76,8 @@ class Series:
     reason: str = ""
     failed: int = 0
     passed: int = 0
-    was_out_ns: int = 0
+    proven_ns: int = 0
+    """Until when (ns) it is on probation: for as long as it was out."""
     over: float = 0.0
     """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: tuple[float, ...] | None = None
@@ -128,10 +129,11 @@ class Series:
             y0, y1, y2 = (*whitened, 0.0, 0.0)[:3]
             learn(self.noise, t_ns * 1e-9, y0, y1, y2, rows)
         self.failed = 0
-        if self.state is Service.SUSPECTED:
-            self.state, self.since_ns = Service.NOMINAL, t_ns
-        elif self.state is Service.PROBATION and t_ns - self.since_ns > self.was_out_ns:
-            self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
+        if t_ns > self.proven_ns:
+            if self.state is not Service.NOMINAL:
+                self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
+        elif self.state is Service.SUSPECTED:
+            self.state, self.since_ns = Service.PROBATION, t_ns
 
     def looked_at(self, t_ns: int, passes: bool, lasting: float = math.nan) -> None:
         """One that is out was compared with what is published. `lasting`: by how much more
@@ -148,7 +150,7 @@ class Series:
             if self.over + prior < RETURNS:
                 return
         if self.passed >= READMIT_COUNT:
-            self.was_out_ns = t_ns - self.since_ns
+            self.proven_ns = 2 * t_ns - self.since_ns
             self.state, self.since_ns = Service.PROBATION, t_ns
             self.failed = self.passed = 0
 

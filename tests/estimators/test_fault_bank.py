@@ -19,6 +19,7 @@ from fusiond.estimators.fault_odds import solve
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.models.catalogue import make_model
+from fusiond.models.vehicle import FIX_TIME, VELOCITY_TIME, time_offset
 from fusiond.navigation.imu_buffer import ImuBuffer
 from tests import runs
 
@@ -50,7 +51,9 @@ def buffer_of(samples: Array) -> ImuBuffer:
     return runs.filled_buffer(IMU, drive()[0], samples)
 
 
-def aids(t_ns: int, rng: np.random.Generator, fault: str, b: Array) -> list[PositionAid | VelocityAid]:
+def aids(
+    t_ns: int, rng: np.random.Generator, fault: str, b: Array
+) -> list[PositionAid | VelocityAid]:
     """A fix and its velocity, with a fault of that size from `FIRST_NS` on."""
     truth = runs.town_truth(30.0, IMU.rate_hz)
     states = truth.at(np.array([t_ns * 1e-9]))
@@ -260,3 +263,48 @@ def test_each_kind_says_what_it_is() -> None:
         assert kind.per_hour > 0.0
     table = table_of(kinds)
     assert table.columns == RESTARTS * sum(kind.size for kind in kinds)
+
+
+def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
+    """Fixes that are stamped too late from the start on, against ones that are not."""
+    tau_s = 0.02
+    blocks = (time_offset(FIX_TIME, 0.1), time_offset(VELOCITY_TIME, 0.1))
+    model = make_model("ins15", imu_noise(IMU), *blocks)
+    kinds = kinds_of(model, {"gnss": "gnss"}, slips=False)
+    truth = runs.town_truth(30.0, IMU.rate_hz)
+    times, samples, start = drive()
+    found = []
+    for late_s in (0.0, tau_s):
+        made = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds))
+        sd = runs.initial_sd(model, np.radians([0.5, 0.5, 2.0]), 0.3, 2.0)
+        p = np.diag(sd**2)
+        p[9:, 9:] = 1e-16 * np.eye(model.size - 9)
+        made.initialise(0, 0, start.copy(), np.zeros(model.size), p)
+        buffer = buffer_of(samples)
+        for second in range(1, LAST_NS // runs.SECOND + 1):
+            t_ns = second * runs.SECOND
+            made.propagate(buffer, t_ns)
+            states = truth.at(np.array([second - late_s]))
+            lat, lon, up = (float(x) for x in states.position[0])
+            v = tuple(states.v_ned[0].tolist())
+            lever, gate = (0.0, 0.0, 0.0), 1.0 - 1e-12
+            made.update(
+                PositionAid(*("gnss", t_ns, gate, lat, lon, up, (0.1,) * 3, lever), time=FIX_TIME)
+            )
+            made.update(
+                VelocityAid("gnss_velocity", t_ns, gate, v, (0.01,) * 3, lever, VELOCITY_TIME)
+            )
+        found.append(made)
+    sound, late = found
+    bank = sound.hypotheses
+    assert bank is not None
+    row = next(k for k, kind in enumerate(kinds) if kind.name == "late")
+    block, column = divmod(int(bank.table.ints[row, 3]) + RESTART, model.width)
+    expected = bank.sensitivities[block, :9, column] * tau_s
+    apart = error_of(late, sound)
+    for part in (slice(3, 6), slice(6, 9)):
+        scale = np.abs(expected[part]).max()
+        assert scale > 1e-3
+        # The velocity's own lag is a hundredth of the noise that it is told with.
+        least = 0.002 if part.start == 3 else 0.0
+        assert np.abs(apart[part] - expected[part]).max() < 0.15 * scale + least, part
