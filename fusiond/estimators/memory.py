@@ -26,24 +26,24 @@ Array = NDArray[np.float64]
 LINE_BYTES, LINE = 64, 8
 """A line of the cache, in bytes and in doubles."""
 
+
+def line_after(doubles: int) -> int:
+    """Where the next line begins."""
+    return doubles + -doubles % LINE
+
+
 SIZE, ROOM, USED, RECORDED, TRANSITION, GAP, AHEAD, BANK = range(8)
 """What the array begins with, a line of int64: states; covariances, and error estimates, that there
 is room for; how many covariances are propagated, from the first on; of which one sigmas are
 recorded; 1 if there is a transition matrix; ns beyond which no sample may stand; 1 if covariances
 are ahead of those that are held, by what has been added up; doubles of the bank of hypotheses."""
-WIDER_AT, PUBLISHED_AT = LINE, LINE + WIDER
-NAV_AT = PUBLISHED_AT + len(Published._fields)
-NAV_AT += -NAV_AT % LINE
+PUBLISHED_AT = LINE
+WIDER_AT = PUBLISHED_AT + len(Published._fields)
+NAV_AT = line_after(WIDER_AT + WIDER)
 STEP_AT, SUMS_AT = NAV_AT + NAV_SIZE, NAV_AT + NAV_SIZE + STEP_SIZE
 XI_AT = SUMS_AT + SUMS
 """What lies where behind it, in doubles; then come parameters and error estimates, and on the next
-line covariances and the bank, with which ends what a snapshot copies, from the navigation state
-on."""
-
-
-def line_after(doubles: int) -> int:
-    """Where the next line begins."""
-    return doubles + -doubles % LINE
+line covariances and the bank, with which ends what a snapshot copies, from `WIDER_AT` on."""
 
 
 def scratch_size(width: int) -> int:
@@ -55,10 +55,10 @@ def scratch_size(width: int) -> int:
 class Memory(NamedTuple):
     """`array` and the parts of it that are written from Python: `head` (8,) as above; the variances
     (9,) that what is published is `wider` by, `Published` (3,); all that is `kept` by a snapshot:
-    nav (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.crossing, `xi` (n,),
-    `dxs` (k, n), `covs` (k, width, width), the `bank` of fusiond.estimators.fault_bank; covariances
-    before what has been added up, flat, `held`; `phi` (width, width) or (0, 0); `work` for kernels
-    that propagate a covariance; `shares` (k,)."""
+    `wider`, nav (10,), the last step (28,), the `sums` (25,) of fusiond.estimators.crossing, `xi`
+    (n,), `dxs` (k, n), `covs` (k, width, width), the `bank` of fusiond.estimators.fault_bank;
+    covariances before what has been added up, flat, `held`; `phi` (width, width) or (0, 0); `work`
+    for kernels that propagate a covariance; `shares` (k,)."""
 
     array: Array
     head: NDArray[np.int64]
@@ -102,9 +102,9 @@ def memory(
     return Memory(
         array,
         head,
-        array[WIDER_AT:PUBLISHED_AT],
-        array[PUBLISHED_AT : PUBLISHED_AT + len(Published._fields)],
-        array[NAV_AT : first + square + hypotheses],
+        array[WIDER_AT : WIDER_AT + WIDER],
+        array[PUBLISHED_AT:WIDER_AT],
+        array[WIDER_AT : first + square + hypotheses],
         array[NAV_AT:STEP_AT],
         array[STEP_AT:SUMS_AT],
         array[SUMS_AT:XI_AT],

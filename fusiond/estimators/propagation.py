@@ -43,7 +43,15 @@ from fusiond.estimators.memory import (
     XI_AT,
     scratch_size,
 )
-from fusiond.estimators.reading import ENTRIES, entries, in_fix_time, moving, sigmas_of, widen
+from fusiond.estimators.reading import (
+    ENTRIES,
+    WIDER,
+    entries,
+    in_fix_time,
+    moving,
+    sigmas_of,
+    widen,
+)
 from fusiond.estimators.turned_axes import rest_rows, turn_at_rest
 from fusiond.models.model import PLAIN, SCALE
 from fusiond.navigation.compiled import compiled
@@ -275,7 +283,7 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
         n, room, used = head[SIZE], head[ROOM], head[USED]
         gap_ns = min(head[GAP], imu_head[HOLD])
         start, end = imu_head[START], imu_head[END]
-        wider, by = state[WIDER_AT:PUBLISHED_AT], state[PUBLISHED_AT:NAV_AT]
+        wider, by = state[WIDER_AT : WIDER_AT + WIDER], state[PUBLISHED_AT:WIDER_AT]
         time_slot, clock_sd_s, axes_sd_rad = int(by[0]), by[1], by[2]
         nav, step, sums = state[NAV_AT:STEP_AT], state[STEP_AT:SUMS_AT], state[SUMS_AT:XI_AT]
         upto = XI_AT + n + room * n

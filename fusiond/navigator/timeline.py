@@ -38,12 +38,9 @@ MOST_WAITING = 4096
 
 @dataclass(slots=True)
 class Entry:
-    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart, `tilts`
-    that what it corrects the tilt by is added up (fusiond.integrity.tilt), `judged` that its
-    innovation has been looked at: a rewind applies it again, and then what it `says` is known.
-    `assumed`: it counts as coarser than it says, and its own errors have not shown that. `error` is
-    what made it `failed`; `raw` is kept where the timeline `keeps_raw`; `ordinary` is what of it is
-    the same each time that it is applied as nearly all are (fusiond.integrity.ordinary)."""
+    """An aid on the timeline and how it ended so far; `serial` tells equal sources apart, `judged`
+    that its innovation has been told a verdict of: a rewind applies it again. `error` is what made
+    it `failed`; `raw` is kept where the timeline `keeps_raw`."""
 
     key: Key
     aid: Aid

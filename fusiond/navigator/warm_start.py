@@ -83,9 +83,6 @@ Turn = Annotated[float, Field(ge=-3.0, le=3.0)]
 Push = Annotated[float, Field(ge=-20.0, le=20.0)]
 Component = Annotated[float, Field(ge=-1.0001, le=1.0001)]
 Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
-# Of twice the Earth's circumference, and of the fastest that a vehicle's class allows.
-Way = Annotated[float, Field(ge=0.0, le=1e16)]
-Running = Annotated[float, Field(ge=0.0, le=1e8)]
 
 
 @dataclass(frozen=True, slots=True, config=STRICT)

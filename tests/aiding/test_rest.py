@@ -106,48 +106,28 @@ def test_a_wheel_that_turns_is_no_rest() -> None:
     assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) == "moving"
 
 
-def test_a_wheel_that_may_have_drifted_keeps_nobody_from_asking_the_gyros() -> None:
-    """Ten speeds of -0.12 m/s: no rest to claim, but a gyro that is off is told. A wheel without a
-    drift says that the vehicle moves."""
-    turned = (0.0, 0.0, 1.0 * DEG)
-    for sd, doubt in ((0.1, "turns_at_rest"), (0.0, "moving")):
-        witnesses = Witnesses()
-        for k in range(10):
-            aid = WheelSpeedAid(
-                "wheel", round((END_S - 0.1 * k) * 1e9), 0.999, -0.12, 0.1, (0.0,) * 3,
-                drifts=(sd, 1.0),
-            )  # fmt: skip
-            witnesses.hear([aid])
-        assert runs.rest(witnesses=witnesses).doubt(_state(0.0, 0.02)) == "moving"
-        assert runs.rest(mean_rate=turned, witnesses=witnesses).doubt(_state(0.0, 0.02)) == doubt
-
-
 def test_a_turn_is_no_bias() -> None:
     """0.6 deg/s are seen in one window, 0.2 deg/s in ten; what the bias's prior allows is none."""
-    known, unknown = _state(0.0, 0.02), _state(0.0, 0.02, sd_bias_deg_s=0.3)
+    sure, unsure = _state(0.0, 0.5), _state(0.0, 0.5, sd_bias_deg_s=0.3)
     fast, slow = (0.0, 0.0, 0.6 * DEG), (0.0, 0.0, 0.2 * DEG)
-    assert runs.rest(mean_rate=fast).doubt(known) == "turning"
-    assert runs.rest(mean_rate=slow).doubt(known) is None
-    assert runs.rest(mean_rate=slow, run=10).doubt(known) == "turning"
-    assert runs.rest(mean_rate=fast, run=10).doubt(unknown) is None
+    assert runs.rest(mean_rate=fast).doubt(sure) == "turning"
+    assert runs.rest(mean_rate=slow).doubt(sure) is None
+    assert runs.rest(mean_rate=slow, run=10).doubt(sure) == "turning"
+    assert runs.rest(mean_rate=fast, run=10).doubt(unsure) is None
 
 
-def test_a_turn_on_the_spot_is_told_apart_where_the_speed_is_known_to_be_zero() -> None:
+def test_a_turn_is_the_gyros_where_the_speed_is_known_to_be_zero() -> None:
+    """By the filter or by fixes: nothing on wheels turns on the spot, and the rows of the zero rate
+    say that the gyros have changed."""
     mean_rate = (0.0, 0.0, 1.0 * DEG)
-    assert runs.rest(mean_rate=mean_rate).doubt(_state(0.0, 0.02)) == "turns_at_rest"
-    assert runs.rest(mean_rate=mean_rate).doubt(_state(0.0, 0.5)) == "turning"
-    known = runs.rest(mean_rate=mean_rate, witnesses=_fixes(0.0, 10))
-    assert known.doubt(_state(0.0, 0.5)) == "turns_at_rest"
-
-
-def test_a_slow_turn_on_the_spot_is_told_by_a_run_of_windows() -> None:
-    """A gyro that is off by 0.25 deg/s at a red light: one window says nothing, ten say it."""
-    mean_rate = (0.0, 0.0, 0.25 * DEG)
-    known = _state(0.0, 0.02)
-    assert runs.rest(mean_rate=mean_rate).doubt(known) is None
-    assert runs.rest(mean_rate=mean_rate, run=3).doubt(known) == "turning"
-    assert runs.rest(mean_rate=mean_rate, run=10).doubt(known) == "turns_at_rest"
-    assert runs.rest(mean_rate=mean_rate, run=10).doubt(_state(0.0, 0.5)) == "turning"
+    for witnesses, sd_m_s in ((Witnesses(), 0.02), (_fixes(0.0, 10), 0.5)):
+        rest = runs.rest(mean_rate=mean_rate, witnesses=witnesses)
+        state = _state(0.0, sd_m_s)
+        assert rest.doubt(state) is None
+        aid = ZeroRateAid("rate", rest.window.end_ns, 0.9999, mean_rate, 0.1 * DEG, rest)
+        found = aid.innovation(state)
+        assert isinstance(found, Innovation)
+        assert abs(found.z[2]) == pytest.approx(1.0 * DEG, rel=0.01)
 
 
 def test_what_a_creep_may_turn_is_bounded_by_what_is_known_of_the_speed() -> None:

@@ -79,9 +79,6 @@ class Drawn:
     def at(self, nav: Array) -> Drawn:
         return self
 
-    def coarser(self, factor: float) -> Drawn:
-        return Drawn(self._aid.coarser(factor), self._offset)
-
     def offers(self) -> tuple[()]:
         """Its nominal values are no measurements that anything may be told from."""
         return ()

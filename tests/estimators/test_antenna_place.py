@@ -222,18 +222,3 @@ def test_of_two_lever_arms_neither_is_carried() -> None:
     lever, time = antenna_slots(model)
     assert lever.tolist() == model.slots_of(f"{ANTENNA_LEVER}_roof")
     assert time.tolist() == model.slots_of(f"{FIX_TIME}_roof")
-
-
-def test_what_a_drift_has_taught_of_an_offset_in_time_is_open_again() -> None:
-    """A doubt of what a device measures; one of the motion says nothing of it."""
-    model = _model()
-    [late] = model.slots_of(FIX_TIME)
-    for measured in (True, False):
-        estimator = KalmanEstimator(model, 0.5)
-        p = np.diag(model.initial**2)
-        p[late, late] = 0.1 * LATE_SD_S**2
-        nav = np.array([0.53, 1.99, 40.0, 8.0, 3.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        estimator.initialise(0, 0, nav, np.zeros(model.size), p)
-        estimator.doubt(_fix(0, nav[:3]), measured, motion=not measured)
-        known = 1.1 if measured else 0.1
-        assert estimator.covariance[late, late] == pytest.approx(known * LATE_SD_S**2)

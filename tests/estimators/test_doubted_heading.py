@@ -65,7 +65,7 @@ def nees_of_tilt_and_force(kind: type[KalmanEstimator], seed: int) -> float:
     nav = with_error(start, draw)
     estimator.initialise(int(times[first - 1]), first, nav, xi, np.diag(sd**2))
     if isinstance(estimator, InvariantFilter):
-        estimator.turns = True  # as after a doubt
+        estimator.turns = True  # as after a start with a heading of 12 deg
     for t_s in (BEND_S + 0.02, *np.arange(FIXES_S, END_S, 0.2)):
         t_ns = round(float(t_s) * 1e9)
         estimator.propagate(buffer, t_ns)

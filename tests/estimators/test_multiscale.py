@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.load import ConfigError, load_config
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.doubt import DOUBTED_FORCE_M_S2, DOUBTED_RATE_RAD_S
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.multiscale.filter import MultiscaleEstimator
 from fusiond.models.catalogue import make_model
 from fusiond.navigator.filters import estimator_of
 from fusiond.navigator.timeline import Timeline
 from tests import runs
-from tests.estimators.town_drive import IMU, LEVER, SD, SD_V, begun, drive, run
+from tests.estimators.town_drive import IMU, LEVER, SD_V, begun, drive, run
 from tests.navigator import vehicle
 
 Array = NDArray[np.float64]
@@ -147,51 +145,6 @@ def test_a_gated_aid_leaves_nothing_behind(at: int) -> None:
         run(estimator, buffer, aids[at + 1 : at + 9])
     assert (clean.nav == tried.nav).all()
     assert (clean.covariance == tried.covariance).all()
-
-
-def test_a_filter_in_doubt_widens_and_begins_anew() -> None:
-    model, buffer, aids, start, sd = drive()
-    estimator = MultiscaleEstimator(model, IMU.gap_s, 2)
-    begun(estimator, start, sd)
-    run(estimator, buffer, aids[:20])
-    lat, lon, height = (float(x) for x in estimator.nav[:3])
-    far = PositionAid("far", estimator.t_ns, 0.999, lat + 1e-4, lon, height, SD, LEVER)
-    assert estimator.update(far).name == "gated"
-    looked = estimator.look(far)
-    assert looked.name == "isolated"
-    estimator.doubt(far, measured=True, motion=True)
-    passed = estimator.update(far)
-    assert passed.name == "fused"
-    assert passed.nis < 2.0 < looked.nis
-    assert abs(estimator.nav[0] - lat - 1e-4) < 1e-6
-    assert estimator.epochs == 1
-    # Alike in the ordinary filter.
-    one, ordinary = MultiscaleEstimator(model, IMU.gap_s, 1), KalmanEstimator(model, IMU.gap_s)
-    for either in (one, ordinary):
-        begun(either, start, sd)
-        run(either, buffer, aids[:20])
-        either.doubt(far, measured=True, motion=True)
-        assert either.update(far).name == "fused"
-    np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-10, atol=1e-9)
-    np.testing.assert_allclose(one.covariance, ordinary.covariance, rtol=1e-7, atol=1e-15)
-
-
-def test_sensors_that_may_change_again_are_known_as_much_less_in_both() -> None:
-    model, buffer, aids, start, sd = drive()
-    one, ordinary = MultiscaleEstimator(model, IMU.gap_s, 1), KalmanEstimator(model, IMU.gap_s)
-    for estimator in (one, ordinary):
-        begun(estimator, start, sd)
-        run(estimator, buffer, aids[:20])
-        before = estimator.covariance.copy()
-        estimator.unsettle(0.25)
-        added = np.diag(estimator.covariance - before)
-        expected = np.zeros(model.size)
-        expected[9:12] = 0.25 * DOUBTED_RATE_RAD_S**2
-        expected[12:15] = 0.25 * DOUBTED_FORCE_M_S2**2
-        np.testing.assert_allclose(added, expected, rtol=1e-9, atol=1e-12)
-        run(estimator, buffer, aids[20:30])
-    np.testing.assert_allclose(one.nav, ordinary.nav, rtol=1e-10, atol=1e-9)
-    np.testing.assert_allclose(one.covariance, ordinary.covariance, rtol=1e-7, atol=1e-15)
 
 
 def test_an_arrival_out_of_order_is_exact() -> None:

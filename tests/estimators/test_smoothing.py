@@ -89,9 +89,9 @@ class Logging(TapedKalman):
         super()._carry_over(before)
         self.prior = self.covariance.copy()
 
-    def _fold_in(self, aid: Linearised) -> Outcome:
+    def _fold_in(self, aid: Linearised, noise: Array) -> Outcome:
         offsets = self.model.slots_of("clock_offset")
-        outcome = super()._fold_in(aid)
+        outcome = super()._fold_in(aid, noise)
         if offsets and self._phi[offsets[0]].any() == 0:  # the clock started anew
             self.prior = self._before[: self.model.size, : self.model.size].copy()
         return outcome

@@ -47,22 +47,20 @@ def test_an_aid_that_raises_costs_itself(error: Exception) -> None:
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
-@pytest.mark.parametrize("where", ["take", "judge"])
+@pytest.mark.parametrize("where", ["comes", "judge"])
 def test_so_does_one_whose_judgement_raises(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the velocity alone, of which every tenth raises."""
     told: list[str] = []
     navigator, row = started(on_event=lambda code, text: told.append(code))
-    isolation, count = navigator.timeline.isolation, iter(range(10**6))
-    judged = getattr(isolation, where)
+    diagnosis, count = navigator.timeline.diagnosis, iter(range(10**6))
+    judged = getattr(diagnosis, where)
 
     def raising(aid: Aid, *given: Any) -> Any:
         if aid.source == "gnss_velocity" and next(count) % 10 == 9:
             raise ValueError("too many values to unpack")
         return judged(aid, *given)
 
-    monkeypatch.setattr(isolation, where, raising)
-    if where == "judge":
-        monkeypatch.setattr(isolation, "take", lambda *_: None)
+    monkeypatch.setattr(diagnosis, where, raising)
     rest_of_the_drive(navigator, row)
     found = outcomes_of(navigator)["gnss_velocity"]
     assert found["failed"] > 0

@@ -19,11 +19,13 @@ from fusiond.aiding.position import PositionAid
 from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
+from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.base import Outcome
-from fusiond.estimators.doubt import DOUBTED_RATE_RAD_S
 from fusiond.estimators.kalman import KalmanEstimator
-from fusiond.integrity.isolation import Isolation
-from fusiond.navigation.error_model import RATE_ERROR
+from fusiond.integrity.catalogue import Kind, kinds_of, table_of
+from fusiond.integrity.diagnosis import Diagnosis
+from fusiond.models.catalogue import make_model
+from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_quaternion, rpy_from_dcm
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
@@ -36,6 +38,11 @@ SECONDS = 30.0
 START_NS = 5 * runs.SECOND
 KEEP_S = 10.0
 GATE = 0.9999
+
+
+def kinds(model: Model) -> list[Kind]:
+    """What may be wrong of all that the drive has."""
+    return kinds_of(model, {"gnss": "gnss", "compass": "compass", "rdss": "rdss"}, slips=False)
 
 
 class Drive:
@@ -77,7 +84,8 @@ class Drive:
 
     def estimator(self) -> KalmanEstimator:
         """At the start, before the first sample."""
-        model, estimator = runs.make_estimator("ins21", IMU)
+        model = make_model("ins21", imu_noise(IMU))
+        estimator = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds(model)))
         p = np.diag(runs.initial_sd(model, self.sd, 0.2, 3.0) ** 2)
         estimator.initialise(START_NS, 0, self.nav, np.zeros(model.size), p)
         return estimator
@@ -85,7 +93,9 @@ class Drive:
     def timeline(self, keep_s: float = KEEP_S, checkpoint_s: float = 0.5) -> Timeline:
         """Started, with no sample and no aid yet; its buffer is moved every 20 s or so."""
         buffer = ImuBuffer(1.0, keep_s, np.eye(3), 0.0, IMU.gap_s)
-        timeline = Timeline(self.estimator(), buffer, keep_s, checkpoint_s)
+        estimator = self.estimator()
+        given = keep_s, checkpoint_s, None, kinds(estimator.model)
+        timeline = Timeline(estimator, buffer, *given)
         timeline.start()
         return timeline
 
@@ -97,10 +107,10 @@ def drive() -> Drive:
 
 @lru_cache(maxsize=1)
 def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
-    """The reference knows no timeline: propagate to each aid in turn, apply it, a velocity with the
-    sigma that its series deserves, go on."""
+    """The reference knows no timeline: propagate to each aid in turn, apply and judge it, go on."""
     d = drive()
-    estimator, isolation = d.estimator(), Isolation()
+    estimator = d.estimator()
+    diagnosis = Diagnosis(kinds(estimator.model))
     buffer = runs.filled_buffer(IMU, d.times, d.samples)
     outcomes = []
     for aid in d.aids:
@@ -109,11 +119,13 @@ def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
             estimator.release()
         elif isinstance(aid, RdssPositionAid):
             estimator.hold()
-        lasting = isolation.coarseness(aid)
-        outcome = estimator.update(aid.coarser(lasting))
+        one = diagnosis.comes(aid, estimator)
+        outcome = estimator.look(aid) if one.out else estimator.update(aid, one.noise)
         outcomes.append(outcome)
         if outcome.name in JUDGED:
-            isolation.judge(aid, outcome, estimator.nav)
+            correction = diagnosis.judge(aid, one, outcome, estimator)
+            if correction is not None:
+                estimator.adopt(correction.mean, correction.spread)
     estimator.propagate(buffer, buffer.latest_ns)
     return estimator, outcomes
 
@@ -125,6 +137,10 @@ def assert_same_state(a: KalmanEstimator, b: KalmanEstimator) -> None:
     assert a.xi.tobytes() == b.xi.tobytes()
     assert a.covariance.tobytes() == b.covariance.tobytes()
     assert a.step.tobytes() == b.step.tobytes()
+    assert a.wider.tobytes() == b.wider.tobytes()
+    assert a.hypotheses is not None
+    assert b.hypotheses is not None
+    assert a.hypotheses.log_odds.tobytes() == b.hypotheses.log_odds.tobytes()
 
 
 def test_the_reference_has_outliers_and_navigates() -> None:
@@ -132,19 +148,9 @@ def test_the_reference_has_outliers_and_navigates() -> None:
     names = Counter(o.name for o in outcomes)
     assert names["gated"] == 3
     assert names["fed_back"] > 5
-    assert names["fused"] == len(outcomes) - 3 - names["fed_back"]
+    assert names["isolated"] == 5  # until as many have passed
+    assert names["fused"] == len(outcomes) - 3 - 5 - names["fed_back"]
     assert np.sqrt(np.diag(estimator.covariance)[6:8]).max() < 1.5
-
-
-def test_a_velocity_that_counts_by_an_assumption_is_no_witness_of_its_sigma() -> None:
-    d = drive()
-    timeline = d.timeline()
-    timeline.imu.append(d.times, d.samples)
-    entries = [timeline.insert(aid) for aid in d.aids]
-    timeline.run()
-    velocities = [entry.assumed for entry in entries if entry.aid.moves]
-    assert velocities == [False] + [True] * (len(velocities) - 1)  # half a minute of them
-    assert not any(entry.assumed for entry in entries if not entry.aid.moves)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -237,14 +243,16 @@ def test_an_aid_at_the_oldest_instant_is_exact_and_before_it_too_old(chunk: int)
         reference = d.estimator()
         buffer = runs.filled_buffer(IMU, d.times[:arrival], d.samples[:arrival])
         reference.propagate(buffer, oldest)
-        reference.update(aid)
+        diagnosis = Diagnosis(kinds(reference.model))
+        one = diagnosis.comes(aid, reference)
+        assert diagnosis.judge(aid, one, reference.update(aid), reference) is None
         reference.propagate(buffer, buffer.latest_ns)
         assert_same_state(timeline.estimator, reference)
 
 
 def test_before_the_start() -> None:
     d = drive()
-    timeline = Timeline(d.estimator(), d.timeline().imu, KEEP_S, 0.5)
+    timeline = Timeline(d.estimator(), d.timeline().imu, KEEP_S, 0.5)  # of no kinds
     early = replace(d.aids[0], t_ns=START_NS - 1)  # type: ignore[type-var]
     entry = timeline.insert(early)
     timeline.insert(d.aids[1])
@@ -298,8 +306,8 @@ def test_memory_does_not_grow_on_a_long_run() -> None:
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.0])
 def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> None:
-    """A source that leaves the filter by 300 m is left out from its third fix on, late or not, and
-    the filter goes on without it."""
+    """A receiver whose positions leave filter and velocities by 300 m is left out from its third
+    fix on, late or not, and the filter goes on without it."""
     d = drive()
     timeline = d.timeline()
     fixes = [
@@ -308,6 +316,8 @@ def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> No
     ]
     entries = []
     sample = 0
+    for velocity in (a for a in d.aids if isinstance(a, VelocityAid)):
+        timeline.insert(velocity)
     for fix in fixes:
         upto = int(np.searchsorted(d.times, fix.t_ns + round(delay_s * 1e9), side="right"))
         timeline.imu.append(d.times[sample:upto], d.samples[sample:upto])
@@ -319,54 +329,48 @@ def test_a_lasting_disagreement_is_never_ended_by_patience(delay_s: float) -> No
     timeline.run()
     names = [e.outcome.name for e in entries if e.outcome]
     assert set(names[:10]) == {"fused"}
-    assert names[10:13] == ["gated"] * 3
-    assert set(names[13:]) == {"isolated"}
-    assert timeline.isolation.excluded == {fixes[0].source: "jumped"}
-    lost = timeline.isolation.lost(timeline.estimator.t_ns)
-    assert lost is not None
-    assert (lost.cause, lost.since_ns) == ("source", fixes[10].t_ns)
+    assert names[10:12] == ["gated"] * 2
+    assert set(names[12:]) == {"isolated"}
+    [finding] = timeline.diagnosis.findings
+    assert timeline.diagnosis.excluded == {"gnss": finding.text}
+    assert finding.kind.text == "gnss position is off"
+    assert finding.largest == 0
+    assert finding.size[0] == pytest.approx(5e-5 * 6.35e6, rel=0.02)
 
 
 def test_a_wrong_heading_is_left_out() -> None:
+    """And told by how much it is off."""
     d = drive()
     timeline = d.timeline()
-    compass = [
-        replace(a, yaw_rad=a.yaw_rad + math.radians(40.0))
-        for a in d.aids
-        if isinstance(a, HeadingAid)
-    ]
     timeline.imu.append(d.times, d.samples)
-    entries = [timeline.insert(a) for a in compass]
+    off = math.radians(40.0)
+    entries = [
+        timeline.insert(replace(a, yaw_rad=a.yaw_rad + off) if isinstance(a, HeadingAid) else a)
+        for a in d.aids
+    ]
     timeline.run()
-    names = [e.outcome.name for e in entries if e.outcome]
+    names = [e.outcome.name for e in entries if e.outcome and isinstance(e.aid, HeadingAid)]
     assert set(names[:3]) == {"gated"}
     assert set(names[3:]) == {"isolated"}
+    finding = next(f for f in timeline.diagnosis.findings if f.kind.device == "compass")
+    assert abs(finding.size[0] - 40.0) < 4.0 * finding.sd[0]
     truth = runs.true_nav(runs.town_truth(SECONDS, IMU.rate_hz), np.array([SECONDS]))[0]
     phi = runs.nav_error(timeline.estimator.nav, truth)[:3]
     assert abs(phi[2]) < 5.0 * math.sqrt(timeline.estimator.covariance[2, 2])
     assert abs(phi[2]) < math.radians(5.0)
 
 
-def test_sensors_that_may_have_changed_are_opened_before_an_aid(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """By as much of a doubt's variance as may have come since the fix before."""
+def test_a_heading_that_nothing_else_can_check_is_published_as_open() -> None:
+    """A compass that is off by 40 deg from the start, beside an inertial unit alone: nobody can
+    tell which of the two has turned."""
     d = drive()
-    fixes = [aid for aid in d.aids if isinstance(aid, PositionAid)]
-    shares = dict.fromkeys((fix.t_ns for fix in fixes), 0.0)
-
-    def bias_sd_rad_s() -> float:
-        timeline = d.timeline()
-        timeline.imu.append(d.times, d.samples)
-        for fix in fixes:
-            timeline.insert(fix)
-        timeline.run()
-        slot = timeline.estimator.model.parameters(RATE_ERROR)[0]
-        return math.sqrt(timeline.estimator.covariance[slot, slot])
-
-    monkeypatch.setattr(Isolation, "unsettled", lambda _, t_ns: shares[t_ns])
-    settled = bias_sd_rad_s()
-    shares[fixes[-1].t_ns] = 0.25
-    opened = 0.5 * DOUBTED_RATE_RAD_S
-    assert bias_sd_rad_s() == pytest.approx(math.hypot(settled, opened), rel=0.02)
-    assert opened > 10.0 * settled
+    timeline = d.timeline()
+    timeline.imu.append(d.times, d.samples)
+    for a in d.aids:
+        if isinstance(a, HeadingAid):
+            timeline.insert(replace(a, yaw_rad=a.yaw_rad + math.radians(40.0)))
+    timeline.run()
+    truth = runs.true_nav(runs.town_truth(SECONDS, IMU.rate_hz), np.array([SECONDS]))[0]
+    error = runs.nav_error(timeline.estimator.nav, truth)[2]
+    assert not timeline.diagnosis.findings
+    assert abs(error) < 3.0 * timeline.estimator.sigmas()[8]

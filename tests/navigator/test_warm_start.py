@@ -18,7 +18,6 @@ from pydantic import TypeAdapter
 from drivers.measurements import MonotonicStamp, PositionFix
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
-from fusiond.integrity.moved import Moved
 from fusiond.models.catalogue import make_model
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.navigator import Navigator
@@ -30,7 +29,6 @@ from fusiond.navigator.state_file import (
 )
 from fusiond.navigator.warm_start import (
     LONGEST_GAP_S,
-    WarmMoved,
     WarmStart,
     WarmState,
     same_run,
@@ -45,9 +43,8 @@ COLD: dict[str, Any] = {**CONFIG, "alignment": {"heading": ["gnss_course"]}}
 
 
 def _kept(navigator: Navigator) -> WarmState:
-    moved = navigator.timeline.isolation.handed_on(navigator.estimator.t_ns)
     given = navigator.estimator, navigator.imu, "gnss course", "digest", "boot", 0
-    return warm_state(*given, confirmed=True, moved=moved)
+    return warm_state(*given, confirmed=True)
 
 
 @lru_cache(maxsize=1)
@@ -187,37 +184,6 @@ def test_precise_velocities_do_not_tell_which_way_it_went_in_the_gap() -> None:
     # Of 40 figures each, every tenth or so independent: 1 % of restarts by chance.
     assert sum(w > 3.0 for w in worst) <= 3
     assert max(worst) < 4.5
-
-
-def _moved(t_s: float, device: str = "gnss") -> Moved:
-    """A receiver that was back for a second after ten without it, off by 20 m at most."""
-    return Moved(device, START_NS + round(t_s * 1e9) - 10**9, 10**10, (400.0, 400.0, 100.0))
-
-
-def test_what_a_receiver_may_be_off_by_outlasts_the_process() -> None:
-    """Where it was left open, a restart vouched for the fixes that it had not."""
-    found = {}
-    for moved in (None, _moved(14.0)):
-        kept = replace(_states()[14.0], moved=None if moved is None else WarmMoved(*moved))
-        state = WARM_STATE.validate_json(WARM_STATE.dump_json(kept))
-        navigator, _ = _restarted(state, 15.0)
-        navigator.add(_fix(navigator), navigator.imu.latest_ns)
-        navigator.advance()
-        assert navigator.timeline.isolation.moved == moved
-        found[moved] = navigator.solution(navigator.imu.latest_ns).sd_ned_m
-    assert max(found[None][:2]) < 2.0
-    # It fades as ten seconds to all that have passed.
-    assert min(found[_moved(14.0)][:2]) > 20.0 * math.sqrt(10.0 / 13.0)
-
-
-def test_nor_is_it_forgotten_where_its_fix_ends_the_restart() -> None:
-    """As of one that was left out when the process ended: the navigation begins anew with it."""
-    state = replace(_states()[20.0], moved=WarmMoved(*_moved(20.0)))
-    navigator, _ = _restarted(state, 21.0)
-    navigator.add(_fix(navigator, north_m=100.0), navigator.imu.latest_ns)
-    navigator.advance()
-    assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.ALIGNING
-    assert navigator._standing.moved == _moved(20.0)
 
 
 def test_a_fix_that_disagrees_ends_it() -> None:

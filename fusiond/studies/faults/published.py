@@ -39,7 +39,6 @@ JUDGED = (0, 1, 2, 3, 4, 6, 7, 8)
 """Columns that lie, as in `judge`: all but the velocity down."""
 _FIGURES = 18
 _TURNS = slice(6, 9)
-NO_ERROR = (0.0,) * 9
 
 
 @dataclass(frozen=True, slots=True)
