@@ -21,6 +21,7 @@ def page(answer: dict[str, Any]) -> list[str]:
     ]
     facts = [
         *(_solution(nav) if nav is not None else ()),
+        *(("FAULT", fault["text"]) for fault in status["faults"]),
         *_vehicle(status),
         *(_process(health) if health is not None else ()),
     ]
@@ -121,21 +122,28 @@ def _sources(
     sources: dict[str, dict[str, Any]], consistency: dict[str, Any] | None
 ) -> Iterator[str]:
     verdicts = {} if consistency is None else consistency["sources"]
-    rows = [("source", "state", "fused", "refused", "age", "latency", "verdict", "")]
+    rows = [("source", "state", "service", "fused", "refused", "age", "latency", "verdict", "")]
     for name, source in sources.items():
         rows.append(
             (
                 name,
                 source["state"],
+                source["service"] or _UNKNOWN,
                 str(source["fused"]),
                 _refused(source["rejected"]),
                 _time(source["age_s"]),
                 _time(source["latency_s"]),
                 verdicts.get(name, {}).get("verdict") or source["verdict"] or _UNKNOWN,
-                source["detail"] if source["state"] != "running" else source["isolated"] or "",
+                source["detail"] if source["state"] != "running" else _left_out(source),
             )
         )
     return columns(rows)
+
+
+def _left_out(source: dict[str, Any]) -> str:
+    """What is wrong with it; nothing where nothing is."""
+    fault = source["diagnosis"]
+    return str(source["isolated"] or "") if fault is None else str(fault["text"])
 
 
 def _refused(reasons: dict[str, int]) -> str:

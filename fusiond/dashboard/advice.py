@@ -39,10 +39,6 @@ WHY: tuple[tuple[str, Level, str], ...] = (
     (r"no fix has confirmed|no motion has confirmed", "info", "Drive on: it needs to be seen."),
     (r"^no position fused", "warning", "Get a receiver back; meanwhile trust sigma, which grows."),
     (r"^horizontal sigma", "error", "Get a receiver back, or set_position: it is lost."),
-    (r"nothing else can check it", "warning", "Two devices disagree: look which one is wrong."),
-    (r"^on trial", "info", "Drive on with turns: it proves itself within the time stated."),
-    (r"^after a failure", "info", "Drive a bend, or brake and speed up: motion proves it."),
-    (r"^IMU and aids did not fit", "info", "Drive on; if it comes back, check the mounting."),
 )
 """Patterns of `why` (the navigator's and the aligner's words), and what helps; the first counts."""
 
@@ -81,6 +77,9 @@ def _of_status(status: Said) -> Iterator[Advice]:
             if re.search(pattern, why):
                 yield Advice(level, "navigation", text)
                 break
+    for fault in _objects(status, "faults"):
+        source, text = str(fault.get("source", "")), str(fault.get("text", ""))
+        yield Advice("warning", source, f"Look after {source}: {text}.")
     if status.get("protection") == "beyond":
         text = "The protection level is beyond its limit: do not rely on the position."
         yield Advice("error", "integrity", text)
@@ -100,7 +99,7 @@ def _of_sources(health: Said) -> Iterator[Advice]:
         elif state in _STATES:
             level, text = _STATES[state]
             yield Advice(level, name, f"{name} {text}.")
-        if source.get("isolated"):
+        if source.get("isolated") and not source.get("diagnosis"):
             yield Advice("warning", name, f"{name} disagrees with the rest and is left out.")
         verdict = source.get("verdict")
         if verdict in _VERDICTS:
@@ -115,6 +114,11 @@ def _of_the_host(status: Said, health: Said) -> Iterator[Advice]:
         yield Advice("warning", "scheduler", text)
     if health.get("utc_settled") is False and status.get("mode") == "navigating":
         yield Advice("info", "clock", "UTC may have jumped: nothing is dated until it settles.")
+
+
+def _objects(said: Said, name: str) -> list[Said]:
+    inner = said.get(name)
+    return [each for each in inner if isinstance(each, Mapping)] if isinstance(inner, list) else []
 
 
 def _mappings(said: Said, name: str) -> list[tuple[str, Said]]:

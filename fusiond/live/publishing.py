@@ -135,6 +135,7 @@ class Publishing:
                 fused=fused,
                 rejected=rejected,
                 imu=self._sources.imu.used,
+                faults=self._sources.faults(t_ns),
                 calibrated=self._navigator.calibrating.settled,
                 recording=self._recording(),
                 injected=self._injection.active,

@@ -26,9 +26,11 @@ from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.live.injection import Injection
 from fusiond.live.supervision import supervise
+from fusiond.navigator.faults import worst
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.raw_gnss import Seen
+from fusiond.outputs.messages.fault import FaultReport, fault_report
 from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth, SourceHealth
 
 Array = NDArray[np.float64]
@@ -161,11 +163,37 @@ class Sources:
         asks = (getattr(s.driver, "request_now", None) for s in self.all.values())
         return [ask(t_ns) for ask in asks if ask is not None]
 
+    def faults(self, now_ns: int) -> tuple[FaultReport, ...]:
+        """Of the whole vehicle, the inertial unit's under the name of the one that is used; the
+        latest at the end."""
+        return tuple(
+            fault_report(f.finding, f.finding.kind.device or self.imu.used or "imu", now_ns)
+            for f in self._navigator.service.faults(now_ns)
+        )
+
+    def _diagnosed(self, now_ns: int) -> Callable[[str], dict[str, Any]]:
+        """What `health` of a source says of its service and of its latest fault."""
+        service = self._navigator.service
+        told = list(zip(service.faults(now_ns), self.faults(now_ns), strict=True))
+
+        def of(name: str) -> dict[str, Any]:
+            states = service.states(name)
+            faults = [said for f, said in told if said.source == name or name in f.series]
+            return {
+                "service": worst(states.values()),
+                "series": states,
+                "isolated": service.reason(name),
+                "diagnosis": faults[-1] if faults else None,
+            }
+
+        return of
+
     def health(self, now_ns: int) -> dict[str, SourceHealth]:
         """`health` by source; what the filter makes by itself (`zero_velocity`) has its own
         line."""
         navigator = self._navigator
         outcomes = navigator.timeline.counters.outcomes
+        diagnosed = self._diagnosed(now_ns)
         health: dict[str, SourceHealth] = {}
         for name in dict.fromkeys((*self.all, *outcomes, *navigator.refused)):
             ended = outcomes.get(name, Counter())
@@ -183,7 +211,7 @@ class Sources:
                     fused=ended["fused"],
                     rejected=rejected,
                     fused_age_s=fused_age,
-                    isolated=navigator.isolated(name),
+                    **diagnosed(name),
                     verdict=navigator.verdicts.verdict(name),
                 )
                 continue
@@ -212,7 +240,7 @@ class Sources:
                 fused_age_s=fused_age,
                 latency_s=None if source.latency_s is None else round(source.latency_s, 4),
                 counters=counters,
-                isolated=navigator.isolated(name),
+                **diagnosed(name),
                 verdict=navigator.verdicts.verdict(name),
                 sky=self._sky(name),
             )

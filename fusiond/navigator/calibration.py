@@ -195,6 +195,12 @@ class CalibrationWatch:
         self.parameters: tuple[Parameter, ...] = ()
         """As last looked at; empty before the filter has run."""
 
+    def corrected(self) -> None:
+        """A fault was taken out of the state, mounting angles with it: what they were before says
+        nothing of a turn."""
+        self._known[:] = False
+        self.turned = None
+
     @property
     def settled(self) -> bool:
         """Whether all that is estimated has settled."""

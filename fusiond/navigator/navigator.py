@@ -28,6 +28,7 @@ from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
+from fusiond.navigator.faults import SourceService
 from fusiond.navigator.filters import (
     estimator_of,
     imu_buffer_of,
@@ -98,7 +99,8 @@ class Navigator:
         self._constraints = ConstraintMaker(config.constraints, self._noise)
         names = e.federated.sources or tuple(config.aiding)
         self._failed = FailedAids(self._event)
-        self._service = ServiceEvents(self.timeline, names, self._event)
+        self._service_events = ServiceEvents(self.timeline, self._event)
+        self.service = SourceService(self.timeline, names)
         self._protection = ProtectionWatch(config, self.estimator, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
@@ -240,6 +242,8 @@ class Navigator:
             self._event("filter_not_finite", f"{what}: aligning anew")
             self.reset(what)
             return
+        if self._service_events.tell():
+            self.calibrating.corrected()
         if self._refuted():  # before it is a failure, of which it would be the reason
             return
         failure = self._status.failure(self.timeline.diagnosis)
@@ -247,7 +251,6 @@ class Navigator:
             self._event("diverged", f"{failure}: aligning anew")
             self.reset(failure)
             return
-        self._service.tell()
         if self.warm is not None and self.warm.refused_by is not None:
             why = f"{self.warm.refused_by} speaks against the state of before the restart"
             self._event("warm_start_refused", f"{why}: aligning anew")
@@ -301,10 +304,6 @@ class Navigator:
         """What the heading hangs on and nothing has shown, in words; empty where it does not."""
         hangs = self._afterwards.unconfirmed if self._afterwards else ""
         return "no fix has confirmed it yet" if self.on_trial else hangs
-
-    def isolated(self, source: str) -> str | None:
-        """Why the fault detection leaves a source out; None if it does not."""
-        return self._service.reason(source)
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, of all that has been run by `advance`.

@@ -1,58 +1,39 @@
-"""Sources that are out of service, told to the operator and asked for by name; faults told."""
+"""Events of faults and of service: told once each, as timeline and estimator find them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from fusiond.estimators.base import Estimator
-from fusiond.estimators.federated.options import local_of
 from fusiond.navigator.timeline import Timeline
 
 
 class ServiceEvents:
-    """What timeline and estimator leave out; `on_event(code, text)` hears of it.
+    """What has changed since the last look; `on_event(code, text)` hears of it."""
 
-    `names`: the estimator's own sources, of which a name may stand for several series.
-    """
+    def __init__(self, timeline: Timeline, on_event: Callable[[str, str], None]) -> None:
+        self._timeline, self._event = timeline, on_event
+        self._out: dict[str, str] = {}
+        """Told to be left out, and why."""
+        self._found_ns: dict[tuple[str, str], int] = {}
+        """By kind and device: the last finding that was seen."""
 
-    def __init__(
-        self,
-        timeline: Timeline,
-        names: tuple[str, ...],
-        on_event: Callable[[str, str], None],
-    ) -> None:
-        self._timeline, self._names, self._event = timeline, names, on_event
-        self._told: dict[str, str] = {}
-        self._told_ns: dict[str, int] = {}
-
-    @property
-    def _estimator(self) -> Estimator:
-        return self._timeline.estimator
-
-    def tell(self) -> None:
-        """Events where the isolated sources are no longer those last told."""
-        for finding in self._timeline.diagnosis.findings:
-            told_ns = self._told_ns.get(finding.kind.name, -1)
-            if finding.kind.corrected and finding.t_ns > told_ns:
-                self._told_ns[finding.kind.name] = finding.t_ns
+    def tell(self) -> bool:
+        """`sensor_fault` for each step that was corrected, `isolated` and `readmitted` for each
+        series that has left or is back in service; whether there are new findings."""
+        diagnosis, found = self._timeline.diagnosis, False
+        for finding in diagnosis.findings:
+            key = finding.kind.name, finding.kind.device
+            if finding.t_ns <= self._found_ns.get(key, -1):
+                continue
+            self._found_ns[key], found = finding.t_ns, True
+            if finding.kind.corrected:
                 self._event("sensor_fault", finding.text)
-        now = self._estimator.isolated | self._timeline.diagnosis.excluded
-        if now == self._told:
-            return
+        now = self._timeline.estimator.isolated | diagnosis.excluded
         for source, reason in now.items():
-            if source not in self._told:
+            if source not in self._out:
                 self._event("isolated", f"{source} is left out of the solution: {reason}")
-        for source in self._told:
+        for source in self._out:
             if source not in now:
                 self._event("readmitted", f"{source} is believed again")
-        self._told = now
-
-    def reason(self, source: str) -> str | None:
-        """Why a source of aids is left out; None if it is not."""
-        if (reason := self._timeline.diagnosis.excluded.get(source)) is not None:
-            return reason
-        found = self._estimator.isolated
-        if not found:
-            return None
-        local = local_of(source, self._names)
-        return None if local is None else found.get(self._names[local])
+        self._out = now
+        return found

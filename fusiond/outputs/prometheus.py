@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from drivers.base import DriverStatus, State
 from fusiond.configuration.outputs import Prometheus
+from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Mode
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.figures import motion, usable
@@ -222,6 +223,14 @@ def _of_status(status: StatusMessage, vehicle: str) -> Iterator[Family]:
     yield _states(
         "fusiond_mode", "What the solution is worth.", ("mode",), [((), status.mode)], Mode
     )
+    labels = ("source", "kind", "axis", "unit", "action")
+    keys = [(f.source, f.kind, f.axis or "", f.unit, f.action) for f in status.faults]
+    text = "Size of each fault that is not over, in its unit."
+    sizes = dict(zip(keys, (f.size for f in status.faults), strict=True))
+    yield _labelled("fusiond_fault_size", "gauge", text, labels, sizes)
+    text = "One sigma of that size."
+    sigmas = dict(zip(keys, (f.sd for f in status.faults), strict=True))
+    yield _labelled("fusiond_fault_sigma", "gauge", text, labels, sigmas)
 
 
 def _of_health(health: HealthMessage) -> Iterator[Family]:
@@ -238,6 +247,9 @@ def _of_health(health: HealthMessage) -> Iterator[Family]:
     text = "What a device is doing."
     held = [((name,), source.state) for name, source in sources.items()]
     yield _states("fusiond_source_state", text, ("source", "state"), held, get_args(State))
+    text = "Whether what a source sends is fused; of a device that of its worst series."
+    served = [((name,), source.service) for name, source in sources.items() if source.service]
+    yield _states("fusiond_source_service", text, ("source", "state"), served, Service)
     ages = (
         ("age", "Since the last measurement came in.", "age_s"),
         ("fused_age", "Since the last measurement was fused.", "fused_age_s"),

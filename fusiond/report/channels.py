@@ -10,7 +10,7 @@ import numpy as np
 
 from fusiond.clock.host import SECOND_NS
 from fusiond.files.csv_tables import Floats
-from fusiond.report.run import Estimated, Innovations, Sky, Verdicts
+from fusiond.report.run import Estimated, Fault, Innovations, Sky, Verdicts
 
 
 def number(value: object) -> float:
@@ -156,6 +156,8 @@ class Healths:
         self._latency: dict[str, list[tuple[float, ...]]] = {}
         self._sky: dict[str, list[tuple[float, ...]]] = {}
         self._reasons: dict[str, Counter[str]] = {}
+        self.service: dict[str, Counter[str]] = {}
+        """By source: messages in each state of service."""
 
     def take(self, t_s: float, said: dict[str, Any]) -> None:
         self._usage.append((t_s, number(said.get("cpu_percent")), number(said.get("memory_mb"))))
@@ -163,6 +165,8 @@ class Healths:
             rejected = _counts(one.get("rejected"))
             self.outcomes[source] = {"fused": _count(one.get("fused")), **rejected}
             self.counters[source] = _counts(one.get("counters"))
+            if isinstance(state := one.get("service"), str):
+                self.service.setdefault(source, Counter())[state] += 1
             latency = number(one.get("latency_s"))
             if not isnan(latency):
                 self._latency.setdefault(source, []).append((t_s, latency))
@@ -194,6 +198,34 @@ class Healths:
             t_s, used, refused, pdop = _rows(rows, 4).T
             found[source] = Sky(t_s, used, refused, pdop, dict(self._reasons[source]))
         return found
+
+
+class FaultLists:
+    """`faults` of `/status`: each from the first message that tells it to the last in a row."""
+
+    def __init__(self) -> None:
+        self.found: list[Fault] = []
+        self._now: dict[tuple[str, ...], Fault] = {}
+
+    def take(self, t_s: float, said: dict[str, Any]) -> None:
+        told = said.get("faults")
+        before, self._now = self._now, {}
+        for one in told if isinstance(told, list) else ():
+            if not isinstance(one, dict):
+                continue
+            source, kind, axis, unit, action = (
+                str(one.get(k) or "") for k in ("source", "kind", "axis", "unit", "action")
+            )
+            key = source, kind, action
+            fault = before.get(key)
+            if fault is None:
+                begun_s = t_s - number(one.get("since_s"))
+                fault = Fault(source, kind, begun_s, t_s)
+                self.found.append(fault)
+            fault.last_s, fault.axis, fault.unit, fault.action = t_s, axis, unit, action
+            fault.size, fault.sd = number(one.get("size")), number(one.get("sd"))
+            fault.log_odds = number(one.get("log_odds"))
+            self._now[key] = fault
 
 
 def _count(value: object) -> int:

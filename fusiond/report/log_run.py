@@ -19,7 +19,14 @@ from fusiond.recording.info import info
 from fusiond.recording.reader import Log, LogMessage
 from fusiond.recording.records import Record
 from fusiond.report.bias_states import Biases
-from fusiond.report.channels import Calibrations, Healths, InnovationLists, VerdictLists, number
+from fusiond.report.channels import (
+    Calibrations,
+    FaultLists,
+    Healths,
+    InnovationLists,
+    VerdictLists,
+    number,
+)
 from fusiond.report.input_look import InputLook
 from fusiond.report.run import Event, LogParts, Problem, Run
 from fusiond.report.settings import differing
@@ -133,6 +140,7 @@ class _Channels:
         self._innovations = InnovationLists(self._epoch_ns)
         self._verdicts = VerdictLists()
         self._health = Healths()
+        self._faults = FaultLists()
         self._calibration = Calibrations()
         self._biases = Biases(log.about.attachments.get(CONFIG))
         self._take: dict[str, Callable[[float, dict[str, Any]], None]] = {
@@ -177,6 +185,7 @@ class _Channels:
         self.events.append(Event(t_s, level, code, source, text))
 
     def _status(self, t_s: float, said: dict[str, Any]) -> None:
+        self._faults.take(t_s, said)
         dropped = number(said.get("recording_dropped"))
         self.dropped = self.dropped if isnan(dropped) else int(dropped)
 
@@ -204,6 +213,8 @@ class _Channels:
         return LogParts(
             outcomes=self._health.outcomes,
             counters=self._health.counters,
+            service=self._health.service,
+            faults=self._faults.found,
             innovations=self._innovations.by_source(),
             verdicts=self._verdicts.by_source(),
             biases=self._biases.by_axis(),

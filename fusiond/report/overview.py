@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from fusiond.files.tables import TrajectoryTable
+from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Mode
 from fusiond.report.items import Item, Section, Sentence, Table, Track
 from fusiond.report.local import metres_from, origin_of
 from fusiond.report.run import Run
 
 MODES = tuple(str(mode) for mode in Mode)
+SERVICES = tuple(str(state) for state in Service)
 MARKED_FROM = 0.05
 """Share of refusals that catches the eye: a gate alone refuses 1e-4 by its default."""
 _NO_FAULT = frozenset(
@@ -34,6 +36,8 @@ def summary(run: Run) -> Section:
         ("facts", Table("Run", ("", ""), [*run.facts, *length])),
         ("modes", _modes(run)),
         ("outcomes", _outcomes(run)),
+        ("service", _service(run)),
+        ("faults", _faults(run)),
         ("events", _events(run)),
         ("differs", _differs(run)),
     ]
@@ -121,6 +125,43 @@ def _outcomes(run: Run) -> Item:
         "Good: nearly all `fused`; `no_alignment` only before the start, `gated` about as often as"
         " the gate's probability says. Marked: more than a twentieth was refused for what it said.",
         frozenset(wrong),
+    )
+
+
+def _service(run: Run) -> Item:
+    if run.log is None or not run.log.service:
+        return Sentence("Nothing here says which sources were in service.")
+    rows, wrong = [], set()
+    for k, (source, counts) in enumerate(run.log.service.items()):
+        shares = [counts[state] / counts.total() for state in SERVICES]
+        rows.append([source, *(f"{100.0 * share:.1f} %" for share in shares)])
+        if counts["out"]:
+            wrong.add(k)
+    good = "Good: all `nominal`, now and then `suspected`. Marked: it was out of service."
+    title = "Service of each source (of a device the worst of what it sends), share of the time"
+    return Table(title, ("source", *SERVICES), rows, good, frozenset(wrong))
+
+
+def _faults(run: Run) -> Item:
+    if run.log is None:
+        return Sentence("A solution file does not hold what was found to be at fault.")
+    if not run.log.faults:
+        return Sentence("No fault was identified.")
+    first = run.span_s[0]
+    rows = [
+        [
+            *(f.source, f.kind, f"{f.begun_s - first:.1f}", f"{f.last_s - first:.1f}", f.axis),
+            *(f"{f.size:.4g} {f.unit}", f"{f.sd:.2g}", f"{f.log_odds:.1f}", f.action),
+        ]
+        for f in run.log.faults
+    ]
+    head = ("source", "kind", "began s", "told until s", "axis", "size", "one sigma", "log odds")
+    return Table(
+        "Faults",
+        (*head, "what was done"),
+        rows,
+        "Good: none. Each should have an explanation; a size many sigma large is a certain one.",
+        frozenset(range(len(rows))),
     )
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from math import nan
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -116,11 +118,30 @@ class ImuLook:
 
 
 @dataclass(slots=True)
+class Fault:
+    """One that the daemon has identified: when it began and was last told, the size that was told
+    last, on the axis where it is largest."""
+
+    source: str
+    kind: str
+    begun_s: float
+    last_s: float
+    axis: str = ""
+    unit: str = ""
+    action: str = ""
+    size: float = nan
+    sd: float = nan
+    log_odds: float = nan
+
+
+@dataclass(slots=True)
 class LogParts:
     """What a log holds beyond the solution; empty where it does not."""
 
     outcomes: dict[str, dict[str, int]] = field(default_factory=dict)
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
+    service: dict[str, Counter[str]] = field(default_factory=dict)
+    faults: list[Fault] = field(default_factory=list)
     innovations: dict[str, Innovations] = field(default_factory=dict)
     verdicts: dict[str, Verdicts] = field(default_factory=dict)
     biases: dict[str, Estimated] = field(default_factory=dict)

@@ -74,12 +74,16 @@ async def test_a_page_of_what_the_daemon_says(tmp_path: Path) -> None:
                 "38.4 m horizontal, 21.1 m vertical",
                 "recording /var/lib/fusiond/logs/truck_20261120T223307Z_5e0c1f9a_0001.mcap, 41.3",
                 "UTC from gnss; system clock -0.012 s against GNSS",
+                "FAULT       gnss velocity is off by 0.521 m/s, 0.081 at one sigma, north",
                 "23:33:07 warning: rdss rdss_suppressed: the terminal's transmitter is suppressed",
             ):
                 assert said in text
             (rdss,) = (line for line in text.splitlines() if line.startswith("rdss"))
             assert rdss.split("  ")[-1] == "no beam above level 2"
             assert "4 multi_value +1" in rdss
+            (gnss,) = (line for line in text.splitlines() if line.startswith("gnss"))
+            assert gnss.split()[1:3] == ["running", "out"]
+            assert gnss.endswith("since 12 s: left out")
             assert "coloured" in rdss
             piped = await asked("--mqtt", f"127.0.0.1:{broker.port}", "--json", "-")
             answer = json.loads(piped.stdout)

@@ -247,8 +247,8 @@ def test_a_step_in_one_source_is_isolated_told_and_taken_back(delay_s: float) ->
             true = runs.true_nav(truth, np.array([t]))[0]
             worst = max(worst, float(np.hypot(*runs.nav_error(navigator.estimator.nav, true)[6:8])))
         if FAULT_S + 8.0 < t < END_S:
-            seen = {name: navigator.isolated(name) for name in config.aiding}
-            assert navigator.isolated("gnss_b_velocity") == seen["gnss_b"]
+            seen = {name: navigator.service.reason(name) for name in config.aiding}
+            assert navigator.service.reason("gnss_b_velocity") == seen["gnss_b"]
     assert seen == {"gnss": None, "gnss_b": INNOVATION, "rnss": None}
     assert worst < 8.0
     told = Counter(code for code, _ in events)
@@ -259,7 +259,7 @@ def test_a_step_in_one_source_is_isolated_told_and_taken_back(delay_s: float) ->
     # back.
     assert 20 <= outcomes["gnss_b"]["isolated"] <= 25 + config.estimator.federated.readmit_after
     assert outcomes["gnss"]["isolated"] == outcomes["rnss"]["isolated"] == 0
-    assert navigator.isolated("gnss_b") is None
+    assert navigator.service.reason("gnss_b") is None
 
 
 @pytest.mark.parametrize(

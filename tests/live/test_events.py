@@ -28,6 +28,8 @@ from tests.clock.host_time import Host, S
         ("imu_sound", "info"),
         ("rdss_suppressed", "warning"),
         ("isolated", "warning"),
+        ("readmitted", "info"),
+        ("sensor_fault", "error"),
         ("utc_jumped", "warning"),
         ("utc_implausible", "warning"),
         ("system_clock_stepped", "warning"),

@@ -6,7 +6,10 @@ from math import radians
 from typing import Any
 
 from fusiond.clock.answers import ClockStatus
+from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
+from fusiond.integrity.diagnosis import Finding
+from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.navigator.calibration import CalibrationState, Parameter
 from fusiond.outputs.messages.base import stamp
@@ -14,6 +17,7 @@ from fusiond.outputs.messages.calibration import calibration_message
 from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
 from fusiond.outputs.messages.events import events_message
+from fusiond.outputs.messages.fault import fault_report
 from fusiond.outputs.messages.health import (
     OutputHealth,
     SchedulerStatus,
@@ -66,6 +70,19 @@ SCHEDULER = SchedulerStatus(
     gc_max_ms=2.1,
 )
 
+FAULT = fault_report(
+    Finding(
+        velocity_kinds("gnss")[0],
+        t_ns=1000_000_000_000,
+        since_s=998.0,
+        size=(0.5213, 0.0412, -0.011),
+        sd=(0.0811, 0.0798, 0.121),
+        log_odds=31.24,
+    ),
+    "gnss",
+    t_ns=1010_000_000_000,
+)
+
 EVENT = event_message(
     UTC_NS,
     source="rdss",
@@ -88,6 +105,7 @@ EXAMPLES: dict[str, Any] = {
         rejected=14,
         calibrated=False,
         imu="imu",
+        faults=(FAULT,),
         recording=RecordingStatus(
             "recording",
             "/var/lib/fusiond/logs/truck_20261120T223307Z_5e0c1f9a_0001.mcap",
@@ -110,6 +128,9 @@ EXAMPLES: dict[str, Any] = {
                 fused_age_s=0.06,
                 latency_s=0.071,
                 counters={"checksum": 2, "sentences": 213_480},
+                service=Service.OUT,
+                series={"gnss": Service.NOMINAL, "gnss_velocity": Service.OUT},
+                diagnosis=FAULT,
                 verdict="consistent",
             ),
             "rdss": SourceHealth(
@@ -122,6 +143,8 @@ EXAMPLES: dict[str, Any] = {
                 fused_age_s=187.2,
                 latency_s=1.42,
                 counters={"no_beam": 12, "requests": 61},
+                service=Service.NOMINAL,
+                series={"rdss": Service.NOMINAL},
                 verdict="coloured",
             ),
         },

@@ -67,6 +67,12 @@ def test_the_metrics_are_what_the_messages_say() -> None:
     assert said['fusiond_measurements_total{source="gnss",outcome="fused"}'] == 35_571
     assert said['fusiond_measurements_total{source="gnss",outcome="gated"}'] == 9
     assert said['fusiond_source_state{source="rdss",state="silent"}'] == 1.0
+    assert said['fusiond_source_service{source="gnss",state="out"}'] == 1.0
+    assert said['fusiond_source_service{source="gnss",state="nominal"}'] == 0.0
+    assert said['fusiond_source_service{source="rdss",state="nominal"}'] == 1.0
+    fault = 'source="gnss",kind="velocity",axis="north",unit="m/s",action="left out"'
+    assert said[f"fusiond_fault_size{{{fault}}}"] == 0.5213
+    assert said[f"fusiond_fault_sigma{{{fault}}}"] == 0.0811
     assert said['fusiond_source_fused_age_seconds{source="rdss"}'] == 187.2
     assert said['fusiond_consistency_verdict{source="rdss",verdict="coloured"}'] == 1.0
     assert said['fusiond_output_events_total{output="gpsd",event="skipped"}'] == 12
@@ -85,7 +91,7 @@ def test_what_is_not_known_is_left_out() -> None:
     assert 'fusiond_position_sigma_meters{axis="down"}' not in said
     assert said['fusiond_protection_level_meters{direction="horizontal"}'] == inf
     invalid = read(exposition(endpoint(nav=nav(mode=Mode.INVALID)).families()))
-    assert not [k for k in invalid if "sigma" in k]
+    assert not [k for k in invalid if "_sigma_" in k]
     empty = PrometheusEndpoint(Prometheus(port=1), Around().surroundings)
     assert list(read(exposition(empty.families()))) == ["process_cpu_seconds_total"]
 

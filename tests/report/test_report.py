@@ -22,6 +22,7 @@ from fusiond.recording.reader import Log
 from fusiond.report.local import metres_from, origin_of
 from fusiond.report.report import report
 from fusiond.report.run import Run
+from tests.outputs.messages_examples import EXAMPLES
 from tests.patience import PATIENCE_S
 from tests.recording.driven import Drive
 from tests.report.pages import (
@@ -201,6 +202,36 @@ def test_biases_come_with_sigma(recorded: Recorded) -> None:
     assert biases["gyro x"].unit == "deg/h"
     assert all(np.all(b.sd > 0.0) for b in biases.values())
     assert items(recorded.document, "Biases and calibration")
+
+
+def test_faults_and_service_over_time(tmp_path: Path) -> None:
+    """Told from 3 s to 5 s and again from 7 s on: two faults; out for three messages of ten."""
+    messages: list[tuple[str, float, bytes]] = []
+    fault = EXAMPLES["status"].model_dump(mode="json")["faults"][0]
+    for k in range(10):
+        told = 3 <= k <= 5 or k >= 7
+        faults = [{**fault, "since_s": k - 2.0, "size": 0.1 * k}] if told else []
+        service = "out" if 3 <= k <= 5 else "nominal"
+        health = {"sources": {"gnss": {"service": service}, "imu": {"service": None}}}
+        messages += [
+            ("/status", float(k), json.dumps({"faults": faults}).encode()),
+            ("/health", k + 0.1, json.dumps(health).encode()),
+        ]
+    nav = {"lat_deg": 31.0, "lon_deg": 121.0, "height_m": 10.0, "mode": "navigating"}
+    messages += [("/nav", 10.0, json.dumps(nav).encode())]
+    (run,) = report([written(tmp_path / "a.mcap", messages)], tmp_path / "a.html")
+    assert run.log is not None
+    first, second = run.log.faults
+    assert (first.source, first.kind, first.axis) == ("gnss", "velocity", "north")
+    begun_s, last_s = (t_s - EPOCH_NS * 1e-9 for t_s in (first.begun_s, first.last_s))
+    assert (begun_s, last_s) == pytest.approx((2.0, 5.0), abs=1e-3)
+    assert (first.size, second.size) == pytest.approx((0.5, 0.9))
+    document = read_page(tmp_path / "a.html")
+    rows = item(document, "Summary", "Faults")["rows"]
+    assert [row[0] for row in rows] == ["gnss", "gnss"]
+    assert rows[0][5:] == ["0.5 m/s", "0.081", "31.2", "left out"]
+    service = item(document, "Summary", "Service")
+    assert service["rows"] == [["gnss", "70.0 %", "0.0 %", "30.0 %", "0.0 %"]]
 
 
 def test_satellites_verdicts_and_calibration_over_time(tmp_path: Path) -> None:

@@ -72,15 +72,20 @@ export function showSources(store) {
     const hz = heard.at === null ? null : rate(name, s, heard.at);
     const seen = agedFurther(inside ? s.fused_age_s : s.age_s, heard, store.now);
     const old = seen !== null && !inside && seen > sourceLimit(s.received, uptime);
-    const state = s.isolated ? "left out" : s.state;
-    const { count, why, title } = refusals(s.rejected);
+    const service = s.service && s.service !== "nominal" && s.state === "running" ? s.service : "";
+    const state = service === "out" ? "left out" : service || (inside ? "derived" : s.state);
+    const wrong = (s.diagnosis && s.diagnosis.text) || s.isolated || "";
+    const refused = refusals(s.rejected);
+    const count = refused.count,
+      why = wrong || refused.why,
+      title = [wrong, refused.title].filter(Boolean).join("\n");
     const used = agedFurther(s.fused_age_s, heard, store.now);
     const row = [
       { text: name, title: s.detail, className: inside ? "quiet" : "" },
       {
-        text: inside ? "derived" : state,
-        className: `state ${inside ? "inside quiet" : s.state}`,
-        title: s.isolated || s.detail,
+        text: state,
+        className: `state ${service || (inside ? "inside quiet" : s.state)}`,
+        title: wrong || s.detail,
       },
       {
         text: stretch(seen),

@@ -10,7 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from drivers.base import State
 from fusiond.clock.answers import ClockStatus
 from fusiond.integrity.consistency import Verdict
+from fusiond.integrity.service import Service
 from fusiond.outputs.messages.base import Count, Message, Number, stamp
+from fusiond.outputs.messages.fault import FaultReport
 
 
 class SatelliteHealth(BaseModel):
@@ -57,8 +59,17 @@ class SourceHealth(BaseModel):
     fused_age_s: Number = Field(default=None, description="since the last one was fused")
     latency_s: Number = Field(default=None, description="from validity to arrival, the last one")
     counters: dict[str, Count] = Field(default_factory=dict, description="of the driver")
+    service: Service | None = Field(
+        default=None, description="state of its worst series; null: none of it is fused"
+    )
+    series: dict[str, Service] = Field(
+        default_factory=dict, description="state of each series that it sends, by its name"
+    )
     isolated: str | None = Field(
-        default=None, description="why the fault detection leaves it out; null: it does not"
+        default=None, description="why the series of its name is left out; null: it is not"
+    )
+    diagnosis: FaultReport | None = Field(
+        default=None, description="its latest fault that is not over; null: none is known"
     )
     verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from fusiond.navigation.solution import BoundState, Mode, Solution
 from fusiond.outputs.messages.base import Count, Message, Milliseconds, Number, stamp
+from fusiond.outputs.messages.fault import FaultReport
 from fusiond.outputs.messages.health import SchedulerStatus
 
 RecordingState = Literal["off", "waiting", "recording", "failed"]
@@ -32,6 +33,9 @@ class StatusMessage(Message):
     why: str
     protection: BoundState
     imu: str | None = Field(description="the source whose samples are used")
+    faults: tuple[FaultReport, ...] = Field(
+        default=(), description="of all devices, as far as they are not over; the latest at the end"
+    )
     calibrated: bool = Field(description="all of `calibration` has settled")
     since_utc: str | None
     since_ms: Milliseconds | None
@@ -67,6 +71,7 @@ def status_message(
     rejected: int,
     calibrated: bool,
     imu: str | None,
+    faults: tuple[FaultReport, ...],
     recording: RecordingStatus,
     injected: tuple[str, ...],
     mqtt: Mapping[str, int],
@@ -81,6 +86,7 @@ def status_message(
         why=solution.reason,
         protection=solution.bound.state,
         imu=imu,
+        faults=faults,
         calibrated=calibrated,
         since_utc=since_utc,
         since_ms=since_ms,

@@ -1,0 +1,49 @@
+"""A fault that has been identified, as an object of `health` and `status`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from fusiond.integrity.diagnosis import Finding
+from fusiond.outputs.messages.base import Number
+
+
+class FaultReport(BaseModel):
+    """One fault that is not over: what, how much, since when, how sure, what is done about it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    source: str = Field(description="the device at fault")
+    kind: str = Field(description="of the catalogue, such as `velocity`")
+    axis: str | None = Field(description="on which it is largest; null where there is one")
+    size: Number = Field(description="on that axis, in `unit`")
+    sd: Number = Field(description="one sigma of `size`, in `unit`")
+    unit: str
+    since_s: float = Field(description="s ago that it began")
+    log_odds: float = Field(description="natural, against nothing being wrong")
+    action: Literal["left out", "corrected"]
+    text: str = Field(description="the same for people")
+
+
+def fault_report(finding: Finding, source: str, t_ns: int) -> FaultReport:
+    """What of a finding people are told at `t_ns`; `source` names its device."""
+    kind, row = finding.kind, finding.largest
+    return FaultReport(
+        source=source,
+        kind=kind.name,
+        axis=kind.axes[row] or None,
+        size=_figures(finding.size[row]),
+        sd=_figures(finding.sd[row]),
+        unit=kind.unit,
+        since_s=round(t_ns * 1e-9 - finding.since_s, 1),
+        log_odds=round(finding.log_odds, 1),
+        action="corrected" if kind.corrected else "left out",
+        text=finding._replace(t_ns=t_ns).text,
+    )
+
+
+def _figures(value: float) -> float:
+    """Four figures: more than any sigma bears out."""
+    return float(f"{value:.4g}")
