@@ -57,6 +57,8 @@ class Guests:
     def __init__(self) -> None:
         soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         self.most = max(soft // 2, soft - RESERVED_DESCRIPTORS)
+        self.wanted = 0
+        """Places of all servers that listen."""
         self.postponed = 0
         self._open: set[Guest] = set()
         self._handlers: dict[int, Handler] = {}
@@ -75,6 +77,10 @@ class Guests:
     def full(self) -> bool:
         """Whether one more would take a descriptor of the daemon's own."""
         return len(self._open) >= self.most
+
+    def places(self, wanted: int) -> int:
+        """Of one server that would have so many: its share, where there are not as many for all."""
+        return min(wanted, self.most * wanted // max(wanted, self.wanted))
 
     def came(self, guest: Guest) -> None:
         self._open.add(guest)

@@ -24,6 +24,7 @@ from fusiond.outputs.activation import activated
 from fusiond.outputs.allowance import Allowance
 from fusiond.outputs.guests import Guests
 from fusiond.outputs.port import Port
+from fusiond.outputs.sockets import bound, tune
 
 MOST_CLIENTS = 256
 """A quarter of the descriptors that a process has by default (1024, RLIMIT_NOFILE)."""
@@ -287,9 +288,11 @@ class TcpServer:
         listener = await self.port.open(self._listening)
         for sock in listener.sockets:
             self._watch(sock)
+        self.guests.wanted += self._most
         try:
             await asyncio.get_running_loop().create_future()
         finally:
+            self.guests.wanted -= self._most
             for sock in listener.sockets:
                 self.guests.forget(sock.fileno())
                 sock.close()
@@ -314,7 +317,7 @@ class TcpServer:
 
     async def _listening(self, host: str, port: int) -> _Listener:
         held = activated(self.name)
-        sockets = await _bound(host, port) if held is None else [held]
+        sockets = await bound(host, port) if held is None else [held]
         for sock in sockets:
             sock.setblocking(False)
             # Inherited by each connection: the kernel would keep megabytes for who does not read.
@@ -334,12 +337,12 @@ class TcpServer:
                 self._pause(listening, error)
             return  # else who came has gone again
         self._make_room()
-        if len(self.clients) >= self._most or self.guests.full:
+        if len(self.clients) >= self._places or self.guests.full:
             self.counters["clients_refused"] += 1
             sock.close()
             return
         try:
-            _tune(sock)
+            tune(sock, STUCK_S)
         except OSError:
             sock.close()
             return
@@ -349,9 +352,13 @@ class TcpServer:
         self.port.serves(len(self.clients))
         client.session = self._greet(client)
 
+    @property
+    def _places(self) -> int:
+        return self.guests.places(self._most)
+
     def _make_room(self) -> None:
         """Where all places are taken: who has been longest without a request goes."""
-        if len(self.clients) < self._most:
+        if len(self.clients) < self._places:
             return
         now_ns = time.perf_counter_ns()
         for client in self.clients:
@@ -368,35 +375,3 @@ class TcpServer:
             self.port.report("clients_refused", f"none for now: {error.strerror}")
         self.guests.forget(listening.fileno())
         asyncio.get_running_loop().call_later(PAUSE_S, self._watch, listening)
-
-
-async def _bound(host: str, port: int) -> list[socket.socket]:
-    """Sockets at every address of `host`. Raises `OSError`."""
-    loop = asyncio.get_running_loop()
-    found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    sockets: list[socket.socket] = []
-    try:
-        for family, kind, proto, _, address in dict.fromkeys(found):
-            sock = socket.socket(family, kind, proto)
-            sockets.append(sock)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            if family == socket.AF_INET6:
-                sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-            sock.bind(address)
-    except OSError:
-        for sock in sockets:
-            sock.close()
-        raise
-    return sockets
-
-
-def _tune(sock: socket.socket) -> None:
-    """A far end that is gone without a word is noticed within STUCK_S: after 20 s of silence it is
-    asked, twice 5 s apart; what it should have confirmed is waited for as long."""
-    sock.setblocking(False)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 2)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STUCK_S))

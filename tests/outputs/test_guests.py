@@ -251,6 +251,30 @@ async def test_descriptors_are_kept_for_the_daemon(monkeypatch: pytest.MonkeyPat
             end.close()
 
 
+async def test_few_descriptors_are_shared_by_the_servers() -> None:
+    """Who takes all places of one server takes none of another's."""
+    around = Around(guests=Guests())
+    around.surroundings.guests.most = 90
+    scraped = PrometheusEndpoint(Prometheus(port=free_port()), around.surroundings)
+    async with gpsd(around) as server, at_work(scraped):
+        ends = []
+        for _ in range(100):
+            end = socket.socket()
+            end.setblocking(False)
+            await asyncio.get_running_loop().sock_connect(end, server.server.port.address)
+            ends.append(end)
+        came = server.counters
+        await until(lambda: came["clients"] + came["clients_refused"] == 100)
+        assert len(server.server.clients) == 90 * tcp.MOST_CLIENTS // (256 + MOST_SCRAPERS)
+        async with connected(scraped.server.port.address) as client:
+            client.writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+            async with asyncio.timeout(PATIENCE_S):
+                assert (await client.reader.read()).startswith(b"HTTP/1.1 200")
+        for end in ends:
+            end.close()
+    assert around.surroundings.guests.wanted == 0
+
+
 async def test_without_a_descriptor_it_pauses_and_says_so_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
