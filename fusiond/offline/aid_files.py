@@ -54,11 +54,13 @@ _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset"
 
 
 class Arrival(NamedTuple):
-    """A measurement, or what a satellite broadcast, when it came, and one sigma of its instant."""
+    """A measurement, or what a satellite broadcast, when it came, and one sigma of its instant;
+    `utc_ns` where the device stamped it with its date (POSIX)."""
 
     t_arrival_ns: int
     measurement: Measurement | RawEvent
     sd_time_s: float = 0.0
+    utc_ns: int | None = None
 
 
 def source_of(kind: str, config: Config) -> str:

@@ -11,7 +11,7 @@ from drivers.measurements import Measurement, MonotonicStamp
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import TableError
+from fusiond.files.csv_tables import TableError, counts
 from fusiond.files.tables import ImuTable, read_imu
 from fusiond.offline.aid_files import READERS, Arrival, source_of
 from fusiond.offline.outages import Outage, named, withheld
@@ -54,8 +54,9 @@ def read_recorded(
         files["imu"] = _imu_read(imu)
         for name, rejected in log.rejected.items():
             rows = [row for row in arrivals if row.measurement.source == name]
-            if rows or rejected:
-                files[name] = FileRead(_span_s(rows), len(rows), rejected)
+            used = log.frames - sum(counts(rejected).values()) if name == "can" else len(rows)
+            if used or rejected:
+                files[name] = FileRead(_span_s(rows), max(0, used), rejected, name != "can")
     else:
         assert imu_path is not None
         imu = read_imu(imu_path)

@@ -140,8 +140,8 @@ def test_a_log_that_ends_in_the_middle_of_a_line(tmp_path: Path) -> None:
     log = read_can_log(path, configuration(tmp_path))
     assert 0.4 * SAMPLES < len(log.imu.t_s) < 0.6 * SAMPLES
     (cut,) = log.rejected["can"]
-    assert cut.reason == "cut"
-    assert "frames" in cut.detail
+    assert cut.reason == "unreadable"
+    assert cut.line == len(path.read_text().splitlines())
 
 
 def test_frames_of_no_device_and_times_that_run_backwards(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_each_source_has_the_channel_of_its_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("bus.txt", b"x", r"no CAN log by its name: .log, .asc, .blf, .mf4 are read"),
+        ("bus.txt", b"x", r"no CAN log by its name: .log, .asc, .blf, .trc, .mf4 are read"),
         ("bus.mf4.gz", b"x", "no CAN log by its name"),
         ("bus.log", b"something else\n", "cannot be read as .log"),
         ("bus.log.gz", b"not zipped", "cannot be read as .log|Not a gzipped file"),
