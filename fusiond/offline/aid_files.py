@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +25,16 @@ from drivers.measurements import (
 from drivers.raw.messages import RawEvent, RawGnssEpoch
 from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
-from fusiond.configuration.aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
+from fusiond.configuration.aiding import (
+    Aiding,
+    BarometerAiding,
+    GnssAiding,
+    RawAiding,
+    RdssAiding,
+    SarAiding,
+    StarTrackerAiding,
+    WheelAiding,
+)
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.tables import (
@@ -38,12 +46,10 @@ from fusiond.files.tables import (
     read_rdss,
     read_wheel,
 )
-from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
+from fusiond.offline.nmea_file import EARLIEST_DATE, Receiver, read_nmea, receiver_of
 
 Array = NDArray[np.float64]
 
-# A recording may be old; before selective availability ended there was no receiver worth replaying.
-EARLIEST_DATE = date(2000, 5, 1)
 SECONDS_OF_WEEK = 604800.0
 FEWEST_VALUES = 20
 """Of n different values without steps the two nearest lie some (range / n^2) apart: of twenty, a
@@ -63,23 +69,30 @@ class Arrival(NamedTuple):
     utc_ns: int | None = None
 
 
+_SECTIONS: dict[str, type[Aiding]] = {
+    "gnss": GnssAiding,
+    "nmea": GnssAiding,
+    "rdss": RdssAiding,
+    "wheel": WheelAiding,
+    "barometer": BarometerAiding,
+    "attitude": StarTrackerAiding,
+    "bearing": SarAiding,
+    "raw": RawAiding,
+}
+
+
 def source_of(kind: str, config: Config) -> str:
     """The source that a file's measurements are taken to come from.
 
-    The kind of the file (`gnss` for `nmea`); an attitude is a star tracker's where the
-    configuration has one and no [aiding.attitude], a bearing that of the configured radar, raw data
-    that of the section of kind `raw`.
+    The kind of the file (`gnss` for `nmea`, `sar` for `bearing`), or else the first section of that
+    kind of aid in the configuration; an attitude is a star tracker's where there is one and no
+    [aiding.attitude], raw data are of the section of kind `raw`.
     """
-    sections: dict[str, type[Aiding]] = {
-        "attitude": StarTrackerAiding,
-        "bearing": SarAiding,
-        "raw": RawAiding,
-    }
-    wanted = sections.get(kind)
-    if wanted is None or kind in config.aiding:
-        return "gnss" if kind == "nmea" else kind
-    fallback = "sar" if kind == "bearing" else kind
-    return next((n for n, s in config.aiding.items() if isinstance(s, wanted)), fallback)
+    name = {"nmea": "gnss", "bearing": "sar"}.get(kind, kind)
+    if name in config.aiding or kind in config.aiding:
+        return name if name in config.aiding else kind
+    wanted = _SECTIONS[kind]
+    return next((n for n, s in config.aiding.items() if isinstance(s, wanted)), name)
 
 
 def _ns(t_s: float) -> int:
@@ -224,25 +237,16 @@ def _read_barometer(path: Path, _: ImuTable, source: str) -> _Read:
 
 
 def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
+    """By the decoders' own options."""
+    return read_nmea_by(path, imu, receiver_of(source, Config()))
+
+
+def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
     """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
     maps to: GPS second of week (below 604800) or POSIX seconds."""
-    from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding  # noqa: PLC0415
-
-    decoder = NmeaDecoder(source, NmeaDecoding(earliest_date=EARLIEST_DATE))
-    found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
-    rows = []
-    for m in found:
-        if not isinstance(m, PositionFix) or not isinstance(m.stamp, UtcStamp):
-            continue
-        t_ns = m.stamp.utc_ns
-        if of_week:
-            t_ns = _ns(utc_ns_to_gps_week_seconds(t_ns))
-        rows.append(Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
-    if found and not rows:
-        raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
-    refused = counted(decoder.counters)
-    return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
+    heard, refused = read_nmea(path, of_week, by)
+    return [Arrival(each.t_ns, each.measurement, utc_ns=each.utc_ns) for each in heard], refused
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:

@@ -11,14 +11,14 @@ import gc
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurements import Measurement
+from drivers.measurements import Measurement, UtcStamp
 from drivers.raw.messages import RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
@@ -217,11 +217,14 @@ def _run(
 
 
 def _give(navigator: Navigator, arrival: Arrival) -> None:
-    m = arrival.measurement
+    m: Any = arrival.measurement
     if isinstance(m, BROADCAST):
         navigator.learn(m)
         return
-    navigator.add(m, valid_ns(m), arrival.sd_time_s)
+    t_ns = valid_ns(m)
+    if arrival.utc_ns is not None:  # of the date a compass' declination depends
+        m = replace(m, stamp=UtcStamp(arrival.utc_ns))
+    navigator.add(m, t_ns, arrival.sd_time_s, arrival.t_arrival_ns)
 
 
 def _late(arrivals: Sequence[Arrival], config: Config) -> list[bool]:

@@ -11,9 +11,10 @@ from drivers.measurements import Measurement, MonotonicStamp
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import TableError, counts
+from fusiond.files.csv_tables import Rejection, TableError, counts
 from fusiond.files.tables import ImuTable, read_imu
-from fusiond.offline.aid_files import READERS, Arrival, source_of
+from fusiond.offline.aid_files import READERS, Arrival, read_nmea_by, source_of
+from fusiond.offline.nmea_file import receiver_of
 from fusiond.offline.outages import Outage, named, withheld
 from fusiond.offline.reasons import FileRead
 
@@ -62,7 +63,7 @@ def read_recorded(
         imu = read_imu(imu_path)
         files["imu"] = _imu_read(imu)
     for kind, path in aids:
-        rows, rejected = READERS[kind](path, imu, source_of(kind, config))
+        rows, rejected = _read_aid(kind, path, imu, config)
         name = kind if kind not in files else f"{kind}:{path.name}"
         files[name] = FileRead(_span_s(rows), len(rows), rejected)
         arrivals += rows
@@ -79,6 +80,15 @@ def read_recorded(
         arrivals = kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
     return Recorded(config, imu, arrivals, files, events, held)
+
+
+def _read_aid(
+    kind: str, path: Path, imu: ImuTable, config: Config
+) -> tuple[list[Arrival], list[Rejection]]:
+    source = source_of(kind, config)
+    if kind == "nmea":
+        return read_nmea_by(path, imu, receiver_of(source, config))
+    return READERS[kind](path, imu, source)
 
 
 BROADCAST = Ephemeris, Klobuchar
