@@ -100,37 +100,45 @@ class Containers:
         while len(head := self._take(_BASE.size)) == _BASE.size:
             signature, _, _, size, kind = _BASE.unpack(head)
             if signature != _SIGNATURE or not _BASE.size <= size <= _LONGEST_CONTAINER:
-                self._ahead = head + self._ahead
-                self._find_next()
+                self._refused(f"{self._find_next(head)} bytes between containers")
                 continue
             body = self._take(size - _BASE.size)
-            self._take(size % 4)
             if kind != can.io.blf.LOG_CONTAINER:
+                self._take(size % 4)
                 continue
-            if len(body) < size - _BASE.size and self.damage is None:
-                self.damage = EOFError("the last container is cut")
+            cut = len(body) < size - _BASE.size
             content = self._content(body)
-            if content is None:
-                self._tail, self._lost = b"", True
+            if content is None:  # its size may be wrong, and others stand in what was taken for it
+                self._find_next(head + body)
                 continue
+            if cut and self.damage is None:
+                self.damage = EOFError("the last container is cut")
+            self._take(size % 4)
             objects = self._objects(bytearray(self._tail + content))
             if objects:
                 yield _container(objects)
 
-    def _find_next(self) -> None:
-        """Pass over what is no object, up to the next that may be one."""
-        passed, window = 1, self._take(_BASE.size)[1:]
-        while (at := window.find(_SIGNATURE)) < 0:
-            kept = window[-len(_SIGNATURE) + 1 :]
-            passed += len(window) - len(kept)
-            more = self._take(1 << 16)
-            if not more:
-                self._refused(f"{passed + len(kept)} bytes at the end")
-                return
-            window = kept + more
-        self._refused(f"{passed + at} bytes between containers")
-        self._ahead = window[at:] + self._ahead
+    def _find_next(self, bad: bytes) -> int:
+        """Pass over what begins with no container, up to the next that may be one: how far."""
         self._tail, self._lost = b"", True
+        passed, window = 1, bad[1:]
+        while True:
+            at = window.find(_SIGNATURE)
+            if at < 0:
+                at = max(0, len(window) - len(_SIGNATURE) + 1)
+            passed, window = passed + at, window[at:]
+            if len(window) < _BASE.size:
+                more = self._take(1 << 16)
+                if not more:
+                    return passed + len(window)
+                window += more
+                continue
+            signature, _, _, size, kind = _BASE.unpack_from(window)
+            known = signature == _SIGNATURE and kind == can.io.blf.LOG_CONTAINER
+            if known and _BASE.size < size <= _LONGEST_CONTAINER:
+                self._ahead = window + self._ahead
+                return passed
+            passed, window = passed + 1, window[1:]
 
     def _content(self, body: bytes) -> bytes | None:
         if len(body) < _CONTAINER.size:

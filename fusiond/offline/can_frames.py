@@ -44,6 +44,7 @@ _ZONES = {
     ".blf": "the date of a BLF log has no zone: taken as UTC",
     ".trc": "the date of a TRC log has no zone: taken as UTC",
 }
+_UNDATED = "the log has no date that is understood: its times count from its beginning"
 _DATED_LOG = "the dates of candump -t A have no zone: taken as local time of this computer, {zone}"
 
 
@@ -230,8 +231,10 @@ def _mf4(
 
 
 def _tell_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
-    """Where the log has a date: in which zone it was taken."""
-    if log.suffix in _ZONES and start:
+    """In which zone the log's date was taken, or that it has none."""
+    if log.suffix in _ZONES and not start:
+        told("recorder_zone", _UNDATED)
+    elif log.suffix in _ZONES:
         zone = _zone(start) if log.suffix == ".asc" else ""
         told("recorder_zone", _ZONES[log.suffix].format(zone=zone))
 

@@ -100,7 +100,7 @@ class TextLines:
             self.damage = error
             return b""
         self.number += 1
-        self._line = self._text(kept.replace(b"\0", b""))
+        self._line = self._text(raw.partition(b"\0")[0])
         self.refuse()
         self.number -= 1
         return kept.rpartition(b"\0")[2] or b"\n" if b"\0" in raw else b"\n"
@@ -232,6 +232,10 @@ def _fall_or_stand(stamps: list[float]) -> bool:
 
 _STAMPED = re.compile(r"\s*(-?)(\d+)\.(\d+)(?=\s)")
 _RELATIVE = re.compile(r"\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
+_HEADER = re.compile(
+    r"\s*(date\s+\w+\s|base\s|//|(no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE
+)
+_HEADER_OVER = re.compile(r"\s*((no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE)
 _FD_EVENT = re.compile(r"\s*-?\d+\.\d+\s+CANFD\s+[^\d\s]", re.IGNORECASE)
 HEADER_ENDS = "internal events logged"
 """A line after which python-can's reader of ASC looks for frames."""
@@ -252,11 +256,9 @@ class Asc:
         """The line with its stamp counted from the beginning and without sign; None for an event of
         no channel."""
         self.before_trigger_s = 0.0
-        if not self.in_frames and _RELATIVE.match(line):
-            self._relative = True
         found = _STAMPED.match(line)
         if found is None:
-            return line
+            return line if self.in_frames else self._of_header(line)
         self.in_frames = True
         if _FD_EVENT.match(line):
             return None if not self._relative else self._counted(found, "")
@@ -266,6 +268,13 @@ class Asc:
             self.before_trigger_s = float(f"{found[2]}.{found[3]}")
             return f"{found[2]}.{found[3]}{line[found.end() :]}"
         return line
+
+    def _of_header(self, line: str) -> str | None:
+        """A line before the first frame. The reader ends the header at one that it does not know, a
+        date in another language among them, and misses what stands behind it."""
+        self._relative |= _RELATIVE.match(line) is not None
+        self.in_frames |= _HEADER_OVER.match(line) is not None
+        return line if _HEADER.match(line) else None
 
     def _counted(self, found: re.Match[str], rest: str) -> str | None:
         """A difference to the event before, of whatever kind that was: summed."""
