@@ -28,6 +28,10 @@ PARSERS = {
     "ntrip": Parser(("drivers.ntrip.reply",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),
     "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
+    "can_log": Parser(
+        tuple(f"fusiond.offline.{m}" for m in ("can_blf", "can_frames", "can_text")), 400
+    ),
+    "dbc": Parser(("drivers.can.dbc_flaws",), 400),
     "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
 }
 """By target."""

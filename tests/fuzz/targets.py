@@ -33,6 +33,7 @@ from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
 from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, ubx
 from tests.fuzz.documents import commands, csv, input_of, state
+from tests.fuzz.recordings import can_log, dbc
 
 EARLIEST = date(2014, 1, 1)
 
@@ -361,5 +362,5 @@ def can(data: bytes) -> None:
 
 _STREAMS = (splitter, nmea, raw, words, rdss_binary, rdss_text, can, ntrip)
 TARGETS: dict[str, Callable[[bytes], None]] = {
-    one.__name__: one for one in (*_STREAMS, commands, state, csv)
+    one.__name__: one for one in (*_STREAMS, commands, state, csv, can_log, dbc)
 }
