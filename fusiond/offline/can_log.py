@@ -75,13 +75,17 @@ REFUSALS = {
 
 class CanLog(NamedTuple):
     """What a log holds: IMU samples with what was refused of them, aids with their arrivals,
-    refusals of frames (`can`) and by source of an aid; `events` (code, text); how many `frames`."""
+    refusals of frames (`can`) and by source of an aid; `events` (code, text); how many `frames`.
+
+    `units` are the samples of all units with their instants (ns), in the order in which they came,
+    where the configuration has a spare; `imu` is then of the first alone."""
 
     imu: ImuTable
     arrivals: list[Arrival]
     rejected: dict[str, list[Rejection]]
     events: list[tuple[str, str]]
     frames: int
+    units: list[tuple[int, ImuSample]]
 
 
 class _LogTime:
@@ -172,7 +176,8 @@ class _Replay:
                 imu.rejected.extend(odd)
             else:
                 rejected[name] = odd
-        return CanLog(imu, self._arrivals, rejected, self._events, frames.number)
+        units = self._imu if self._config.imu.spare is not None else []
+        return CanLog(imu, self._arrivals, rejected, self._events, frames.number, units)
 
     def _buses(self) -> dict[Any, list[CanDriver[Any]]]:
         """Whose frames those of each channel of the log are.
@@ -254,7 +259,9 @@ class _Replay:
         """Times by the recorder's clock as it was at the end."""
         if not (set_ns := self._recorder.set_ns):
             return
-        self._imu = [(t_ns + set_ns, m) for t_ns, m in self._imu]
+        self._imu = [
+            (t_ns + set_ns, replace(m, t_seen_ns=m.t_seen_ns + set_ns)) for t_ns, m in self._imu
+        ]
         self._arrivals = [_later(arrival, set_ns) for arrival in self._arrivals]
 
     # ------------------------------------------------------------------ what drivers make
@@ -282,11 +289,12 @@ class _Replay:
 
     def _imu_table(self) -> ImuTable:
         """Of the first source that has sent any, as the daemon does."""
-        first = self._imu[0][1].source if self._imu else ""
+        spare = self._config.imu.spare
+        spare_name = None if spare is None else spare.source
+        first = next((m.source for _, m in self._imu if m.source != spare_name), spare_name)
         kept = [(t_ns, m) for t_ns, m in self._imu if m.source == first]
         rejected = []
-        if len(kept) < len(self._imu):
-            others = len(self._imu) - len(kept)
+        if others := sum(m.source not in (first, spare_name) for _, m in self._imu):
             rejected.append(Rejection(0, "second_imu", f"{others} samples", others))
         times = np.array([t_ns for t_ns, _ in kept], dtype=np.int64)
         samples = [(*m.gyro_rad_s, *m.accel_m_s2) for _, m in kept]

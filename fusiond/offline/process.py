@@ -29,6 +29,7 @@ from fusiond.files.tables import ImuTable
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import longest_step
 from fusiond.navigator.filters import estimator_of
+from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import Arrival
 from fusiond.offline.outages import Outage
@@ -112,7 +113,11 @@ def _process(
     smoothed = _smoothed(navigator, writer) if smooth and writer is not None else None
     recorder = _Recorder(navigator, writer, smoothed, watch)
     if why is None:
-        _run(navigator, imu, arrivals, recorder, progress)
+        if read.units:
+            _run_units(navigator, read, recorder, progress)
+        else:
+            _run(navigator, imu, arrivals, recorder, progress)
+        recorder.close()
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     if why is None and not recorder.rows:
         why = nothing_navigated(read.files, navigator.refused, reason)
@@ -230,7 +235,38 @@ def _run(
             given += 1
             navigator.advance(record=True)
             recorder.take()
-    recorder.close()
+
+
+def _run_units(
+    navigator: Navigator,
+    read: Recorded,
+    recorder: _Recorder,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Tick by tick, as in the daemon, which of two inertial units is used."""
+    units, arrivals = read.units, read.arrivals
+    choice = ImuChoice(
+        read.config.imu, lambda _, code, text: read.events.append({"code": code, "text": text})
+    )
+    tick_ns = round(1e9 / read.config.scheduler.rate_hz)
+    seen = [units[k][1].t_seen_ns for k in (0, -1)] + [a.t_arrival_ns for a in arrivals[-1:]]
+    taken = given = 0
+    for k in range(seen[0] // tick_ns, max(seen) // tick_ns + 2):
+        now_ns = k * tick_ns
+        while given < len(arrivals) and arrivals[given].t_arrival_ns <= now_ns:
+            _give(navigator, arrivals[given])
+            given += 1
+        while taken < len(units) and units[taken][1].t_seen_ns <= now_ns:
+            choice.take(units[taken][1], units[taken][0])
+            taken += 1
+        if choice.changes(now_ns, navigator.imu.latest_ns if navigator.imu.end else None):
+            navigator.change_imu()
+        if (arrived := choice.samples()) is not None:
+            navigator.add_imu(*arrived)
+        navigator.advance(record=True)
+        recorder.take()
+        if taken % _TOLD_EVERY < 2:
+            progress(taken, len(units))
 
 
 def _give(navigator: Navigator, arrival: Arrival) -> None:

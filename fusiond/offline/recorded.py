@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.measurements import Measurement, MonotonicStamp
+from drivers.measurements import ImuSample, Measurement, MonotonicStamp
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
@@ -29,6 +29,8 @@ class Recorded:
     files: dict[str, FileRead]
     events: list[dict[str, str]]
     withheld: Counter[str]
+    units: list[tuple[int, ImuSample]]
+    """Samples of all inertial units as they came, where one of them is a spare; else none."""
 
 
 def read_recorded(
@@ -45,12 +47,13 @@ def read_recorded(
     events: list[dict[str, str]] = []
     arrivals: list[Arrival] = []
     files: dict[str, FileRead] = {}
+    units: list[tuple[int, ImuSample]] = []
     if can_log is not None:
         # python-can and the DBC files' reader come only where there is a bus to be read.
         from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
 
         log = read_can_log(can_log, config)
-        imu, arrivals = log.imu, log.arrivals
+        imu, arrivals, units = log.imu, log.arrivals, log.units
         events += [{"code": code, "text": text} for code, text in log.events]
         files["imu"] = _imu_read(imu)
         for name, rejected in log.rejected.items():
@@ -79,7 +82,7 @@ def read_recorded(
         held -= Counter(row.measurement.source for row in kept)
         arrivals = kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
-    return Recorded(config, imu, arrivals, files, events, held)
+    return Recorded(config, imu, arrivals, files, events, held, units)
 
 
 def _read_aid(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import can
@@ -30,6 +31,9 @@ FIX = {
     },
     "gnss_speed": {"SpeedValid": 1, "Speed": 12.0, "SpeedAccuracy": 0.2},
 }
+NORTH_DEG_S = 12.0 * math.cos(math.radians(227.9)) / 111_350.0
+EAST_DEG_S = 12.0 * math.sin(math.radians(227.9)) / 62_370.0
+"""A degree north of 56 deg, and one east."""
 IMU = {
     "ImuValid": 1,
     "AccelerationX": 9.75,
@@ -39,8 +43,8 @@ IMU = {
 
 
 def bus(seconds: int, utc: bool = True) -> Iterator[can.Message]:
-    """Samples at 100 Hz; each second a fix, 120 ms after its epoch and some jitter. Stamps are true
-    UTC, from `BEGIN_S` on."""
+    """Samples at 100 Hz; each second a fix, 130 ms after its epoch and some jitter, of a vehicle
+    that goes straight on at 12 m/s. Stamps are true UTC, from `BEGIN_S` on."""
     draw = np.random.default_rng(40)
     imu = MODULE.get_message_by_name("gnss_imu")
     for k in range(seconds * RATE_HZ):
@@ -51,7 +55,12 @@ def bus(seconds: int, utc: bool = True) -> Iterator[can.Message]:
             at_s = t_s + 0.004 * float(draw.random())
             for i, (name, values) in enumerate(FIX.items()):
                 now = {"Epoch": BEGIN_S + k // RATE_HZ, "TimeConfirmed": utc}
-                told = values | now if name == "gnss_time" else values
+                way = {
+                    "Latitude": values.get("Latitude", 0.0) + NORTH_DEG_S * (k // RATE_HZ),
+                    "Longitude": values.get("Longitude", 0.0) + EAST_DEG_S * (k // RATE_HZ),
+                }
+                changes = {"gnss_time": now, "gnss_pos": way}
+                told = values | changes.get(name, {})
                 message = MODULE.get_message_by_name(name)
                 yield can.Message(
                     at_s + 1e-4 * i,
