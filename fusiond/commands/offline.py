@@ -31,6 +31,7 @@ AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "barometer", "nmea"
 LOG_EVENTS = {
     "recorder_zone",
     "recorder_paused",
+    "recorder_clock_off",
     "system_clock_stepped",
     "utc_jumped",
     "utc_implausible",

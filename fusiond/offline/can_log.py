@@ -49,9 +49,11 @@ from fusiond.files.tables import ImuTable
 from fusiond.offline.aid_files import Arrival
 from fusiond.offline.can_frames import Refusals, channels, messages
 
-REPORTS_WITHIN_NS = 20_000_000_000
-"""So far ahead reports of UTC are looked for where a clock may have been set: a receiver of several
-messages tells after four epochs what belongs together (`drivers.can.pairing`), at 1 Hz."""
+REPORTS_WITHIN_NS = 120_000_000_000
+"""So far ahead reports of UTC are looked for where a clock may have been set: tunnels are shorter,
+and in two minutes a recorder's clock is off by 12 ms (100 ppm)."""
+OFF_S = 1.0
+"""By so much a recorder's clock is as likely slow as wrong: receivers report UTC a second late."""
 PAUSE_NS = 60_000_000_000
 """Of a shorter pause the solution says enough; no bus that is awake is silent for so long."""
 LATEST_S = 9e9
@@ -125,6 +127,8 @@ class _Replay:
         self._imu: list[tuple[int, ImuSample]] = []
         self._reports: dict[str, deque[int]] = {}
         """By source the last reports of UTC: the recorder's stamp less what was reported."""
+        self._silent_ns = (1, 0)
+        """Stamps from and to which nobody reports UTC."""
         self._drivers = self._make_drivers(self._emit)
         self._on_buses: dict[Any, list[CanDriver[Any]]] = {}
         if not self._drivers:
@@ -168,6 +172,10 @@ class _Replay:
             for driver in buses[message.channel]:
                 driver.feed(frame)
         refusals.count(refused)
+        status = self._clock.status()
+        if status.system_error_s is not None and abs(status.system_error_s) >= OFF_S:
+            how = f"by {status.system_error_s:+.1f} s from the UTC of {status.utc_source}"
+            self._told("recorder_clock_off", f"the recorder's clock is off {how}")
         self._shift()
         rejected, imu = {"can": refusals.all()}, self._imu_table()
         for name, driver in self._drivers.items():
@@ -222,7 +230,7 @@ class _Replay:
         """By how much the recorder's clock was set before this frame, by the reports of UTC of the
         sources that have told it before and go on to tell it."""
         known = {name for name, reports in self._reports.items() if reports}
-        if not known:
+        if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
             return None
         after: dict[str, list[int]] = {name: [] for name in known}
         stamp_ns = first_ns
@@ -244,6 +252,8 @@ class _Replay:
                 driver.feed(_frame(message, stamp_ns, stamp_ns))
             if any(len(reports) >= ENOUGH_REPORTS for reports in after.values()):
                 break
+        if not any(after.values()):
+            self._silent_ns = first_ns, stamp_ns
         found = (set_by(self._reports[name], reports) for name, reports in after.items())
         return next((ns for ns in found if ns is not None), None)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -113,3 +114,22 @@ def test_a_real_drive_goes_on_over_the_step(tmp_path: Path) -> None:
     found = json.loads(report.read_text())
     assert found["sources"]["gnss"] == {"no_alignment": 11, "start": 1, "fused": 85}
     assert "! the system clock was set by +86400.0" in done.stdout
+
+
+def test_a_wrong_zone_is_told_by_the_receivers_utc(even: CanLog, tmp_path: Path) -> None:
+    log = read(tmp_path, candump(bus(SECONDS), lambda t_s: 7200.0))
+    (told,) = [text for code, text in log.events if code == "recorder_clock_off"]
+    assert told == "the recorder's clock is off by +7200.0 s from the UTC of gnss"
+    assert not [code for code, _ in even.events if code == "recorder_clock_off"]
+
+
+def test_a_step_while_the_receiver_is_silent(even: CanLog, tmp_path: Path) -> None:
+    """In a tunnel: what tells UTC again after it tells the step apart."""
+
+    def outside(m: can.Message) -> bool:
+        return m.arbitration_id == 9 or not 25.0 < m.timestamp - BEGIN_S < 40.0
+
+    lines = candump(filter(outside, bus(SECONDS)), lambda t_s: 5.0 if t_s >= AT_S else 0.0)
+    log = read(tmp_path, lines)
+    assert np.abs(log.imu.t_s - 5.0 - even.imu.t_s).max() < 5e-3
+    assert len(fixes(log)) > len(fixes(even)) - 20
