@@ -10,9 +10,11 @@ Each but the last may end in .gz as well. Dates without a zone are taken as pyth
 from __future__ import annotations
 
 import contextlib
+import gc
 import gzip
 import importlib.util
 import logging
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -224,10 +226,15 @@ def _mf4(
         raise MissingPackageError("MF4 logs need the package asammdf: pip install 'fusiond[mf4]'")
     with_mf4()
     log.path.open("rb").close()
+    failure = ""
     try:
         yield from can.MF4Reader(log.path)
     except Exception as error:  # whatever asammdf raises for a file that is none
-        lost.add(0, "cut", f"the log ends in damage: {type(error).__name__}: {error}")
+        failure = f"{type(error).__name__}: {error}"
+    if failure:
+        lost.add(0, "cut", f"the log ends in damage: {failure}")
+        with _deleted_in_silence():
+            gc.collect()
 
 
 def _tell_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
@@ -259,6 +266,16 @@ def _warned(call: Callable[[], None]) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.propagate = propagated
+
+
+@contextlib.contextmanager
+def _deleted_in_silence() -> Iterator[None]:
+    """asammdf's file, where it could not be opened, fails once more as it is deleted."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
 
 
 class _Heard(logging.Handler):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import importlib.util
 import random
 import re
 import struct
@@ -505,3 +506,17 @@ def test_any_damage_ends_in_frames_a_count_or_a_sentence(name: str, tmp_path: Pa
             continue
         assert all(each.reason in ("unreadable", "cut") for each in refused.all())
         assert len(found) <= 16 * len(frames)  # pieces may be repeated
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("asammdf") is None,
+    reason="the package asammdf is not installed: pip install 'fusiond[mf4]'",
+)
+@pytest.mark.parametrize("content", [b"hello", b"MDF     4.10    " + bytes(range(256)) * 9])
+def test_what_is_no_mf4(content: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """asammdf's own file fails a second time as it is deleted, and says so on the terminal."""
+    path = tmp_path / "bus.mf4"
+    path.write_bytes(content)
+    with pytest.raises(TableError, match=r"cannot be read as \.mf4: cut: .* MdfException: "):
+        read(path)
+    assert capfd.readouterr().err == ""
