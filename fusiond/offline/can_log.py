@@ -129,20 +129,15 @@ class _Replay:
         """By source the last reports of UTC: the recorder's stamp less what was reported."""
         self._silent_ns = (1, 0)
         """Stamps from and to which nobody reports UTC."""
+        self._sources = _on_a_bus(config)
         self._drivers = self._make_drivers(self._emit)
         self._on_buses: dict[Any, list[CanDriver[Any]]] = {}
         if not self._drivers:
             raise TableError(f"{path}: the configuration has no source on a CAN bus")
 
     def _make_drivers(self, emit: Emit) -> dict[str, CanDriver[Any]]:
-        points = driver_entry_points()
-        drivers: dict[str, CanDriver[Any]] = {}
-        for name, section in self._config.sources.items():
-            make = points[section.driver].load()
-            if issubclass(make, CanDriver):
-                options = make.Options(**section.options)
-                drivers[name] = make(name, options, emit, self._host.monotonic_ns)
-        return drivers
+        now_ns = self._host.monotonic_ns
+        return {name: make(name, o, emit, now_ns) for name, (make, o) in self._sources.items()}
 
     def run(self) -> CanLog:
         """Read the log to its end."""
@@ -310,6 +305,13 @@ class _Replay:
         samples = [(*m.gyro_rad_s, *m.accel_m_s2) for _, m in kept]
         t_s = times.astype(np.float64) * 1e-9
         return ImuTable(t_s, np.array(samples, dtype=np.float64).reshape(-1, 6), rejected)
+
+
+def _on_a_bus(config: Config) -> dict[str, tuple[Any, Any]]:
+    """The class and the options of each driver of a source on a CAN bus."""
+    points = driver_entry_points()
+    made = ((name, points[s.driver].load(), s.options) for name, s in config.sources.items())
+    return {n: (make, make.Options(**o)) for n, make, o in made if issubclass(make, CanDriver)}
 
 
 class _Ahead:
