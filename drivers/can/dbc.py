@@ -228,19 +228,24 @@ def find_signal(database: Database, name: str, what: str) -> tuple[Message, Sign
     """The signal `Message.Signal`; PermanentDriverError lists what there is."""
     message_name, dot, signal_name = name.partition(".")
     messages = {message.name: message for message in database.messages}
-    left_out = database.left_out if isinstance(database, SoundPart) else {}
-    for flawed in (message_name, name):
-        if flawed in left_out:
-            raise PermanentDriverError(
-                f"{what}: {flawed} cannot be read of the DBC file: {left_out[flawed]}"
-            )
     if not dot or message_name not in messages:
+        _refuse_flawed(database, message_name, what)
         names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
         raise _unknown(what, name, "Message.Signal", names)
     signals = {signal.name: signal for signal in messages[message_name].signals}
     if signal_name not in signals:
+        _refuse_flawed(database, name, what)
         raise _unknown(what, signal_name, f"signal of {message_name}", list(signals))
     return messages[message_name], signals[signal_name]
+
+
+def _refuse_flawed(database: Database, name: str, what: str) -> None:
+    """PermanentDriverError, where what is asked for has been left out."""
+    left_out = database.left_out if isinstance(database, SoundPart) else {}
+    if name in left_out:
+        raise PermanentDriverError(
+            f"{what}: {name} cannot be read of the DBC file: {left_out[name]}"
+        )
 
 
 def _unknown(what: str, name: str, kind: str, names: Sequence[str]) -> PermanentDriverError:

@@ -29,6 +29,7 @@ from fusiond.live.events import Events
 from fusiond.live.sources import Source
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.navigator import Navigator
+from fusiond.offline.aid_files import source_of
 from fusiond.offline.process import process
 from fusiond.offline.recorded import read_recorded
 from fusiond.simulation.imu_truth import Truth
@@ -505,6 +506,21 @@ def test_every_option_is_tried_or_known_to_no_file() -> None:
 
 def _under(name: str, section: str) -> bool:
     return name == section or name.startswith(f"{section}.")
+
+
+@pytest.mark.parametrize(
+    ("kind", "section"),
+    [
+        *(("gnss", "gnss"), ("nmea", "gnss"), ("rdss", "rdss"), ("wheel", "wheel")),
+        *(("barometer", "barometer"), ("attitude", "star_tracker"), ("bearing", "sar")),
+    ],
+)
+def test_a_section_of_another_name_is_that_of_its_kind(kind: str, section: str) -> None:
+    config = Config.model_validate({"aiding": {"rear": {"kind": section}}})
+    assert source_of(kind, config) == "rear"
+    both = Config.model_validate({"aiding": {"rear": {"kind": section}, section: {}}})
+    named = "rear" if section == "star_tracker" else section  # its files have the kind `attitude`
+    assert source_of(kind, both) == named
 
 
 @pytest.fixture(scope="module")

@@ -141,14 +141,17 @@ def test_who_asks_for_what_is_left_out_hears_why(
 ) -> None:
     path = tmp_path / "flawed.dbc"
     texts = [FLAWS[f][0] for f in ("decimal comma", "standard identifier of 29 bits")]
+    texts.append("BO_ 4294967295 IMU_600: 8 X\n")  # of the name of a sound one
     path.write_text("\n".join((content("racelogic_imu04"), *texts)))
     with caplog.at_level(logging.WARNING, "drivers.can.dbc"):
         dbc = load_dbc(str(path))
     assert [record.getMessage().split(": ")[1] for record in caplog.records] == [
         "FOO.A is left out",
         "EEC1 is left out",
+        "IMU_600 is left out",
     ]
     find_signal(dbc, "FOO.B", "gyro")
+    find_signal(dbc, "IMU_600.YAW_RATE", "gyro")
     with pytest.raises(PermanentDriverError, match=r"gyro: FOO.A cannot be read .* \(0,1>>!<<,0\)"):
         find_signal(dbc, "FOO.A", "gyro")
     with pytest.raises(PermanentDriverError, match=r"EEC1 cannot be read .* more than 11 bits"):
