@@ -10,7 +10,10 @@ does not, and stamps that leap ahead are a pause: whoever takes a pause for a st
 through it, who takes a step for a pause aligns anew.
 
 A stamp alone among others, which come from where it left, is damage: `time_backwards`,
-`time_ahead`. All times are integer nanoseconds; a pure function of its inputs.
+`time_ahead`. Stamps of another channel that lie a little behind are its controller's own clock, or
+were written late: those frames have come by now, and their stamps stand.
+
+All times are integer nanoseconds; a pure function of its inputs.
 """
 
 from __future__ import annotations
@@ -24,8 +27,7 @@ from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
 
 AHEAD_NS = SECOND_NS
 """A stamp that is later than those that follow by more is damaged: a recorder writes as frames
-come, and two controllers' clocks agree better. For the same reason stamps that go back by less are
-of another controller, unless UTC says otherwise."""
+come, and two controllers' clocks agree better."""
 LEAP_NS = 200 * MILLISECOND_NS
 """A receiver's reports of UTC are at most so late on a healthy line (fusiond.clock.utc_envelope):
 of a smaller step they say nothing, and the envelope follows it."""
@@ -45,6 +47,8 @@ ENOUGH_REPORTS = 3
 
 Verdict = Literal["taken", "time_backwards", "time_ahead"]
 SetOff = Callable[[], int | None]
+Of = tuple[Hashable, int]
+"""Channel and identifier of a frame."""
 
 
 class Step(NamedTuple):
@@ -55,8 +59,8 @@ class Step(NamedTuple):
 
 
 class RecorderClock:
-    """Takes the stamps in their order. `t_ns` is the monotonic instant of the last one taken, which
-    begins at its stamp; `stamp_ns` that stamp; `steps` what the clock was set by."""
+    """Takes the stamps in their order. `t_ns` is monotonic time, which begins at the first of them;
+    `stamp_ns` the latest stamp taken; `steps` what the clock was set by."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -67,26 +71,31 @@ class RecorderClock:
         """Time itself did, as UTC says: what was recorded before is refused until it is over."""
         self._denied_ns: int | None = None
         self._spacings: deque[int] = deque(maxlen=_LATELY)
-        self._frames: deque[tuple[Hashable, int]] = deque(maxlen=_OWN_PERIOD)
+        self._frames: deque[tuple[Of, int]] = deque(maxlen=_OWN_PERIOD)
+        self._of_channel: dict[Hashable, int] = {}
+        """Its last stamp."""
 
     @property
     def set_ns(self) -> int:
         """All steps together: the last stamps less monotonic time."""
         return sum(step.set_ns for step in self.steps)
 
-    def is_odd(self, stamp_ns: int) -> bool:
+    def is_odd(self, stamp_ns: int, of: Of) -> bool:
         """Whether `take` has to look at what follows."""
         change = stamp_ns - self.stamp_ns
-        return not self._begun or change < 0 or change >= LEAP_NS
+        if 0 <= change < LEAP_NS:
+            return not self._begun
+        own_ns = self._of_channel.get(of[0], stamp_ns)
+        return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
 
-    def next(self, stamp_ns: int, of: Hashable) -> None:
-        """A stamp that is not odd, of a frame with this identifier."""
-        self._on(stamp_ns, stamp_ns - self.stamp_ns, of)
+    def next(self, stamp_ns: int, of: Of) -> None:
+        """The stamp of a frame, which is not odd."""
+        if stamp_ns >= self.stamp_ns:
+            self._on(stamp_ns, stamp_ns - self.stamp_ns, of)
+        self._of_channel[of[0]] = stamp_ns
 
-    def take(
-        self, stamp_ns: int, of: Hashable, following: Sequence[int], set_by_utc: SetOff
-    ) -> Verdict:
-        """A stamp of a frame with this identifier, before those that follow (`FOLLOWING`).
+    def take(self, stamp_ns: int, of: Of, following: Sequence[int], set_by_utc: SetOff) -> Verdict:
+        """The stamp of a frame before those that follow (`FOLLOWING`).
 
         `set_by_utc()`: by how much reports of UTC say that the clock was set here; None where they
         say nothing. It is asked where a step is possible.
@@ -102,6 +111,8 @@ class RecorderClock:
                 return "time_backwards"
             if change > -AHEAD_NS:
                 return self._little_back(stamp_ns, of, set_by_utc)
+            if stamp_ns > self._of_channel.get(of[0], stamp_ns) - AHEAD_NS:
+                return "time_backwards"  # of another channel, which was written too late
             set_ns = set_by_utc()
             if set_ns is not None and change - set_ns < -AHEAD_NS:
                 self._went_back = True
@@ -118,8 +129,8 @@ class RecorderClock:
         self._on(stamp_ns, change, of)
         return "taken"
 
-    def _little_back(self, stamp_ns: int, of: Hashable, set_by_utc: SetOff) -> Verdict:
-        """By so little that another controller may have stamped the frame: UTC must say more."""
+    def _little_back(self, stamp_ns: int, of: Of, set_by_utc: SetOff) -> Verdict:
+        """By so little that controllers of one channel may disagree: UTC must say more."""
         change = stamp_ns - self.stamp_ns
         denied = self._denied_ns is not None and stamp_ns - self._denied_ns < ASKED_AGAIN_NS
         set_ns = None if denied or change > -LEAP_NS else set_by_utc()
@@ -130,14 +141,15 @@ class RecorderClock:
             self._denied_ns = stamp_ns
         return "time_backwards"
 
-    def _on(self, stamp_ns: int, passed_ns: int, of: Hashable) -> None:
+    def _on(self, stamp_ns: int, passed_ns: int, of: Of) -> None:
         self._went_back = False
+        self._of_channel[of[0]] = stamp_ns
         self.t_ns += passed_ns
         self.stamp_ns = stamp_ns
         self._spacings.append(passed_ns)
         self._frames.append((of, self.t_ns))
 
-    def _step(self, stamp_ns: int, set_ns: int, of: Hashable) -> None:
+    def _step(self, stamp_ns: int, set_ns: int, of: Of) -> None:
         """Reports of UTC come with jitter: where they say that no time passed, or as good as none,
         so much did as passes between frames of this identifier."""
         change = stamp_ns - self.stamp_ns
@@ -145,10 +157,11 @@ class RecorderClock:
         if passed < LEAP_NS:
             passed = self._due_ns(of)
         self.steps.append(Step(stamp_ns, change - passed))
+        self._of_channel.clear()
         self._on(stamp_ns, passed, of)
 
-    def _due_ns(self, of: Hashable) -> int:
-        """How long after the last frame the next of this identifier is due."""
+    def _due_ns(self, of: Of) -> int:
+        """How long after the last frame the next of this channel and identifier is due."""
         times = [t_ns for each, t_ns in self._frames if each == of][-2:]
         spacing = median_low(self._spacings) if self._spacings else 0
         if len(times) < 2:

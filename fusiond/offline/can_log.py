@@ -150,7 +150,7 @@ class _Replay:
                 refused["unknown_channel"] += 1
                 continue
             of = message.channel, message.arbitration_id
-            if recorder.is_odd(stamp_ns):
+            if recorder.is_odd(stamp_ns, of):
                 before_ns, steps = recorder.stamp_ns, len(recorder.steps)
                 following = [ns for _, ns in frames.ahead(FOLLOWING)]
                 set_off = partial(self._set, frames, message, stamp_ns)
@@ -162,7 +162,7 @@ class _Replay:
                     self._tell_pause(stamp_ns - before_ns)
             else:
                 recorder.next(stamp_ns, of)
-            host.t_ns, host.stamp_ns = recorder.t_ns, stamp_ns
+            host.t_ns, host.stamp_ns = recorder.t_ns, recorder.stamp_ns
             frame = _frame(message, host.t_ns, stamp_ns)
             for driver in buses[message.channel]:
                 driver.feed(frame)

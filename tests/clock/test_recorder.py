@@ -17,17 +17,20 @@ PERIOD = 10 * MS
 
 
 def replayed(
-    stamps: Sequence[int], utc: Callable[[int], int | None] = lambda k: None
+    stamps: Sequence[int],
+    utc: Callable[[int], int | None] = lambda k: None,
+    channel: Callable[[int], int] = lambda k: 0,
 ) -> tuple[RecorderClock, list[int], Counter[str]]:
     """The clock at the end, monotonic instants of the frames that are taken, and the verdicts;
     `utc(k)` is what reports say of a step before frame k."""
     clock, times, verdicts = RecorderClock(), [], Counter[str]()
     for k, stamp in enumerate(stamps):
-        if clock.is_odd(stamp):
+        of = channel(k), 9
+        if clock.is_odd(stamp, of):
             following = stamps[k + 1 : k + 1 + FOLLOWING]
-            verdict = clock.take(stamp, 9, following, lambda k=k: utc(k))  # type: ignore[misc]
+            verdict = clock.take(stamp, of, following, lambda k=k: utc(k))  # type: ignore[misc]
         else:
-            clock.next(stamp, 9)
+            clock.next(stamp, of)
             verdict = "taken"
         verdicts[verdict] += 1
         if verdict == "taken":
@@ -102,6 +105,26 @@ def test_a_stamp_alone_is_damage(wrong: int, at: int) -> None:
     name = "time_backwards" if wrong < 0 else "time_ahead"
     assert verdicts == {"taken": 999, name: 1}
     assert times == [t for k, t in enumerate(even()) if k != at]
+
+
+def test_another_channel_may_be_a_little_behind() -> None:
+    """By its controller's clock, or because it is written in blocks: its frames have come."""
+    stamps = [t - (400 * MS if k % 2 else 0) for k, t in enumerate(even())]
+    clock, times, verdicts = replayed(stamps, lambda k: 0 // 0, lambda k: k % 2)
+    assert (clock.steps, verdicts) == ([], {"taken": 1000})
+    assert times == [even()[k - k % 2] for k in range(1000)]
+    first, second = even()[0::2], even()[1::2]
+    blocks = [t for k in range(0, 500, 50) for t in first[k : k + 50] + second[k : k + 50]]
+    clock, times, verdicts = replayed(blocks, lambda k: 0 // 0, lambda k: k // 50 % 2)
+    assert (clock.steps, verdicts) == ([], {"taken": 1000})
+    assert times == sorted(times)
+
+
+def test_another_channel_that_is_far_behind_is_left_out() -> None:
+    stamps = [t - (7 * S if k % 2 else 0) for k, t in enumerate(even())]
+    clock, times, verdicts = replayed(stamps, lambda k: None, lambda k: k % 2)
+    assert (clock.steps, times) == ([], even()[::2])
+    assert verdicts == {"taken": 500, "time_backwards": 500}
 
 
 def test_controllers_that_disagree_are_no_steps() -> None:

@@ -41,9 +41,12 @@ def can_log(data: bytes) -> None:
     stamps = [round(m.timestamp * 1e9) for m in found if abs(m.timestamp) < 9e9]
     clock, times = RecorderClock(), []
     for k, stamp in enumerate(stamps):
-        if not clock.is_odd(stamp):
-            clock.next(stamp, 0)
-        elif clock.take(stamp, 0, stamps[k + 1 : k + 1 + FOLLOWING], lambda: None) != "taken":
+        if not clock.is_odd(stamp, (k % 2, 0)):
+            clock.next(stamp, (k % 2, 0))
+        elif (
+            clock.take(stamp, (k % 2, 0), stamps[k + 1 : k + 1 + FOLLOWING], lambda: None)
+            != "taken"
+        ):
             continue
         times.append(clock.t_ns)
     assert all(before <= after for before, after in itertools.pairwise(times))

@@ -179,6 +179,25 @@ def test_each_source_has_the_channel_of_its_name(tmp_path: Path) -> None:
         read_can_log(named, configuration(tmp_path, wheel_channel="can7"))
 
 
+def test_a_channel_whose_clock_is_a_little_behind(tmp_path: Path) -> None:
+    """As live: its frames have come by now, and are as old as their stamps say."""
+    messages = recorded("can0", "can1")
+    for m in messages:
+        m.timestamp -= 0.3 if m.channel == "can1" else 0.0
+    lines = [
+        f"({m.timestamp:.6f}) {m.channel} {m.arbitration_id:03X}#{m.data.hex()}" for m in messages
+    ]
+    path = tmp_path / "bus.log"
+    path.write_text("\n".join(lines))
+    log = read_can_log(path, configuration(tmp_path, wheel_channel="can1"))
+    assert log.rejected["can"] == []
+    assert len(log.imu.t_s) == SAMPLES
+    times = [m.stamp.t_ns * 1e-9 for m in (row.measurement for row in log.arrivals)]  # type: ignore[union-attr]
+    expected = START_S - 0.3 + 0.1 * np.arange(SAMPLES // 10) + 0.005
+    assert np.abs(np.array(times) - expected).max() < 2e-6
+    assert not [code for code, _ in log.events if code == "system_clock_stepped"]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
