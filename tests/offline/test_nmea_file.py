@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
-from functools import reduce
-from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +17,11 @@ from fusiond.files.csv_tables import TableError
 from fusiond.offline.aid_files import Arrival
 from fusiond.offline.process import process
 from fusiond.offline.recorded import Recorded, read_recorded
+from tests.offline.nmea_lines import sentence
 
 BEGIN = datetime(2026, 3, 24, 7, 33, tzinfo=UTC)
 BEGIN_S = int(BEGIN.timestamp())
 SECONDS = 20
-
-
-def sentence(body: str) -> bytes:
-    return f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode()
 
 
 def gga(k: int) -> bytes:

@@ -22,8 +22,8 @@ from fusiond.live.events import Events
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.process import process
 from tests.clock.host_time import Host
+from tests.offline.both_ways import Told, told
 from tests.offline.recorded_bus import BEGIN_S, CONFIG, bus
-from tests.offline.test_options import Told, told
 
 SECONDS = 40
 FAILS_S = 25.0
