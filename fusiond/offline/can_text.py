@@ -212,13 +212,14 @@ def dated(stamp: str) -> bool:
 def first_stamps(stream: BinaryIO) -> list[str]:
     """Of the first lines in the terminal's form."""
     lines = TextLines(stream, lambda line: line, lambda line, text: None)
-    found = (_TERMINAL.fullmatch(_COLOUR.sub("", line).rstrip()) for line in islice(lines, 1000))
+    first = islice(lines, _FIRST_LINES)
+    found = (_TERMINAL.fullmatch(_COLOUR.sub("", line).rstrip()) for line in first)
     return [each["t"] for each in found if each is not None and each["t"] is not None]
 
 
 def candump_of(stamps: list[str]) -> Candump:
     """The reader of lines for a log whose first stamps these are."""
-    seconds = [stamp_s(stamp) for stamp in stamps[:_FIRST_LINES]]
+    seconds = [stamp_s(stamp) for stamp in stamps]
     return Candump([s for s in seconds if s is not None])
 
 

@@ -188,22 +188,27 @@ def _run(
 ) -> None:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
+    # One whose stamp goes back comes no earlier for that.
+    came = np.maximum.accumulate(times)
     # So many samples have come when arrival k comes.
-    breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
+    breaks = np.searchsorted(came, [a.t_arrival_ns for a in arrivals], side="right").tolist()
     late = _late(arrivals, navigator.config)
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
     tick_ns = round(1e9 / navigator.config.scheduler.rate_hz)
     done = given = told = 0
     while done < len(times) or given < len(arrivals):
+        if done - told >= _TOLD_EVERY:
+            told = done
+            progress(done, len(times))
         if navigator.started is None:
             # The daemon tries to align at each tick, with all that has come until then.
-            begin = [int(t) for t in times[done : done + 1]]
+            begin = [int(t) for t in came[done : done + 1]]
             begin += [a.t_arrival_ns for a in arrivals[given : given + 1]]
             now_ns = -(-min(begin) // tick_ns) * tick_ns
             while given < len(arrivals) and arrivals[given].t_arrival_ns <= now_ns:
                 _give(navigator, arrivals[given])
                 given += 1
-            upto = done + int(np.searchsorted(times[done : done + CHUNK], now_ns, side="right"))
+            upto = done + int(np.searchsorted(came[done : done + CHUNK], now_ns, side="right"))
             if upto > done:
                 navigator.add_imu(times[done:upto], imu.samples[done:upto])
             navigator.advance(record=True)
@@ -227,9 +232,6 @@ def _run(
         navigator.advance(record=True)
         recorder.take()
         given, done = ahead, upto
-        if done - told >= _TOLD_EVERY:
-            told = done
-            progress(done, len(times))
         if given < len(arrivals) and breaks[given] <= done and (alone or late[given]):
             _give(navigator, arrivals[given])
             given += 1

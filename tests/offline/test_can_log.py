@@ -20,6 +20,7 @@ from fusiond.files.csv_tables import MissingPackageError, TableError
 from fusiond.files.tables import read_gnss, read_imu, read_wheel
 from fusiond.offline.aid_files import READERS, Arrival
 from fusiond.offline.can_log import CanLog, read_can_log
+from fusiond.offline.process import process
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.places import DATA, REPOSITORY
 
@@ -304,3 +305,22 @@ def test_the_drives_fixes_are_those_of_its_table(drive: CanLog) -> None:
     # The module takes 0.1 s by the configuration, and its bus no more than jitter beside it.
     assert min(behind_s) > 0.099
     assert np.median(behind_s) < 0.15
+
+
+def test_stamps_of_samples_that_go_back_a_little(tmp_path: Path) -> None:
+    """As a reader of two queues writes them: the run ends, and what goes back is named."""
+    lines = []
+    for k, m in enumerate(recorded()):
+        t_s = m.timestamp - (0.05 if k % 7 == 0 else 0.0)
+        lines.append(f"({t_s:.6f}) can0 {m.arbitration_id:03X}#{m.data.hex()}")
+    path = tmp_path / "bus.log"
+    path.write_text("\n".join(lines))
+    config = configuration(tmp_path)
+    log = read_can_log(path, config)
+    assert log.rejected["can"] == []
+    assert len(log.imu.t_s) > 0.9 * SAMPLES
+    for heading in (["gnss_course"], ["config"]):
+        section = {"heading": heading, "heading_deg": 10.0, "position_deg_m": (56.0, 10.0, 20.0)}
+        alignment = Config.model_validate({"alignment": section}).alignment
+        found = process(config.model_copy(update={"alignment": alignment}), None, [], can_log=path)
+        assert found["mode"] in {"aligning", "coasting", "navigating"}
