@@ -32,6 +32,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.clock import dates
 from fusiond.clock.clock import Clock
 from fusiond.clock.recorder import (
     AHEAD_NS,
@@ -167,10 +168,7 @@ class _Replay:
             for driver in buses[message.channel]:
                 driver.feed(frame)
         refusals.count(refused)
-        status = self._clock.status()
-        if status.system_error_s is not None and abs(status.system_error_s) >= OFF_S:
-            how = f"by {status.system_error_s:+.1f} s from the UTC of {status.utc_source}"
-            self._told("recorder_clock_off", f"the recorder's clock is off {how}")
+        self._tell_error()
         self._shift()
         rejected, imu = {"can": refusals.all()}, self._imu_table()
         for name, driver in self._drivers.items():
@@ -220,6 +218,15 @@ class _Replay:
             if not any(self._reports.values()):
                 text += ": a pause, or its clock was set, of which no device tells UTC"
             self._told("recorder_paused", text)
+
+    def _tell_error(self) -> None:
+        """How far a recorder that knows the date is from a receiver's UTC at the end: a wrong zone
+        shows so."""
+        status = self._clock.status()
+        off_s = status.system_error_s or 0.0
+        if abs(off_s) >= OFF_S and dates.plausible(self._host.stamp_ns):
+            how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
+            self._told("recorder_clock_off", f"the recorder's clock is off {how}")
 
     def _set(self, frames: _Ahead, first: can.Message, first_ns: int) -> int | None:
         """By how much the recorder's clock was set before this frame, by the reports of UTC of the
