@@ -40,7 +40,12 @@ def decode(path: Path, size: int = 1024, **options: Any) -> tuple[list[RawEvent]
 
 
 def ephemerides(events: list[RawEvent]) -> dict[str, Ephemeris]:
-    return {e.satellite: e for e in events if isinstance(e, Ephemeris)}
+    """By satellite, but for those of B-CNAV, which BeiDou sends beside its D1."""
+    return {
+        e.satellite: e
+        for e in events
+        if isinstance(e, Ephemeris) and not e.message.startswith("bcnav")
+    }
 
 
 # --------------------------------------------------------------------------- the walk
@@ -71,13 +76,14 @@ def test_walk_is_complete_and_every_frame_accounted_for() -> None:
         "subframes_lnav": 80,
         "gps_cnav_not_used": 148,
         "subframes_d1": 153,
-        "bcnav_not_used": 512,
+        "subframes_bcnav1": 148,
+        "subframes_bcnav2": 364,
         "subframes_inav": 393,
         "fnav_not_used": 98,
         "galileo_cnav_not_used": 634,
         "sbas_not_used": 307,
         "ephemeris_mixed": 3,
-        "ephemerides": 53,
+        "ephemerides": 53 + 134,
         "ionospheres": 1,
     }
 
@@ -338,7 +344,8 @@ def test_rtcm_epoch_of_beidou_is_gps_time() -> None:
     assert counters["msm"] == 6  # 1076 and then 1077, and so on: MSM7 takes the place of MSM6
     assert counters["signal_superseded"] == 100
     assert counters["signal_repeated"] == 0
-    assert counters["leap_seconds_assumed"] == 1
+    assert counters["rtcm_system_parameters"] == 1  # 1013 says 18
+    assert counters["leap_seconds_assumed"] == 0
 
 
 def test_rtcm_observations_are_those_of_rtklib() -> None:
