@@ -4,10 +4,10 @@
     B-CNAV2  one message in 9 words: PRN 6, type 6, second of week 18, data 234, CRC 24
     A        A_ref + dA,  A_ref 27,906,100 m of a MEO, 42,162,200 m of an IGSO
 
-The receiver has undone LDPC code and interleaving, and fills the last word with zeros. Subframe 2 is
-an ephemeris with its clock and delays; health is in subframe 3. Messages 10, 11 and 30 are one when
-the low byte of IODC is IODE; 11 has no issue number and follows its 10 by 3 s. The clock refers to
-B3I, as that of D1. Sources: BDS-SIS-ICD-B1C-1.0 sections 6 and 7; BDS-SIS-ICD-B2a-1.0 sections 6
+The receiver has undone LDPC code and interleaving, and fills the last word with zeros. Subframe 2
+is an ephemeris with its clock and delays; health is in subframe 3. Messages 10, 11 and 30 are one
+when the low byte of IODC is IODE; 11 has no issue number and follows its 10 by 3 s. The clock
+refers to B3I, as that of D1. Sources: BDS-SIS-ICD-B1C-1.0 sections 6 and 7; BDS-SIS-ICD-B2a-1.0 sections 6
 and 7.
 """
 

@@ -7,8 +7,9 @@ Every verified frame ends in exactly one of these counters:
     RTCM 3  msm, week_unknown, rtcm_ephemerides, ..._not_used, rtcm_unreadable, and the refusals of
             an ephemeris
 
-A subframe's name is `subframes_lnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or `_inav` where it was used, a message that is
-not decoded (`fnav_not_used`), or the reason of its refusal (`parity_bad`). See `docs/gnss-raw.md`.
+A subframe's name is `subframes_lnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or `_inav` where it was
+used, a message that is not decoded (`fnav_not_used`), or the reason of its refusal (`parity_bad`).
+See `docs/gnss-raw.md`.
 """
 
 from __future__ import annotations

@@ -186,15 +186,15 @@ class RtcmDecoder:
         return [RawGnssEpoch(self._source, self._t_seen_ns, stamp, week, tow_s, signals)]
 
     def _parameters(self, bits: Bits) -> None:
-        """1013: the day (DF051, modified Julian), second of UTC's day (DF052), leap seconds (DF054);
-        a day or leap seconds that cannot be are not known."""
+        """1013: day (DF051, modified Julian), second of UTC's day (DF052), leap seconds (DF054); a
+        day or leap seconds that cannot be are not known."""
         self._counters["rtcm_system_parameters"] += 1
         day, second, leap = bits.unsigned(24, 16), bits.unsigned(40, 17), bits.unsigned(62, 8)
         if not within(leap, PLAUSIBLE_LEAP_SECONDS):
             self._counters["leap_seconds_implausible"] += 1
             return
         self.leap_seconds = leap
-        if MJD_1980_01_06 <= day and second < 86_400:
+        if day >= MJD_1980_01_06 and second < 86_400:
             self._weeks.note(0, (day - MJD_1980_01_06) * 86_400 + second + leap)
 
     def _message(self, frame: bytes) -> Any | None:

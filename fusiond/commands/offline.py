@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from drivers.raw.messages import System
     from fusiond.offline.outages import Outage
 
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "barometer", "nmea", "raw")
+AID_KINDS = (
+    *("gnss", "rdss", "attitude", "bearing", "wheel", "barometer"),
+    *("nmea", "ubx", "bestpos", "sbf", "raw"),
+)
 # What was recorded, as `process` and `calibrate` take it.
 ImuFile = Annotated[Path | None, typer.Option("--imu", metavar="F.csv", help="IMU samples.")]
 CanLog = Annotated[

@@ -12,10 +12,10 @@ r"""Satellite position, velocity and clock from a broadcast Keplerian ephemeris.
     dt = a0 + a1 (t - toc) + a2 (t - toc)^2 + F e sqrtA sin E,   F = -2 sqrt(GM) / c^2
 
 tk = t - toe, t the system time of transmission; R(x) are rotations of the axes. Velocity and clock
-drift are the derivatives of these lines by t; Edot = (n + n' tk) / (1 - e cos E) carries them all. Angles
-rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS agree to
-centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv); the
-relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
+drift are the derivatives of these lines by t; Edot = (n + n' tk) / (1 - e cos E) carries all.
+Angles rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS
+agree to centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv);
+the relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
 
 BeiDou's time is 14 s behind GPS time. It is settled here and nowhere else: `Orbits` is asked in GPS
 time, and toe and toc are moved to GPS time when they come in; `we toe` keeps the system's own toe.

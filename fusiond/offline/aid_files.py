@@ -50,6 +50,8 @@ FEWEST_VALUES = 20
 step of a four-hundredth of the range is seen at most, which adds nothing to any sigma."""
 
 
+OF_A_RECEIVER = frozenset({"nmea", "ubx", "bestpos", "sbf"})
+"""Kinds that are fixes of a receiver, as its own protocol states them."""
 _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset", "unknown")
 
 
@@ -64,7 +66,7 @@ class Arrival(NamedTuple):
 def source_of(kind: str, config: Config) -> str:
     """The source that a file's measurements are taken to come from.
 
-    The kind of the file (`gnss` for `nmea`); an attitude is a star tracker's where the
+    The kind of the file (`gnss` for those of a receiver); an attitude is a star tracker's where the
     configuration has one and no [aiding.attitude], a bearing that of the configured radar, raw data
     that of the section of kind `raw`.
     """
@@ -75,7 +77,7 @@ def source_of(kind: str, config: Config) -> str:
     }
     wanted = sections.get(kind)
     if wanted is None or kind in config.aiding:
-        return "gnss" if kind == "nmea" else kind
+        return "gnss" if kind in OF_A_RECEIVER else kind
     fallback = "sar" if kind == "bearing" else kind
     return next((n for n, s in config.aiding.items() if isinstance(s, wanted)), fallback)
 
@@ -244,20 +246,27 @@ def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
-    """UBX or RTCM 3 as it came off the wire. An epoch's time is GPS time: the IMU's `t_s` must be
-    GPS second of week or POSIX seconds.
+    """UBX or RTCM 3 as it came off the wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
+    must be GPS second of week or POSIX seconds.
 
     What the satellites broadcast is known from the first epoch on, as to a receiver that has been
     on for some minutes: a recording that starts in the middle would take half a minute to several
     to say it again.
     """
     from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
+    from fusiond.offline.receiver_logs import content, read_rinex, rinex_text  # noqa: PLC0415
 
+    data = content(path)
+    text = rinex_text(path, data)
+    if text is not None:
+        return read_rinex(path, text, imu, source)
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    if not of_week and len(imu.t_s):
+        decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are those of the IMU's time
     epochs: list[Arrival] = []
     broadcast: list[RawEvent] = []
-    for event in [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]:
+    for event in [*decoder.feed(data, 0), *decoder.flush()]:
         if not isinstance(event, RawGnssEpoch):
             broadcast.append(event)
             continue
@@ -266,10 +275,21 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
             now = event.stamp.utc_ns
         epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
     if not epochs:
-        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
+        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)")
     refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
     return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused
+
+
+def _read_solutions(kind: str) -> Callable[[Path, ImuTable, str], _Read]:
+    """Of a receiver's own protocol; its decoders come only where there is such a file."""
+
+    def read(path: Path, imu: ImuTable, source: str) -> _Read:
+        from fusiond.offline.receiver_logs import read_solutions  # noqa: PLC0415
+
+        return read_solutions(kind, path, imu, source)
+
+    return read
 
 
 READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
@@ -280,5 +300,6 @@ READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {
     "wheel": _read_wheel,
     "barometer": _read_barometer,
     "nmea": _read_nmea,
+    **{kind: _read_solutions(kind) for kind in ("ubx", "bestpos", "sbf")},
     "raw": _read_raw,
 }

@@ -107,10 +107,11 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
 
 
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
-    """Of the measurements' instants; what a satellite broadcasts has none."""
+    """Of the measurements' instants; what a satellite broadcasts has none, so that a file of
+    nothing else has those of its arrivals."""
     instants = [
         valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
-    ]
+    ] or [row.t_arrival_ns for row in rows]
     return (min(instants) * 1e-9, max(instants) * 1e-9) if instants else None
 
 

@@ -105,7 +105,7 @@ async def test_raw_alone_is_running_and_tells_the_time(device: Device) -> None:
     [
         (b"", "silent", "no bytes for 0.3 s"),
         (b"\xa5" * 50, "silent", "neither NMEA, UBX nor RTCM 3 verifies at 115200 baud"),
-        (ubx(b"\x01\x07", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
+        (ubx(b"\x0a\x04", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
         (rawx(measurement(), week=0), "running", "no time yet"),
         (gga(29, quality=0), "running", "no fix"),
     ],
