@@ -43,10 +43,10 @@ class Cycle:
             return False
         return key != self._key or name in self._names or len(self._names) >= MAX_CYCLE
 
-    def late(self, key: Hashable) -> bool:
+    def late(self, key: Hashable, name: Name) -> bool:
         """Whether a message is of the epoch that was closed just now: what was learned is too
-        short."""
-        if self._names or not self._at_once or key != self._key:
+        short. One that this epoch had is none: the receiver repeats itself."""
+        if self._names or not self._at_once or key != self._key or name in self._last:
             return False
         self._counters["late_message"] += 1
         if self._learned and len(self._too_short) < MAX_UNLEARNED:

@@ -159,7 +159,7 @@ class BestposDecoder:
         key = log.week, log.tow_s
         if self._cycle.begins_anew(key, log.name):
             self._close(found, learn=True)
-        elif self._cycle.late(key):
+        elif self._cycle.late(key, log.name):
             return
         epoch = self._epoch
         place = self._place(log, t_seen_ns) if log.name in POSITIONS else None

@@ -7,8 +7,8 @@
 The receiver has undone LDPC code and interleaving, and fills the last word with zeros. Subframe 2
 is an ephemeris with its clock and delays; health is in subframe 3. Messages 10, 11 and 30 are one
 when the low byte of IODC is IODE; 11 has no issue number and follows its 10 by 3 s. The clock
-refers to B3I, as that of D1. Sources: BDS-SIS-ICD-B1C-1.0 sections 6 and 7; BDS-SIS-ICD-B2a-1.0 sections 6
-and 7.
+refers to B3I, as that of D1. Sources: BDS-SIS-ICD-B1C-1.0 sections 6 and 7; BDS-SIS-ICD-B2a-1.0
+sections 6 and 7.
 """
 
 from __future__ import annotations

@@ -161,7 +161,7 @@ class SbfDecoder:
         """Whether a block is taken into an epoch."""
         if self._cycle.begins_anew(when, block.number):
             self._close(found, learn=True)
-        elif self._cycle.late(when):
+        elif self._cycle.late(when, block.number):
             return False
         epoch = self._epoch or _Epoch()
         self._epoch, self._when, epoch.t_seen_ns = epoch, when, self._t_seen_ns
@@ -244,7 +244,7 @@ class SbfDecoder:
             quality=quality or 1,
             lat_rad=lat if placed else None,
             lon_rad=lon if placed else None,
-            height_m=height if height > NO_NUMBER and not plane else None,
+            height_m=None if height <= NO_NUMBER or plane else height,
             sd_ned_m=sd,
             v_ned_m_s=(v_n, v_e, down) if moving else None,
             satellites=None if satellites == 255 else satellites,

@@ -99,7 +99,7 @@ class UbxNavDecoder:
         (itow_ms,) = struct.unpack_from("<I", payload, itow_at)
         if self._cycle.begins_anew(itow_ms, kind):
             self._close(found, learn=True)
-        elif self._cycle.late(itow_ms):
+        elif self._cycle.late(itow_ms, kind):
             return
         epoch = self._epoch or NavEpoch(itow_ms)
         try:
