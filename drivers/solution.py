@@ -11,6 +11,8 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
+from functools import reduce
+from operator import xor
 
 from drivers.base import DriverOptions
 from drivers.measurements import (
@@ -95,6 +97,8 @@ class SolutionJudge:
         self.counters = counters
         self.refusal = ""
         """Why the last epoch was refused, by counter name; empty when it was not."""
+        self.gga = b""
+        """The last fix as a GGA, for a caster that asks where the receiver is; empty before one."""
         self._source = source
         self._decoding = decoding
         self._calendar = Calendar(decoding.earliest_date, counters)
@@ -118,7 +122,9 @@ class SolutionJudge:
         if not self._order.accept(day, stamp.utc_ns % DAY_NS):
             self.refusal = "duplicate_epoch"
             return found
-        found.append(self._fix(s, stamp))
+        fix = self._fix(s, stamp)
+        self.gga = _gga(fix, stamp)
+        found.append(fix)
         return found
 
     def heading(
@@ -178,6 +184,24 @@ class SolutionJudge:
             v,
             sd_v if v is not None else None,
         )
+
+
+def _gga(fix: PositionFix, stamp: UtcStamp) -> bytes:
+    """NMEA 0183's sentence, without its line end; the height is the ellipsoid's, separation 0."""
+    time = datetime.fromtimestamp(stamp.utc_ns // 1_000_000_000, UTC)
+    lat, lon = abs(math.degrees(fix.lat_rad)), abs(math.degrees(fix.lon_rad))
+    body = (
+        f"GNGGA,{time:%H%M%S}.00,{_minutes(lat, 2)},{'NS'[fix.lat_rad < 0]},{_minutes(lon, 3)},"
+        f"{'EW'[fix.lon_rad < 0]},{fix.quality},{fix.satellites or 4:02d},{fix.hdop or 1.0:.2f},"
+        f"{fix.height_m or 0.0:.3f},M,0.0,M,,"
+    ).encode()
+    return b"$%b*%02X" % (body, reduce(xor, body))
+
+
+def _minutes(degrees: float, digits: int) -> str:
+    """Degrees and minutes of an angle in one number; a minute is never printed as 60."""
+    tenths = round(degrees * 60e5)
+    return f"{tenths // 6_000_000:0{digits}d}{tenths % 6_000_000 / 1e5:08.5f}"
 
 
 def _implausible(s: Solution) -> str | None:

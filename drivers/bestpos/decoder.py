@@ -90,8 +90,6 @@ class BestposDecoder:
     `position_type_unknown`, `velocity_latent`.
     """
 
-    gga = b""
-
     def __init__(
         self,
         source: str,
@@ -110,6 +108,11 @@ class BestposDecoder:
     def refusal(self) -> str:
         """Why the last epoch gave no fix, by counter name."""
         return self._judge.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._judge.gga
 
     @property
     def epoch_open(self) -> bool:

@@ -92,8 +92,8 @@ class GnssDecoder:
 
     @property
     def gga(self) -> bytes:
-        """The last GGA with a position; empty before one."""
-        return self._nmea.gga
+        """The last GGA with a position, or else the last fix of UBX-NAV as one; empty before."""
+        return self._nmea.gga or self._ubx.gga
 
     @property
     def epoch_open(self) -> bool:

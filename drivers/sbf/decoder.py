@@ -77,8 +77,6 @@ class SbfDecoder:
     `position_type_unknown`; the rest is `BlockSplitter`'s and `SolutionJudge`'s.
     """
 
-    gga = b""
-
     def __init__(
         self,
         source: str,
@@ -100,6 +98,11 @@ class SbfDecoder:
     def refusal(self) -> str:
         """Why the last epoch gave no fix, by counter name."""
         return self._judge.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._judge.gga
 
     @property
     def epoch_open(self) -> bool:

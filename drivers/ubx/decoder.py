@@ -54,6 +54,11 @@ class UbxNavDecoder:
         return self._judge.refusal
 
     @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._judge.gga
+
+    @property
     def epoch_open(self) -> bool:
         """Whether `silence` would close an epoch."""
         return self._epoch is not None
@@ -188,8 +193,6 @@ def _solution(e: NavEpoch) -> Solution:
 class UbxDecoder:
     """Bytes in, measurements out: `UbxNavDecoder` behind the splitter of a line."""
 
-    gga = b""
-
     def __init__(
         self,
         source: str,
@@ -205,6 +208,11 @@ class UbxDecoder:
     def refusal(self) -> str:
         """Why the last epoch gave no fix, by counter name."""
         return self._nav.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._nav.gga
 
     @property
     def epoch_open(self) -> bool:
