@@ -60,9 +60,11 @@ def version_and_type(text: str) -> tuple[float, str]:
 def gps_seconds(numbers: list[str]) -> float:
     """Seconds since 1980-01-06 of a printed year, month, day, hour, minute, second; no leap
     seconds. ValueError."""
+    if len(numbers) < 6:
+        raise ValueError("no date")
     year, month, day, hour, minute = (int(x) for x in numbers[:5])
     second = float(numbers[5])
-    if not (0 <= hour <= 24 and 0 <= minute < 60 and 0.0 <= second < 61.0):
+    if year < 1980 or not (0 <= hour <= 24 and 0 <= minute < 60 and 0.0 <= second < 61.0):
         raise ValueError("no such time of day")
     days = date(year, month, day).toordinal() - _GPS_ORDINAL
     return days * 86_400 + hour * 3_600 + minute * 60 + second

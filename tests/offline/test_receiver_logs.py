@@ -124,7 +124,9 @@ def test_three_protocols_give_one_navigation(logs: dict[str, Path], tmp_path: Pa
             (other.lon_rad, ubx.lon_rad, 6.4e6),
             (other.height_m, ubx.height_m, 1.0),
         ):
-            assert np.abs(a[-rows:] - b[-rows:]).max() * metres < 0.05
+            apart = np.abs(a[-rows:] - b[-rows:]) * metres
+            assert np.quantile(apart, 0.99) < 0.005
+            assert apart.max() < 0.2  # where the course starts it half a millisecond later
 
 
 @pytest.mark.parametrize(
