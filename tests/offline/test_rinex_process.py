@@ -1,4 +1,4 @@
-"""A station's RINEX files, as they are published, through `fusiond process`: it stands where it is."""
+"""A station's RINEX files, as published, through `fusiond process`: it stands where it is."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def test_an_epoch() -> None:
 
 
 def test_what_was_not_measured() -> None:
-    """Blank, zero, or a line that ends early; a satellite that is not used; a blank in its number."""
+    """Blank, zero, a line that ends early; a system that is not used; a blank in a number."""
     lines = (
         f"C21{observed(2.2e7, None, 0.0, 2.3e7, 40.0)}\n"
         f"C22{observed(2.2e7)}\n"
