@@ -33,14 +33,12 @@ from drivers.nmea.epochs import (
     time_of_day_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
+from drivers.nmea.geoid import Geoid
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
 
 BUILD_DATE = date(2026, 11, 20)
 """No receiver can truly report a date before this software was written."""
-GEOID_SD_M = 107.0 / math.sqrt(3.0)
-"""One sigma of the geoid's height where the receiver does not print it: it lies between -107 and
-85 m everywhere (EGM96; Lemoine et al., NASA/TP-1998-206861), taken for uniform in +-107 m."""
 RMC_ALONE_AFTER = 2
 """Epochs in a row without GGA or GNS after which RMC's position is a fix: one may be damaged."""
 
@@ -93,6 +91,7 @@ class NmeaDecoder:
         self._trust = TimeTrust()
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
+        self._geoid = Geoid()
         self._cycle = Cycle()
         self._closed_ns: int | None = None
         """Time of day of the epoch before."""
@@ -306,15 +305,13 @@ class NmeaDecoder:
         self.counters["fixes"] += 1
         if epoch.by_rmc:
             self.counters["rmc_alone"] += 1
-        height, geoid_sd_m = epoch.altitude_m, 0.0
-        if height is not None and epoch.two_dimensional:
+        altitude, separation, height, geoid_sd_m = epoch.altitude_m, epoch.separation_m, None, 0.0
+        if altitude is not None and epoch.two_dimensional:
             self.counters["height_not_measured"] += 1
-            height = None
-        elif height is not None and epoch.separation_m is None:
-            self.counters["height_above_sea"] += 1
-            geoid_sd_m = GEOID_SD_M
-        elif height is not None and epoch.separation_m is not None:
-            height += epoch.separation_m
+        elif altitude is not None:
+            height, geoid_sd_m = self._geoid.height(altitude, separation, lat_deg, lon_deg)
+            if separation is None:
+                self.counters["height_above_sea"] += 1
         sd_ned_m = epoch.sd_ned_m
         if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:
             self.counters["sigma_too_small"] += 1

@@ -209,7 +209,7 @@ async def test_a_client_without_semicolon_and_one_that_wants_nmea() -> None:
 
 
 async def test_a_client_that_names_no_format_gets_answers_alone() -> None:
-    """As gpsd 3.22 has it: gpsd-py3 enables, then reads the answer to each POLL as the next line."""
+    """As gpsd 3.22 has it: gpsd-py3 enables, then takes the next line for the answer to a POLL."""
     async with serving() as server, connected(server.server.port.address) as client:
         lines = await watching(server, client, b'?WATCH={"enable":true}\n')
         assert json.loads(lines[2]) == {

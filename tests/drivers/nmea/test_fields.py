@@ -18,8 +18,8 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from drivers.nmea.decoder import GEOID_SD_M
 from drivers.nmea.fields import typed
+from drivers.nmea.geoid import GEOID_SD_M
 from tests.drivers.nmea.sentences import (
     GGA,
     GGA_NO_FIX,
@@ -152,6 +152,15 @@ def test_a_two_dimensional_fix_above_the_sea_has_no_height_either() -> None:
     few = changed(changed(GGA, ",18,", ",03,"), "-9.100", "")
     assert fix_of(few, GSA_2D).height_m is None
     assert fix_of(few).height_m == 45.3
+
+
+def test_a_separation_that_was_printed_once_is_remembered() -> None:
+    """As far as the geoid is level: 1 m in 20 km; where the vehicle was shipped, not at all."""
+    later = changed(changed(changed(GGA, "-9.100", ""), "021429", "021430"), "3958.", "4008.")
+    elsewhere = changed(changed(changed(GGA, "-9.100", ""), "021429", "021431"), "N,116", "S,016")
+    found = fixes(decode(GGA, later, elsewhere)[0])
+    assert [f.height_m for f in found] == [pytest.approx(36.2), pytest.approx(36.2), 45.3]
+    assert [f.geoid_sd_m for f in found] == [0.0, pytest.approx(0.93, abs=0.01), GEOID_SD_M]
 
 
 @pytest.mark.parametrize(
