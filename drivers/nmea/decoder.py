@@ -34,6 +34,7 @@ from drivers.nmea.epochs import (
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.geoid import Geoid
+from drivers.nmea.reasons import POSITIONS, Heard, cautions, no_fix, note, nothing_verified
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
 
@@ -83,6 +84,7 @@ class NmeaDecoder:
         """Why the last epoch was refused, by counter name; empty when it was not."""
         self.gga = b""
         """The last GGA with a position, without its line end; empty before one."""
+        self.heard = Heard()
         self._source = source
         self._decoding = decoding or NmeaDecoding()
         self._splitter = NmeaSplitter(self.counters)
@@ -101,6 +103,18 @@ class NmeaDecoder:
         """What closed it: `last` sentence, `silence`, or what came then."""
         self._without_gga = 0
         """Epochs with RMC in a row that had neither GGA nor GNS."""
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        return cautions(self.counters, self.heard, self._decoding.earliest_date)
+
+    @property
+    def cause(self) -> str:
+        """Why there is no fix, as a sentence; "" where bytes say nothing of why none verifies."""
+        if not self.counters["sentences"]:
+            return nothing_verified(self.counters, self._splitter.unread)
+        return no_fix(self.counters, self.heard, self.refusal)
 
     @property
     def epoch_open(self) -> bool:
@@ -147,15 +161,19 @@ class NmeaDecoder:
             return
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
+            note(self.heard.unused, sentence.formatter)
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
+            if sentence.formatter in POSITIONS:
+                note(self.heard.talkers, sentence.talker)
             return
         try:
             self._group(sentence, t_seen_ns, found)
         except BadFieldError:
             self.counters["bad_field"] += 1
             return
+        note(self.heard.used, sentence.formatter)
         if sentence.formatter == "GGA" and sentence.fields[5:6] not in ((), ("",), ("0",)):
             self.gga = sentence.raw
 
@@ -221,6 +239,7 @@ class NmeaDecoder:
         self.counters["epochs"] += 1
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
+            note(self.heard.statuses, epoch.unknown_status)
         if epoch.quality is not None:
             self._without_gga = 0
         elif epoch.rmc_valid is not None:
@@ -278,7 +297,10 @@ class NmeaDecoder:
         """The epoch's date, its own or the calendar's; reports the time when it is its own."""
         if epoch.time_of_day_ns is None:
             return None
-        if epoch.day is None or not self._calendar.plausible(epoch.day):
+        if epoch.day is not None and not self._calendar.plausible(epoch.day):
+            self.heard.implausible_date = epoch.day
+            epoch.day = None
+        if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
         # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
         believed = valid and bool(epoch.quality) if epoch.rmc_valid is None else epoch.rmc_valid

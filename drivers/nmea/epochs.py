@@ -90,8 +90,8 @@ class Epoch:
     day: date | None = None
     t_day_seen_ns: int = 0
     rmc_valid: bool | None = None
-    unknown_status: bool = False
-    """RMC has a status that is none: it says nothing of the others, and counts for nothing."""
+    unknown_status: str = ""
+    """A status of RMC that is none: it says nothing of the others, and RMC counts for nothing."""
     rmc_position: Printed | None = None
     by_rmc: bool = False
     """Place and quality are RMC's: there is neither GGA nor GNS."""
@@ -293,7 +293,7 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     elif status in _NOT_VALID:
         epoch.rmc_valid = False
     else:
-        epoch.unknown_status = True
+        epoch.unknown_status = status
     epoch.modes |= set(mode)
     day = fields.get("date", "")
     if isinstance(day, date):

@@ -165,6 +165,7 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
         report.findings.append(f"the driver ended: {task.exception()!r}: please report this")
     report.findings += open_findings(heard.name, heard.driver, heard.options, seconds)
     report.findings += _damage(heard.driver.counters)
+    report.findings += getattr(heard.driver, "cautions", {}).values()
     if "ImuSample" in heard.kinds:
         _imu(heard, config, report)
     elif "PositionFix" in heard.kinds:
@@ -174,10 +175,10 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
                 f"fixes are up to {oldest:.1f} s old on arrival: raise the baud rate or switch off "
                 "sentences that are not needed (GSV)"
             )
-    elif heard.driver_name == "nmea" and status.state == "running" and not status.detail:
-        report.findings.append(
-            "sentences arrive but no fix: give the antenna a free sky and wait, or switch on GGA"
-        )
+    elif status.state == "running" and not status.detail:
+        cause = getattr(heard.driver, "cause", "")
+        if cause:
+            report.findings.append(cause)
     return report
 
 
