@@ -103,6 +103,10 @@ class Epoch:
     modes: set[str] = field(default_factory=set)
     """Mode letters of RMC, VTG and the systems in use in GNS."""
     satellites: int | None = None
+    counted: int = 0
+    """Satellites that GGA and GNS say were used; of several systems GGA may count one."""
+    listed: set[tuple[str, str]] = field(default_factory=set)
+    """Those that GSA lists, with the number of their system where it says it."""
     hdop: float | None = None
     vdop: float | None = None
     nav_modes: set[int] = field(default_factory=set)
@@ -148,8 +152,7 @@ class Epoch:
         """Whether the height is none that was measured: GSA says so, and may be right."""
         if 2 not in self.nav_modes or 3 in self.nav_modes:
             return False
-        many = self.satellites is not None and self.satellites >= OVERDETERMINED
-        return not many or self.vdop is None
+        return max(self.counted, len(self.listed)) < OVERDETERMINED or self.vdop is None
 
     @property
     def rounding_sd_ned_m(self) -> Vector3:
@@ -266,6 +269,7 @@ def _take_gga(epoch: Epoch, fields: Fields) -> None:
     _take_height(epoch, fields)
     epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality or 0
     epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
+    epoch.counted = max(epoch.counted, satellites or 0)
 
 
 def _take_gns(epoch: Epoch, fields: Fields) -> None:
@@ -273,6 +277,7 @@ def _take_gns(epoch: Epoch, fields: Fields) -> None:
     satellites, hdop = _count(fields, "numSV"), _dop(fields, "HDOP")
     used = set(_letter(fields, "posMode")) - {"N"}
     epoch.modes |= used
+    epoch.counted = max(epoch.counted, satellites or 0)
     if "GGA" in epoch.cycle:
         return
     _take_height(epoch, fields)
@@ -322,6 +327,8 @@ def _take_gsa(epoch: Epoch, fields: Fields) -> None:
     nav_mode = _count(fields, "navMode")
     if nav_mode is not None:
         epoch.nav_modes.add(nav_mode)
+    system = _letter(fields, "systemId")
+    epoch.listed.update((number, system) for number in fields["printed"][2:14] if number)
     epoch.hdop = epoch.hdop if epoch.hdop is not None else hdop
     epoch.vdop = epoch.vdop if epoch.vdop is not None else vdop
 

@@ -136,6 +136,10 @@ def test_velocity_needs_a_course_unless_at_rest() -> None:
         ([GGA, changed(GSA_2D, "1.50", "")], None),
         ([GGA, GSA_2D], 36.2),  # Quectel, Telit: 14 satellites and GSA says 2
         ([changed(GGA, ",18,", ",05,"), GSA_2D], 36.2),
+        # Quectel EG25-G: GGA counts GPS alone, GNS and GSA all.
+        ([changed(GGA, ",18,", ",04,"), changed(GNS, ",18,", ",08,"), GSA_2D], 36.2),
+        ([changed(GGA, ",18,", ",03,"), GSA_2D, changed(GSA_2D, "1.50,4", "1.50,1")], 36.2),
+        ([changed(GGA, ",18,", ",03,"), GSA_2D, changed(GSA_2D, "GN", "GP")], None),
         ([changed(GGA, ",18,", ",04,"), GSA_2D, GSA], 36.2),  # another system's says 3
         ([changed(GGA, ",18,", ",04,"), GSA], 36.2),
     ],
