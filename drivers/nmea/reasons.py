@@ -69,6 +69,11 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
     """Why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
     if counters["checksum_missing"] >= MANY > counters["sentences"]:
         return f"NMEA {CHECKSUMS}"
+    if counters["checksum_bad"] >= MANY > counters["sentences"]:
+        return (
+            f"{counters['checksum_bad']} wrong checksums against 0 sound: check ground, cable "
+            "length and that nobody else reads this port, or has edited this file"
+        )
     if counters["ubx_frames"]:
         return "UBX frames arrive, but no NMEA: switch on NMEA output on this port"
     if counters["rtcm_frames"]:
@@ -90,12 +95,12 @@ def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
         )
     if counters["checksum_missing"] >= MANY:
         return CHECKSUMS
+    if counters["bad_field"] and not POSITIONS & set(heard.used):
+        return "the positions that arrive have fields that cannot be true (bad_field)"
     names = [*heard.used, *heard.unused]
     which = f" ({', '.join(names[:MOST_NAMES])})" if names else ""
     if not counters["epochs"]:
         return f"sentences arrive{which}, but none that counts: switch on GGA and RMC"
-    if counters["bad_field"] and not POSITIONS & set(heard.used):
-        return "the positions that arrive have fields that cannot be true (bad_field)"
     return f"epochs arrive{which}, but none has a position: switch on GGA"
 
 
@@ -131,5 +136,5 @@ def implausible_date(day: date, earliest: date) -> str:
     text = f"the receiver's date is {day}, {wrong}: its dates are not used, its times of day are"
     later = day + ROLLOVER if day < earliest else day
     if earliest <= later <= earliest + ROLLOVER_SPAN and later != day:
-        return f"{text}; 1024 weeks later is {later}: the rollover of the GPS week"
+        return f"{text}; if {later} is right, 1024 weeks later, its GPS week has rolled over"
     return text
