@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import math
 
+from drivers.plausible import HEIGHT_M, within
+
 BOUND_M = 107.0
 GEOID_SD_M = BOUND_M / math.sqrt(3.0)
 SLOPE_SD = 5e-5
@@ -31,7 +33,8 @@ class Geoid:
         """Height above the ellipsoid (m), and one sigma (m) of N in it, 0 where it is printed; that
         above the sea where nothing is known of N."""
         if separation_m is not None:
-            self._known = separation_m, lat_deg, lon_deg
+            if abs(separation_m) <= BOUND_M:
+                self._known = separation_m, lat_deg, lon_deg
             return altitude_m + separation_m, 0.0
         if self._known is None:
             return altitude_m, GEOID_SD_M
@@ -39,6 +42,6 @@ class Geoid:
         north = math.radians(lat_deg - lat)
         east = math.radians(math.remainder(lon_deg - lon, 360.0)) * math.cos(math.radians(lat))
         sd_m = SLOPE_SD * EARTH_M * math.hypot(north, east)
-        if sd_m > GEOID_SD_M:
+        if sd_m > GEOID_SD_M or not within(altitude_m + separation_m, HEIGHT_M):
             return altitude_m, GEOID_SD_M
         return altitude_m + separation_m, sd_m

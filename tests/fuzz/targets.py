@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from drivers.can.bus import CanFrame
 from drivers.can.dbc import MessagePlan
 from drivers.can.imu import CanImuDecoder, CanImuOptions
-from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
+from drivers.measurements import DeviceStamp, Heading, ImuSample, Measurement, PositionFix
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.nmea.running_checks import crc24q
@@ -130,11 +130,29 @@ def nmea(data: bytes) -> None:
     for kind, pieces in _whole_and_cut(NmeaDecoder, choice, stream):
         decoder = kind("fuzz", DECODING)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
-        found.append((events + decoder.flush(), decoder.counters))
+        found.append((events + decoder.flush(), decoder.counters, decoder.cause))
         assert not decoder.epoch_open
+        assert all(decoder.cautions.values())
     assert found[0] == found[1]
-    for event in found[0][0]:
+    _check_fixes(found[0][0])
+    _check_fixes(_with_silences(_pieces(choice, stream)))
+
+
+def _with_silences(pieces: list[bytes]) -> list[Measurement]:
+    """The same bytes off a line that pauses between the pieces, now shorter, now longer."""
+    decoder, now_ns, events = NmeaDecoder("fuzz", DECODING), 0, []
+    for number, piece in enumerate(pieces):
+        events += decoder.feed(piece, now_ns)
+        if number % 3:
+            events += decoder.silence()
+        now_ns += (number % 5) * 70_000_000
+    return events + decoder.flush()
+
+
+def _check_fixes(events: Sequence[Measurement]) -> None:
+    for event in events:
         if isinstance(event, PositionFix):
+            assert math.isfinite(sum(event.rounding_sd_ned_m) + event.geoid_sd_m)
             assert abs(event.lat_rad) <= math.pi / 2
             assert abs(event.lon_rad) <= math.pi
             assert event.height_m is None or within(event.height_m, HEIGHT_M)
