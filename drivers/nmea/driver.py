@@ -8,10 +8,11 @@ from typing import ClassVar
 from drivers.base import Emit, Now, monotonic_ns
 from drivers.measurements import DeviceEvent, Measurement
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
+from drivers.nmea.reasons import REFUSALS
 from drivers.raw.messages import RawEvent
 from drivers.receiver import ReceiverDriver, ReceiverOptions
 
-__all__ = ["NmeaDecoder", "NmeaDecoding", "NmeaDriver", "NmeaOptions"]
+__all__ = ["REFUSALS", "NmeaDecoder", "NmeaDecoding", "NmeaDriver", "NmeaOptions"]
 
 
 class NmeaOptions(ReceiverOptions, NmeaDecoding):

@@ -8,9 +8,8 @@ from typing import ClassVar
 from drivers.base import Emit, Now, monotonic_ns
 from drivers.measurements import Measurement, PositionFix, TimeReport, UtcStamp
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.nmea.driver import NmeaOptions
+from drivers.nmea.driver import REFUSALS, NmeaOptions
 from drivers.nmea.framing import Item, Sentence, StreamSplitter
-from drivers.nmea.reasons import REFUSALS
 from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import RawEvent, RawGnssEpoch

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, date, datetime, timedelta
+from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,6 @@ from drivers.measurements import (
     UtcStamp,
     WheelSpeed,
 )
-from drivers.nmea.reasons import ROLLOVER
 from drivers.raw.messages import RawEvent, RawGnssEpoch
 from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
@@ -231,58 +230,17 @@ def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
     found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     rows = []
-    fixes = [m for m in found if isinstance(m, PositionFix) and isinstance(m.stamp, UtcStamp)]
-    later_ns, dates = _rolled_over([_utc_ns(m) for m in fixes], imu, of_week)
-    for m in fixes:
-        t_ns = _utc_ns(m) + later_ns
+    for m in found:
+        if not isinstance(m, PositionFix) or not isinstance(m.stamp, UtcStamp):
+            continue
+        t_ns = m.stamp.utc_ns
         if of_week:
             t_ns = _ns(utc_ns_to_gps_week_seconds(t_ns))
         rows.append(Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
+    if found and not rows:
+        raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
     refused = counted(decoder.counters)
-    notes = [Rejection(0, name, text, 0) for name, text in (decoder.cautions | dates).items()]
-    if not rows:
-        undated = any(isinstance(m, PositionFix) for m in found)
-        why = "no fix has a date: RMC or ZDA is missing" if undated else decoder.cause
-        notes.insert(0, Rejection(0, "nothing_read", why or "no NMEA sentence verifies", 0))
-    named = ("refused", "no_fix", "checksum_bad", "checksum_missing", "implausible", "too_large")
-    return rows, [*notes, *(r for r in refused if r.reason.endswith(named))]
-
-
-def _utc_ns(m: PositionFix) -> int:
-    assert isinstance(m.stamp, UtcStamp)
-    return m.stamp.utc_ns
-
-
-def _rolled_over(utc_ns: Sequence[int], imu: ImuTable, of_week: bool) -> tuple[int, dict[str, str]]:
-    """What to add (ns) to instants of a receiver whose GPS week has rolled over, and a sentence.
-
-    An IMU with POSIX time tells: fixes that are 1024 weeks off and else of its time. With GPS
-    second of week nothing tells, and only the leap seconds are those of the wrong date.
-    """
-    from drivers.nmea.decoder import BUILD_DATE  # noqa: PLC0415
-
-    if not utc_ns or not len(imu.t_s):
-        return 0, {}
-    first_ns, last_ns = min(utc_ns), max(utc_ns)
-    first = datetime.fromtimestamp(first_ns * 1e-9, UTC).date()
-    span = ROLLOVER // timedelta(microseconds=1) * 1000
-    if of_week:
-        if first + ROLLOVER > BUILD_DATE:
-            return 0, {}
-        now_s, later_s = (utc_ns_to_gps_week_seconds(first_ns + ns) for ns in (0, span))
-        return 0, {
-            "old_date": f"the fixes are of {first}, with the leap seconds of then: if they are of "
-            f"{first + ROLLOVER}, the receiver's GPS week has rolled over, and their times are "
-            f"{later_s - now_s:.0f} s too early"
-        }
-    turns = round((_ns(float(imu.t_s[0])) - first_ns) / span)
-    begins, ends = (_ns(float(t)) - turns * span for t in (imu.t_s[0], imu.t_s[-1]))
-    if not turns or begins > last_ns or ends < first_ns:
-        return 0, {}
-    return turns * span, {
-        "week_rollover": f"the fixes are of {first}, {abs(turns) * 1024} weeks off the IMU's time: "
-        "the receiver's GPS week has rolled over, and its dates are corrected"
-    }
+    return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:

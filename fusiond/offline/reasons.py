@@ -83,8 +83,6 @@ def nothing_navigated(
     alignment's.
     """
     for name, file in files.items():
-        if not file.used and file.rejected and not file.rejected[0].times:
-            return f"{name}: {file.rejected[0].detail}"
         if file.refused > file.used:
             return _refused_rows(name, file)
     (imu_name, imu), *aids = files.items()

@@ -1,4 +1,4 @@
-"""A file of NMEA as an aid: what it gives, and in one sentence why it gives nothing."""
+"""A file of NMEA that gives nothing, or less than it could, says why in one sentence."""
 
 from __future__ import annotations
 
