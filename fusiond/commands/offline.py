@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from drivers.raw.messages import System
     from fusiond.offline.outages import Outage
 
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "barometer", "nmea", "raw")
+AID_KINDS = (
+    *("gnss", "rdss", "attitude", "bearing", "wheel", "barometer"),
+    *("nmea", "ubx", "bestpos", "sbf", "raw"),
+)
 # What an engineer has to know of a log's times.
 LOG_EVENTS = {
     "recorder_zone",

@@ -56,6 +56,8 @@ FEWEST_VALUES = 20
 step of a four-hundredth of the range is seen at most, which adds nothing to any sigma."""
 
 
+OF_A_RECEIVER = frozenset({"nmea", "ubx", "bestpos", "sbf"})
+"""Kinds that are fixes of a receiver, as its own protocol states them."""
 _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset", "unknown")
 
 
@@ -72,6 +74,9 @@ class Arrival(NamedTuple):
 _SECTIONS: dict[str, type[Aiding]] = {
     "gnss": GnssAiding,
     "nmea": GnssAiding,
+    "ubx": GnssAiding,
+    "bestpos": GnssAiding,
+    "sbf": GnssAiding,
     "rdss": RdssAiding,
     "wheel": WheelAiding,
     "barometer": BarometerAiding,
@@ -84,11 +89,11 @@ _SECTIONS: dict[str, type[Aiding]] = {
 def source_of(kind: str, config: Config) -> str:
     """The source that a file's measurements are taken to come from.
 
-    The kind of the file (`gnss` for `nmea`, `sar` for `bearing`), or else the first section of that
-    kind of aid in the configuration; an attitude is a star tracker's where there is one and no
-    [aiding.attitude], raw data are of the section of kind `raw`.
+    The kind of the file (`gnss` for those of a receiver, `sar` for `bearing`), or else the first
+    section of that kind of aid in the configuration; an attitude is a star tracker's where there is
+    one and no [aiding.attitude], raw data are of the section of kind `raw`.
     """
-    name = {"nmea": "gnss", "bearing": "sar"}.get(kind, kind)
+    name = "gnss" if kind in OF_A_RECEIVER else {"bearing": "sar"}.get(kind, kind)
     if name in config.aiding or kind in config.aiding:
         return name if name in config.aiding else kind
     wanted = _SECTIONS[kind]
@@ -245,25 +250,34 @@ def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
     """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
     maps to: GPS second of week (below 604800) or POSIX seconds."""
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
-    heard, refused = read_nmea(path, of_week, by)
+    posix = len(imu.t_s) and not of_week
+    imu_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if posix else None
+    heard, refused = read_nmea(path, imu_s, by)
     return [Arrival(each.t_ns, each.measurement, utc_ns=each.utc_ns) for each in heard], refused
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
-    """UBX or RTCM 3 as it came off the wire. An epoch's time is GPS time: the IMU's `t_s` must be
-    GPS second of week or POSIX seconds.
+    """UBX or RTCM 3 as it came off the wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
+    must be GPS second of week or POSIX seconds.
 
     What the satellites broadcast is known from the first epoch on, as to a receiver that has been
     on for some minutes: a recording that starts in the middle would take half a minute to several
     to say it again.
     """
     from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
+    from fusiond.offline.receiver_logs import content, read_rinex, rinex_text  # noqa: PLC0415
 
+    data = content(path)
+    text = rinex_text(path, data)
+    if text is not None:
+        return read_rinex(path, text, imu, source)
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    if not of_week and len(imu.t_s):
+        decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are those of the IMU's time
     epochs: list[Arrival] = []
     broadcast: list[RawEvent] = []
-    for event in [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]:
+    for event in [*decoder.feed(data, 0), *decoder.flush()]:
         if not isinstance(event, RawGnssEpoch):
             broadcast.append(event)
             continue
@@ -272,7 +286,7 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
             now = event.stamp.utc_ns
         epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
     if not epochs:
-        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
+        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)")
     refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
     return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused

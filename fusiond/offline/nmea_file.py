@@ -37,6 +37,7 @@ from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
+from fusiond.offline.week_rollover import rollover_of
 
 # A recording may be old; before selective availability ended there was no receiver worth replaying.
 EARLIEST_DATE = date(2000, 5, 1)
@@ -85,8 +86,11 @@ def receiver_of(source: str, config: Config) -> Receiver:
     return Receiver(source, decoding, compass, compass_decoding)
 
 
-def read_nmea(path: Path, of_week: bool, by: Receiver) -> tuple[list[Heard], list[Rejection]]:
-    """Measurements in the file's order; times are GPS second of week (`of_week`) or POSIX.
+def read_nmea(
+    path: Path, imu_s: tuple[float, float] | None, by: Receiver
+) -> tuple[list[Heard], list[Rejection]]:
+    """Measurements in the file's order; times are POSIX, as the IMU's from and to `imu_s`, or GPS
+    second of week where that is None. What makes them poorer than they could be is a note.
 
     Raises `TableError` for a file without a single measurement, with the reason.
     """
@@ -123,8 +127,12 @@ def read_nmea(path: Path, of_week: bool, by: Receiver) -> tuple[list[Heard], lis
     refused["untimed"] += 0 if epochs.times else len(untimed)
     if not found:
         raise TableError(f"{path}: {_why_nothing(decoder, refused)}")
-    heard = [_heard(utc_ns, m, of_week) for utc_ns, m in sorted(found, key=lambda each: each[0])]
-    return heard, [r for r in counted(refused) if _is_refusal(r.reason)]
+    add_ns, said = rollover_of([utc_ns for utc_ns, _ in found], imu_s)
+    of_week = imu_s is None
+    in_order = sorted(found, key=lambda each: each[0])
+    heard = [_heard(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
+    notes = [Rejection(0, *note, 0) for note in (*decoder.cautions.items(), *said)]
+    return heard, [*notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
 
 
 def _fed(decoder: NmeaDecoder | CompassDecoder, lines: Iterable[tuple[int, bytes]]) -> list[Any]:
@@ -190,14 +198,15 @@ def _is_refusal(name: str) -> bool:
 
 
 def _why_nothing(decoder: NmeaDecoder, refused: Counter[str]) -> str:
-    """In words, the most frequent of what stands in the way of a measurement."""
+    """In words, what stands in the way of a measurement."""
     if refused["undated"] or refused["untimed"]:
-        return "no measurement with a date (RMC or ZDA missing)"
+        missing = "no measurement with a date (RMC or ZDA missing)"
+        return decoder.cautions.get("implausible_date", missing)
     if not decoder.counters["sentences"]:
-        return "no NMEA sentence whose checksum is right"
+        return decoder.cause or "no NMEA sentence whose checksum is right"
     name = max(REFUSALS, key=lambda each: refused[each])
     if refused[name]:
         return REFUSALS[name]
     if refused["compass_not_configured"]:
         return "headings of a compass alone, and the configuration has none ([aiding.compass])"
-    return "no sentence that gives a position or a heading (GGA, GNS, HDT, THS)"
+    return decoder.cause

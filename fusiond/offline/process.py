@@ -120,7 +120,7 @@ def _process(
         recorder.close()
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     if why is None and not recorder.rows:
-        why = nothing_navigated(read.files, navigator.refused, reason)
+        why = nothing_navigated(read.files, refusals_of(navigator), reason)
     return {
         **({} if smoothed is None else {"smoothed": smoothed.counts()}),
         "files": {name: _account(file) for name, file in read.files.items()},
@@ -156,12 +156,21 @@ def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
     return SmoothedRows(navigator, writer)
 
 
+def refusals_of(navigator: Navigator) -> dict[str, Counter[str]]:
+    """What was refused by source and name, satellites of raw epochs among it."""
+    found = {source: Counter(refused) for source, refused in navigator.refused.items()}
+    for source, receiver in navigator.raw.items():
+        if receiver.refused:
+            found.setdefault(source, Counter()).update(receiver.refused)
+    return found
+
+
 def outcomes_of(navigator: Navigator, withheld: Mapping[str, int]) -> dict[str, dict[str, int]]:
     """Of each source's measurements, by name."""
     sources: dict[str, dict[str, int]] = {}
     for source, outcomes in navigator.timeline.counters.outcomes.items():
         sources[source] = {name: count for name, count in outcomes.items() if count}
-    for source, refused in navigator.refused.items():
+    for source, refused in refusals_of(navigator).items():
         sources.setdefault(source, {}).update(refused)
     for source, count in withheld.items():
         if count:

@@ -13,7 +13,7 @@ from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counts
 from fusiond.files.tables import ImuTable, read_imu
-from fusiond.offline.aid_files import READERS, Arrival, read_nmea_by, source_of
+from fusiond.offline.aid_files import OF_A_RECEIVER, READERS, Arrival, read_nmea_by, source_of
 from fusiond.offline.nmea_file import receiver_of
 from fusiond.offline.outages import Outage, named, withheld
 from fusiond.offline.reasons import FileRead
@@ -91,6 +91,10 @@ def _read_aid(
     source = source_of(kind, config)
     if kind == "nmea":
         return read_nmea_by(path, imu, receiver_of(source, config))
+    if kind in OF_A_RECEIVER:  # their decoders come only where there is such a file
+        from fusiond.offline.receiver_logs import decoding_of, read_solutions  # noqa: PLC0415
+
+        return read_solutions(kind, path, imu, source, decoding_of(source, config))
     return READERS[kind](path, imu, source)
 
 
@@ -121,10 +125,11 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
 
 
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
-    """Of the measurements' instants; what a satellite broadcasts has none."""
+    """Of the measurements' instants; what a satellite broadcasts has none, so that a file of
+    nothing else has those of its arrivals."""
     instants = [
         valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
-    ]
+    ] or [row.t_arrival_ns for row in rows]
     return (min(instants) * 1e-9, max(instants) * 1e-9) if instants else None
 
 

@@ -105,7 +105,7 @@ async def test_raw_alone_is_running_and_tells_the_time(device: Device) -> None:
     [
         (b"", "silent", "no bytes for 0.3 s"),
         (b"\xa5" * 50, "silent", "neither NMEA, UBX nor RTCM 3 verifies at 115200 baud"),
-        (ubx(b"\x01\x07", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
+        (ubx(b"\x0a\x04", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
         (rawx(measurement(), week=0), "running", "no time yet"),
         (gga(29, quality=0), "running", "no fix"),
     ],
@@ -285,3 +285,35 @@ def test_old_logs_need_their_date() -> None:
     (found,) = decoder.feed(stream, 0)
     assert isinstance(found, Ephemeris)
     assert found.week == 2450 - 1024
+
+
+@pytest.mark.parametrize(
+    ("utc_s", "leap_s"),
+    [(1_459_975_092, 17), (1_341_100_799, 15), (1_341_100_800, 16), (1_136_073_599, 13)],
+)
+def test_stamps_of_an_old_log_have_the_leap_seconds_of_their_date(utc_s: int, leap_s: int) -> None:
+    decoder = RawDecoder("gnss", earliest=date(2000, 5, 1))
+    decoder.note_utc(utc_s * 1_000_000_000)
+    tow_ms = (utc_s - 315_964_800 + leap_s) % 604_800 * 1000
+    (epoch,) = decoder.feed(msm7(1077, tow_ms, 0, [GOOD]), 0)
+    assert isinstance(epoch, RawGnssEpoch)
+    assert epoch.stamp == UtcStamp(utc_s * 1_000_000_000)
+
+
+def system_parameters(day: int, second: int, leap: int) -> bytes:
+    fields = [(1013, 12), (0, 12), (day, 16), (second, 17), (0, 5), (leap, 8)]
+    value = total = 0
+    for field, length in fields:
+        value, total = value << length | field, total + length
+    return rtcm((value << -total % 8).to_bytes((total + 7) // 8, "big"))
+
+
+def test_1013_dates_a_stream_and_tells_its_leap_seconds() -> None:
+    decoder = RawDecoder("gnss")
+    assert decoder.feed(system_parameters(57_484, 74_292, 16), 0) == []  # 2016-04-06, a wrong count
+    (epoch,) = decoder.feed(msm7(1077, 333_509_000, 0, [GOOD]), 0)
+    assert isinstance(epoch, RawGnssEpoch)
+    assert (epoch.week, epoch.stamp) == (1891, UtcStamp(1_459_975_093_000_000_000))
+    assert decoder.counters["rtcm_system_parameters"] == 1
+    decoder.feed(system_parameters(57_484, 74_292, 255), 0)
+    assert decoder.counters["leap_seconds_implausible"] == 1
