@@ -30,7 +30,9 @@ from drivers.nmea.epochs import (
     TALKERS,
     BadFieldError,
     Epoch,
+    one_time,
     time_of_day_ns,
+    time_step_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.geoid import Geoid
@@ -95,10 +97,8 @@ class NmeaDecoder:
         self._t_seen_ns = 0
         self._geoid = Geoid()
         self._cycle = Cycle()
-        self._closed_ns: int | None = None
-        """Time of day of the epoch before."""
-        self._closed_seen_ns = 0
-        """When its last sentence came."""
+        self._closed: Epoch | None = None
+        """The epoch before."""
         self._closed_by = ""
         """What closed it: `last` sentence, `silence`, or what came then."""
         self._without_gga = 0
@@ -186,7 +186,7 @@ class NmeaDecoder:
         if epoch is not None:
             again = formatter in epoch.cycle and formatter != "GSA"
             if (
-                (time_ns is not None and epoch.time_of_day_ns not in (None, time_ns))
+                (time_ns is not None and not self._of_epoch(epoch, time_ns, sentence))
                 or (again and sentence.address in epoch.addresses)
                 or len(epoch.cycle) >= MAX_CYCLE
             ):
@@ -201,20 +201,36 @@ class NmeaDecoder:
         epoch.take(sentence, t_seen_ns)
         self._epoch = epoch
         if epoch.time_of_day_ns is None and time_ns is not None:
-            epoch.time_of_day_ns = time_ns
-            if time_ns == self._closed_ns and formatter not in self._cycle.last:
+            epoch.time_of_day_ns, epoch.time_step_ns = time_ns, time_step_ns(sentence)
+            closed = self._closed
+            if (
+                closed is not None
+                and closed.time_of_day_ns is not None
+                and formatter not in self._cycle.last
+                and self._of_epoch(closed, time_ns, sentence)
+            ):
                 self._late()
+        elif time_ns is not None and time_step_ns(sentence) < epoch.time_step_ns:
+            epoch.time_of_day_ns, epoch.time_step_ns = time_ns, time_step_ns(sentence)
         if formatter == self._decoding.last_sentence or (
             self._decoding.last_sentence is None and self._cycle.whole(epoch.cycle)
         ):
             self._close(found, learn=False, by="last")
 
+    def _of_epoch(self, epoch: Epoch, time_ns: int, sentence: Sentence) -> bool:
+        """Whether a sentence with a time is of an epoch, by that alone."""
+        if epoch.time_of_day_ns is None:
+            return True
+        step_ns = time_step_ns(sentence)
+        return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
+
     def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
         """Whether what has no time of its own came sooner after the epoch that a silence closed
         than before the one that begins now."""
-        if self._closed_by != "silence" or not _is_tail(epoch):
+        closed = self._closed
+        if closed is None or self._closed_by != "silence" or not _is_tail(epoch):
             return False
-        return epoch.t_seen_ns - self._closed_seen_ns < t_seen_ns - epoch.t_seen_ns
+        return epoch.t_seen_ns - closed.t_seen_ns < t_seen_ns - epoch.t_seen_ns
 
     def _late(self) -> None:
         """More of an epoch that was closed: where it was closed is learned anew."""
@@ -229,8 +245,7 @@ class NmeaDecoder:
         if epoch is None:
             return
         self._cycle.ended(epoch.cycle, learn=learn)
-        self._closed_ns, self._closed_seen_ns = epoch.time_of_day_ns, epoch.t_seen_ns
-        self._closed_by = by
+        self._closed, self._closed_by = epoch, by
         self._judge(epoch, found)
 
     # ----------------------------------------------------------------- epochs to measurements

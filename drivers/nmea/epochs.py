@@ -56,6 +56,8 @@ OVERDETERMINED = 5
 """Satellites with which a fix is three-dimensional whatever GSA says, if it has an altitude and
 VDOP: four give place and clock, one more than that checks them (modules of Quectel and Telit say 2
 beside 8 to 14)."""
+ROUNDED_NS = 10_000_000
+"""A time with fewer decimals than two is cut: rounded, it would be that of another epoch."""
 MINUTE_M = 1852.0
 """Of latitude."""
 _PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
@@ -81,6 +83,8 @@ class Epoch:
     """What the sentences of one instant said; None where none did. Degrees as printed, SI else."""
 
     time_of_day_ns: int | None = None
+    time_step_ns: int = 0
+    """Of its last digit."""
     t_seen_ns: int = 0
     """When the last sentence that counts came in."""
     cycle: list[str] = field(default_factory=list)
@@ -184,6 +188,20 @@ class Epoch:
             return (0.0, 0.0, None) if self.speed_m_s < STANDSTILL_M_S else None
         course = math.radians(self.course_deg)
         return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
+
+
+def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
+    """Whether two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
+    it to two."""
+    if a_step_ns == b_step_ns:
+        return a_ns == b_ns
+    step_ns, beyond = max((a_step_ns, b_ns - a_ns), (b_step_ns, a_ns - b_ns))
+    return 0 <= beyond < step_ns or (step_ns <= ROUNDED_NS and 2 * abs(beyond) <= step_ns)
+
+
+def time_step_ns(sentence: Sentence) -> int:
+    """One step of the last digit of its time."""
+    return int(10 ** (9 - min(9, len(sentence.fields[0].partition(".")[2]))))
 
 
 def time_of_day_ns(sentence: Sentence) -> int | None:

@@ -65,8 +65,8 @@ def note(names: Counter[str], name: str) -> None:
         names[name] += 1
 
 
-def nothing_verified(counters: Counter[str], unread: bytes) -> str:
-    """Why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
+def wrong_checksums(counters: Counter[str]) -> str:
+    """Why no sentence verifies, where it is for their checksums; "" where it is not."""
     if counters["checksum_missing"] >= MANY > counters["sentences"]:
         return f"NMEA {CHECKSUMS}"
     if counters["checksum_bad"] >= MANY > counters["sentences"]:
@@ -74,6 +74,13 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
             f"{counters['checksum_bad']} wrong checksums against 0 sound: check ground, cable "
             "length and that nobody else reads this port, or has edited this file"
         )
+    return ""
+
+
+def nothing_verified(counters: Counter[str], unread: bytes) -> str:
+    """Why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
+    if wrong := wrong_checksums(counters):
+        return wrong
     if counters["ubx_frames"]:
         return (
             "UBX frames arrive, but no NMEA: switch on NMEA output on this port, or have UBX read: "

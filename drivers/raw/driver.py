@@ -11,6 +11,7 @@ from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.driver import REFUSALS as NMEA_REFUSALS
 from drivers.nmea.driver import NmeaOptions
 from drivers.nmea.framing import Item, Sentence, StreamSplitter
+from drivers.nmea.reasons import wrong_checksums
 from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawEvent, RawGnssEpoch
@@ -274,3 +275,9 @@ class GnssDriver(ReceiverDriver):
     def _unintelligible_detail(self) -> str:
         where = self._where_to_look()
         return f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies{where}"
+
+    @property
+    def cause(self) -> str:
+        """Why nothing on the line verifies, as a sentence; "" where nothing that arrives tells."""
+        alive = any(self.counters[name] for name in self.alive_by)
+        return "" if alive else wrong_checksums(self.counters)

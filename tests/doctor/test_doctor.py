@@ -212,6 +212,21 @@ async def test_the_right_cause_is_named(tmp_path: Path, data: bytes, words: str)
     assert "115200 baud is probably not" not in text
 
 
+async def test_the_driver_of_raw_data_names_missing_checksums_too(tmp_path: Path) -> None:
+    device = Device(tmp_path / "gnss")
+    device.plug()
+    data = SENTENCE % (b"GP", b"33.3") + b"\r\n"
+    sender = asyncio.create_task(_sending(device, lambda: data))
+    base = without(config(tmp_path), "imu", "rdss")
+    raw = base.sources["gnss"].model_copy(update={"driver": "gnss"})
+    code, text = await report(base.model_copy(update={"sources": {"gnss": raw}}))
+    sender.cancel()
+    device.unplug()
+    assert code == 1
+    assert "without a checksum" in text
+    assert "115200 baud is probably not" not in text
+
+
 async def test_silent_line(tmp_path: Path) -> None:
     device = Device(tmp_path / "gnss")
     device.plug()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.measurements import ArrivalStamp, Heading, Measurement
+from drivers.measurements import ArrivalStamp, Heading, Measurement, UtcStamp
 from tests.drivers.nmea.sentences import (
     GGA,
     GSA,
@@ -144,6 +145,55 @@ def test_any_chunks_give_the_same_measurements(size: int) -> None:
     other = decoder()
     assert found + one.flush() == other.feed(stream, 1) + other.flush()
     assert one.counters == other.counters
+
+
+def test_a_time_with_other_decimals_is_the_same_time() -> None:
+    """Magellan 315 prints .76 in GGA and .758 elsewhere; a ZDA has whole seconds."""
+    one = decoder()
+    found = []
+    for gga, rmc, zda in seconds(10, 4, GGA, RMC, ZDA):
+        sentences = (
+            changed(gga, ".00,", ".76,"),
+            changed(rmc, ".00,", ".758,"),
+            changed(zda, ".00,", ","),
+        )
+        found += one.feed(wire(*sentences), 1)
+    found += one.flush()
+    assert [f.v_ned_m_s is not None for f in fixes(found)] == [True] * 4
+    assert one.counters["epochs"] == 4
+    assert one.counters["late_sentence"] == 0
+
+
+def test_epochs_a_step_of_the_last_digit_apart_are_two() -> None:
+    fine, _ = decode(*(changed(GGA, "29.00,", f"29.{i:02d},") for i in range(10)))
+    assert len(fixes(fine)) == 10
+    whole, _ = decode(*(changed(GGA, "021429.00,", f"0214{29 + i},") for i in range(10)))
+    assert len(fixes(whole)) == 10
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("29.76", "29.758", True),
+        ("29.76", "29.754", False),
+        ("29.76", "29.764", True),
+        ("29.76", "29.7699", True),
+        ("29", "29.90", True),
+        ("30", "29.90", False),
+        ("29.9", "29.95", True),
+        ("29.90", "29.91", False),
+        ("29.00", "29", True),
+    ],
+)
+def test_decimals_that_are_cut_or_rounded(one: str, other: str, same: bool) -> None:
+    for first, second in ((one, other), (other, one)):
+        pair = changed(GGA, "29.00", first), changed(RMC, "29.00", second)
+        (fix,) = fixes(decode(*pair)[0])
+        assert (fix.v_ned_m_s is not None) is same
+        if same:  # and the time with more decimals is that of the fix
+            assert isinstance(fix.stamp, UtcStamp)
+            finer = max(one, other, key=lambda text: len(text.partition(".")[2]))
+            assert fix.stamp.utc_ns % 60_000_000_000 == round(float(finer) * 1e9)
 
 
 class Line:
