@@ -16,10 +16,12 @@ from operator import xor
 
 from drivers.base import DriverOptions
 from drivers.measurements import (
+    ArrivalStamp,
     Heading,
     Measurement,
     PositionFix,
     Stamp,
+    TimeOfDayStamp,
     TimeReport,
     UtcStamp,
     Vector3,
@@ -37,7 +39,6 @@ REFUSALS = {
     "datum_refused": "the receiver's positions are not on WGS 84: set its datum",
     "status_missing": "positions arrive without the receiver's own judgement of them",
     "untimed_epoch": "the receiver does not know the time yet",
-    "implausible_date": "the receiver's date is before earliest_date: week rollover, or an old log",
     "duplicate_epoch": "the receiver repeats an epoch or goes back in time",
     "position_implausible": "the receiver states a place that is none",
     "height_implausible": "the receiver states a height at which no vehicle can be",
@@ -111,26 +112,27 @@ class SolutionJudge:
         self.counters["epochs"] += 1
         stamp = self._stamp(s, found)
         # The position's own fault is told before the time's.
-        self.refusal = s.refusal or _implausible(s) or (stamp if isinstance(stamp, str) else "")
-        if self.refusal == "implausible_date":
-            return found  # counted by the calendar
+        self.refusal = s.refusal or _implausible(s) or ("" if stamp else "untimed_epoch")
         if self.refusal:
             self.counters[self.refusal] += 1
             return found
-        assert isinstance(stamp, UtcStamp)
-        day = day_of(stamp.utc_ns)
-        if not self._order.accept(day, stamp.utc_ns % DAY_NS):
+        assert stamp is not None
+        assert s.utc_ns is not None
+        day = day_of(s.utc_ns) if isinstance(stamp, UtcStamp) else None
+        if not self._order.accept(day, s.utc_ns % DAY_NS):
             self.refusal = "duplicate_epoch"
             return found
         fix = self._fix(s, stamp)
-        self.gga = _gga(fix, stamp)
+        self.gga = _gga(fix, s.utc_ns)
         found.append(fix)
         return found
 
     def heading(
-        self, t_seen_ns: int, stamp: Stamp, heading_rad: float, sd_rad: float | None
+        self, t_seen_ns: int, utc_ns: int | None, heading_rad: float, sd_rad: float | None
     ) -> list[Measurement]:
-        """Of two antennas, the baseline's direction (rad, from north, clockwise)."""
+        """Of two antennas, the baseline's direction (rad, from north, clockwise). Without UTC it is
+        as old as it can be: true when it came."""
+        stamp: Stamp = ArrivalStamp() if utc_ns is None else self._stamp_of(utc_ns)
         good = abs(heading_rad) <= 2.0 * math.tau and (sd_rad is None or 0.0 <= sd_rad < math.pi)
         if not good:
             self.counters["heading_implausible"] += 1
@@ -140,19 +142,23 @@ class SolutionJudge:
         sd = sd_rad or None
         return [Heading(self._source, t_seen_ns, stamp, math.remainder(yaw, math.tau), sd)]
 
-    def plausible(self, utc_ns: int) -> bool:
-        """Whether a receiver can truly report this instant; counted where not."""
-        return self._calendar.plausible(day_of(utc_ns))
-
-    def _stamp(self, s: Solution, found: list[Measurement]) -> UtcStamp | str:
+    def _stamp(self, s: Solution, found: list[Measurement]) -> Stamp | None:
+        """The solution's instant, None where it has none; reports the time when it is believed."""
         if s.utc_ns is None:
-            return "untimed_epoch"
-        if not self.plausible(s.utc_ns):
-            return "implausible_date"
-        trusted = self._trust.report(s.utc_ns, s.t_seen_ns, valid=s.utc_known)
-        if trusted is not None:
-            found.append(TimeReport(self._source, s.t_seen_ns, s.utc_ns, trusted))
-        return UtcStamp(s.utc_ns)
+            return None
+        stamp = self._stamp_of(s.utc_ns)
+        if isinstance(stamp, UtcStamp):
+            trusted = self._trust.report(s.utc_ns, s.t_seen_ns, valid=s.utc_known)
+            if trusted is not None:
+                found.append(TimeReport(self._source, s.t_seen_ns, s.utc_ns, trusted))
+        return stamp
+
+    def _stamp_of(self, utc_ns: int) -> Stamp:
+        """A date that no receiver can truly report is left out: of the time of day it says nothing,
+        whichever week was taken for which."""
+        if self._calendar.plausible(day_of(utc_ns)):
+            return UtcStamp(utc_ns)
+        return TimeOfDayStamp(utc_ns % DAY_NS * 1e-9)
 
     def _fix(self, s: Solution, stamp: Stamp) -> PositionFix:
         assert s.lat_rad is not None
@@ -186,9 +192,9 @@ class SolutionJudge:
         )
 
 
-def _gga(fix: PositionFix, stamp: UtcStamp) -> bytes:
+def _gga(fix: PositionFix, utc_ns: int) -> bytes:
     """NMEA 0183's sentence, without its line end; the height is the ellipsoid's, separation 0."""
-    time = datetime.fromtimestamp(stamp.utc_ns // 1_000_000_000, UTC)
+    time = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC)
     lat, lon = abs(math.degrees(fix.lat_rad)), abs(math.degrees(fix.lon_rad))
     body = (
         f"GNGGA,{time:%H%M%S}.00,{_minutes(lat, 2)},{'NS'[fix.lat_rad < 0]},{_minutes(lon, 3)},"

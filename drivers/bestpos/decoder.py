@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from drivers.bestpos.framing import Log, LogSplitter
 from drivers.cycle import Cycle
-from drivers.measurements import ArrivalStamp, Measurement, Stamp, UtcStamp
+from drivers.measurements import Measurement
 from drivers.plausible import LEAP_SECONDS, within
 from drivers.raw.weeks import leap_seconds, utc_ns
 from drivers.solution import Solution, SolutionDecoding, SolutionJudge
@@ -268,16 +268,13 @@ class BestposDecoder:
             self.counters["heading_not_fixed"] += 1
             return
         heading, sd = _number(f[3]), _number(f[6])
-        stamp: Stamp = ArrivalStamp()
+        at_ns = None
         if log.week is not None:
             leap = log.leap_seconds if log.leap_seconds is not None else self._leap_seconds
             if leap is None:
                 leap = leap_seconds(log.week, log.tow_s)
             at_ns = utc_ns(log.week, log.tow_s, leap)
-            if not self._judge.plausible(at_ns):
-                return
-            stamp = UtcStamp(at_ns)
-        found += self._judge.heading(t_seen_ns, stamp, math.radians(heading), math.radians(sd))
+        found += self._judge.heading(t_seen_ns, at_ns, math.radians(heading), math.radians(sd))
 
     def _time(self, log: Log) -> None:
         f = log.fields

@@ -19,7 +19,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from drivers.cycle import Cycle
-from drivers.measurements import ArrivalStamp, Measurement, Stamp, UtcStamp, Vector3
+from drivers.measurements import Measurement, Vector3
 from drivers.plausible import LEAP_SECONDS, within
 from drivers.raw.weeks import LAST_WEEK, WEEK_S, leap_seconds, utc_ns
 from drivers.sbf.framing import Block, BlockSplitter
@@ -269,8 +269,4 @@ class SbfDecoder:
         if heading is None:
             return
         when, yaw, t_seen_ns = heading
-        at_ns = self._utc(when)
-        if at_ns is not None and not self._judge.plausible(at_ns):
-            return
-        stamp: Stamp = ArrivalStamp() if at_ns is None else UtcStamp(at_ns)
-        found += self._judge.heading(t_seen_ns, stamp, yaw, sd_rad)
+        found += self._judge.heading(t_seen_ns, self._utc(when), yaw, sd_rad)

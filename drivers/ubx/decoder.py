@@ -9,7 +9,7 @@ import struct
 from collections import Counter
 
 from drivers.cycle import Cycle
-from drivers.measurements import ArrivalStamp, Measurement, Stamp, UtcStamp, Vector3
+from drivers.measurements import Measurement, Vector3
 from drivers.nmea.framing import Frame, Item, StreamSplitter
 from drivers.solution import Solution, SolutionDecoding, SolutionJudge
 from drivers.ubx.messages import (
@@ -151,10 +151,7 @@ class UbxNavDecoder:
         epoch = self._epoch
         if epoch is not None and epoch.itow_ms == baseline.itow_ms and epoch.utc_ns is not None:
             utc_ns = epoch.utc_ns
-        if utc_ns is not None and not self._judge.plausible(utc_ns):
-            return
-        stamp: Stamp = ArrivalStamp() if utc_ns is None else UtcStamp(utc_ns)
-        found += self._judge.heading(t_seen_ns, stamp, baseline.heading_rad, baseline.sd_rad)
+        found += self._judge.heading(t_seen_ns, utc_ns, baseline.heading_rad, baseline.sd_rad)
 
 
 def _refusal(epoch: NavEpoch) -> str | None:

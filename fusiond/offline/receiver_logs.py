@@ -101,8 +101,12 @@ def read_solutions(
     found = [*decoder.feed(content(path), 0), *decoder.flush()]
     of_week = is_of_week(imu)
     rows = []
+    undated = 0
     for m in found:
-        if not isinstance(m, PositionFix | Heading) or not isinstance(m.stamp, UtcStamp):
+        if not isinstance(m, PositionFix | Heading):
+            continue
+        if not isinstance(m.stamp, UtcStamp):
+            undated += 1
             continue
         utc_ns = t_ns = m.stamp.utc_ns
         if of_week:
@@ -113,7 +117,7 @@ def read_solutions(
         why = REFUSALS.get(decoder.refusal)
         raise TableError(f"{path}: no fix: {why}" if why else f"{path}: no {_NAMES[kind]}")
     refused = {name: n for name, n in decoder.counters.items() if name not in _USED}
-    return rows, counted(refused)
+    return rows, counted({**refused, "undated": undated})
 
 
 def is_of_week(imu: ImuTable) -> bool:

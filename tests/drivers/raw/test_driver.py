@@ -22,7 +22,7 @@ from drivers.raw.driver import GnssDecoder, GnssDriver, GnssOptions
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import gga, rmc
-from tests.drivers.raw.frames import d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
+from tests.drivers.raw.frames import bcnav1, d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
 from tests.patience import until
 from tests.pty_device import Device
 
@@ -120,6 +120,24 @@ async def test_status_says_what_is_wrong(
             device.send(sent)
             await asyncio.sleep(0.02)
     assert vehicle.of(RawGnssEpoch) == []
+
+
+async def test_b1c_without_its_group_delays_says_so_until_they_come(device: Device) -> None:
+    vehicle = Vehicle(device)
+    b1c = measurement(gnss=3, prn=21, sig=5)
+    async with running(vehicle):
+        device.send(b"".join(sfrbx(3, 21, 4, words) for words in d1(1)))
+        device.send(rawx(b1c))
+        await until(lambda: "no_group_delay" in vehicle.status()[1])
+        assert "1 BeiDou satellites on B1C or B2a" in vehicle.status()[1]
+        assert "switch on UBX-RXM-SFRBX" in vehicle.status()[1]
+        device.send(b"".join(sfrbx(3, 21, 6, words) for words in bcnav1(1)))
+        device.send(rawx(b1c, tow_s=345_601.0))
+        await until(lambda: vehicle.status() == ("running", ""))
+        # One that is tracked on B3I too, or another that has its delays, is no reason to complain.
+        device.send(rawx(measurement(gnss=3, prn=22, sig=5), b1c, tow_s=345_602.0))
+        await until(lambda: len(vehicle.of(RawGnssEpoch)) == 3)
+        assert vehicle.status() == ("running", "")
 
 
 async def test_unplugged_in_the_middle_of_a_frame(device: Device) -> None:

@@ -19,6 +19,7 @@ from drivers.measurements import (
     Heading,
     Measurement,
     PositionFix,
+    TimeOfDayStamp,
     TimeReport,
     UtcStamp,
 )
@@ -132,7 +133,6 @@ def test_velocity_of_sol_is_turned_from_earth_axes() -> None:
         (hpposllh(flags=1) + status(), "no_fix"),
         (pvt(fix=1), "dead_reckoning_refused"),
         (pvt(valid=1), "untimed_epoch"),
-        (pvt(day=(2007, 4, 17)), "implausible_date"),
         (pvt(height=200_000_000), "height_implausible"),
         (pvt(lat=910_000_000), "position_implausible"),
         (pvt(v=(2_000_000, 0, 0)), "speed_implausible"),
@@ -157,6 +157,14 @@ def test_unreadable(frame: bytes) -> None:
     found, decoder = decoded(frame)
     assert found == []
     assert decoder.counters["nav_unreadable"] == 1
+
+
+def test_a_date_that_cannot_be_leaves_the_time_of_day() -> None:
+    """A week rollover: 1024 weeks back. The fix is one all the same, and nobody's clock is set."""
+    (fix,), decoder = decoded(pvt(day=(2007, 4, 17)))
+    assert isinstance(fix, PositionFix)
+    assert fix.stamp == TimeOfDayStamp(pytest.approx(2 * 3600 + 14 * 60 + 29 - 127_759e-9))
+    assert decoder.counters["implausible_date"] == decoder.counters["fixes"] == 1
 
 
 def test_a_plane_fix_has_no_height() -> None:
