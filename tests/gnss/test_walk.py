@@ -1,11 +1,12 @@
 """Least-squares solutions of the real walk, causally, against its RTK track.
 
 The track hangs on a base station of unstated datum. GPS, Galileo and BeiDou, each alone, are off it
-by 3 to 5 m north, 6 to 7 m east and 24 to 27 m down. Ionosphere-free pairs of Galileo give 4 north,
-4 east, 17 down (one epoch scatters by 2, 3 and 10 m): the horizontal part is not the ionosphere's
-model, some of the vertical part is. The range model agrees with RTKLIB's to 1 cm, so the rest is
-put down to the track, which nothing here can prove. The solutions are judged about their mean and
-against each other; RMS to the track is not asserted.
+by 3 to 5 m north, 6 to 7 m east and 24 to 27 m down. Of the latter 21.4 m are the geoid: the file's
+heights are those above the sea of the receiver's own UBX-NAV-PVT, not the ellipsoid's. Ionosphere-
+free pairs of Galileo give 4 north, 4 east, 17 down (one epoch scatters by 2, 3 and 10 m): the
+horizontal part is not the ionosphere's model, some of the vertical part is. The range model agrees
+with RTKLIB's to 1 cm, so the rest is put down to the track, which nothing here can prove. The
+solutions are judged about their mean and against each other; RMS to the track is not asserted.
 """
 
 from __future__ import annotations
