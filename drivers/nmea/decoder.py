@@ -343,9 +343,12 @@ class NmeaDecoder:
         if epoch.by_rmc:
             self.counters["rmc_alone"] += 1
         altitude, separation, height, geoid_sd_m = epoch.altitude_m, epoch.separation_m, None, 0.0
-        if altitude is not None and epoch.two_dimensional:
+        if altitude is None:
+            if not epoch.by_rmc:
+                self.counters["height_missing"] += 1
+        elif epoch.two_dimensional:
             self.counters["height_not_measured"] += 1
-        elif altitude is not None:
+        else:
             height, geoid_sd_m = self._geoid.height(altitude, separation, lat_deg, lon_deg)
             if separation is None:
                 self.counters["height_above_sea"] += 1

@@ -38,6 +38,8 @@ ROLLOVER_SPAN = timedelta(days=3653)
 """A date that is right but for the rollover is of the ten years from this software's on."""
 MANY = 3
 """Sentences without a checksum before anybody hears of it: one may have lost its own."""
+FIRST_FIXES = 10
+"""Of a cold receiver, which may be two-dimensional for a while."""
 CHECKSUMS = (
     "sentences come without a checksum and are not used, for a damaged digit would pass: switch "
     "checksums on at the receiver"
@@ -127,6 +129,13 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
             "the receiver does not say how high the geoid is: its altitude above the sea is used, "
             "with one sigma of 62 m (GGA's separation is empty)"
         )
+    if counters["height_not_measured"] > max(counters["fixes"] // 2, FIRST_FIXES):
+        found["height_not_measured"] = (
+            "GSA says that fixes are two-dimensional: they are used without their height; give the "
+            "antenna more sky, or set the receiver to three dimensions"
+        )
+    if counters["height_missing"] > counters["fixes"] // 2:
+        found["height_missing"] = "the altitude in GGA is empty: fixes are used without a height"
     if counters["rmc_alone"]:
         found["rmc_alone"] = (
             "only RMC has a position: it is used without height and with the sigma of a poor sky; "

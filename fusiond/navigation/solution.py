@@ -9,10 +9,10 @@ from math import nan
 from drivers.immutable import immutable
 
 Vector3 = tuple[float, float, float]
-HEIGHT_KNOWN_SD_M = 1000.0
-"""A height with a larger sigma is not known, and not published: over the whole of what roads climb
-(-430 to 5,900 m) less than a third would be left out. What no fix has measured starts at 3,500 m,
-what is above the sea without a geoid at 62 m."""
+HEIGHT_KNOWN_SD_M = 200.0
+"""A height with a larger sigma is not known, and not published. The poorest that anything measures
+are altitudes above the sea without a geoid (62 m) and pressures without the weather (85 m); what
+nothing has measured starts at 3,464 m, and gravity alone makes 700 m of that in minutes."""
 HELD_UNKNOWN_M = 0.5
 """A model that holds the height holds 0, to within this, where its start knew none: what updates
 round off, and the way of the first step."""

@@ -19,6 +19,7 @@ from tests.drivers.nmea.sentences import (
     GGA_NO_FIX,
     GGA_SW,
     GSA,
+    GSA_2D,
     RMC,
     VTG,
     ZDA,
@@ -43,6 +44,10 @@ def fed(data: bytes) -> NmeaDecoder:
 
 def minutes(sentence: str, count: int) -> list[str]:
     return [changed(sentence, "0214", f"02{14 + i}") for i in range(count)]
+
+
+def two_dimensional(minute: int) -> list[str]:
+    return [changed(changed(GGA, ",18,", ",03,"), "0214", f"02{minute}"), GSA_2D]
 
 
 # ------------------------------------------------------------------ nothing verifies
@@ -233,6 +238,9 @@ def test_the_rollover_of_the_gps_week_is_told() -> None:
     [
         ([GGA_SW, changed(GGA_SW, "021429", "021430")], "height_above_sea"),
         (minutes(RMC, 3), "rmc_alone"),
+        ([changed(GGA, "45.300", ""), RMC], "height_missing"),
+        ([s for m in range(14, 26) for s in two_dimensional(m)], "height_not_measured"),
+        ([s for m in range(14, 20) for s in two_dimensional(m)], None),
         ([GGA, changed(RMC, ",A,", ",Z,")], "unknown_status"),
         ([GGA, RMC, *["$GPVTG,1,2"] * MANY], "checksum_missing"),
         ([GGA, RMC], None),
