@@ -9,17 +9,14 @@ from typing import Any
 
 import pytest
 
-from drivers.bestpos.driver import BestposOptions
 from drivers.measurements import PositionFix
-from drivers.sbf.driver import SbfOptions
-from drivers.ubx.driver import UbxOptions
+from drivers.solution_driver import SolutionOptions
 from fusiond.configuration.schema import Config
 from tests.drivers.bestpos.logs import bestpos
 from tests.drivers.sbf.blocks import pvt as sbf_pvt
 from tests.drivers.ubx.frames import pvt as ubx_pvt
 from tests.places import REPOSITORY
 
-OPTIONS: dict[str, Any] = {"ubx": UbxOptions, "bestpos": BestposOptions, "sbf": SbfOptions}
 EPOCHS = {"ubx": ubx_pvt(), "bestpos": bestpos(), "sbf": sbf_pvt()}
 DRIVERS = REPOSITORY / "drivers"
 SHARED = "".join(
@@ -38,19 +35,19 @@ def block(name: str, language: str) -> str:
     return str(found)
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("name", EPOCHS)
 def test_configuration_is_accepted_with_every_option(name: str) -> None:
     text = block(name, "toml")
     source = Config.model_validate(tomllib.loads(text)).sources["gnss"]
     assert source.driver == name
     commented_in = re.sub(r"^# (\w+ = )", r"\1", text, flags=re.MULTILINE)
     options = Config.model_validate(tomllib.loads(commented_in)).sources["gnss"].options
-    assert set(options) == set(OPTIONS[name].model_fields)
-    defaults = OPTIONS[name](port=options["port"], ntrip=options["ntrip"])
-    assert OPTIONS[name].model_validate(options) == defaults
+    assert set(options) == set(SolutionOptions.model_fields)
+    defaults = SolutionOptions(port=options["port"], ntrip=options["ntrip"])
+    assert SolutionOptions.model_validate(options) == defaults
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("name", EPOCHS)
 def test_counters_are_those_of_the_code(name: str) -> None:
     code = "".join(path.read_text() for path in sorted((DRIVERS / name).glob("*.py")))
     section = page(name).partition("## What is refused")[2].partition("## When it does not")[0]
@@ -65,7 +62,7 @@ def test_counters_are_those_of_the_code(name: str) -> None:
     assert counted - LINE <= documented
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("name", EPOCHS)
 def test_program_runs_on_a_log(name: str, tmp_path: Path) -> None:
     log = tmp_path / "log"
     log.write_bytes(EPOCHS[name])

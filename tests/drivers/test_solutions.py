@@ -57,7 +57,7 @@ PROTOCOLS = {
         bestpos.bestpos(kind="INS_PSRSP"),
         "own inertial solution",
         bestpos.novatel("RXSTATUSA", "0,5"),
-        "LOG BESTPOSA ONTIME",
+        "switch it on (LOG BESTPOSA ONTIME",
     ),
     "sbf": Protocol(
         SbfDriver,
@@ -124,6 +124,31 @@ async def test_status_says_what_is_wrong(name: str, device: Device) -> None:
                 device.send(sent)
                 await asyncio.sleep(0.02)
         assert of(emitted, PositionFix) == []
+
+
+@pytest.mark.parametrize("other", ["nmea", *PROTOCOLS])
+async def test_another_protocol_is_named_with_its_driver(
+    name: str, other: str, device: Device
+) -> None:
+    """By the doctor too, which would say otherwise that the baud rate is wrong."""
+    if other == name:
+        return
+    config = Config.model_validate(
+        {
+            "sources": {"gnss": {"driver": name, "port": str(device.link), "timeout_s": 0.3}},
+            "mqtt": {"enabled": False},
+        }
+    )
+    out = io.StringIO()
+    task = asyncio.create_task(examine(config, 1.5, out))
+    for k in range(12):
+        await asyncio.sleep(0.1)
+        device.send(gga(29 + k) + rmc(29 + k) if other == "nmea" else PROTOCOLS[other].epoch(k))
+    await task
+    findings = [line for line in out.getvalue().splitlines() if line.startswith("  ! ")]
+    said = [line for line in findings if f'driver = "{other}"' in line]
+    assert said, out.getvalue()
+    assert "baud" not in "".join(findings)
 
 
 async def test_doctor_reads_it(name: str, device: Device) -> None:
