@@ -123,6 +123,7 @@ class UbxNavDecoder:
         if epoch is None:
             return
         self._cycle.close(learn=learn, at_once=at_once)
+        epoch.whole()
         if epoch.utc_ns is not None:
             self._known = epoch.itow_ms, epoch.utc_ns
         elif self._known is not None:

@@ -2,6 +2,7 @@
 
     PVT 0x07      everything; POSLLH 0x02, VELNED 0x12 and HPPOSLLH 0x14 parts of it, finer
     SOL 0x06      what PVT was before generation 7: ECEF, GPS time
+    POSECEF 0x01 and VELECEF 0x11    the same without status and time
     STATUS 0x03, DOP 0x04, COV 0x36, TIMEGPS 0x20, TIMEUTC 0x21
     hAcc          sqrt(sd_n^2 + sd_e^2), pAcc and sAcc over three axes
 
@@ -56,6 +57,8 @@ class NavEpoch:
     sd_ned_m: Vector3 | None = None
     covariance_ned_m: Vector3 | None = None
     v_rank: int = 0
+    v_ecef_m_s: tuple[Vector3, float] | None = None
+    """With its sigma; turned to the place when the epoch is whole."""
     v_ned_m_s: Vector3 | None = None
     sd_v_m_s: float | None = None
     covariance_v_m_s: Vector3 | None = None
@@ -74,6 +77,12 @@ class NavEpoch:
     def velocity(self, rank: int, v: Vector3, sd_m_s: float) -> None:
         if rank >= self.v_rank:
             self.v_rank, self.v_ned_m_s, self.sd_v_m_s = rank, v, sd_m_s * _EVEN_3
+
+    def whole(self) -> None:
+        """No more will come of this epoch: what needed its place gets it."""
+        if self.v_ecef_m_s is not None and self.lat_rad is not None and self.lon_rad is not None:
+            v, sd_m_s = self.v_ecef_m_s
+            self.velocity(1, north_east_down(v, self.lat_rad, self.lon_rad), sd_m_s)
 
     def status(self, fix: int, flags: int, carrier: int, rank: int) -> None:
         """gnssFixOK and diffSoln are the lowest bits of `flags` in every message."""
@@ -96,6 +105,7 @@ _POSLLH = struct.Struct("<IiiiiII")
 _HPPOSLLH = struct.Struct("<B2xBIiiiibbbbII")
 _VELNED = struct.Struct("<IiiiIIiII")
 _SOL = struct.Struct("<IihBBiiiIiiiIHBB")
+_ECEF = struct.Struct("<IiiiI")
 _STATUS = struct.Struct("<IBBBBII")
 _DOP = struct.Struct("<IHHHHHHH")
 _COV = struct.Struct("<IBBB9x12f")
@@ -176,6 +186,19 @@ def _sol(epoch: NavEpoch, payload: bytes) -> None:
     epoch.velocity(1, v, sd_speed * 1e-2)
 
 
+def _posecef(epoch: NavEpoch, payload: bytes) -> None:
+    _, x, y, z, sd_p = _ECEF.unpack_from(payload)
+    if x == y == 0:
+        return
+    spread = sd_p * 1e-2 * _EVEN_3
+    epoch.place(1, geodetic(x * 1e-2, y * 1e-2, z * 1e-2), spread / _EVEN_2, spread)
+
+
+def _velecef(epoch: NavEpoch, payload: bytes) -> None:
+    _, x, y, z, sd = _ECEF.unpack_from(payload)
+    epoch.v_ecef_m_s = (x * 1e-2, y * 1e-2, z * 1e-2), sd * 1e-2
+
+
 def _status(epoch: NavEpoch, payload: bytes) -> None:
     _, fix, flags, _, more, _, _ = _STATUS.unpack_from(payload)
     epoch.status(fix, flags, more >> 6, 2)
@@ -225,6 +248,8 @@ MESSAGES: dict[int, tuple[str, int, int, Callable[[NavEpoch, bytes], None]]] = {
     0x14: ("HPPOSLLH", _HPPOSLLH.size, 4, _hpposllh),
     0x12: ("VELNED", _VELNED.size, 0, _velned),
     0x06: ("SOL", 52, 0, _sol),
+    0x01: ("POSECEF", _ECEF.size, 0, _posecef),
+    0x11: ("VELECEF", _ECEF.size, 0, _velecef),
     0x03: ("STATUS", _STATUS.size, 0, _status),
     0x04: ("DOP", _DOP.size, 0, _dop),
     0x36: ("COV", _COV.size, 0, _cov),

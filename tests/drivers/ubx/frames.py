@@ -97,6 +97,15 @@ def sol(second: int = 0, *, flags: int = 0xD) -> bytes:
     )  # fmt: skip
 
 
+def posecef(second: int = 0) -> bytes:
+    """Where `sol` is, and how `velecef` moves."""
+    return nav(0x01, "IiiiI", itow(second), 358_210_529, 53_258_973, 523_275_481, 1_000)
+
+
+def velecef(second: int = 0) -> bytes:
+    return nav(0x11, "IiiiI", itow(second), -82, -12, 57, 17)
+
+
 def end_of_epoch(second: int = 0) -> bytes:
     return nav(0x61, "I", itow(second))
 

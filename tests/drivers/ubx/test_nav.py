@@ -34,6 +34,7 @@ from tests.drivers.ubx.frames import (
     end_of_epoch,
     hpposllh,
     nav,
+    posecef,
     posllh,
     pvt,
     relposned,
@@ -42,6 +43,7 @@ from tests.drivers.ubx.frames import (
     timegps,
     timeutc,
     utc_ns,
+    velecef,
     velned,
 )
 
@@ -115,6 +117,11 @@ def test_before_generation_7(frames: tuple[bytes, ...], height_m: float | None) 
 
 def test_velocity_of_sol_is_turned_from_earth_axes() -> None:
     (fix,) = fixes(decoded(sol())[0])
+    for order in ((posecef(), velecef(), status()), (velecef(), status(), posecef())):
+        (other,) = fixes(decoded(*order, timeutc())[0])
+        assert other.lat_rad == fix.lat_rad
+        assert (other.height_m, other.sd_ned_m) == (fix.height_m, fix.sd_ned_m)
+        assert (other.v_ned_m_s, other.sd_v_ned_m_s) == (fix.v_ned_m_s, fix.sd_v_ned_m_s)
     assert fix.v_ned_m_s is not None
     north, east, down = fix.v_ned_m_s
     assert north == pytest.approx(1.006, abs=5e-3)
@@ -322,7 +329,7 @@ def test_split_at_every_byte_gives_the_same(path: Path) -> None:
 # --------------------------------------------------------------------------- hostile bytes
 
 SEEDS = (pvt(), hpposllh(), dop(), cov(), timegps(), timeutc(), posllh(), velned(), status(),
-         sol(), end_of_epoch(), relposned())  # fmt: skip
+         sol(), posecef(), velecef(), end_of_epoch(), relposned())  # fmt: skip
 
 
 @given(st.lists(st.sampled_from(SEEDS), max_size=8), st.randoms(use_true_random=False))
