@@ -7,8 +7,8 @@ row is read with care instead, so that what is refused carries its line and the 
 Reasons: `columns` (more or fewer cells than the header), `unreadable` (not a number), `missing`
 (empty where the value must be known), `not_finite` (nan or inf), `out_of_range`,
 `sd_not_positive`, `time_backwards`, `time_repeated`, `time_ahead` (a stamp later than those of the
-rows that follow it), and those of a table's own rules. `sd_all_zero` rejects no row: a sigma that is
-0 in all of them is not given.
+rows that follow it), and those of a table's own rules. `sd_all_zero` rejects no row: a sigma that
+is 0 in all of them is not given.
 """
 
 from __future__ import annotations

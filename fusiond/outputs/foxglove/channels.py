@@ -24,7 +24,7 @@ from fusiond.outputs.topics import EVENT, EVENTS, NAV, REPLY, TOPICS, Topic
 
 _DIAGONAL_KNOWN = 2
 NO_HEIGHT_SD_M = 3464.0
-"""One sigma of an altitude of 0 where no height is known: roads are within 6 km of the ellipsoid."""
+"""One sigma of an altitude of 0 where no height is known: roads are within 6 km of that."""
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
 _NUMBER = {"type": "number"}
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
