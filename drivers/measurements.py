@@ -97,6 +97,9 @@ class PositionFix:
     `sd_ned_m` and `sd_v_ned_m_s` are one sigma; None where the device did not say (the aiding then
     uses what the configuration holds). A velocity whose down part is None is horizontal only.
     `quality` follows NMEA GGA: 1 autonomous, 2 differential, 4 RTK fixed, 5 RTK float.
+    `height_m` is None where the device does not know it. It is the height above the sea where the
+    device does not say how high the geoid is: `geoid_sd_m` is then one sigma of that, which all
+    fixes of a neighbourhood share; else 0.
     """
 
     source: str
@@ -114,6 +117,7 @@ class PositionFix:
     sd_v_ned_m_s: tuple[float, float, float | None] | None = None
     rounding_sd_ned_m: Vector3 = (0.0, 0.0, 0.0)
     rounding_sd_v_m_s: float = 0.0
+    geoid_sd_m: float = 0.0
 
 
 @immutable()

@@ -1,4 +1,4 @@
-"""What the drivers `nmea` and `gnss` share: one receiver on one line, read and judged.
+"""What the drivers of GNSS receivers and compasses share: one on one line, read and judged.
 
 A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
 silent, and says in `status` whether the device is there and intelligible.
@@ -26,7 +26,7 @@ SILENCE_S = 0.05
 """A pause that ends an epoch: receivers send an epoch's sentences in one burst."""
 STATUS_INTERVAL_S = 0.25
 
-_LIFE_SIGNS = ("bytes_in", "sentences", "ubx_frames", "rtcm_frames")
+_LIFE_SIGNS = ("bytes_in", "sentences", "ubx_frames", "rtcm_frames", "logs", "sbf_blocks")
 
 
 class ReceiverDecoder(Protocol):

@@ -36,3 +36,13 @@ def test_every_reason_of_why_not_is_on_the_page() -> None:
     sentences = re.findall(r'(?:return|=) \[?\s*f?"([^"]{12,})"', text)
     assert len(sentences) >= 12
     assert [s for s in sentences if not any(row in s for row in rows)] == []
+
+
+def test_what_doctor_says_of_a_receiver_is_what_the_code_says() -> None:
+    """The sentences of the table are parts of those of the code."""
+    places = (REPOSITORY / "drivers" / "nmea", REPOSITORY / "fusiond" / "doctor")
+    text = "\n".join(path.read_text() for place in places for path in place.rglob("*.py"))
+    said = re.sub(r'"\s*\n\s*f?"', "", text)
+    rows = quoted("The receiver sends, and there is no fix")
+    assert len(rows) >= 8
+    assert [row for row in rows if row not in said] == []

@@ -7,21 +7,26 @@ and comes out in rad/s or m/s^2.
 
 from __future__ import annotations
 
+import logging
 import math
+from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cantools
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from drivers.base import PermanentDriverError
+from drivers.can.dbc_flaws import SoundPart, UnreadableError, read_whole, sound_part
 from drivers.can.layout import AbsentSignalError, Layout
 from drivers.shipped import shipped
+
+log = logging.getLogger(__name__)
 
 SHIPPED = shipped("dbc")
 
@@ -186,15 +191,37 @@ def find_dbc(name: str) -> Path:
 
 
 def load_dbc(name: str) -> Database:
-    """Load a DBC file; PermanentDriverError when there is none or it cannot be read."""
+    """Load a DBC file; PermanentDriverError when there is none or it cannot be read.
+
+    A message with a flaw in it is left out, which the log says; whoever asks for it hears why.
+    """
     path = find_dbc(name)
     try:
-        database = cantools.database.load_file(path, database_format="dbc", strict=False)
-    except (OSError, ValueError, cantools.Error) as error:
+        return _loaded(path, path.stat().st_mtime_ns)
+    except OSError as error:
         raise PermanentDriverError(f"dbc: {path}: {error}") from error
-    if not isinstance(database, Database):
-        raise PermanentDriverError(f"dbc: {path} is no CAN database")
-    return database
+
+
+@lru_cache(maxsize=16)
+def _loaded(path: Path, changed_ns: int) -> Database:
+    """The file as it was then: sources of one bus share one."""
+    content = path.read_bytes()
+    # As cantools takes it; a BOM says that it is not so.
+    encoding = "utf-8-sig" if content.startswith(BOM_UTF8) else "cp1252"
+    text = content.decode(encoding, "replace")
+    flaw: Exception | str = "there is no message in it"
+    try:
+        if (database := read_whole(text)).messages:
+            return database
+    except Exception as error:  # its parser raises what its parts raise: KeyError, bitstruct.Error
+        flaw = error
+    try:
+        sound = sound_part(text)
+    except UnreadableError as error:
+        raise PermanentDriverError(f"dbc: {path}: {flaw}") from error
+    for left_out, reason in sound.left_out.items():
+        log.warning("%s: %s is left out: %s", path, left_out, reason)
+    return sound
 
 
 def find_signal(database: Database, name: str, what: str) -> tuple[Message, Signal]:
@@ -202,12 +229,23 @@ def find_signal(database: Database, name: str, what: str) -> tuple[Message, Sign
     message_name, dot, signal_name = name.partition(".")
     messages = {message.name: message for message in database.messages}
     if not dot or message_name not in messages:
+        _refuse_flawed(database, message_name, what)
         names = [f"{m.name}.{s.name}" for m in database.messages for s in m.signals]
         raise _unknown(what, name, "Message.Signal", names)
     signals = {signal.name: signal for signal in messages[message_name].signals}
     if signal_name not in signals:
+        _refuse_flawed(database, name, what)
         raise _unknown(what, signal_name, f"signal of {message_name}", list(signals))
     return messages[message_name], signals[signal_name]
+
+
+def _refuse_flawed(database: Database, name: str, what: str) -> None:
+    """PermanentDriverError, where what is asked for has been left out."""
+    left_out = database.left_out if isinstance(database, SoundPart) else {}
+    if name in left_out:
+        raise PermanentDriverError(
+            f"{what}: {name} cannot be read of the DBC file: {left_out[name]}"
+        )
 
 
 def _unknown(what: str, name: str, kind: str, names: Sequence[str]) -> PermanentDriverError:

@@ -1,7 +1,8 @@
 """Bytes of a GNSS receiver in, measurements out: epochs grouped, dated, judged. No I/O, no clock.
 
 An epoch closes when the time of day changes, when a sentence repeats, when its last one came, or
-on `silence`. Which one is the last is configured, or learned: the same cycle seen twice in a row.
+on `silence`. Which one is the last is configured, or learned, as is where a receiver pauses inside
+an epoch (drivers.nmea.cycle).
 """
 
 from __future__ import annotations
@@ -22,23 +23,29 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
+from drivers.nmea.cycle import Cycle
 from drivers.nmea.epochs import (
     FORMATTERS,
     MAX_CYCLE,
     TALKERS,
     BadFieldError,
     Epoch,
+    one_time,
     time_of_day_ns,
+    time_step_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
+from drivers.nmea.geoid import Geoid
+from drivers.nmea.reasons import POSITIONS, Heard, cautions, no_fix, note, nothing_verified
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
 
 BUILD_DATE = date(2026, 11, 20)
 """No receiver can truly report a date before this software was written."""
-MAX_UNLEARNED = 8
-"""Cycles remembered as too short; a receiver mixes at most a few output rates."""
+RMC_ALONE_AFTER = 2
+"""Epochs in a row without GGA or GNS after which RMC's position is a fix: one may be damaged."""
 
+_TIMELESS = frozenset({"GSA", "VTG"})
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
 Formatter = Literal["GGA", "GNS", "RMC", "VTG", "GSA", "GST", "ZDA", "HDT", "THS"]
 
@@ -64,7 +71,8 @@ class NmeaDecoder:
     `repeated_sentence`; noted `late_sentence`; refused epochs `no_fix`,
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
-    `height_not_measured`, `sigma_too_small`, `untimed_epoch`.
+    `height_not_measured`, `height_above_sea`, `rmc_alone`, `unknown_status`, `sigma_too_small`,
+    `untimed_epoch`.
     """
 
     def __init__(
@@ -78,6 +86,7 @@ class NmeaDecoder:
         """Why the last epoch was refused, by counter name; empty when it was not."""
         self.gga = b""
         """The last GGA with a position, without its line end; empty before one."""
+        self.heard = Heard()
         self._source = source
         self._decoding = decoding or NmeaDecoding()
         self._splitter = NmeaSplitter(self.counters)
@@ -86,11 +95,26 @@ class NmeaDecoder:
         self._trust = TimeTrust()
         self._epoch: Epoch | None = None
         self._t_seen_ns = 0
-        self._closed_ns: int | None = None
-        self._closed_at_once = False
-        self._last_cycle: tuple[str, ...] = ()
-        self._learned: tuple[str, ...] = ()
-        self._too_short: set[tuple[str, ...]] = set()
+        self._geoid = Geoid()
+        self._cycle = Cycle()
+        self._closed: Epoch | None = None
+        """The epoch before."""
+        self._closed_by = ""
+        """What closed it: `last` sentence, `silence`, or what came then."""
+        self._without_gga = 0
+        """Epochs with RMC in a row that had neither GGA nor GNS."""
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        return cautions(self.counters, self.heard, self._decoding.earliest_date)
+
+    @property
+    def cause(self) -> str:
+        """Why there is no fix, as a sentence; "" where bytes say nothing of why none verifies."""
+        if not self.counters["sentences"]:
+            return nothing_verified(self.counters, self._splitter.unread)
+        return no_fix(self.counters, self.heard, self.refusal)
 
     @property
     def epoch_open(self) -> bool:
@@ -113,9 +137,12 @@ class NmeaDecoder:
         return found
 
     def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        """The line has been silent for longer than most receivers pause inside an epoch (50 ms)."""
         found: list[Measurement] = []
-        self._close(found, learn=True)
+        epoch = self._epoch
+        if epoch is None or self._cycle.pauses(epoch.cycle) or _is_tail(epoch):
+            return found
+        self._close(found, learn=True, by="silence")
         return found
 
     def flush(self) -> list[Measurement]:
@@ -134,25 +161,32 @@ class NmeaDecoder:
             return
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
+            note(self.heard.unused, sentence.formatter)
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
+            if sentence.formatter in POSITIONS:
+                note(self.heard.talkers, sentence.talker)
             return
         try:
             self._group(sentence, t_seen_ns, found)
         except BadFieldError:
             self.counters["bad_field"] += 1
             return
+        note(self.heard.used, sentence.formatter)
         if sentence.formatter == "GGA" and sentence.fields[5:6] not in ((), ("",), ("0",)):
             self.gga = sentence.raw
 
     def _group(self, sentence: Sentence, t_seen_ns: int, found: list[Measurement]) -> None:
         formatter, time_ns = sentence.formatter, time_of_day_ns(sentence)
         epoch = self._epoch
+        if epoch is not None and time_ns is not None and self._belongs_before(epoch, t_seen_ns):
+            epoch = self._epoch = None
+            self._late()
         if epoch is not None:
             again = formatter in epoch.cycle and formatter != "GSA"
             if (
-                (time_ns is not None and epoch.time_of_day_ns not in (None, time_ns))
+                (time_ns is not None and not self._of_epoch(epoch, time_ns, sentence))
                 or (again and sentence.address in epoch.addresses)
                 or len(epoch.cycle) >= MAX_CYCLE
             ):
@@ -160,45 +194,73 @@ class NmeaDecoder:
             elif again:  # of another talker: the same fix by another name
                 self.counters["repeated_sentence"] += 1
                 return
-        elif time_ns is None and self._closed_at_once and formatter not in self._last_cycle:
+        elif time_ns is None and self._closed_by == "last" and formatter not in self._cycle.last:
             self._late()
             return
         epoch = self._epoch or Epoch()
         epoch.take(sentence, t_seen_ns)
         self._epoch = epoch
         if epoch.time_of_day_ns is None and time_ns is not None:
-            epoch.time_of_day_ns = time_ns
-            if time_ns == self._closed_ns and formatter not in self._last_cycle:
+            epoch.time_of_day_ns, epoch.time_step_ns = time_ns, time_step_ns(sentence)
+            closed = self._closed
+            if (
+                closed is not None
+                and closed.time_of_day_ns is not None
+                and formatter not in self._cycle.last
+                and self._of_epoch(closed, time_ns, sentence)
+            ):
                 self._late()
+        elif time_ns is not None and time_step_ns(sentence) < epoch.time_step_ns:
+            epoch.time_of_day_ns, epoch.time_step_ns = time_ns, time_step_ns(sentence)
         if formatter == self._decoding.last_sentence or (
-            self._decoding.last_sentence is None and tuple(epoch.cycle) == self._learned
+            self._decoding.last_sentence is None and self._cycle.whole(epoch.cycle)
         ):
-            self._close(found, learn=False)
-            self._closed_at_once = True
+            self._close(found, learn=False, by="last")
+
+    def _of_epoch(self, epoch: Epoch, time_ns: int, sentence: Sentence) -> bool:
+        """Whether a sentence with a time is of an epoch, by that alone."""
+        if epoch.time_of_day_ns is None:
+            return True
+        step_ns = time_step_ns(sentence)
+        return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
+
+    def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
+        """Whether what has no time of its own came sooner after the epoch that a silence closed
+        than before the one that begins now."""
+        closed = self._closed
+        if closed is None or self._closed_by != "silence" or not _is_tail(epoch):
+            return False
+        return epoch.t_seen_ns - closed.t_seen_ns < t_seen_ns - epoch.t_seen_ns
 
     def _late(self) -> None:
-        """More of an epoch that was closed at once: what was learned is too short."""
+        """More of an epoch that was closed: where it was closed is learned anew."""
         self.counters["late_sentence"] += 1
-        if self._learned and len(self._too_short) < MAX_UNLEARNED:
-            self._too_short.add(self._learned)
-        self._learned = self._last_cycle = ()
+        if self._closed_by == "silence":
+            self._cycle.paused()
+        else:
+            self._cycle.too_short()
 
-    def _close(self, found: list[Measurement], *, learn: bool) -> None:
+    def _close(self, found: list[Measurement], *, learn: bool, by: str = "") -> None:
         epoch, self._epoch = self._epoch, None
         if epoch is None:
             return
-        cycle = tuple(epoch.cycle)
-        if learn and cycle == self._last_cycle and cycle not in self._too_short:
-            self._learned = cycle
-        self._last_cycle = cycle
-        self._closed_at_once = False
-        self._closed_ns = epoch.time_of_day_ns
+        self._cycle.ended(epoch.cycle, learn=learn)
+        self._closed, self._closed_by = epoch, by
         self._judge(epoch, found)
 
     # ----------------------------------------------------------------- epochs to measurements
 
     def _judge(self, epoch: Epoch, found: list[Measurement]) -> None:
         self.counters["epochs"] += 1
+        if epoch.unknown_status:
+            self.counters["unknown_status"] += 1
+            note(self.heard.statuses, epoch.unknown_status)
+        if epoch.quality is not None:
+            self._without_gga = 0
+        elif epoch.rmc_valid is not None:
+            self._without_gga += 1
+            if self._without_gga >= RMC_ALONE_AFTER:
+                epoch.take_rmc_position()
         refusal = self._refusal(epoch)
         day = self._date(epoch, found, valid=refusal is None)
         self.refusal = refusal or ""
@@ -239,7 +301,7 @@ class NmeaDecoder:
             return "no_fix"
         if epoch.quality is None:
             return None
-        if epoch.lat_deg is None:
+        if epoch.place is None:
             return "no_fix"
         simulated = self._decoding.allow_simulator and epoch.quality in (7, 8)
         if not (epoch.quality in _QUALITIES or simulated):
@@ -250,7 +312,10 @@ class NmeaDecoder:
         """The epoch's date, its own or the calendar's; reports the time when it is its own."""
         if epoch.time_of_day_ns is None:
             return None
-        if epoch.day is None or not self._calendar.plausible(epoch.day):
+        if epoch.day is not None and not self._calendar.plausible(epoch.day):
+            self.heard.implausible_date = epoch.day
+            epoch.day = None
+        if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
         # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
         believed = valid and bool(epoch.quality) if epoch.rmc_valid is None else epoch.rmc_valid
@@ -275,12 +340,18 @@ class NmeaDecoder:
         self, epoch: Epoch, stamp: Stamp, lat_deg: float, lon_deg: float, quality: int
     ) -> PositionFix:
         self.counters["fixes"] += 1
-        height = None
-        if epoch.altitude_m is not None and epoch.separation_m is not None:
-            height = epoch.altitude_m + epoch.separation_m
-        if epoch.two_dimensional and height is not None:
+        if epoch.by_rmc:
+            self.counters["rmc_alone"] += 1
+        altitude, separation, height, geoid_sd_m = epoch.altitude_m, epoch.separation_m, None, 0.0
+        if altitude is None:
+            if not epoch.by_rmc:
+                self.counters["height_missing"] += 1
+        elif epoch.two_dimensional:
             self.counters["height_not_measured"] += 1
-            height = None
+        else:
+            height, geoid_sd_m = self._geoid.height(altitude, separation, lat_deg, lon_deg)
+            if separation is None:
+                self.counters["height_above_sea"] += 1
         sd_ned_m = epoch.sd_ned_m
         if sd_ned_m is not None and min(sd_ned_m) < SIGMA_M[0]:
             self.counters["sigma_too_small"] += 1
@@ -298,4 +369,11 @@ class NmeaDecoder:
             epoch.vdop,
             sd_ned_m,
             epoch.v_ned_m_s(),
+            rounding_sd_ned_m=epoch.rounding_sd_ned_m,
+            geoid_sd_m=geoid_sd_m,
         )
+
+
+def _is_tail(epoch: Epoch) -> bool:
+    """Whether it has nothing but sentences that have no time and belong to another epoch."""
+    return epoch.time_of_day_ns is None and _TIMELESS.issuperset(epoch.cycle)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
+from drivers.measurements import DeviceEvent, Measurement
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
+from drivers.nmea.reasons import REFUSALS
+from drivers.raw.messages import RawEvent
 from drivers.receiver import ReceiverDriver, ReceiverOptions
 
-__all__ = ["NmeaDecoder", "NmeaDecoding", "NmeaDriver", "NmeaOptions"]
-
-REFUSALS = {
-    "no_fix": "the receiver has no fix",
-    "dead_reckoning_refused": "only the receiver's own dead reckoning, which is not fused",
-    "manual_refused": "the receiver repeats a position that was put in by hand",
-    "simulator_refused": "the receiver simulates: allow_simulator would accept it",
-    "duplicate_epoch": "the receiver repeats an epoch or goes back in time",
-    "unknown_quality": "the receiver states a GGA quality that NMEA does not know",
-    "height_implausible": "the receiver states a height at which no vehicle can be",
-    "speed_implausible": "the receiver states a speed that no vehicle has",
-    "sigma_too_large": "the receiver states that it does not know where it is (GST)",
-}
+__all__ = ["REFUSALS", "NmeaDecoder", "NmeaDecoding", "NmeaDriver", "NmeaOptions"]
 
 
 class NmeaOptions(ReceiverOptions, NmeaDecoding):
@@ -36,18 +28,38 @@ class NmeaDriver(ReceiverDriver):
         self, name: str, options: NmeaOptions, emit: Emit, now_ns: Now = monotonic_ns
     ) -> None:
         self._options = options
+        self._told: set[str] = set()
         super().__init__(name, options, emit, now_ns)
 
     def _make_decoder(self) -> NmeaDecoder:
         self._nmea = NmeaDecoder(self.name, self._options, self.counters)
         return self._nmea
 
+    @property
+    def cause(self) -> str:
+        """Why there is no fix, as a sentence; "" where nothing that arrives tells."""
+        return self._nmea.cause if self.counters["bytes_in"] else ""
+
+    @property
+    def cautions(self) -> dict[str, str]:
+        """By counter: what makes the fixes poorer than they could be, and what was done."""
+        return self._nmea.cautions
+
+    def _hand_over(self, found: Sequence[Measurement | RawEvent]) -> None:
+        super()._hand_over(found)
+        for code, text in self.cautions.items():
+            if code not in self._told:
+                self._told.add(code)
+                self._emit(DeviceEvent(self.name, self._now_ns(), code, text))
+
     def _useless_detail(self) -> str:
-        if not self.counters["epochs"]:
-            return "sentences arrive, but none that counts: switch on GGA and RMC"
-        return REFUSALS.get(self._nmea.refusal, "epochs arrive, but none has a position")
+        return self.cause
 
     def _unintelligible_detail(self) -> str:
         if self._since_alive("ubx_frames") or self._since_alive("rtcm_frames"):
-            return "UBX or RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port"
-        return f"bytes arrive, but no NMEA sentence verifies{self._where_to_look()}"
+            return (
+                "UBX or RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port, or "
+                'have UBX read: driver = "ubx"'
+            )
+        unknown = f"bytes arrive, but no NMEA sentence verifies{self._where_to_look()}"
+        return unknown if self.counters["sentences"] else self.cause or unknown

@@ -4,10 +4,18 @@
 sentence with a field that cannot be true is refused whole (`BadFieldError`) and leaves the epoch as
 it was. Empty fields are normal and become None.
 
-Quality comes from GGA. Where only GNS is sent it comes from its mode string, one letter a system:
-the worst letter of the systems in use counts, in the order A (1), D (2), P (3), F (5), R (4), and
-E, M or S in any of them marks the whole epoch as estimated, manual or simulated.
-Source: NMEA 0183 4.11; u-blox ZED-F9P interface description, "Position fix flags in NMEA".
+Quality comes from GGA; NovAtel's 9 is a fix with corrections of a satellite (2). Where only GNS is
+sent it comes from its mode string, one letter a system: the worst letter of the systems in use
+counts, in the order A (1), D (2), P (3), F (5), R (4), and E, M or S in any of them marks the whole
+epoch as estimated, manual or simulated. Where only RMC is sent it comes from its mode, or from its
+status in receivers that put the mode there (Unicore: D beside mode R):
+
+    A  D  F  P  R    valid: autonomous, differential, float RTK, precise, fixed RTK
+    E  M  S          valid for the receiver: estimated, manual, simulated
+    V  N             not valid
+
+Source: NMEA 0183 4.11, RMC and the table of mode indicators; u-blox ZED-F9P interface description,
+"Position fix flags in NMEA"; NovAtel OEM7 commands and logs, GPGGA.
 """
 
 from __future__ import annotations
@@ -17,14 +25,17 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import date
+from typing import NamedTuple
 
 from drivers.measurements import Vector3
 from drivers.nmea.fields import Fields, typed
 from drivers.nmea.framing import Sentence
 from drivers.nmea.time import parse_time_of_day
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
+from drivers.rounding import NEAREST_SD
 
-TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GQ"})
+TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GI", "GQ", "QZ"})
+"""Satellites: GPS, several, BeiDou (two names), GLONASS, Galileo, NavIC, QZSS (two names)."""
 MAX_CYCLE = 24
 """Sentences that one epoch may hold; a receiver sends at most nine formatters and some GSA."""
 
@@ -37,8 +48,30 @@ NO_DOP = 99.0
 """Receivers without a solution print 99.99."""
 
 _MODE_QUALITY = {"A": 1, "D": 2, "P": 3, "F": 5, "R": 4}  # worst first
+_ESTIMATED = frozenset("EMS")
+_NOT_VALID = frozenset(("V", "N", ""))
+NOVATEL_SBAS = 9
+"""GGA quality of NovAtel for a fix with the corrections of a satellite (WAAS)."""
+OVERDETERMINED = 5
+"""Satellites with which a fix is three-dimensional whatever GSA says, if it has an altitude and
+VDOP: four give place and clock, one more than that checks them (modules of Quectel and Telit say 2
+beside 8 to 14)."""
+ROUNDED_NS = 10_000_000
+"""A time with fewer decimals than two is cut: rounded, it would be that of another epoch."""
+MINUTE_M = 1852.0
+"""Of latitude."""
 _PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
 _NO_TIME = frozenset({"GSA", "VTG", "HDT", "THS"})
+
+
+class Printed(NamedTuple):
+    """Latitude and longitude (deg) of a sentence, and one step of their last digits (m), that of
+    the longitude at the equator."""
+
+    lat_deg: float
+    lon_deg: float
+    lat_step_m: float
+    lon_step_m: float
 
 
 class BadFieldError(ValueError):
@@ -50,6 +83,8 @@ class Epoch:
     """What the sentences of one instant said; None where none did. Degrees as printed, SI else."""
 
     time_of_day_ns: int | None = None
+    time_step_ns: int = 0
+    """Of its last digit."""
     t_seen_ns: int = 0
     """When the last sentence that counts came in."""
     cycle: list[str] = field(default_factory=list)
@@ -59,17 +94,27 @@ class Epoch:
     day: date | None = None
     t_day_seen_ns: int = 0
     rmc_valid: bool | None = None
-    lat_deg: float | None = None
-    lon_deg: float | None = None
+    unknown_status: str = ""
+    """A status of RMC that is none: it says nothing of the others, and RMC counts for nothing."""
+    rmc_position: Printed | None = None
+    by_rmc: bool = False
+    """Place and quality are RMC's: there is neither GGA nor GNS."""
+    place: Printed | None = None
     altitude_m: float | None = None
+    height_step_m: float = 0.0
     separation_m: float | None = None
     quality: int | None = None
     modes: set[str] = field(default_factory=set)
     """Mode letters of RMC, VTG and the systems in use in GNS."""
     satellites: int | None = None
+    counted: int = 0
+    """Satellites that GGA and GNS say were used; of several systems GGA may count one."""
+    listed: set[tuple[str, str]] = field(default_factory=set)
+    """Those that GSA lists, with the number of their system where it says it."""
     hdop: float | None = None
     vdop: float | None = None
-    two_dimensional: bool = False
+    nav_modes: set[int] = field(default_factory=set)
+    """What GSA says: 1 no fix, 2 two-dimensional, 3 three-dimensional."""
     sd_ned_m: Vector3 | None = None
     """As printed; `implausible` judges it."""
     speed_m_s: float | None = None
@@ -93,9 +138,36 @@ class Epoch:
 
     def position(self) -> tuple[float, float, int] | None:
         """Latitude, longitude (deg) and quality, where the epoch has them."""
-        if self.lat_deg is None or self.lon_deg is None or self.quality is None:
+        if self.place is None or self.quality is None:
             return None
-        return self.lat_deg, self.lon_deg, self.quality
+        return self.place.lat_deg, self.place.lon_deg, self.quality
+
+    def take_rmc_position(self) -> None:
+        """RMC is all that the receiver says of its place."""
+        if self.rmc_position is None or not self.rmc_valid:
+            return
+        known = [quality for mode, quality in _MODE_QUALITY.items() if mode in self.modes]
+        if "N" in self.modes:
+            known = [0]
+        self.place, self.quality, self.by_rmc = self.rmc_position, (known or [1])[0], True
+
+    @property
+    def two_dimensional(self) -> bool:
+        """Whether the height is none that was measured: GSA says so, and may be right."""
+        if 2 not in self.nav_modes or 3 in self.nav_modes:
+            return False
+        return max(self.counted, len(self.listed)) < OVERDETERMINED or self.vdop is None
+
+    @property
+    def rounding_sd_ned_m(self) -> Vector3:
+        """One sigma of what the printed digits leave out."""
+        place = self.place
+        if place is None:
+            return 0.0, 0.0, 0.0
+        east = place.lon_step_m * math.cos(math.radians(place.lat_deg))
+        steps = place.lat_step_m, east, self.height_step_m
+        north, east, down = (NEAREST_SD * step for step in steps)
+        return north, east, down
 
     def implausible(self) -> str | None:
         """The counter of what no receiver can mean, None where all can be."""
@@ -116,6 +188,20 @@ class Epoch:
             return (0.0, 0.0, None) if self.speed_m_s < STANDSTILL_M_S else None
         course = math.radians(self.course_deg)
         return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
+
+
+def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
+    """Whether two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
+    it to two."""
+    if a_step_ns == b_step_ns:
+        return a_ns == b_ns
+    step_ns, beyond = max((a_step_ns, b_ns - a_ns), (b_step_ns, a_ns - b_ns))
+    return 0 <= beyond < step_ns or (step_ns <= ROUNDED_NS and 2 * abs(beyond) <= step_ns)
+
+
+def time_step_ns(sentence: Sentence) -> int:
+    """One step of the last digit of its time."""
+    return int(10 ** (9 - min(9, len(sentence.fields[0].partition(".")[2]))))
 
 
 def time_of_day_ns(sentence: Sentence) -> int | None:
@@ -169,53 +255,73 @@ def _angle(fields: Fields, name: str) -> float | None:
     return angle
 
 
-def _position(fields: Fields) -> tuple[float | None, float | None]:
-    """Signed degrees from the fields `lat`, `NS`, `lon`, `EW`, the second to fifth of GGA, GNS."""
+def _step(printed: str) -> float:
+    """Of the last digit."""
+    return 10.0 ** -len(printed.partition(".")[2])
+
+
+def _position(fields: Fields, first: int = 1) -> Printed | None:
+    """From the fields `lat`, `NS`, `lon`, `EW`, which follow one another from number `first` on."""
     lat, lon = _number(fields, "lat"), _number(fields, "lon")
     if lat is None or lon is None:
-        return None, None
-    printed = ",".join(fields["printed"][1:5])
+        return None
+    parts = fields["printed"][first : first + 4]
+    printed = ",".join(parts)
     if not _PRINTED_POSITION.match(printed):  # no hemisphere, 60 minutes, signs
         raise BadFieldError(f"not a position: {printed}")
     if abs(lat) > 90.0 or abs(lon) > 180.0:
         raise BadFieldError(f"no such place: {lat} {lon}")
-    return lat, lon
+    return Printed(lat, lon, MINUTE_M * _step(parts[0]), MINUTE_M * _step(parts[2]))
+
+
+def _take_height(epoch: Epoch, fields: Fields) -> None:
+    epoch.altitude_m, epoch.separation_m = _number(fields, "alt"), _number(fields, "sep")
+    if epoch.altitude_m is not None:
+        epoch.height_step_m = _step(fields["printed"][8])
 
 
 def _take_gga(epoch: Epoch, fields: Fields) -> None:
-    lat, lon = _position(fields)
+    place = _position(fields)
     quality, satellites = _count(fields, "quality"), _count(fields, "numSV")
     hdop = _dop(fields, "HDOP")
-    altitude, separation = _number(fields, "alt"), _number(fields, "sep")
-    epoch.lat_deg, epoch.lon_deg, epoch.quality = lat, lon, quality or 0
-    epoch.altitude_m, epoch.separation_m = altitude, separation
+    _take_height(epoch, fields)
+    epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality or 0
     epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
+    epoch.counted = max(epoch.counted, satellites or 0)
 
 
 def _take_gns(epoch: Epoch, fields: Fields) -> None:
-    lat, lon = _position(fields)
+    place = _position(fields)
     satellites, hdop = _count(fields, "numSV"), _dop(fields, "HDOP")
-    altitude, separation = _number(fields, "alt"), _number(fields, "sep")
     used = set(_letter(fields, "posMode")) - {"N"}
     epoch.modes |= used
+    epoch.counted = max(epoch.counted, satellites or 0)
     if "GGA" in epoch.cycle:
         return
-    epoch.lat_deg, epoch.lon_deg = lat, lon
+    _take_height(epoch, fields)
+    epoch.place = place
     worst = [quality for mode, quality in _MODE_QUALITY.items() if mode in used]
     epoch.quality = worst[0] if worst else 0
-    epoch.altitude_m, epoch.separation_m = altitude, separation
     epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
 
 
 def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     speed, course = _number(fields, "spd", 0.0), _angle(fields, "cog")
-    status = _letter(fields, "status")
-    epoch.rmc_valid = status == "A"
-    epoch.modes |= set(_letter(fields, "posMode"))
+    status, mode = _letter(fields, "status"), _letter(fields, "posMode")
+    place = _position(fields, 2)
+    if status in _MODE_QUALITY or status in _ESTIMATED:
+        epoch.rmc_valid, epoch.rmc_position = True, place
+        # Who sends D beside R means R; who sends E beside it means that, too.
+        mode = mode + status if status in _ESTIMATED else mode or status
+    elif status in _NOT_VALID:
+        epoch.rmc_valid = False
+    else:
+        epoch.unknown_status = status
+    epoch.modes |= set(mode)
     day = fields.get("date", "")
     if isinstance(day, date):
         epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
-    if speed is not None and status == "A":
+    if speed is not None and epoch.rmc_valid:
         epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course
 
 
@@ -236,7 +342,11 @@ def _take_vtg(epoch: Epoch, fields: Fields) -> None:
 
 def _take_gsa(epoch: Epoch, fields: Fields) -> None:
     hdop, vdop = _dop(fields, "HDOP"), _dop(fields, "VDOP")
-    epoch.two_dimensional |= _count(fields, "navMode") == 2
+    nav_mode = _count(fields, "navMode")
+    if nav_mode is not None:
+        epoch.nav_modes.add(nav_mode)
+    system = _letter(fields, "systemId")
+    epoch.listed.update((number, system) for number in fields["printed"][2:14] if number)
     epoch.hdop = epoch.hdop if epoch.hdop is not None else hdop
     epoch.vdop = epoch.vdop if epoch.vdop is not None else vdop
 

@@ -27,6 +27,8 @@ MAX_SENTENCE = 256
 is lines merged by an overrun."""
 MAX_UBX_PAYLOAD = 8192
 """A RXM-RAWX of 255 measurements takes 8176; a longer length is a false header."""
+MOST_UNREAD = 4096
+"""Bytes that nobody understood, kept to tell what they are: two seconds at 19,200 baud."""
 SLICE = 4096
 """Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
 
@@ -113,6 +115,7 @@ class StreamSplitter:
 
     def __init__(self, counters: Counter[str] | None = None) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
+        self._unread = bytearray()
         self._buffer = bytearray()
         self._whole = _WholeSentences()
         self._fletcher = RunningFletcher()
@@ -122,6 +125,11 @@ class StreamSplitter:
     def waiting(self) -> int:
         """Bytes kept until more come."""
         return len(self._buffer)
+
+    @property
+    def unread(self) -> bytes:
+        """The last bytes that belonged to nothing, line ends included."""
+        return bytes(self._unread[-MOST_UNREAD:])
 
     @property
     def summed(self) -> int:
@@ -153,6 +161,7 @@ class StreamSplitter:
             if start.start() > at:
                 self._garbage(buffer[at : start.start()])
                 at = start.start()
+            before = len(items)
             if buffer[at] == 0x24:
                 if start.end() - at > 1:  # the last of them may begin a sentence
                     at += self._inner_dollars(start.end() - at - 1)
@@ -168,13 +177,21 @@ class StreamSplitter:
                 self.counters["garbage_bytes"] += 1
                 if buffer[at] != 0x24:
                     self.counters["frame_cut"] += 1
+            if len(items) == before:
+                self._keep(buffer[at : at + used])
             at += used
         if at:
             del buffer[:at]
             for along in (self._whole, self._fletcher, self._crc):
                 along.drop(at)
 
+    def _keep(self, nothing: bytearray) -> None:
+        self._unread += nothing
+        if len(self._unread) > 2 * MOST_UNREAD:
+            del self._unread[:-MOST_UNREAD]
+
     def _garbage(self, skipped: bytearray) -> None:
+        self._keep(skipped)
         self.counters["garbage_bytes"] += len(skipped) - skipped.count(0x0D) - skipped.count(0x0A)
 
     def _refuse(self, why: str, length: int) -> int:
@@ -286,6 +303,11 @@ class NmeaSplitter:
     def waiting(self) -> int:
         """Bytes kept until more come."""
         return self._stream.waiting
+
+    @property
+    def unread(self) -> bytes:
+        """As `StreamSplitter.unread`."""
+        return self._stream.unread
 
     def feed(self, data: bytes) -> list[Sentence]:
         """The sentences that `data` completes, in order."""

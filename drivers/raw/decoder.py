@@ -7,8 +7,9 @@ Every verified frame ends in exactly one of these counters:
     RTCM 3  msm, week_unknown, rtcm_ephemerides, ..._not_used, rtcm_unreadable, and the refusals of
             an ephemeris
 
-A subframe's name is `subframes_lnav`, `_d1`, `_d2` or `_inav` where it was used, a message that is
-not decoded (`fnav_not_used`), or the reason of its refusal (`parity_bad`). See `docs/gnss-raw.md`.
+A subframe's name is `subframes_lnav`, `_d1`, `_d2`, `_bcnav1`, `_bcnav2` or `_inav` where it was
+used, a message that is not decoded (`fnav_not_used`), or the reason of its refusal (`parity_bad`).
+See `docs/gnss-raw.md`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Protocol
 from drivers.measurements import UtcStamp
 from drivers.nmea.decoder import BUILD_DATE
 from drivers.nmea.framing import Frame, StreamSplitter
+from drivers.raw.bcnav import Bcnav1Decoder, Bcnav2Decoder
 from drivers.raw.beidou_words import GEO
 from drivers.raw.d1 import D1Decoder
 from drivers.raw.d2 import D2Decoder
@@ -39,7 +41,7 @@ from drivers.raw.ubx import (
     parse_rawx,
     parse_sfrbx,
 )
-from drivers.raw.weeks import FIRST_RAWX_WEEK, LAST_WEEK, LEAP_SECONDS, WeekReference, utc_ns
+from drivers.raw.weeks import FIRST_RAWX_WEEK, LAST_WEEK, WeekReference, leap_seconds, utc_ns
 
 
 class MessageDecoder(Protocol):
@@ -52,9 +54,12 @@ _DECODERS: dict[str, Callable[[], MessageDecoder]] = {
     "lnav": LnavDecoder,
     "d1": D1Decoder,
     "d2": D2Decoder,
+    "bcnav1": Bcnav1Decoder,
+    "bcnav2": Bcnav2Decoder,
     "inav": InavDecoder,
 }
 _BEIDOU_D1, _BEIDOU_D2 = frozenset({0, 2, 4}), frozenset({1, 3, 10})
+_BCNAV = {5: "bcnav1", 6: "bcnav1", 7: "bcnav2", 8: "bcnav2"}
 _GALILEO_INAV, _GALILEO_FNAV = frozenset({0, 1, 5}), frozenset({3, 4})
 
 
@@ -113,7 +118,7 @@ class RawDecoder:
 
     def note_utc(self, utc: int) -> None:
         """UTC (POSIX ns) from another source, to be believed: it dates MSM epochs."""
-        self._weeks.note_utc(utc, self.leap_seconds or LEAP_SECONDS)
+        self._weeks.note_utc(utc, self.leap_seconds)
 
     def take(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
         """What a frame that `StreamSplitter` verified completes."""
@@ -151,7 +156,7 @@ class RawDecoder:
         self.leap_seconds = leap = epoch.leap_seconds
         if leap is None:
             self.counters["leap_seconds_assumed"] += 1
-            leap = LEAP_SECONDS
+            leap = leap_seconds(epoch.week, epoch.tow_s)
         elif self._rtcm is not None:
             self._rtcm.leap_seconds = leap
         self._weeks.note(epoch.week, epoch.tow_s)
@@ -222,5 +227,5 @@ def message_of(sfrbx: Sfrbx) -> str:
     if sfrbx.gnss_id == 3:
         if signal in _BEIDOU_D2 or (signal in _BEIDOU_D1 and sfrbx.prn in GEO):
             return "d2"
-        return "d1" if signal in _BEIDOU_D1 else "bcnav_not_used"
+        return "d1" if signal in _BEIDOU_D1 else _BCNAV.get(signal, "bcnav_not_used")
     return f"{OTHER_SYSTEMS.get(sfrbx.gnss_id, 'unknown_system')}_not_used"

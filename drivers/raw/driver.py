@@ -1,4 +1,4 @@
-"""A GNSS receiver's serial line with raw observations and NMEA mixed: see `docs/gnss-raw.md`."""
+"""A GNSS receiver's line with raw observations, NMEA and UBX mixed: see `docs/gnss-raw.md`."""
 
 from __future__ import annotations
 
@@ -8,27 +8,38 @@ from typing import ClassVar
 from drivers.base import Emit, Now, monotonic_ns
 from drivers.measurements import Measurement, PositionFix, TimeReport, UtcStamp
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.nmea.driver import REFUSALS, NmeaOptions
+from drivers.nmea.driver import REFUSALS as NMEA_REFUSALS
+from drivers.nmea.driver import NmeaOptions
 from drivers.nmea.framing import Item, Sentence, StreamSplitter
+from drivers.nmea.reasons import wrong_checksums
 from drivers.nmea.time import TimeTrust
 from drivers.raw.decoder import RawDecoder
-from drivers.raw.messages import RawEvent, RawGnssEpoch
+from drivers.raw.messages import Ephemeris, RawEvent, RawGnssEpoch
 from drivers.raw.rtcm import load_pyrtcm
 from drivers.receiver import ReceiverDriver
+from drivers.solution import REFUSALS, SolutionDecoding
+from drivers.ubx.decoder import UbxNavDecoder
+from drivers.ubx.messages import CLASS_NAV
 
 Found = Measurement | RawEvent
 
 NMEA_TIME_NS = 5_000_000_000
-"""RXM-RAWX tells the time when no RMC or ZDA has for this long: five epochs at 1 Hz. Its own is up
-to some milliseconds off, as the receiver's clock is."""
+"""Another message tells the time when no RMC or ZDA has for this long: five epochs at 1 Hz. That of
+RXM-RAWX is up to some milliseconds off, as the receiver's clock is."""
+UBX_FIX_NS = 5_000_000_000
+"""Fixes of UBX-NAV, which have a velocity down and sigmas of their own, stand for the same ones by
+NMEA until none has come for this long."""
+SAME_FIX_NS = 20_000_000
+"""NMEA prints hundredths of a second, of what UBX gives in nanoseconds; fixes come 50 ms apart at
+the least."""
 
 
 class GnssOptions(NmeaOptions):
     """Options of a `driver = "gnss"` source: those of `nmea`, and which of the stream to use."""
 
     use_nmea_fix: bool = True
-    """Hand over the receiver's own fixes too. They are made of the same pseudoranges: fuse one of
-    the two. Headings and times are handed over in any case."""
+    """Hand over the receiver's own fixes too, of NMEA or UBX-NAV. They are made of the same
+    pseudoranges: fuse one of the two. Headings and times are handed over in any case."""
     use_raw: bool = True
     """Hand over observations, ephemerides and ionosphere models."""
     rtcm: bool = True
@@ -36,7 +47,10 @@ class GnssOptions(NmeaOptions):
 
 
 class GnssDecoder:
-    """One stream, two decoders: sentences go to the one, frames to the other."""
+    """One stream, three decoders: of sentences, of UBX-NAV, and of all other frames.
+
+    Counts `nmea_fix_superseded`: the same fix comes by UBX-NAV, too.
+    """
 
     def __init__(
         self,
@@ -53,6 +67,10 @@ class GnssDecoder:
         self._use_nmea_fix = use_nmea_fix
         self._splitter = StreamSplitter(self.counters)
         self._nmea = NmeaDecoder(source, decoding, self.counters)
+        same = {name: getattr(decoding, name) for name in SolutionDecoding.model_fields}
+        self._ubx = UbxNavDecoder(source, SolutionDecoding(**same), self.counters)
+        self._ubx_fix_ns: int | None = None
+        self._nmea_fix: UtcStamp | None = None
         self._raw = (
             RawDecoder(source, self.counters, earliest=decoding.earliest_date, rtcm=rtcm)
             if use_raw
@@ -61,22 +79,28 @@ class GnssDecoder:
         self._trust = TimeTrust()
         self._nmea_told_ns: int | None = None
         """UTC of RMC or ZDA when last told, else of the first epoch of RXM-RAWX."""
+        self._delays: set[int] = set()
+        """BeiDou satellites whose B-CNAV has come."""
+        self.undelayed = 0
+        """BeiDou satellites of the last epoch, where all of them are tracked on B1C or B2a alone
+        and no group delay of any is known; 0 where one could serve."""
         self._t_seen_ns = 0
 
     @property
     def refusal(self) -> str:
-        """Why the last NMEA epoch gave no fix, by counter name."""
-        return self._nmea.refusal
+        """Why the last epoch of NMEA, or else of UBX-NAV, gave no fix, by counter name."""
+        return self._nmea.refusal or self._ubx.refusal
 
     @property
     def gga(self) -> bytes:
-        """The last GGA with a position; empty before one."""
-        return self._nmea.gga
+        """The last GGA with a position, or else the last fix of UBX-NAV as one; empty before."""
+        return self._nmea.gga or self._ubx.gga
 
     @property
     def epoch_open(self) -> bool:
         """Whether `silence` would close an epoch."""
-        return self._nmea.epoch_open or (self._raw is not None and self._raw.epoch_open)
+        raw = self._raw is not None and self._raw.epoch_open
+        return self._nmea.epoch_open or self._ubx.epoch_open or raw
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Found]:
         """What `data`, seen at `t_seen_ns`, completes."""
@@ -90,6 +114,7 @@ class GnssDecoder:
         """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
         found: list[Found] = []
         self._take_nmea(self._nmea.silence(), found)
+        self._take_ubx(self._ubx.silence(), found)
         if self._raw is not None:
             self._take_raw(self._raw.flush_epoch(), found)
         return found
@@ -100,6 +125,7 @@ class GnssDecoder:
         for item in self._splitter.finish():
             self._take(item, found)
         self._take_nmea(self._nmea.flush(), found)
+        self._take_ubx(self._ubx.flush(), found)
         if self._raw is not None:
             self._take_raw(self._raw.flush_epoch(), found)
         return found
@@ -107,6 +133,8 @@ class GnssDecoder:
     def _take(self, item: Item, found: list[Found]) -> None:
         if isinstance(item, Sentence):
             self._take_nmea(self._nmea.take(item, self._t_seen_ns), found)
+        elif item.kind == "ubx" and item.raw[2] == CLASS_NAV:
+            self._take_ubx(self._ubx.take(item.raw, self._t_seen_ns), found)
         elif self._raw is not None:
             self._take_raw(self._raw.take(item, self._t_seen_ns), found)
 
@@ -116,15 +144,56 @@ class GnssDecoder:
                 self._nmea_told_ns = measurement.utc_ns
                 if measurement.trusted and self._raw is not None:
                     self._raw.note_utc(measurement.utc_ns)
-            if isinstance(measurement, PositionFix) and not self._use_nmea_fix:
+            if isinstance(measurement, PositionFix) and not self._own_fix(measurement):
                 continue
             found.append(measurement)
+
+    def _own_fix(self, fix: PositionFix) -> bool:
+        """Whether a fix by NMEA is handed over."""
+        if not self._use_nmea_fix:
+            return False
+        if self._ubx_fix_ns is not None and self._t_seen_ns - self._ubx_fix_ns < UBX_FIX_NS:
+            self.counters["nmea_fix_superseded"] += 1
+            return False
+        self._nmea_fix = fix.stamp if isinstance(fix.stamp, UtcStamp) else None
+        return True
+
+    def _take_ubx(self, measurements: list[Measurement], found: list[Found]) -> None:
+        for measurement in measurements:
+            if isinstance(measurement, TimeReport):
+                if measurement.trusted and self._raw is not None:
+                    self._raw.note_utc(measurement.utc_ns)
+                if not self._told_by_nmea(measurement.utc_ns):
+                    found.append(measurement)
+                continue
+            if isinstance(measurement, PositionFix):
+                if not self._use_nmea_fix:
+                    continue
+                self._ubx_fix_ns = self._t_seen_ns
+                if self._already(measurement):
+                    continue
+            found.append(measurement)
+
+    def _already(self, fix: PositionFix) -> bool:
+        """Whether NMEA has told this very fix: the first one, where its sentences come first."""
+        last, self._nmea_fix = self._nmea_fix, None
+        if last is None or not isinstance(fix.stamp, UtcStamp):
+            return False
+        return abs(fix.stamp.utc_ns - last.utc_ns) < SAME_FIX_NS
 
     def _take_raw(self, events: list[RawEvent], found: list[Found]) -> None:
         for event in events:
             if isinstance(event, RawGnssEpoch):
                 self._report_time(event, found)
+                self._look_for_delays(event)
+            elif isinstance(event, Ephemeris) and event.message.startswith("bcnav"):
+                self._delays.add(event.prn)
             found.append(event)
+
+    def _look_for_delays(self, epoch: RawGnssEpoch) -> None:
+        beidou = [s for s in epoch.signals if s.system == "C"]
+        served = any(s.signal[0] not in "15" or s.prn in self._delays for s in beidou)
+        self.undelayed = 0 if served else len({s.prn for s in beidou})
 
     def _report_time(self, epoch: RawGnssEpoch, found: list[Found]) -> None:
         """UTC of RXM-RAWX, where the receiver knows the leap seconds and no RMC or ZDA comes."""
@@ -133,13 +202,17 @@ class GnssDecoder:
         if not isinstance(epoch.stamp, UtcStamp):
             return
         utc_ns = epoch.stamp.utc_ns
-        if self._nmea_told_ns is None:
-            self._nmea_told_ns = utc_ns
-        if abs(utc_ns - self._nmea_told_ns) < NMEA_TIME_NS:
+        if self._told_by_nmea(utc_ns):
             return
         trusted = self._trust.report(utc_ns, epoch.t_seen_ns, valid=True)
         if trusted is not None:
             found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))
+
+    def _told_by_nmea(self, utc_ns: int) -> bool:
+        """Whether RMC or ZDA have told the time lately, or may yet."""
+        if self._nmea_told_ns is None:
+            self._nmea_told_ns = utc_ns
+        return abs(utc_ns - self._nmea_told_ns) < NMEA_TIME_NS
 
 
 class GnssDriver(ReceiverDriver):
@@ -178,6 +251,11 @@ class GnssDriver(ReceiverDriver):
             return useless
         if not (counters["ephemerides"] or counters["rtcm_ephemerides"]):
             return "no ephemeris yet: are UBX-RXM-SFRBX, or RTCM 1019, 1042, 1046, switched on?"
+        if self._gnss.undelayed:
+            return (
+                f"no group delay of {self._gnss.undelayed} BeiDou satellites on B1C or B2a yet "
+                "(no_group_delay): B-CNAV has it, so switch on UBX-RXM-SFRBX, or B1I or B3I"
+            )
         return ""
 
     def _useless_detail(self) -> str:
@@ -190,9 +268,16 @@ class GnssDriver(ReceiverDriver):
             if not counters["epochs_raw"] and not self._gnss.refusal:
                 return "no observations arrive: switch on UBX-RXM-RAWX, or RTCM MSM4 or MSM7"
         if self._options.use_nmea_fix and counters["epochs"]:
-            return REFUSALS.get(self._gnss.refusal, "epochs arrive, but none has a position")
+            words = {**REFUSALS, **NMEA_REFUSALS}
+            return words.get(self._gnss.refusal, "epochs arrive, but none has a position")
         return "neither observations nor epochs of NMEA arrive"
 
     def _unintelligible_detail(self) -> str:
         where = self._where_to_look()
         return f"bytes arrive, but neither NMEA, UBX nor RTCM 3 verifies{where}"
+
+    @property
+    def cause(self) -> str:
+        """Why nothing on the line verifies, as a sentence; "" where nothing that arrives tells."""
+        alive = any(self.counters[name] for name in self.alive_by)
+        return "" if alive else wrong_checksums(self.counters)

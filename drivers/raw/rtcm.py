@@ -1,4 +1,4 @@
-"""RTCM 3: MSM4 to MSM7 of GPS, Galileo and BeiDou, and the ephemerides 1019, 1042, 1045, 1046.
+"""RTCM 3: MSM4 to MSM7 of GPS, Galileo and BeiDou, ephemerides 1019, 1042, 1045, 1046, and 1013.
 
     pseudorange  c/1000 * (DF397 + DF398 + DF400)     DF405 in place of DF400 in MSM6 and 7; ms
     carrier      f/1000 * (DF397 + DF398 + DF401)     DF406 in MSM6 and 7; cycles
@@ -24,6 +24,8 @@ from typing import Any
 
 from drivers.base import PermanentDriverError
 from drivers.measurements import UtcStamp
+from drivers.plausible import LEAP_SECONDS as PLAUSIBLE_LEAP_SECONDS
+from drivers.plausible import within
 from drivers.raw.beidou_words import GEO
 from drivers.raw.bits import PI, Bits
 from drivers.raw.messages import (
@@ -37,7 +39,7 @@ from drivers.raw.messages import (
 )
 from drivers.raw.subframes import RefusedError, check_orbit, sisa_m, ura_m
 from drivers.raw.ubx import MAX_PRN, PSEUDORANGE_M
-from drivers.raw.weeks import BDT_BEHIND_GPS_S, LEAP_SECONDS, WEEK_S, WeekReference, utc_ns
+from drivers.raw.weeks import BDT_BEHIND_GPS_S, WEEK_S, WeekReference, leap_seconds, utc_ns
 
 MSM_SYSTEMS: dict[int, System] = {107: "G", 109: "E", 112: "C"}
 """By the message number without its last digit, which is the kind of MSM."""
@@ -48,6 +50,9 @@ OTHER_MSM = {
     111: "qzss_not_used",
     113: "navic_not_used",
 }
+SYSTEM_PARAMETERS = 1013
+MJD_1980_01_06 = 44_244
+"""Day 0 of GPS time as a modified Julian date."""
 EPHEMERIDES: dict[int, System] = {1019: "G", 1042: "C", 1045: "E", 1046: "E"}
 
 _MS_M = SPEED_OF_LIGHT_M_S / 1000.0
@@ -140,6 +145,9 @@ class RtcmDecoder:
         if msm and bits.length < 55:
             self._counters["rtcm_unreadable"] += 1
             return []
+        if number == SYSTEM_PARAMETERS and bits.length >= 70:
+            self._parameters(bits)
+            return []
         if not msm and number not in EPHEMERIDES:
             self._counters["rtcm_not_used"] += 1
             return []
@@ -172,10 +180,22 @@ class RtcmDecoder:
         leap = self.leap_seconds
         if leap is None:
             self._counters["leap_seconds_assumed"] += 1
-            leap = LEAP_SECONDS
+            leap = leap_seconds(week, tow_s)
         self._counters["epochs_raw"] += 1
         stamp = UtcStamp(utc_ns(week, tow_s, leap))
         return [RawGnssEpoch(self._source, self._t_seen_ns, stamp, week, tow_s, signals)]
+
+    def _parameters(self, bits: Bits) -> None:
+        """1013: day (DF051, modified Julian), second of UTC's day (DF052), leap seconds (DF054); a
+        day or leap seconds that cannot be are not known."""
+        self._counters["rtcm_system_parameters"] += 1
+        day, second, leap = bits.unsigned(24, 16), bits.unsigned(40, 17), bits.unsigned(62, 8)
+        if not within(leap, PLAUSIBLE_LEAP_SECONDS):
+            self._counters["leap_seconds_implausible"] += 1
+            return
+        self.leap_seconds = leap
+        if day >= MJD_1980_01_06 and second < 86_400:
+            self._weeks.note(0, (day - MJD_1980_01_06) * 86_400 + second + leap)
 
     def _message(self, frame: bytes) -> Any | None:
         """pyrtcm's view of the frame; None when it cannot read it, whatever it raises."""

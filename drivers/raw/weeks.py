@@ -20,8 +20,15 @@ BDT_WEEK = 1356
 BDT_BEHIND_GPS_S = 14
 GALILEO_WEEK = 1024
 """GPS week of 1999-08-22, Galileo week 0."""
-LEAP_SECONDS = 18
-"""GPS time minus UTC since 2017, taken while a receiver does not know better."""
+LEAP_SECONDS = (
+    (date(1999, 1, 1), 13),
+    (date(2006, 1, 1), 14),
+    (date(2009, 1, 1), 15),
+    (date(2012, 7, 1), 16),
+    (date(2015, 7, 1), 17),
+    (date(2017, 1, 1), 18),
+)
+"""GPS time minus UTC from a date on (IERS Bulletin C): taken where a receiver does not say."""
 FIRST_RAWX_WEEK = 1773
 """Start of 2014. No receiver sent RXM-RAWX before; an earlier week is a clock never set."""
 LAST_WEEK = 6260
@@ -33,6 +40,16 @@ _GPS_ORDINAL = date(1980, 1, 6).toordinal()
 def week_of(day: date) -> int:
     """GPS week of a date."""
     return (day.toordinal() - _GPS_ORDINAL) // 7
+
+
+def leap_seconds(week: int, tow_s: float = 0.0) -> int:
+    """GPS time minus UTC at a GPS time, by the table; before 1999 what held then."""
+    gps_s = week * WEEK_S + tow_s
+    found = LEAP_SECONDS[0][1]
+    for since, seconds in LEAP_SECONDS[1:]:
+        if gps_s >= (since.toordinal() - _GPS_ORDINAL) * 86_400 + seconds:
+            found = seconds
+    return found
 
 
 def utc_ns(week: int, tow_s: float, leap_seconds: int) -> int:
@@ -60,9 +77,10 @@ class WeekReference:
         """An instant whose week is from `week_of_tow`: as good as the reference was."""
         self._gps_s = week * WEEK_S + tow_s
 
-    def note_utc(self, t_utc_ns: int, leap_seconds: int = LEAP_SECONDS) -> None:
+    def note_utc(self, t_utc_ns: int, leap_s: int | None = None) -> None:
         """Somebody who is to be believed said UTC."""
-        self.note(0, t_utc_ns * 1e-9 - GPS_EPOCH_S + leap_seconds)
+        utc_s = t_utc_ns * 1e-9 - GPS_EPOCH_S
+        self.note(0, utc_s + (leap_seconds(0, utc_s) if leap_s is None else leap_s))
 
     def gps_week(self, count: int, tow_s: float) -> int:
         """The full week of GPS's ten bits, transmitted at about `tow_s`."""

@@ -26,14 +26,24 @@ if TYPE_CHECKING:
     from drivers.raw.messages import System
     from fusiond.offline.outages import Outage
 
-AID_KINDS = ("gnss", "rdss", "attitude", "bearing", "wheel", "barometer", "nmea", "raw")
+AID_KINDS = (
+    *("gnss", "rdss", "attitude", "bearing", "wheel", "barometer"),
+    *("nmea", "ubx", "bestpos", "sbf", "raw"),
+)
+# What an engineer has to know of a log's times.
+LOG_EVENTS = {
+    "recorder_zone",
+    "recorder_paused",
+    "recorder_clock_off",
+    "system_clock_stepped",
+    "utc_jumped",
+    "utc_implausible",
+}
 # What was recorded, as `process` and `calibrate` take it.
 ImuFile = Annotated[Path | None, typer.Option("--imu", metavar="F.csv", help="IMU samples.")]
 CanLog = Annotated[
     Path | None,
-    typer.Option(
-        "--can", metavar="LOG", help="Recorded CAN bus of the sources: .log, .asc, .blf, .mf4."
-    ),
+    typer.Option("--can", metavar="LOG", help="Recorded CAN bus: .log, .asc, .blf, .trc, .mf4."),
 ]
 AidFiles = Annotated[
     list[str] | None,
@@ -253,6 +263,9 @@ def _print_summary(result: dict[str, Any], err: bool) -> None:
     for name, outcomes in result["sources"].items():
         counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
         typer.echo(f"{name}: {counts or 'nothing'}", err=err)
+    for event in result["events"]:
+        if event["code"] in LOG_EVENTS:
+            typer.echo(f"! {event['text']}", err=err)
     rows = result["solution_rows"]
     if not rows:
         return

@@ -27,6 +27,7 @@ LONGEST_M: dict[VehicleClass, float] = {
 96/53/EC), a railway coach (27.5 m, UIC 567), a container ship (400 m), the An-225 (84 m)."""
 
 GIVES: dict[str, tuple[str, ...]] = {
+    "bestpos": ("gnss", "heading"),
     "can_imu": (),
     "can_attitude": ("attitude", "star_tracker"),
     "can_bearing": ("sar",),
@@ -38,6 +39,8 @@ GIVES: dict[str, tuple[str, ...]] = {
     "nmea": ("gnss", "heading"),
     "obd_speed": ("wheel",),
     "rdss": ("rdss",),
+    "sbf": ("gnss", "heading"),
+    "ubx": ("gnss", "heading"),
 }
 """Kinds of aid that come of each shipped driver; of drivers in other packages nothing is known."""
 

@@ -51,7 +51,11 @@ _NO_IMU = """\
 # accel = ["ACCELERATION.ACCEL_X", "ACCELERATION.ACCEL_Y", "ACCELERATION.ACCEL_Z"]
 # device_time = "SAMPLE_TIME.TIME"
 """
-_AIDING_KIND = {"nmea": "gnss", "gnss": "raw", "rdss": "rdss", "can_gnss": "gnss"}
+_AIDING_KIND = {
+    **dict.fromkeys(("nmea", "can_gnss", "bestpos", "sbf", "ubx"), "gnss"),
+    "gnss": "raw",
+    "rdss": "rdss",
+}
 
 
 def toml(draft: Draft) -> str:

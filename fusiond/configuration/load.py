@@ -38,6 +38,9 @@ EXIT_CONFIG = 78
 
 _DEFAULT_AIDING: dict[str, type[AnyAiding]] = {
     "nmea": GnssAiding,
+    "bestpos": GnssAiding,
+    "sbf": GnssAiding,
+    "ubx": GnssAiding,
     "gnss": RawAiding,
     "rdss": RdssAiding,
     "can_attitude": StarTrackerAiding,

@@ -61,9 +61,15 @@ def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> li
             f"`candump {options.channel}` shows what is on the bus, [sources.{name}] what is wanted"
         ]
     if on_network(str(port)):
+        cause = getattr(driver, "cause", "")
+        if cause:
+            return [cause]
         return [f"{detail}: see what {port} says with `nc` or `gpspipe`, and who may connect there"]
     if not driver.counters["bytes_in"]:
         return [f"nothing arrives in {seconds:g} s: check power, and that its TX goes to our RX"]
+    cause = getattr(driver, "cause", "")
+    if cause:
+        return [cause]
     baud = getattr(options, "baud", None)
     if baud == "auto":
         return [

@@ -44,6 +44,7 @@ OLD_FIX_S = 1.0
 """Receivers send within 0.3 s of the epoch; older means a line too slow for its sentences."""
 _BROKER_S = 5.0
 _SHOWN_EVENTS = 6
+_CHECKSUMS = "wrong checksums against"
 
 
 @dataclass(slots=True)
@@ -164,7 +165,8 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
     if task.done() and not task.cancelled():
         report.findings.append(f"the driver ended: {task.exception()!r}: please report this")
     report.findings += open_findings(heard.name, heard.driver, heard.options, seconds)
-    report.findings += _damage(heard.driver.counters)
+    report.findings += _damage(heard.driver.counters, report.findings)
+    report.findings += getattr(heard.driver, "cautions", {}).values()
     if "ImuSample" in heard.kinds:
         _imu(heard, config, report)
     elif "PositionFix" in heard.kinds:
@@ -174,10 +176,10 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
                 f"fixes are up to {oldest:.1f} s old on arrival: raise the baud rate or switch off "
                 "sentences that are not needed (GSV)"
             )
-    elif heard.driver_name == "nmea" and status.state == "running" and not status.detail:
-        report.findings.append(
-            "sentences arrive but no fix: give the antenna a free sky and wait, or switch on GGA"
-        )
+    elif status.state == "running" and not status.detail:
+        cause = getattr(heard.driver, "cause", "")
+        if cause:
+            report.findings.append(cause)
     return report
 
 
@@ -190,8 +192,9 @@ def _kind_line(name: str, kind: Kind) -> str:
     return f"{name}: {kind.count}{rate}{age}"
 
 
-def _damage(counters: Counter[str]) -> list[str]:
-    """What arrived broken or not at all, where it is more than a sound line has."""
+def _damage(counters: Counter[str], said: list[str]) -> list[str]:
+    """What arrived broken or not at all, where it is more than a sound line has and has not been
+    `said`."""
     findings = []
     lost, samples = counters["lost_samples"], counters["samples"]
     if lost > DAMAGED_SHARE * max(1, samples):
@@ -206,9 +209,9 @@ def _damage(counters: Counter[str]) -> list[str]:
         )
     bad = counters["checksum_bad"] + counters["bad_checksum"]
     good = counters["sentences"] + counters["frames"]
-    if bad > max(1, DAMAGED_SHARE * good):
+    if bad > max(1, DAMAGED_SHARE * good) and not any(_CHECKSUMS in one for one in said):
         findings.append(
-            f"{bad} wrong checksums against {good} sound: check ground, cable length and that "
+            f"{bad} {_CHECKSUMS} {good} sound: check ground, cable length and that "
             "nobody else reads this port"
         )
     overflow = counters["socket_overflow"] + counters["ring_overflow"] + counters["error_overflow"]

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.base import monotonic_ns
+from drivers.bestpos.decoder import POSITIONS as LOGGED_POSITIONS
+from drivers.bestpos.framing import LogSplitter
 from drivers.can.bus import CanBus, CanFrame, Interface
 from drivers.can.decoder import CanDecoder
 from drivers.can.gnss import CanGnssDriver
@@ -22,6 +24,7 @@ from drivers.can.imu import CanImuDriver
 from drivers.nmea.compass import FORMATTERS
 from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
 from drivers.rdss.driver import RdssDriver, RdssOptions
+from drivers.sbf.framing import BlockSplitter
 from drivers.serial_line import SerialLine
 from fusiond.doctor.known_devices import KNOWN_DEVICES
 
@@ -42,10 +45,21 @@ _DRIVERS: dict[str, Any] = {"can_imu": CanImuDriver, "can_gnss": CanGnssDriver}
 # RTCM 10403.3, table 3.5-78: MSM1 to MSM7 of GPS to BeiDou are 1071 to 1127.
 _MSM = range(1071, 1128)
 _RXM_RAWX = b"\x02\x15"
+_NAV_POSITIONS = frozenset({b"\x01\x07", b"\x01\x02", b"\x01\x06"})
+"""UBX-NAV-PVT, POSLLH and SOL."""
 # NMEA 0183 4.11: sentences that hold a position.
 _POSITIONS = ("GGA", "GNS", "RMC", "GLL")
 _HEADINGS = Counter(FORMATTERS)
-_BINARY = {"raw": "raw observations", "ubx": "UBX frames", "rtcm": "RTCM frames"}
+_BINARY = {
+    "raw": "raw observations",
+    "ubx_nav": "UBX navigation messages",
+    "bestpos": "logs of the BESTPOS family",
+    "sbf": "SBF blocks",
+    "ubx": "UBX frames",
+    "rtcm": "RTCM frames",
+}
+_SOLUTIONS = {"ubx_nav": "ubx", "bestpos": "bestpos", "sbf": "sbf"}
+"""Drivers of those that have a position, where no sentence has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +79,15 @@ class _Line:
     """What came over a serial line."""
 
     splitter: StreamSplitter = field(default_factory=StreamSplitter)
+    logs: LogSplitter = field(default_factory=lambda: LogSplitter(Counter()))
+    blocks: BlockSplitter = field(default_factory=lambda: BlockSplitter(Counter()))
     kinds: Counter[str] = field(default_factory=Counter)
 
     def take(self, data: bytes, t_seen_ns: int) -> None:
         for item in self.splitter.feed(data):
             self.kinds[_kind(item)] += 1
+        self.kinds["bestpos"] += sum(log.name in LOGGED_POSITIONS for log in self.logs.feed(data))
+        self.kinds["sbf"] += len(self.blocks.feed(data))
 
     @property
     def sound(self) -> bool:
@@ -89,7 +107,8 @@ def _kind(item: Sentence | Frame) -> str:
         name = item.formatter
         return name if name in FORMATTERS else "position" if name in _POSITIONS else "nmea"
     if item.kind == "ubx":
-        return "raw" if item.raw[2:4] == _RXM_RAWX else "ubx"
+        kind = item.raw[2:4]
+        return "raw" if kind == _RXM_RAWX else "ubx_nav" if kind in _NAV_POSITIONS else "ubx"
     number = int.from_bytes(item.raw[3:5], "big") >> 4
     return "raw" if number in _MSM else "rtcm"
 
@@ -123,6 +142,10 @@ def _receiver(port: str, baud: int, kinds: Counter[str]) -> Device:
     options = {"port": port, "baud": baud}
     if kinds["raw"]:
         return Device("gnss", options, _told(port, baud, said))
+    if not kinds["position"]:
+        for kind, driver in _SOLUTIONS.items():
+            if kinds[kind]:
+                return Device(driver, options, _told(port, baud, said))
     headings = [name for name in FORMATTERS if kinds[name]]
     if headings and not kinds["position"]:
         text = _told(port, baud, [f"a compass ({', '.join(headings)})"])

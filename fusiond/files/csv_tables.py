@@ -7,7 +7,8 @@ row is read with care instead, so that what is refused carries its line and the 
 Reasons: `columns` (more or fewer cells than the header), `unreadable` (not a number), `missing`
 (empty where the value must be known), `not_finite` (nan or inf), `out_of_range`,
 `sd_not_positive`, `time_backwards`, `time_repeated`, `time_ahead` (a stamp later than those of the
-rows that follow it), and those of a table's own rules.
+rows that follow it), and those of a table's own rules. `sd_all_zero` rejects no row: a sigma that
+is 0 in all of them is not given.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class MissingPackageError(Exception):
 @immutable()
 class Rejection:
     """A row that is not used: line in the file (the header is 1; 0: it has none), reason's name,
-    what was seen, and how often."""
+    what was seen, and how often; 0 times: a note on the whole file."""
 
     line: int
     reason: str
@@ -94,6 +95,11 @@ class RawTable:
     rejected: list[Rejection]
 
 
+FEWEST_ZEROS = 10
+"""Rows from which on a sigma that is always 0 is one that was not written down; a lone 0 is a row
+that cannot be true."""
+
+
 def counted(refused: Mapping[str, int]) -> list[Rejection]:
     """Rejections of what has no lines, frames and sentences, from their number by reason."""
     return [Rejection(0, name, f"{n} times", n) for name, n in refused.items() if n]
@@ -104,7 +110,7 @@ def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
     found = Counter[str]()
     for each in rejected:
         found[each.reason] += each.times
-    return dict(found)
+    return dict(+found)
 
 
 def file_report(rows: int, rejected: Sequence[Rejection], first: int = 5) -> dict[str, Any]:
@@ -152,6 +158,7 @@ def read_table(
     n = len(lines)
     named = {c.name: values[c.name] if c.name in values else np.full(n, nan) for c in columns}
     keep = np.ones(n, dtype=np.bool_)
+    rejected += _not_given(columns, named)
     for rule in _column_rules(columns):
         _apply(rule, named, lines, keep, rejected)
     for rule in rules:
@@ -291,6 +298,22 @@ def _column_rules(columns: Sequence[Column]) -> list[Rule]:
             detail = f"{c.name} = {{{c.name}:.10g}}, allowed {c.low:g} to {c.high:g}"
             rules.append(Rule("out_of_range", detail, _outside(c)))
     return rules
+
+
+def _not_given(columns: Sequence[Column], named: dict[str, Floats]) -> list[Rejection]:
+    """Optional sigmas that are 0 in all rows become NaN: the writer had none. One sentence on it,
+    which rejects no row."""
+    zero = []
+    for c in columns:
+        values = named[c.name]
+        given = values[~np.isnan(values)] if c.positive and not c.required else values[:0]
+        if len(given) >= FEWEST_ZEROS and not given.any():
+            zero.append(c.name)
+            named[c.name] = np.full_like(values, nan)
+    if not zero:
+        return []
+    names = f"{', '.join(zero)} {'are' if zero[1:] else 'is'} 0 in every row"
+    return [Rejection(0, "sd_all_zero", f"{names}: taken as not given", 0)]
 
 
 def _not_positive(c: Column) -> Callable[[dict[str, Floats]], Flags]:

@@ -9,17 +9,22 @@ Galileo (clock of I/NAV refers to E1/E5b, of F/NAV to E1/E5a, each ionosphere-fr
     E5b: I/NAV d = (f1/f5b)^2 BGDb
     E5a: F/NAV d = (f1/f5a)^2 BGDa;  I/NAV d = BGDb + ((f1/f5a)^2 - 1) BGDa
 BeiDou (clock refers to B3I):
-    B3I: d = 0,  B1I: d = TGD1,  B2I: d = TGD2
+    B3I: d = 0,  B1I: d = TGD1,  B2I: d = TGD2                          by D1 and D2
+    B1C and B2a, pilot: d = T_GD,  data: d = T_GD + ISC                  by B-CNAV1 and B-CNAV2
+    both together, by their power: B1C d = T_GD + ISC / 4, B2a d = T_GD + ISC / 2
+B-CNAV1 has T_GD of both and the ISC of B1C, B-CNAV2 that of B2a. A clock of either message refers
+to B3I.
 
-Without a broadcast delay, so refused by name: BeiDou B1C and B2a (B-CNAV only), Galileo E5 as a
-whole and E6.
+Without a broadcast delay, so refused by name: BeiDou B1C and B2a until B-CNAV has come, B1I and B2I
+until D1 or D2 has, Galileo E5 as a whole and E6.
 
 E5a with an I/NAV clock: both clocks serve E1, so dt_F - BGDa = dt_I - BGDb there, and dt_F follows.
 L5: the inter-signal correction is in CNAV only. IS-GPS-705J 20.3.3.3.1.2.1 has it within
 +-2^-35 2^12 = 120 ns, in orbit it is a few ns: 3 m.
 
 Source: IS-GPS-200N 20.3.3.3.3.2; Galileo OS SIS ICD 2.1 5.1.5; BDS-SIS-ICD-B1I-3.0 5.2.4
-(equipment group delay), BDS-SIS-ICD-B3I-1.0 5.2.4 (B3I takes none).
+(equipment group delay), BDS-SIS-ICD-B3I-1.0 5.2.4 (B3I takes none), BDS-SIS-ICD-B1C-1.0 7.6 and
+BDS-SIS-ICD-B2a-1.0 7.6 (T_GD, ISC), 4.2 of both (power of the components).
 """
 
 from __future__ import annotations
@@ -41,6 +46,9 @@ class GroupDelay(NamedTuple):
 _L1_L2 = (CARRIER_HZ["G", "1"] / CARRIER_HZ["G", "2"]) ** 2
 _E1_E5A = (CARRIER_HZ["E", "1"] / CARRIER_HZ["E", "5"]) ** 2
 _E1_E5B = (CARRIER_HZ["E", "1"] / CARRIER_HZ["E", "7"]) ** 2
+_DATA_BAND = {"bcnav1": "1", "bcnav2": "5"}
+"""Band of the data component whose ISC a message has."""
+_DATA_SHARE = {"1P": 0.0, "1D": 1.0, "1X": 0.25, "5P": 0.0, "5D": 1.0, "5X": 0.5}
 
 
 def group_delay(ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
@@ -50,6 +58,8 @@ def group_delay(ephemeris: Ephemeris, signal: str) -> GroupDelay | None:
         return _gps(band, delays)
     if ephemeris.system == "E":
         return _galileo(band, delays, ephemeris.message)
+    if ephemeris.message in _DATA_BAND:
+        return _bcnav(signal, delays, _DATA_BAND[ephemeris.message])
     return _beidou(band, signal, delays)
 
 
@@ -79,3 +89,13 @@ def _beidou(band: str, signal: str, delays: tuple[float, ...]) -> GroupDelay | N
     if at is None or (band == "7" and signal[1] not in "IQX") or at >= len(delays):
         return None
     return GroupDelay(delays[at])
+
+
+def _bcnav(signal: str, delays: tuple[float, ...], data_band: str) -> GroupDelay | None:
+    """`delays` (T_GD of B1C's pilot, T_GD of B2a's, ISC of the data component on `data_band`)."""
+    if signal[0] == "6":
+        return GroupDelay(0.0)
+    share = _DATA_SHARE.get(signal)
+    if share is None or len(delays) < 3 or (share and signal[0] != data_band):
+        return None
+    return GroupDelay(delays[0 if signal[0] == "1" else 1] + share * delays[2])

@@ -1,6 +1,7 @@
 r"""Satellite position, velocity and clock from a broadcast Keplerian ephemeris.
 
-    A = sqrtA^2,  n = sqrt(GM / A^3) + dn,  M = M0 + n tk,  M = E - e sin E
+    A0 = sqrtA^2,  A = A0 + Adot tk,  n = sqrt(GM / A0^3) + dn,  M = M0 + (n + n' tk / 2) tk
+    M = E - e sin E
     phi = atan2(sqrt(1 - e^2) sin E, cos E - e) + omega
     u = phi + cus sin 2phi + cuc cos 2phi
     r = A (1 - e cos E) + crs sin 2phi + crc cos 2phi
@@ -11,16 +12,17 @@ r"""Satellite position, velocity and clock from a broadcast Keplerian ephemeris.
     dt = a0 + a1 (t - toc) + a2 (t - toc)^2 + F e sqrtA sin E,   F = -2 sqrt(GM) / c^2
 
 tk = t - toe, t the system time of transmission; R(x) are rotations of the axes. Velocity and clock
-drift are the derivatives of these lines by t; Edot = n / (1 - e cos E) carries them all. Angles
-rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS agree to
-centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv); the
-relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
+drift are the derivatives of these lines by t; Edot = (n + n' tk) / (1 - e cos E) carries all.
+Angles rad, lengths m, times s; ECEF is that of the instant of transmission (WGS 84, GTRF and BDCS
+agree to centimetres). A satellite that its clock says sent at t_sv sent at t = t_sv - dt(t_sv);
+the relativistic term is left out of this one step: 50 ns move a satellite 0.2 mm.
 
 BeiDou's time is 14 s behind GPS time. It is settled here and nowhere else: `Orbits` is asked in GPS
 time, and toe and toc are moved to GPS time when they come in; `we toe` keeps the system's own toe.
 
 Source: IS-GPS-200N 20.3.3.3.3.1, 20.3.3.4.3 and table 20-IV; BDS-SIS-ICD-B1I-3.0 5.2.4
-(ephemeris parameters, with the rotation for GEO); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4.
+(ephemeris parameters, with the rotation for GEO); BDS-SIS-ICD-B1C-1.0 7.7 (Adot and n', which
+are 0 elsewhere); Galileo OS SIS ICD 2.1 5.1.1 and 5.1.4.
 """
 
 from __future__ import annotations
@@ -44,6 +46,8 @@ BDT_WEEK_0_IN_GPS_WEEKS = 1356
 """2006-01-01, where BeiDou's weeks start."""
 
 GEO_TILT_RAD = math.radians(-5.0)
+_TILTED = ("d1", "d2")
+"""Messages whose GEO orbits are so; B-CNAV knows no GEO."""
 
 
 class Constants(NamedTuple):
@@ -77,11 +81,12 @@ def gps_time(system: System, week: int, seconds: float) -> tuple[int, float]:
 
 
 # Columns of the elements' array.
-_COLUMNS = 31
+_COLUMNS = 33
 (
     _WEEK, _TOE, _TOC, _RATE, _F, _GEO, _OWN_TOE, _SQRT_A, _E, _ROOT, _COS_I0, _SIN_I0, _NODE,
     _COS_PERIGEE, _SIN_PERIGEE, _M0, _MOTION, _I_RATE, _NODE_RATE, _CUC, _CUS, _CRC, _CRS, _CIC,
-    _CIS, _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK,
+    _CIS, _A0, _A1, _A2, _COS_TILT, _SIN_TILT, _TOC_WEEK, _AXIS_RATE,
+    _MOTION_RATE,
 ) = range(_COLUMNS)  # fmt: skip
 
 
@@ -104,7 +109,7 @@ def satellite_states(
 ) -> None:
     """Write (n, 8): position m, velocity m/s, clock offset s and drift s/s.
 
-    `elements` (n, 31) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
+    `elements` (n, 33) rows of `Orbits`; `week`, `tow` (n,) GPS time of transmission, as the
     satellite's own clock has it if `by_satellite_clock`.
     """
     for k in range(elements.shape[0]):
@@ -120,8 +125,8 @@ def satellite_states(
             tk -= step
         sqrt_a = q[_SQRT_A]
         ecc = q[_E]
-        axis = sqrt_a * sqrt_a
-        mean = q[_M0] + q[_MOTION] * tk
+        axis = sqrt_a * sqrt_a + q[_AXIS_RATE] * tk
+        mean = q[_M0] + (q[_MOTION] + 0.5 * q[_MOTION_RATE] * tk) * tk
         anomaly = mean + ecc * math.sin(mean)
         cos_e, sin_e = math.cos(anomaly), math.sin(anomaly)
         for _ in range(12):  # Newton: two steps at e = 0.02; one more is the last one squared
@@ -134,7 +139,7 @@ def satellite_states(
             if abs(change) < 1e-8:
                 break
         nearness = 1.0 - ecc * cos_e
-        anomaly_rate, root = q[_MOTION] / nearness, q[_ROOT]
+        anomaly_rate, root = (q[_MOTION] + q[_MOTION_RATE] * tk) / nearness, q[_ROOT]
         sin_true, cos_true = root * sin_e / nearness, (cos_e - ecc) / nearness
         cos_phi = cos_true * q[_COS_PERIGEE] - sin_true * q[_SIN_PERIGEE]
         sin_phi = sin_true * q[_COS_PERIGEE] + cos_true * q[_SIN_PERIGEE]
@@ -143,6 +148,7 @@ def satellite_states(
         u_rate = phi_rate * (1.0 + 2.0 * (q[_CUS] * c2 - q[_CUC] * s2))
         r = axis * nearness + q[_CRS] * s2 + q[_CRC] * c2
         r_rate = axis * ecc * sin_e * anomaly_rate + 2.0 * phi_rate * (q[_CRS] * c2 - q[_CRC] * s2)
+        r_rate += q[_AXIS_RATE] * nearness
         inc_rate = q[_I_RATE] + 2.0 * phi_rate * (q[_CIS] * c2 - q[_CIC] * s2)
         we = q[_RATE]
         geo = q[_GEO] > 0.0
@@ -178,7 +184,7 @@ def satellite_states(
 
 
 def elements_row(ephemeris: Ephemeris) -> Array:
-    """One ephemeris as the row (31,) that `satellite_states` takes."""
+    """One ephemeris as the row (33,) that `satellite_states` takes."""
     e = ephemeris
     constants = CONSTANTS[e.system]
     week, toe = gps_time(e.system, e.week, e.toe_s)
@@ -189,12 +195,13 @@ def elements_row(ephemeris: Ephemeris) -> Array:
     motion = math.sqrt(constants.gm / axis) / axis + e.mean_motion_correction
     values = (
         week, toe, toc, constants.earth_rate, constants.relativity,
-        is_beidou_geo(e.system, e.prn), e.toe_s, e.sqrt_a, e.eccentricity,
+        is_beidou_geo(e.system, e.prn) and e.message in _TILTED, e.toe_s, e.sqrt_a, e.eccentricity,
         math.sqrt(1.0 - e.eccentricity * e.eccentricity), math.cos(e.inclination),
         math.sin(e.inclination), e.ascending_node, math.cos(e.perigee), math.sin(e.perigee),
         e.mean_anomaly, motion, e.inclination_rate, e.ascending_node_rate, e.cuc, e.cus, e.crc,
         e.crs, e.cic, e.cis, e.clock_bias_s, e.clock_drift, e.clock_drift_rate,
-        math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week,
+        math.cos(GEO_TILT_RAD), math.sin(GEO_TILT_RAD), toc_week, e.semi_major_rate,
+        e.mean_motion_rate,
     )  # fmt: skip
     return np.array(values, float)
 
@@ -210,7 +217,7 @@ class SatelliteStates(NamedTuple):
 
 @immutable()
 class Orbits:
-    """Ephemerides of n satellites, stacked once: `elements` (n, 31)."""
+    """Ephemerides of n satellites, stacked once: `elements` (n, 33)."""
 
     elements: Array
 

@@ -87,7 +87,7 @@ def range_rows(
     """Write (21, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 31), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
+    `elements` (n, 33), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
     BeiDou's coefficients; `noise` (8,).
     """
     n = elements.shape[0]

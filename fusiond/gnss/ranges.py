@@ -52,7 +52,7 @@ Array = npt.NDArray[np.float64]
 PREFERRED: dict[System, tuple[str, ...]] = {
     "G": ("1C", "1W", "1P", "2W", "2L", "2S", "2X", "5Q", "5I", "5X"),
     "E": ("1C", "1B", "1X", "7Q", "7I", "7X", "5Q", "5I", "5X"),
-    "C": ("2I", "2X", "6I", "6X", "7I", "7X"),
+    "C": ("2I", "2X", "6I", "6X", "1P", "1X", "1D", "5P", "5X", "5D", "7I", "7X"),
 }
 """Signals that have a broadcast group delay, best known first."""
 

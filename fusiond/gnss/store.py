@@ -25,8 +25,16 @@ KEPT_ISSUES = 4
 
 Missing = Literal["no_ephemeris", "unhealthy", "stale_ephemeris"]
 
-_MESSAGES: dict[tuple[System, str], tuple[str, ...]] = {("E", "5"): ("fnav", "inav")}
-_OTHERS: dict[System, tuple[str, ...]] = {"G": ("lnav",), "E": ("inav", "fnav"), "C": ("d1", "d2")}
+_MESSAGES: dict[tuple[System, str], tuple[str, ...]] = {
+    ("E", "5"): ("fnav", "inav"),
+    ("C", "1"): ("bcnav1", "bcnav2", "d1", "d2"),
+    ("C", "5"): ("bcnav2", "bcnav1", "d1", "d2"),
+}
+_OTHERS: dict[System, tuple[str, ...]] = {
+    "G": ("lnav",),
+    "E": ("inav", "fnav"),
+    "C": ("d1", "d2", "bcnav1", "bcnav2"),
+}
 
 
 class EphemerisStore:
@@ -64,7 +72,8 @@ class EphemerisStore:
     ) -> Ephemeris | Missing:
         """The ephemeris for a GPS time, or why there is none.
 
-        `band` (first character of a signal): Galileo's clock for E5a is that of F/NAV.
+        `band` (first character of a signal): Galileo's clock for E5a is that of F/NAV, BeiDou's
+        delays for B1C and B2a are in B-CNAV; without it D1 is given, which has none.
         """
         outcome: Missing = "no_ephemeris"
         for message in _MESSAGES.get((system, band), _OTHERS[system]):

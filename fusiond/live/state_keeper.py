@@ -103,7 +103,7 @@ class StateKeeper:
         try:
             return SavedState(
                 utc_ns * 1e-9,
-                (s.lat_rad, s.lon_rad, s.height_m),
+                (s.lat_rad, s.lon_rad, None if math.isnan(s.height_m) else s.height_m),
                 math.hypot(s.sd_ned_m[0], s.sd_ned_m[1]),
                 s.rpy_rad[2],
                 s.sd_rpy_rad[2],

@@ -9,6 +9,13 @@ from math import nan
 from drivers.immutable import immutable
 
 Vector3 = tuple[float, float, float]
+HEIGHT_KNOWN_SD_M = 200.0
+"""A height with a larger sigma is not known, and not published. The poorest that anything measures
+are altitudes above the sea without a geoid (62 m) and pressures without the weather (85 m); what
+nothing has measured starts at 3,464 m, and gravity alone makes 700 m of that in minutes."""
+HELD_UNKNOWN_M = 0.5
+"""A model that holds the height holds 0, to within this, where its start knew none: what updates
+round off, and the way of the first step."""
 _UNKNOWN: Vector3 = (nan, nan, nan)
 
 
@@ -55,7 +62,8 @@ class Solution:
     `t_ns` host monotonic. Position geodetic (rad, rad, m, WGS 84); velocity NED (m/s); attitude
     roll, pitch, yaw (rad, NED to body, 3-2-1). `sd_ned_m` metres north, east, down. Every figure is
     NaN while it is not known: while `mode` is WAITING or ALIGNING, and for an instant before the
-    history that is kept; a sigma also where the model holds the figure.
+    history that is kept; height and its sigma while nothing has told the height
+    (`HEIGHT_KNOWN_SD_M`); a sigma also where the model holds the figure.
     """
 
     t_ns: int

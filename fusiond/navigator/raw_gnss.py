@@ -156,10 +156,11 @@ class RawGnss:
         else:
             self._guess = found.position
             offers = self._fix(found, aid.t_ns)
+        left_out = aid.picked.plan.refused
         if self._guess is not None:
-            rows = self._model.evaluate(aid.picked, self._guess)
-            self._judged, self._left_out = None, dict(rows.refused)
-            self._count(aid, rows)
+            left_out = self._model.evaluate(aid.picked, self._guess).refused
+        self._judged, self._left_out = None, dict(left_out)
+        self._count(aid, left_out)
         return offers
 
     def correct(self, aid: RawEpochAid, guess: Array) -> tuple[Rows, PseudorangeAid]:
@@ -194,7 +195,7 @@ class RawGnss:
         """The filter has looked at an epoch; one that a rewind brings again counts once."""
         self._judged = aid, corrected, codes, whitened
         self._guess = corrected.guess
-        self._count(aid, corrected.rows)
+        self._count(aid, corrected.rows.refused)
         if not codes or aid.t_ns <= self._counted_ns:
             return
         self._counted_ns = aid.t_ns
@@ -204,11 +205,11 @@ class RawGnss:
             if code != KEPT:
                 self.refused[f"{satellite[0]}_{what}_{REASONS.get(code, 'gated')}"] += 1
 
-    def _count(self, aid: RawEpochAid, rows: Rows) -> None:
+    def _count(self, aid: RawEpochAid, refused: Sequence[tuple[str, str]]) -> None:
         """Satellites that do not serve, once an epoch."""
         if not aid.memory.counted:
             aid.memory.counted = True
-            for satellite, reason in rows.refused:
+            for satellite, reason in refused:
                 self.refused[f"{satellite[0]}_{reason}"] += 1
 
     def sky(self) -> Sky:

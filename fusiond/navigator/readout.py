@@ -9,7 +9,7 @@ import numpy as np
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.propagation import published_ahead
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.solution import Bound, Mode, Solution
+from fusiond.navigation.solution import HEIGHT_KNOWN_SD_M, HELD_UNKNOWN_M, Bound, Mode, Solution
 from fusiond.navigation.strapdown import NAV_SIZE
 
 _SIZE = NAV_SIZE + 3
@@ -38,6 +38,8 @@ def solution_of(
     sd, bias = e.sigmas().tolist(), errors.tolist()
     for k in model.unstated:
         sd[k] = math.nan
+    if sd[2] > HEIGHT_KNOWN_SD_M or (model.hold_height and abs(height) < HELD_UNKNOWN_M):
+        height = sd[2] = math.nan
     return Solution(
         t_ns,
         mode,

@@ -30,13 +30,14 @@ STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class SavedState:
-    """Position (rad, rad, m), yaw (rad) and sigmas of a vehicle at rest, with POSIX time (s).
+    """Position (rad, rad, m), yaw (rad) and sigmas of a vehicle at rest, with POSIX time (s); no
+    height where it is not known.
 
     Raises pydantic's `ValidationError` for what no vehicle can have.
     """
 
     utc_s: Annotated[float, Field(ge=0.0, le=1e11)]
-    position: tuple[Latitude, Longitude, Height]
+    position: tuple[Latitude, Longitude, Height | None]
     sd_position_m: PositionSigma
     yaw_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)]
     sd_yaw_rad: Annotated[float, Field(gt=0.0, le=2.0 * math.pi)]

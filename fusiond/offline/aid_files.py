@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +25,16 @@ from drivers.measurements import (
 from drivers.raw.messages import RawEvent, RawGnssEpoch
 from drivers.rounding import rounded_speed
 from drivers.standard_atmosphere import pressure_height_m
-from fusiond.configuration.aiding import Aiding, RawAiding, SarAiding, StarTrackerAiding
+from fusiond.configuration.aiding import (
+    Aiding,
+    BarometerAiding,
+    GnssAiding,
+    RawAiding,
+    RdssAiding,
+    SarAiding,
+    StarTrackerAiding,
+    WheelAiding,
+)
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.tables import (
@@ -38,46 +46,58 @@ from fusiond.files.tables import (
     read_rdss,
     read_wheel,
 )
-from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
+from fusiond.offline.nmea_file import EARLIEST_DATE, Receiver, read_nmea, receiver_of
 
 Array = NDArray[np.float64]
 
-# A recording may be old; before selective availability ended there was no receiver worth replaying.
-EARLIEST_DATE = date(2000, 5, 1)
 SECONDS_OF_WEEK = 604800.0
 FEWEST_VALUES = 20
 """Of n different values without steps the two nearest lie some (range / n^2) apart: of twenty, a
 step of a four-hundredth of the range is seen at most, which adds nothing to any sigma."""
 
 
+OF_A_RECEIVER = frozenset({"nmea", "ubx", "bestpos", "sbf"})
+"""Kinds that are fixes of a receiver, as its own protocol states them."""
 _REFUSALS = ("unreadable", "bad", "checksum", "mixed", "cut", "invalid", "unset", "unknown")
 
 
 class Arrival(NamedTuple):
-    """A measurement, or what a satellite broadcast, when it came, and one sigma of its instant."""
+    """A measurement, or what a satellite broadcast, when it came, and one sigma of its instant;
+    `utc_ns` where the device stamped it with its date (POSIX)."""
 
     t_arrival_ns: int
     measurement: Measurement | RawEvent
     sd_time_s: float = 0.0
+    utc_ns: int | None = None
+
+
+_SECTIONS: dict[str, type[Aiding]] = {
+    "gnss": GnssAiding,
+    "nmea": GnssAiding,
+    "ubx": GnssAiding,
+    "bestpos": GnssAiding,
+    "sbf": GnssAiding,
+    "rdss": RdssAiding,
+    "wheel": WheelAiding,
+    "barometer": BarometerAiding,
+    "attitude": StarTrackerAiding,
+    "bearing": SarAiding,
+    "raw": RawAiding,
+}
 
 
 def source_of(kind: str, config: Config) -> str:
     """The source that a file's measurements are taken to come from.
 
-    The kind of the file (`gnss` for `nmea`); an attitude is a star tracker's where the
-    configuration has one and no [aiding.attitude], a bearing that of the configured radar, raw data
-    that of the section of kind `raw`.
+    The kind of the file (`gnss` for those of a receiver, `sar` for `bearing`), or else the first
+    section of that kind of aid in the configuration; an attitude is a star tracker's where there is
+    one and no [aiding.attitude], raw data are of the section of kind `raw`.
     """
-    sections: dict[str, type[Aiding]] = {
-        "attitude": StarTrackerAiding,
-        "bearing": SarAiding,
-        "raw": RawAiding,
-    }
-    wanted = sections.get(kind)
-    if wanted is None or kind in config.aiding:
-        return "gnss" if kind == "nmea" else kind
-    fallback = "sar" if kind == "bearing" else kind
-    return next((n for n, s in config.aiding.items() if isinstance(s, wanted)), fallback)
+    name = "gnss" if kind in OF_A_RECEIVER else {"bearing": "sar"}.get(kind, kind)
+    if name in config.aiding or kind in config.aiding:
+        return name if name in config.aiding else kind
+    wanted = _SECTIONS[kind]
+    return next((n for n, s in config.aiding.items() if isinstance(s, wanted)), name)
 
 
 def _ns(t_s: float) -> int:
@@ -222,42 +242,42 @@ def _read_barometer(path: Path, _: ImuTable, source: str) -> _Read:
 
 
 def _read_nmea(path: Path, imu: ImuTable, source: str) -> _Read:
+    """By the decoders' own options."""
+    return read_nmea_by(path, imu, receiver_of(source, Config()))
+
+
+def read_nmea_by(path: Path, imu: ImuTable, by: Receiver) -> _Read:
     """NMEA as it came off the wire. The bytes hold UTC, so the IMU's `t_s` must be a time that UTC
     maps to: GPS second of week (below 604800) or POSIX seconds."""
-    from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding  # noqa: PLC0415
-
-    decoder = NmeaDecoder(source, NmeaDecoding(earliest_date=EARLIEST_DATE))
-    found = [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
-    rows = []
-    for m in found:
-        if not isinstance(m, PositionFix) or not isinstance(m.stamp, UtcStamp):
-            continue
-        t_ns = m.stamp.utc_ns
-        if of_week:
-            t_ns = _ns(utc_ns_to_gps_week_seconds(t_ns))
-        rows.append(Arrival(t_ns, replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))))
-    if found and not rows:
-        raise TableError(f"{path}: no fix with a date (RMC or ZDA missing)")
-    refused = counted(decoder.counters)
-    return rows, [r for r in refused if r.reason.endswith(("refused", "no_fix", "checksum"))]
+    posix = len(imu.t_s) and not of_week
+    imu_s = (float(imu.t_s[0]), float(imu.t_s[-1])) if posix else None
+    heard, refused = read_nmea(path, imu_s, by)
+    return [Arrival(each.t_ns, each.measurement, utc_ns=each.utc_ns) for each in heard], refused
 
 
 def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
-    """UBX or RTCM 3 as it came off the wire. An epoch's time is GPS time: the IMU's `t_s` must be
-    GPS second of week or POSIX seconds.
+    """UBX or RTCM 3 as it came off the wire, or RINEX. An epoch's time is GPS time: the IMU's `t_s`
+    must be GPS second of week or POSIX seconds.
 
     What the satellites broadcast is known from the first epoch on, as to a receiver that has been
     on for some minutes: a recording that starts in the middle would take half a minute to several
     to say it again.
     """
     from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
+    from fusiond.offline.receiver_logs import content, read_rinex, rinex_text  # noqa: PLC0415
 
+    data = content(path)
+    text = rinex_text(path, data)
+    if text is not None:
+        return read_rinex(path, text, imu, source)
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+    if not of_week and len(imu.t_s):
+        decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are those of the IMU's time
     epochs: list[Arrival] = []
     broadcast: list[RawEvent] = []
-    for event in [*decoder.feed(path.read_bytes(), 0), *decoder.flush()]:
+    for event in [*decoder.feed(data, 0), *decoder.flush()]:
         if not isinstance(event, RawGnssEpoch):
             broadcast.append(event)
             continue
@@ -266,7 +286,7 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
             now = event.stamp.utc_ns
         epochs.append(Arrival(now, replace(event, t_seen_ns=now, stamp=MonotonicStamp(now))))
     if not epochs:
-        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX or RTCM 3 MSM)")
+        raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)")
     refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
     return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused

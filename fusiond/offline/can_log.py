@@ -2,49 +2,63 @@
 
 Frames go to the very drivers that the configuration names, and their stamps to the daemon's own
 `Clock`, whose host lives by the log: the recorder's stamp of a frame is the instant at which it
-came. Times are those of the log, POSIX seconds where the recorder knew the date.
+came, and its clock is the system's, which may be set (fusiond.clock.recorder). Times are those of
+the log, POSIX seconds where the recorder knew the date; where its clock was set, they are those of
+the clock as it was at the end.
 """
 
 from __future__ import annotations
 
-import contextlib
-import gzip
-import importlib.util
-import struct
-import zlib
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain, pairwise
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from drivers.base import Emitted
+from drivers.base import Emit, Emitted
 from drivers.can.bus import CanFrame
 from drivers.can.driver import CanDriver
 from drivers.can.imu import CanImuDriver
-from drivers.can.python_can import can, with_mf4
+from drivers.can.python_can import can
 from drivers.measurements import (
     DeviceEvent,
     ImuSample,
     MonotonicStamp,
     TimeReport,
+    UtcStamp,
 )
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from fusiond.clock import dates
 from fusiond.clock.clock import Clock
+from fusiond.clock.recorder import (
+    AHEAD_NS,
+    ENOUGH_REPORTS,
+    FOLLOWING,
+    LEAP_NS,
+    REPORTS,
+    RecorderClock,
+    set_by,
+)
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
+from fusiond.files.csv_tables import Rejection, TableError, counted
 from fusiond.files.tables import ImuTable
 from fusiond.offline.aid_files import Arrival
+from fusiond.offline.can_frames import Refusals, channels, messages
 
-FORMATS = (".log", ".asc", ".blf", ".mf4")
-"""candump -L or -l, Vector's text and binary, ASAM MDF 4; each may end in .gz but for the last."""
-AHEAD_NS = 1_000_000_000
-"""A stamp that is later than the next by more is damaged: a recorder writes as frames come, and two
-controllers' clocks agree better. Taken for the time, it would make all others too old."""
+REPORTS_WITHIN_NS = 120_000_000_000
+"""So far ahead reports of UTC are looked for where a clock may have been set: tunnels are shorter,
+and in two minutes a recorder's clock is off by 12 ms (100 ppm)."""
+OFF_S = 1.0
+"""By so much a recorder's clock is as likely slow as wrong: receivers report UTC a second late."""
+PAUSE_NS = 60_000_000_000
+"""Of a shorter pause the solution says enough; no bus that is awake is silent for so long."""
+LATEST_S = 9e9
+"""Seconds beyond which nanoseconds leave a 64-bit integer."""
 REFUSALS = {
     "wrong_length",
     "undecodable",
@@ -64,24 +78,34 @@ REFUSALS = {
 
 class CanLog(NamedTuple):
     """What a log holds: IMU samples with what was refused of them, aids with their arrivals,
-    refusals of frames (`can`) and by source of an aid; `events` (code, text)."""
+    refusals of frames (`can`) and by source of an aid; `events` (code, text); how many `frames`.
+
+    `units` are the samples of all units with their instants (ns), in the order in which they came,
+    where the configuration has a spare; `imu` is then of the first alone."""
 
     imu: ImuTable
     arrivals: list[Arrival]
     rejected: dict[str, list[Rejection]]
     events: list[tuple[str, str]]
+    frames: int
+    units: list[tuple[int, ImuSample]]
 
 
 class _LogTime:
-    """A host whose clocks are the log's: monotonic, real and boot time are that of the frame."""
+    """A host whose clocks are the log's: real time is the recorder's stamp of the frame, monotonic
+    and boot time that without what the recorder's clock was set by."""
 
     def __init__(self) -> None:
         self.t_ns = 0
+        self.stamp_ns = 0
 
     def monotonic_ns(self) -> int:
         return self.t_ns
 
-    realtime_ns = boottime_ns = monotonic_ns
+    boottime_ns = monotonic_ns
+
+    def realtime_ns(self) -> int:
+        return self.stamp_ns
 
 
 def read_can_log(path: Path, config: Config) -> CanLog:
@@ -94,60 +118,67 @@ class _Replay:
 
     def __init__(self, path: Path, config: Config) -> None:
         self._path = path
+        self._config = config
         self._host = _LogTime()
+        self._recorder = RecorderClock()
         self._clock = Clock(config.clock, self._host)
         self._events: list[tuple[str, str]] = []
-        self._clock.on_event = lambda code, text: self._events.append((code, text))
+        self._clock.on_event = self._clock_told
         self._arrivals: list[Arrival] = []
         self._imu: list[tuple[int, ImuSample]] = []
-        self._drivers = self._make_drivers(config)
+        self._reports: dict[str, deque[int]] = {}
+        """By source the last reports of UTC: the recorder's stamp less what was reported."""
+        self._silent_ns = (1, 0)
+        """Stamps from and to which nobody reports UTC."""
+        self._sources = _on_a_bus(config)
+        self._drivers = self._make_drivers(self._emit)
+        self._on_buses: dict[Any, list[CanDriver[Any]]] = {}
         if not self._drivers:
             raise TableError(f"{path}: the configuration has no source on a CAN bus")
 
-    def _make_drivers(self, config: Config) -> dict[str, CanDriver[Any]]:
-        points = driver_entry_points()
-        drivers: dict[str, CanDriver[Any]] = {}
-        for name, section in config.sources.items():
-            make = points[section.driver].load()
-            if issubclass(make, CanDriver):
-                options = make.Options(**section.options)
-                drivers[name] = make(name, options, self._emit, self._host.monotonic_ns)
-        return drivers
+    def _make_drivers(self, emit: Emit) -> dict[str, CanDriver[Any]]:
+        now_ns = self._host.monotonic_ns
+        return {name: make(name, o, emit, now_ns) for name, (make, o) in self._sources.items()}
 
     def run(self) -> CanLog:
         """Read the log to its end."""
-        buses = self._buses()
-        frames = Counter[str]()
-        damage: list[str] = []
-        whole = messages(self._path, damage.append)
-        for message, following in pairwise(chain(whole, (None,))):
-            assert message is not None
-            kind = _not_data(message)
-            if kind is not None:
-                frames[kind] += 1
+        self._on_buses = buses = self._buses()
+        refusals, refused = Refusals(), Counter[str]()
+        recorder, host = self._recorder, self._host
+        frames = _Ahead(messages(self._path, refusals, self._told), refused)
+        for message, stamp_ns in frames:
+            if message.channel not in buses:
+                refused["unknown_channel"] += 1
                 continue
-            t_ns = round(message.timestamp * 1e9)
-            if t_ns < self._host.t_ns:
-                frames["time_backwards"] += 1
-                continue
-            after_ns = t_ns if following is None else round(following.timestamp * 1e9)
-            if self._host.t_ns <= after_ns < t_ns - AHEAD_NS:
-                frames["time_ahead"] += 1
-                continue
-            self._host.t_ns = t_ns
-            can_id, extended = message.arbitration_id, message.is_extended_id
-            frame = CanFrame(can_id, extended, bytes(message.data), t_ns, t_ns)
+            of = message.channel, message.arbitration_id
+            if recorder.is_odd(stamp_ns, of):
+                before_ns, steps = recorder.stamp_ns, len(recorder.steps)
+                following = [ns for _, ns in frames.ahead(FOLLOWING)]
+                set_off = partial(self._set, frames, message, stamp_ns)
+                verdict = recorder.take(stamp_ns, of, following, set_off)
+                if verdict != "taken":
+                    refused[verdict] += 1
+                    continue
+                if len(recorder.steps) == steps and self._arrivals:
+                    self._tell_pause(stamp_ns - before_ns)
+            else:
+                recorder.next(stamp_ns, of)
+            host.t_ns, host.stamp_ns = recorder.t_ns, recorder.stamp_ns
+            frame = _frame(message, host.t_ns, stamp_ns)
             for driver in buses[message.channel]:
                 driver.feed(frame)
-        cut = [Rejection(0, "cut", f"the log ends in damage: {text}") for text in damage]
-        rejected, imu = {"can": [*counted(frames), *cut]}, self._imu_table()
+        refusals.count(refused)
+        self._tell_error()
+        self._shift()
+        rejected, imu = {"can": refusals.all()}, self._imu_table()
         for name, driver in self._drivers.items():
-            refused = counted({n: c for n, c in driver.counters.items() if n in REFUSALS})
+            odd = counted({n: c for n, c in driver.counters.items() if n in REFUSALS})
             if isinstance(driver, CanImuDriver):
-                imu.rejected.extend(refused)
+                imu.rejected.extend(odd)
             else:
-                rejected[name] = refused
-        return CanLog(imu, self._arrivals, rejected, self._events)
+                rejected[name] = odd
+        units = self._imu if self._config.imu.spare is not None else []
+        return CanLog(imu, self._arrivals, rejected, self._events, frames.number, units)
 
     def _buses(self) -> dict[Any, list[CanDriver[Any]]]:
         """Whose frames those of each channel of the log are.
@@ -155,30 +186,107 @@ class _Replay:
         A log of one channel is everybody's bus. In one of several each source has the channel of
         its name, or `canN` of number N.
         """
-        channels = sorted(_channels(self._path), key=str)
-        if not channels:
+        there = sorted(channels(self._path), key=str)
+        if not there:
             raise TableError(f"{self._path}: no CAN frame")
-        if len(channels) == 1:
-            return {channels[0]: list(self._drivers.values())}
-        buses: dict[Any, list[CanDriver[Any]]] = {channel: [] for channel in channels}
+        if len(there) == 1:
+            return {there[0]: list(self._drivers.values())}
+        buses: dict[Any, list[CanDriver[Any]]] = {channel: [] for channel in there}
         for name, driver in self._drivers.items():
             wanted = driver.options.channel
-            mine = [c for c in channels if wanted in (str(c), f"can{c}")]
+            mine = [c for c in there if wanted in (str(c), f"can{c}")]
             if not mine:
-                there = ", ".join(map(str, channels))
                 raise TableError(
-                    f"{self._path}: there are the channels {there}, and none is {wanted} of "
-                    f"[sources.{name}]"
+                    f"{self._path}: there are the channels {', '.join(map(str, there))}, and none "
+                    f"is {wanted} of [sources.{name}]"
                 )
             buses[mine[0]].append(driver)
         return buses
+
+    # ------------------------------------------------------------------ the recorder's clock
+
+    def _told(self, code: str, text: str) -> None:
+        self._events.append((code, text))
+
+    def _clock_told(self, code: str, text: str) -> None:
+        self._told(code, f"{text}, at {self._host.stamp_ns * 1e-9:.3f} s of the log")
+
+    def _tell_pause(self, passed_ns: int) -> None:
+        """A step of the clock and a pause look alike where no device tells UTC."""
+        if passed_ns > PAUSE_NS:
+            text = f"no frame for {passed_ns * 1e-9:.0f} s by the recorder's clock"
+            if not any(self._reports.values()):
+                text += ": a pause, or its clock was set, of which no device tells UTC"
+            self._told("recorder_paused", text)
+
+    def _tell_error(self) -> None:
+        """How far a recorder that knows the date is from a receiver's UTC at the end: a wrong zone
+        shows so."""
+        status = self._clock.status()
+        off_s = status.system_error_s or 0.0
+        if abs(off_s) >= OFF_S and dates.plausible(self._host.stamp_ns):
+            how = f"by {off_s:+.1f} s from the UTC of {status.utc_source}"
+            self._told("recorder_clock_off", f"the recorder's clock is off {how}")
+
+    def _set(self, frames: _Ahead, first: can.Message, first_ns: int) -> int | None:
+        """By how much the recorder's clock was set before this frame, by the reports of UTC of the
+        sources that have told it before and go on to tell it."""
+        known = {name for name, reports in self._reports.items() if reports}
+        if not known or self._silent_ns[0] <= first_ns <= self._silent_ns[1]:
+            return None
+        after: dict[str, list[int]] = {name: [] for name in known}
+        stamp_ns = first_ns
+
+        def emit(item: Emitted) -> None:
+            if isinstance(item, TimeReport) and item.trusted and item.source in known:
+                after[item.source].append(stamp_ns - item.utc_ns)
+
+        scouts = self._make_drivers(emit)
+        buses = self._scouted(scouts)
+        for driver in buses.get(first.channel, ()):
+            driver.feed(_frame(first, first_ns, first_ns))
+        for message, ns in frames.ahead():
+            leaps = not stamp_ns - AHEAD_NS < ns < stamp_ns + AHEAD_NS + LEAP_NS
+            if leaps or ns > first_ns + REPORTS_WITHIN_NS:
+                break
+            stamp_ns = max(stamp_ns, ns)
+            for driver in buses.get(message.channel, ()):
+                driver.feed(_frame(message, stamp_ns, stamp_ns))
+            if any(len(reports) >= ENOUGH_REPORTS for reports in after.values()):
+                break
+        if not any(after.values()):
+            self._silent_ns = first_ns, stamp_ns
+        found = (set_by(self._reports[name], reports) for name, reports in after.items())
+        return next((ns for ns in found if ns is not None), None)
+
+    def _scouted(self, scouts: dict[str, CanDriver[Any]]) -> dict[Any, list[CanDriver[Any]]]:
+        """The scouts in the places of the drivers."""
+        names = {id(driver): name for name, driver in self._drivers.items()}
+        return {
+            channel: [scouts[names[id(driver)]] for driver in drivers]
+            for channel, drivers in self._on_buses.items()
+        }
+
+    def _shift(self) -> None:
+        """Times by the recorder's clock as it was at the end."""
+        if not (set_ns := self._recorder.set_ns):
+            return
+        self._imu = [
+            (t_ns + set_ns, replace(m, t_seen_ns=m.t_seen_ns + set_ns)) for t_ns, m in self._imu
+        ]
+        self._arrivals = [_later(arrival, set_ns) for arrival in self._arrivals]
+
+    # ------------------------------------------------------------------ what drivers make
 
     def _emit(self, item: Emitted) -> None:
         """As `fusiond.live.sources` does, at the instant of the frame."""
         match item:
             case DeviceEvent():
-                self._events.append((item.code, f"{item.source}: {item.text}"))
+                self._told(item.code, f"{item.source}: {item.text}")
             case TimeReport():
+                if item.trusted:
+                    reports = self._reports.setdefault(item.source, deque(maxlen=REPORTS))
+                    reports.append(self._host.stamp_ns - item.utc_ns)
                 self._clock.report(item)
             case Ephemeris() | Klobuchar() | RawGnssEpoch():
                 raise AssertionError("no driver on a CAN bus has raw observations")
@@ -187,16 +295,18 @@ class _Replay:
                 if isinstance(item, ImuSample):
                     self._imu.append((instant.t_valid_ns, item))
                     return
+                utc_ns = item.stamp.utc_ns if isinstance(item.stamp, UtcStamp) else None
                 held = replace(item, stamp=MonotonicStamp(instant.t_valid_ns))
-                self._arrivals.append(Arrival(item.t_seen_ns, held, instant.sd_s))
+                self._arrivals.append(Arrival(item.t_seen_ns, held, instant.sd_s, utc_ns))
 
     def _imu_table(self) -> ImuTable:
         """Of the first source that has sent any, as the daemon does."""
-        first = self._imu[0][1].source if self._imu else ""
+        spare = self._config.imu.spare
+        spare_name = None if spare is None else spare.source
+        first = next((m.source for _, m in self._imu if m.source != spare_name), spare_name)
         kept = [(t_ns, m) for t_ns, m in self._imu if m.source == first]
         rejected = []
-        if len(kept) < len(self._imu):
-            others = len(self._imu) - len(kept)
+        if others := sum(m.source not in (first, spare_name) for _, m in self._imu):
             rejected.append(Rejection(0, "second_imu", f"{others} samples", others))
         times = np.array([t_ns for t_ns, _ in kept], dtype=np.int64)
         samples = [(*m.gyro_rad_s, *m.accel_m_s2) for _, m in kept]
@@ -204,79 +314,63 @@ class _Replay:
         return ImuTable(t_s, np.array(samples, dtype=np.float64).reshape(-1, 6), rejected)
 
 
-# --------------------------------------------------------------------------- frames
+def _on_a_bus(config: Config) -> dict[str, tuple[Any, Any]]:
+    """The class and the options of each driver of a source on a CAN bus."""
+    points = driver_entry_points()
+    made = ((name, points[s.driver].load(), s.options) for name, s in config.sources.items())
+    return {n: (make, make.Options(**o)) for n, make, o in made if issubclass(make, CanDriver)}
 
 
-def messages(path: Path, damaged: Callable[[str], None]) -> Iterator[can.Message]:
-    """The messages of a log in its order; `damaged` hears of what ends it before its end.
+class _Ahead:
+    """The data frames of a log with their stamps (ns), of which some may be looked at before they
+    are taken. What else a log holds is counted in `refused`."""
 
-    Raises `TableError` where there is no message to be read, `MissingPackageError` for MF4 without
-    asammdf, OSError for a file that cannot be opened.
-    """
-    suffix, zipped = _format(path)
-    count = 0
-    with contextlib.ExitStack() as stack:
-        try:
-            for message in _reader(path, suffix, zipped, stack):
-                count += 1
-                yield message
-        except _DAMAGE as error:
-            if not count:
-                raise TableError(f"{path}: cannot be read as {suffix}: {error}") from error
-            damaged(f"{type(error).__name__} after {count} frames: {error}")
+    def __init__(self, messages: Iterator[can.Message], refused: Counter[str]) -> None:
+        self._messages = messages
+        self._refused = refused
+        self._kept: deque[tuple[can.Message, int]] = deque()
+        self.number = 0
+        """Of all frames."""
 
+    def __iter__(self) -> Iterator[tuple[can.Message, int]]:
+        while True:
+            while self._kept:
+                yield self._kept.popleft()
+            if (each := self._read()) is None:
+                return
+            yield each
 
-def _format(path: Path) -> tuple[str, bool]:
-    """One of `FORMATS`, and whether it is zipped; by the name. Raises `TableError`."""
-    suffixes = [s.lower() for s in path.suffixes]
-    zipped = suffixes[-1:] == [".gz"]
-    suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
-    if suffix not in FORMATS or (zipped and suffix == ".mf4"):
-        raise TableError(f"{path}: no CAN log by its name: {', '.join(FORMATS)} are read")
-    return suffix, zipped
+    def ahead(self, number: int | None = None) -> Iterator[tuple[can.Message, int]]:
+        """Those that have not been taken, at most so many, in order; they remain."""
+        yield from list(islice(self._kept, number))
+        while number is None or len(self._kept) < number:
+            if (each := self._read()) is None:
+                return
+            self._kept.append(each)
+            yield each
 
-
-def _channels(path: Path) -> set[Any]:
-    """The channels of a log, up to where it is damaged. Raises as `messages` does.
-
-    What candump wrote says them in the second word of its lines: to parse every frame for that
-    takes as long as to parse it for the drivers.
-    """
-    suffix, zipped = _format(path)
-    found: set[Any] = set()
-    if suffix == ".log":
-        with contextlib.suppress(*_DAMAGE), (gzip.open if zipped else open)(path, "rt") as lines:
-            for words in filter(None, map(str.split, lines)):
-                if not words[2].partition("#")[1]:
-                    break
-                found.add(int(words[1]) if words[1].isdigit() else words[1])
-    return found or {m.channel for m in messages(path, lambda text: None)}
+    def _read(self) -> tuple[can.Message, int] | None:
+        for message in self._messages:
+            self.number += 1
+            if message.is_error_frame:
+                self._refused["error_frames"] += 1
+            elif message.is_remote_frame:
+                self._refused["remote_frames"] += 1
+            elif not -LATEST_S < message.timestamp < LATEST_S:  # NaN too
+                self._refused["time_out_of_range"] += 1
+            else:
+                return message, round(message.timestamp * 1e9)
+        return None
 
 
-_DAMAGE = (ValueError, LookupError, EOFError, struct.error, zlib.error, can.CanError)
-"""What the readers of python-can raise for a file that is not what it is called."""
+def _frame(message: can.Message, t_ns: int, stamp_ns: int) -> CanFrame:
+    can_id, extended = message.arbitration_id, message.is_extended_id
+    return CanFrame(can_id, extended, bytes(message.data), t_ns, stamp_ns)
 
 
-def _reader(path: Path, suffix: str, zipped: bool, stack: contextlib.ExitStack) -> Any:
-    """The reader of python-can; what it reads of is closed by `stack`."""
-    if suffix == ".mf4":
-        if importlib.util.find_spec("asammdf") is None:
-            raise MissingPackageError(
-                "MF4 logs need the package asammdf: pip install 'fusiond[mf4]'"
-            )
-        with_mf4()
-        return can.MF4Reader(path)
-    opened = gzip.open if zipped else open
-    source: Any = stack.enter_context(opened(path, "rb" if suffix == ".blf" else "rt"))
-    if suffix == ".blf":
-        return can.BLFReader(source)
-    if suffix == ".asc":
-        return can.ASCReader(source, relative_timestamp=False)
-    return can.CanutilsLogReader(source)
-
-
-def _not_data(message: can.Message) -> str | None:
-    """Whether a message is none of a device, as the bus counts it."""
-    if message.is_error_frame:
-        return "error_frames"
-    return "remote_frames" if message.is_remote_frame else None
+def _later(arrival: Arrival, by_ns: int) -> Arrival:
+    """The same, where all times are this much later."""
+    m: Any = arrival.measurement
+    seen_ns = m.t_seen_ns + by_ns
+    moved = replace(m, t_seen_ns=seen_ns, stamp=MonotonicStamp(m.stamp.t_ns + by_ns))
+    return arrival._replace(t_arrival_ns=arrival.t_arrival_ns + by_ns, measurement=moved)

@@ -59,7 +59,6 @@ def errors_of(solution: TrajectoryTable, truth: TrajectoryTable, after_s: float 
     Raises `NothingToCompareError`.
     """
     usable = np.isfinite(solution.lat_rad) & np.isfinite(solution.lon_rad)
-    usable &= np.isfinite(solution.height_m)
     start = float(solution.t_s[0]) + after_s if len(solution.t_s) else np.inf
     at = _Epochs(solution.t_s, usable, truth.t_s)
     chosen = at.bridged & (truth.t_s >= start)

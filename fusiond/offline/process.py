@@ -11,14 +11,14 @@ import gc
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.measurements import Measurement
+from drivers.measurements import Measurement, UtcStamp
 from drivers.raw.messages import RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import GnssAiding, WheelAiding
 from fusiond.configuration.schema import Config
@@ -30,6 +30,7 @@ from fusiond.integrity.catalogue import Kind
 from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import longest_step
 from fusiond.navigator.filters import estimator_of
+from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.offline.aid_files import Arrival
 from fusiond.offline.outages import Outage
@@ -41,8 +42,9 @@ if TYPE_CHECKING:
     from fusiond.offline.smooth import SmoothedRows
 
 # Samples handed over at once where no late aid arrives in between: the solution's mode is judged at
-# this spacing, and memory stays bounded.
-CHUNK = 512
+# this spacing, and what ends the navigation is noticed at it, by which time later aids have been
+# handed over. At 100 Hz that is half a second; ten times as many take a seventh less time.
+CHUNK = 50
 # Objects that are made before the garbage collector looks through them: some 10 MB.
 YOUNG = 50_000
 _SHOWN = 20
@@ -112,10 +114,14 @@ def _process(
     smoothed = _smoothed(navigator, writer) if smooth and writer is not None else None
     recorder = _Recorder(navigator, writer, smoothed, watch)
     if why is None:
-        _run(navigator, imu, arrivals, recorder, progress)
+        if read.units:
+            _run_units(navigator, read, recorder, progress)
+        else:
+            _run(navigator, imu, arrivals, recorder, progress)
+        recorder.close()
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     if why is None and not recorder.rows:
-        why = nothing_navigated(read.files, navigator.refused, reason)
+        why = nothing_navigated(read.files, refusals_of(navigator), reason)
     return {
         **({} if smoothed is None else {"smoothed": smoothed.counts()}),
         "files": {name: _account(file) for name, file in read.files.items()},
@@ -151,12 +157,21 @@ def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
     return SmoothedRows(navigator, writer)
 
 
+def refusals_of(navigator: Navigator) -> dict[str, Counter[str]]:
+    """What was refused by source and name, satellites of raw epochs among it."""
+    found = {source: Counter(refused) for source, refused in navigator.refused.items()}
+    for source, receiver in navigator.raw.items():
+        if receiver.refused:
+            found.setdefault(source, Counter()).update(receiver.refused)
+    return found
+
+
 def outcomes_of(navigator: Navigator, withheld: Mapping[str, int]) -> dict[str, dict[str, int]]:
     """Of each source's measurements, by name."""
     sources: dict[str, dict[str, int]] = {}
     for source, outcomes in navigator.timeline.counters.outcomes.items():
         sources[source] = {name: count for name, count in outcomes.items() if count}
-    for source, refused in navigator.refused.items():
+    for source, refused in refusals_of(navigator).items():
         sources.setdefault(source, {}).update(refused)
     for source, count in withheld.items():
         if count:
@@ -183,17 +198,38 @@ def _run(
 ) -> None:
     times = np.rint(imu.t_s * 1e9).astype(np.int64)
     # A sample is there once its time has come; its own time offset shifts validity, not arrival.
+    # One whose stamp goes back comes no earlier for that.
+    came = np.maximum.accumulate(times)
     # So many samples have come when arrival k comes.
-    breaks = np.searchsorted(times, [a.t_arrival_ns for a in arrivals], side="right").tolist()
+    breaks = np.searchsorted(came, [a.t_arrival_ns for a in arrivals], side="right").tolist()
     late = _late(arrivals, navigator.config)
     gap_ns = round(navigator.config.imu.gap_s * 1e9)
+    tick_ns = round(1e9 / navigator.config.scheduler.rate_hz)
     done = given = told = 0
     while done < len(times) or given < len(arrivals):
+        if done - told >= _TOLD_EVERY:
+            told = done
+            progress(done, len(times))
+        if navigator.started is None:
+            # The daemon tries to align at each tick, with all that has come until then.
+            begin = [int(t) for t in came[done : done + 1]]
+            begin += [a.t_arrival_ns for a in arrivals[given : given + 1]]
+            now_ns = -(-min(begin) // tick_ns) * tick_ns
+            while given < len(arrivals) and arrivals[given].t_arrival_ns <= now_ns:
+                _give(navigator, arrivals[given])
+                given += 1
+            upto = done + int(np.searchsorted(came[done : done + CHUNK], now_ns, side="right"))
+            if upto > done:
+                navigator.add_imu(times[done:upto], imu.samples[done:upto])
+            navigator.advance(record=True)
+            recorder.take()
+            done = upto
+            continue
         # Samples up to the next arrival that must find the filter where it then stood. One that is
         # valid when it comes need not: the timeline keeps it until the samples reach it.
         ahead = given
         upto = min(len(times), done + CHUNK)
-        alone = navigator.started is None or _has_gap(times[max(done - 1, 0) : upto], gap_ns)
+        alone = _has_gap(times[max(done - 1, 0) : upto], gap_ns)
         while ahead < len(arrivals) and breaks[ahead] <= upto:
             if alone or late[ahead]:
                 upto = breaks[ahead]
@@ -206,23 +242,54 @@ def _run(
         navigator.advance(record=True)
         recorder.take()
         given, done = ahead, upto
-        if done - told >= _TOLD_EVERY:
-            told = done
-            progress(done, len(times))
         if given < len(arrivals) and breaks[given] <= done and (alone or late[given]):
             _give(navigator, arrivals[given])
             given += 1
             navigator.advance(record=True)
             recorder.take()
-    recorder.close()
+
+
+def _run_units(
+    navigator: Navigator,
+    read: Recorded,
+    recorder: _Recorder,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Tick by tick, as in the daemon, which of two inertial units is used."""
+    units, arrivals = read.units, read.arrivals
+    choice = ImuChoice(
+        read.config.imu, lambda _, code, text: read.events.append({"code": code, "text": text})
+    )
+    tick_ns = round(1e9 / read.config.scheduler.rate_hz)
+    seen = [units[k][1].t_seen_ns for k in (0, -1)] + [a.t_arrival_ns for a in arrivals[-1:]]
+    taken = given = 0
+    for k in range(seen[0] // tick_ns, max(seen) // tick_ns + 2):
+        now_ns = k * tick_ns
+        while given < len(arrivals) and arrivals[given].t_arrival_ns <= now_ns:
+            _give(navigator, arrivals[given])
+            given += 1
+        while taken < len(units) and units[taken][1].t_seen_ns <= now_ns:
+            choice.take(units[taken][1], units[taken][0])
+            taken += 1
+        if choice.changes(now_ns, navigator.imu.latest_ns if navigator.imu.end else None):
+            navigator.change_imu()
+        if (arrived := choice.samples()) is not None:
+            navigator.add_imu(*arrived)
+        navigator.advance(record=True)
+        recorder.take()
+        if taken % _TOLD_EVERY < 2:
+            progress(taken, len(units))
 
 
 def _give(navigator: Navigator, arrival: Arrival) -> None:
-    m = arrival.measurement
+    m: Any = arrival.measurement
     if isinstance(m, BROADCAST):
         navigator.learn(m)
         return
-    navigator.add(m, valid_ns(m), arrival.sd_time_s)
+    t_ns = valid_ns(m)
+    if arrival.utc_ns is not None:  # of the date a compass' declination depends
+        m = replace(m, stamp=UtcStamp(arrival.utc_ns))
+    navigator.add(m, t_ns, arrival.sd_time_s, arrival.t_arrival_ns)
 
 
 def _late(arrivals: Sequence[Arrival], config: Config) -> list[bool]:

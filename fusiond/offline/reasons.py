@@ -25,11 +25,13 @@ _TIMES = {"time_backwards", "time_ahead"}
 @immutable()
 class FileRead:
     """A file's rows as they were read: s of its own time from the first to the last that is used
-    (None: none is), how many are, and those that are not."""
+    (None: none is), how many are, and those that are not. Frames of a bus are no aid by
+    themselves."""
 
     span_s: tuple[float, float] | None
     used: int
     rejected: Sequence[Rejection]
+    is_aid: bool = True
 
     @property
     def refused(self) -> int:
@@ -85,7 +87,7 @@ def nothing_navigated(
     for name, file in files.items():
         if file.refused > file.used:
             return _refused_rows(name, file)
-    (imu_name, imu), *aids = files.items()
+    imu_name, imu, aids = _aids(files)
     if not aids:
         return f"no aid was given: {reason}"
     others = [f"{name} from {_span(file)}" for name, file in aids if not _overlap(imu, file)]
@@ -100,7 +102,7 @@ def apart(files: Mapping[str, FileRead]) -> list[str]:
     """A line for each aid whose times have nothing in common with the IMU's, which come first."""
     if not files:
         return []
-    (imu_name, imu), *aids = files.items()
+    imu_name, imu, aids = _aids(files)
     return [
         f"{name} from {_span(file)}: no time in common with {imu_name}, from {_span(imu)}"
         for name, file in aids
@@ -108,11 +110,21 @@ def apart(files: Mapping[str, FileRead]) -> list[str]:
     ]
 
 
+def _aids(
+    files: Mapping[str, FileRead],
+) -> tuple[str, FileRead, list[tuple[str, FileRead]]]:
+    """The IMU's file, which comes first, and those of aids."""
+    (imu_name, imu), *others = files.items()
+    return imu_name, imu, [(name, file) for name, file in others if file.is_aid]
+
+
 def _refused_rows(name: str, file: FileRead) -> str:
     by_reason = Counter(counts(file.rejected))
     times = sum(by_reason[reason] for reason in _TIMES)
     if times > file.refused / 2:
         return f"{name}: its times run backwards in {times} of {file.rows} rows"
+    if len(by_reason) > 1:
+        del by_reason["unpaired"]  # frames, of which several make a row
     most, number = by_reason.most_common(1)[0]
     said = f"{name}: {number} of {file.rows} rows are refused as {most}"
     return f"{said}: {file.rejected[0]}" if file.rejected[0].line else said

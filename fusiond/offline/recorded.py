@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.measurements import Measurement, MonotonicStamp
+from drivers.measurements import ImuSample, Measurement, MonotonicStamp
 from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch, System
 from fusiond.configuration.aiding import RawAiding
 from fusiond.configuration.schema import Config
-from fusiond.files.csv_tables import TableError
+from fusiond.files.csv_tables import Rejection, TableError, counts
 from fusiond.files.tables import ImuTable, read_imu
-from fusiond.offline.aid_files import READERS, Arrival, source_of
+from fusiond.offline.aid_files import OF_A_RECEIVER, READERS, Arrival, read_nmea_by, source_of
+from fusiond.offline.nmea_file import receiver_of
 from fusiond.offline.outages import Outage, named, withheld
 from fusiond.offline.reasons import FileRead
 
@@ -28,6 +29,8 @@ class Recorded:
     files: dict[str, FileRead]
     events: list[dict[str, str]]
     withheld: Counter[str]
+    units: list[tuple[int, ImuSample]]
+    """Samples of all inertial units as they came, where one of them is a spare; else none."""
 
 
 def read_recorded(
@@ -44,24 +47,26 @@ def read_recorded(
     events: list[dict[str, str]] = []
     arrivals: list[Arrival] = []
     files: dict[str, FileRead] = {}
+    units: list[tuple[int, ImuSample]] = []
     if can_log is not None:
         # python-can and the DBC files' reader come only where there is a bus to be read.
         from fusiond.offline.can_log import read_can_log  # noqa: PLC0415
 
         log = read_can_log(can_log, config)
-        imu, arrivals = log.imu, log.arrivals
+        imu, arrivals, units = log.imu, log.arrivals, log.units
         events += [{"code": code, "text": text} for code, text in log.events]
         files["imu"] = _imu_read(imu)
         for name, rejected in log.rejected.items():
             rows = [row for row in arrivals if row.measurement.source == name]
-            if rows or rejected:
-                files[name] = FileRead(_span_s(rows), len(rows), rejected)
+            used = log.frames - sum(counts(rejected).values()) if name == "can" else len(rows)
+            if used or rejected:
+                files[name] = FileRead(_span_s(rows), max(0, used), rejected, name != "can")
     else:
         assert imu_path is not None
         imu = read_imu(imu_path)
         files["imu"] = _imu_read(imu)
     for kind, path in aids:
-        rows, rejected = READERS[kind](path, imu, source_of(kind, config))
+        rows, rejected = _read_aid(kind, path, imu, config)
         name = kind if kind not in files else f"{kind}:{path.name}"
         files[name] = FileRead(_span_s(rows), len(rows), rejected)
         arrivals += rows
@@ -77,7 +82,20 @@ def read_recorded(
         held -= Counter(row.measurement.source for row in kept)
         arrivals = kept
     arrivals.sort(key=lambda a: a.t_arrival_ns)
-    return Recorded(config, imu, arrivals, files, events, held)
+    return Recorded(config, imu, arrivals, files, events, held, units)
+
+
+def _read_aid(
+    kind: str, path: Path, imu: ImuTable, config: Config
+) -> tuple[list[Arrival], list[Rejection]]:
+    source = source_of(kind, config)
+    if kind == "nmea":
+        return read_nmea_by(path, imu, receiver_of(source, config))
+    if kind in OF_A_RECEIVER:  # their decoders come only where there is such a file
+        from fusiond.offline.receiver_logs import decoding_of, read_solutions  # noqa: PLC0415
+
+        return read_solutions(kind, path, imu, source, decoding_of(source, config))
+    return READERS[kind](path, imu, source)
 
 
 BROADCAST = Ephemeris, Klobuchar
@@ -107,10 +125,11 @@ def _with_raw(config: Config, systems: tuple[System, ...] | None) -> Config:
 
 
 def _span_s(rows: list[Arrival]) -> tuple[float, float] | None:
-    """Of the measurements' instants; what a satellite broadcasts has none."""
+    """Of the measurements' instants; what a satellite broadcasts has none, so that a file of
+    nothing else has those of its arrivals."""
     instants = [
         valid_ns(row.measurement) for row in rows if not isinstance(row.measurement, BROADCAST)
-    ]
+    ] or [row.t_arrival_ns for row in rows]
     return (min(instants) * 1e-9, max(instants) * 1e-9) if instants else None
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.files.solution_csv import SolutionWriter
+from fusiond.navigation.solution import HEIGHT_KNOWN_SD_M, HELD_UNKNOWN_M
+from fusiond.navigation.strapdown import HEIGHT
 
 Array = NDArray[np.float64]
 
@@ -29,7 +31,8 @@ class Rows(NamedTuple):
 
 
 class RowsWriter:
-    """Writes rows to a file; a figure that the model holds (not `stated`, (9,)) has no sigma."""
+    """Writes rows to a file; a figure that the model holds (not `stated`, (9,)) has no sigma, and
+    a height that is not known no cell."""
 
     def __init__(self, out: Path, stated: NDArray[np.bool_]) -> None:
         self._writer = SolutionWriter(out)
@@ -37,7 +40,13 @@ class RowsWriter:
 
     def write(self, rows: Rows) -> None:
         """Append rows."""
-        self._writer.states(rows.times, rows.nav, rows.sigmas, self._stated, rows.status)
+        nav, sigmas = rows.nav, rows.sigmas
+        held = np.abs(nav[:, HEIGHT]) < HELD_UNKNOWN_M
+        unknown = sigmas[:, 2] > HEIGHT_KNOWN_SD_M if self._stated[2] else held
+        if unknown.any():
+            nav, sigmas = nav.copy(), sigmas.copy()
+            nav[unknown, HEIGHT] = sigmas[unknown, 2] = np.nan
+        self._writer.states(rows.times, nav, sigmas, self._stated, rows.status)
 
     def close(self) -> None:
         """Write out what is left."""

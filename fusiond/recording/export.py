@@ -22,13 +22,13 @@ _HEIGHTS = "heights above the ellipsoid WGS 84"
 
 
 class Point(NamedTuple):
-    """A point of the track; `t_utc` ISO, degrees, m above the ellipsoid."""
+    """A point of the track; `t_utc` ISO, degrees, m above the ellipsoid where that is known."""
 
     t_utc: str
     t_ms: int
     lat_deg: float
     lon_deg: float
-    height_m: float
+    height_m: float | None
     mode: str
     sigma_m: float | None
 
@@ -51,7 +51,7 @@ def track(recording: Log, interval_s: float) -> Iterator[Point]:
             t_ms,
             nav["lat_deg"],
             nav["lon_deg"],
-            nav["height_m"] or 0.0,
+            nav["height_m"],
             nav["mode"],
             sigma,
         )
@@ -75,9 +75,10 @@ def _gpx(file: TextIO, vehicle: str, points: list[Point]) -> None:
         lon = f"{p.lon_deg:.9f}"
         if lon == _ANTIMERIDIAN:
             lon = f"-{lon}"
+        elevation = "" if p.height_m is None else f"<ele>{p.height_m:.3f}</ele>"
         file.write(
             f"<trkpt lat={quoteattr(f'{p.lat_deg:.9f}')} lon={quoteattr(lon)}>"
-            f"<ele>{p.height_m:.3f}</ele><time>{p.t_utc}</time><cmt>{p.mode}</cmt></trkpt>\n"
+            f"{elevation}<time>{p.t_utc}</time><cmt>{p.mode}</cmt></trkpt>\n"
         )
     file.write("</trkseg></trk>\n</gpx>\n")
 
@@ -92,9 +93,9 @@ def _kml(file: TextIO, vehicle: str, points: list[Point]) -> None:
         f"<Placemark><name>{escape(vehicle)}</name><gx:Track><altitudeMode>clampToGround</altitudeMode>\n"
     )
     file.writelines(f"<when>{p.t_utc}</when>\n" for p in points)
-    file.writelines(
-        f"<gx:coord>{p.lon_deg:.9f} {p.lat_deg:.9f} {p.height_m:.3f}</gx:coord>\n" for p in points
-    )
+    for p in points:  # on the ground, whatever stands for the height
+        height = 0.0 if p.height_m is None else p.height_m
+        file.write(f"<gx:coord>{p.lon_deg:.9f} {p.lat_deg:.9f} {height:.3f}</gx:coord>\n")
     file.write("</gx:Track></Placemark></Document>\n</kml>\n")
 
 
@@ -114,7 +115,7 @@ def _geojson(file: TextIO, vehicle: str, points: list[Point]) -> None:
 
 
 def _stretch(points: list[Point]) -> dict[str, object]:
-    line = [[p.lon_deg, p.lat_deg, p.height_m] for p in points]
+    line = [[p.lon_deg, p.lat_deg, *([] if p.height_m is None else [p.height_m])] for p in points]
     if len(line) == 1:
         line *= 2  # a line has two positions at least (RFC 7946, 3.1.4)
     return {

@@ -11,6 +11,8 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import reduce
+from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -171,6 +173,58 @@ async def test_wrong_baud_rate(tmp_path: Path) -> None:
     device.unplug()
     assert code == 1
     assert "115200 baud is probably not the device's rate" in text
+
+
+SENTENCE = b"$%bGGA,104000.00,4712.34567,N,00812.34567,E,1,07,2.31,115.4,M,%b,M,,"
+UBX = b"\xb5\x62\x05\x01\x02\x00\x06\x01\x0f\x38"
+
+
+def summed(sentence: bytes) -> bytes:
+    return b"%b*%02X\r\n" % (sentence, reduce(xor, sentence[1:], 0))
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (SENTENCE % (b"GP", b"33.3") + b"\r\n", "without a checksum"),
+        (UBX, "UBX frames arrive, but no NMEA: switch on NMEA output"),
+        (summed(SENTENCE % (b"II", b"33.3")), "positions of talker II"),
+        (summed(b"$GPGLL,4712.34,N,00812.34,E,104000.00,A"), "(GLL), but none that counts"),
+        (b'{"class":"VERSION","release":"3.22"}\r\n', "set port to gpsd://HOST"),
+        (summed(SENTENCE % (b"GP", b"")), "one sigma of 62 m"),
+        (
+            summed(b"$GPRMC,104000.00,A,4712.34,N,00812.34,E,5.2,87.5,110807,,,A"),
+            "if 2027-03-27 is right, 1024 weeks later, its GPS week has rolled over",
+        ),
+    ],
+    ids=["no_checksum", "ubx", "talker", "formatter", "gpsd", "geoid", "rollover"],
+)
+async def test_the_right_cause_is_named(tmp_path: Path, data: bytes, words: str) -> None:
+    device = Device(tmp_path / "gnss")
+    device.plug()
+    sender = asyncio.create_task(_sending(device, lambda: data))
+    code, text = await report(without(config(tmp_path), "imu", "rdss"))
+    sender.cancel()
+    device.unplug()
+    findings = [line for line in text.splitlines() if line.lstrip().startswith("! ")]
+    assert code == 1
+    assert any(words in finding for finding in findings), text
+    assert "115200 baud is probably not" not in text
+
+
+async def test_the_driver_of_raw_data_names_missing_checksums_too(tmp_path: Path) -> None:
+    device = Device(tmp_path / "gnss")
+    device.plug()
+    data = SENTENCE % (b"GP", b"33.3") + b"\r\n"
+    sender = asyncio.create_task(_sending(device, lambda: data))
+    base = without(config(tmp_path), "imu", "rdss")
+    raw = base.sources["gnss"].model_copy(update={"driver": "gnss"})
+    code, text = await report(base.model_copy(update={"sources": {"gnss": raw}}))
+    sender.cancel()
+    device.unplug()
+    assert code == 1
+    assert "without a checksum" in text
+    assert "115200 baud is probably not" not in text
 
 
 async def test_silent_line(tmp_path: Path) -> None:

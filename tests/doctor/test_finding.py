@@ -22,8 +22,11 @@ from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
+from tests.drivers.bestpos.logs import bestpos
 from tests.drivers.nmea.sentences import gga, made
 from tests.drivers.raw.frames import measurement, rawx
+from tests.drivers.sbf.blocks import pvt as sbf_pvt
+from tests.drivers.ubx.frames import pvt
 from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 from tests.pty_device import Device
@@ -90,6 +93,10 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
         (RAWX * 3, "gnss", "raw observations"),
         (b"$GNVTG,,T,,M,0.0,N,0.0,K,A*3D\r\n" * 4 + RAWX, "gnss", "NMEA sentences, raw"),
         (HDT * 3 + gga(1), "nmea", "NMEA sentences"),  # a receiver of two antennas
+        (pvt() * 3, "ubx", "UBX navigation messages"),
+        (pvt() * 3 + gga(1), "nmea", "NMEA sentences, UBX navigation messages"),
+        (bestpos() * 3, "bestpos", "logs of the BESTPOS family"),
+        (sbf_pvt() * 3, "sbf", "SBF blocks"),
         (b"$BDICI,0242286,,,,,,60*00\r\n", None, ""),
         (bytes(range(256)) * 4, None, ""),
     ],

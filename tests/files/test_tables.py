@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fusiond.files.csv_tables import TableError, counts, file_report
+from fusiond.files.csv_tables import FEWEST_ZEROS, TableError, counts, file_report
 from fusiond.files.fixed_decimal import newlines, parse_rows
 from fusiond.files.tables import (
     read_attitude,
@@ -229,6 +229,29 @@ def test_attitude_needs_a_sigma_for_each_angle_given(tmp_path: Path) -> None:
         (5, "out_of_range"),
     ]
     assert "sd_yaw_deg" in table.rejected[0].detail
+
+
+def test_a_sigma_that_is_zero_in_every_row_is_none(tmp_path: Path) -> None:
+    """Who has none writes 0; the fixes are used as if the columns were not there."""
+    header = "t_s,lat_deg,lon_deg,height_m,sd_n_m,sd_e_m,sd_d_m,sd_vn_m_s"
+    rows = [f"{i},40,-105,1600,0,0.000,0,{0.1 * i + 0.1}" for i in range(FEWEST_ZEROS)]
+    table = read_gnss(write(tmp_path, header, *rows))
+    assert len(table.t_s) == FEWEST_ZEROS
+    assert np.isnan(table.sd_position).all()
+    assert table.sd_v[0, 0] == pytest.approx(0.1)
+    assert [str(r) for r in table.rejected] == [
+        "sd_all_zero: sd_n_m, sd_e_m, sd_d_m are 0 in every row: taken as not given"
+    ]
+    assert file_report(FEWEST_ZEROS, table.rejected)["rejected"] == {}
+    # One row that knows its sigma, and a 0 is a row that cannot be true.
+    one = read_gnss(write(tmp_path, header, *rows, "99,40,-105,1600,1,1,1,1"))
+    assert counts(one.rejected) == {"sd_not_positive": FEWEST_ZEROS}
+    # Too few to tell, and a class that must be there.
+    few = read_gnss(write(tmp_path, header, *rows[1:]))
+    assert counts(few.rejected) == {"sd_not_positive": FEWEST_ZEROS - 1}
+    rdss = "t_s,t_arrival_s,lat_deg,lon_deg,height_m,precision_class_m"
+    table_rdss = read_rdss(write(tmp_path, rdss, *(f"{i},{i},40,9,5,0" for i in range(20))))
+    assert counts(table_rdss.rejected) == {"sd_not_positive": 20}
 
 
 def test_wheel(tmp_path: Path) -> None:

@@ -15,14 +15,19 @@ class Parser(NamedTuple):
 
 _NMEA = ("decoder", "epochs", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
-_WORDS = ("beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes", "weeks")
+_WORDS = ("bcnav", "beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes")
+_SHARED = ("drivers.cycle", "drivers.solution")
 _HUB = ("advice", "history", "hub", "schemas", "vehicle")
 
 PARSERS = {
     "splitter": Parser(("drivers.nmea.framing",), 128),
     "nmea": Parser(tuple(f"drivers.nmea.{m}" for m in _NMEA), 256),
     "raw": Parser(tuple(f"drivers.raw.{m}" for m in _RAW), 192),
-    "words": Parser(tuple(f"drivers.raw.{m}" for m in _WORDS), 128),
+    "words": Parser(tuple(f"drivers.raw.{m}" for m in (*_WORDS, "weeks")), 128),
+    "ubx": Parser(("drivers.ubx.decoder", "drivers.ubx.messages", *_SHARED), 256),
+    "bestpos": Parser(("drivers.bestpos.decoder", "drivers.bestpos.framing", *_SHARED), 640),
+    "sbf": Parser(("drivers.sbf.decoder", "drivers.sbf.framing", *_SHARED), 256),
+    "rinex": Parser(("drivers.raw.rinex", "drivers.raw.rinex_nav"), 1200),
     "rdss_binary": Parser(("drivers.rdss.framing", "drivers.rdss.binary_4_0"), 128),
     "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
     "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 162),
@@ -31,6 +36,10 @@ PARSERS = {
     "hub": Parser(tuple(f"fusiond.dashboard.{module}" for module in _HUB), 512),
     "log": Parser(tuple(f"fusiond.recording.{m}" for m in ("info", "reader", "records")), 400),
     "state": Parser(("fusiond.navigator.state_file", "fusiond.navigator.saved_state"), 384),
+    "can_log": Parser(
+        tuple(f"fusiond.offline.{m}" for m in ("can_blf", "can_frames", "can_text")), 400
+    ),
+    "dbc": Parser(("drivers.can.dbc_flaws",), 400),
     "csv": Parser(tuple(f"fusiond.files.{m}" for m in ("csv_tables", "dialect", "tables")), 160),
 }
 """By target."""

@@ -8,21 +8,18 @@ first, so that a fuzzer reaches what stands behind them. What is no stream is in
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
-from datetime import date
-from typing import Any, TypeVar
+from typing import Any
 
 from drivers.can.bus import CanFrame
 from drivers.can.dbc import MessagePlan
 from drivers.can.imu import CanImuDecoder, CanImuOptions
-from drivers.measurements import DeviceStamp, Heading, ImuSample, PositionFix
+from drivers.measurements import DeviceStamp, Heading, ImuSample, Measurement, PositionFix
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.framing import Frame, StreamSplitter
-from drivers.nmea.running_checks import crc24q
 from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.decoder import RawDecoder
@@ -31,63 +28,15 @@ from drivers.raw.rtcm import load_pyrtcm
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
-from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, ubx
+from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, with_crc
 from tests.fuzz.documents import commands, csv, hub, input_of, log, state
+from tests.fuzz.pieces import EARLIEST, UNTRACED, mended_lines, pieces_of, whole_and_cut
+from tests.fuzz.recordings import can_log, dbc
+from tests.fuzz.solutions import bestpos, rinex, sbf, ubx
 
-EARLIEST = date(2014, 1, 1)
-
-
-_EVERYWHERE = 15
-_PIECES = 8
-
-
-def _pieces(choice: int, stream: bytes) -> list[bytes]:
-    """Of a size by the low bits of `choice`, everywhere or where its high ones say: a few pieces
-    between two long ones find what many do, at each place in turn, for a tenth of the work."""
-    size, place = (1, 2, 3, 7, 16, 61, 255, 5000)[choice & 7], choice >> 4
-    begin, end = 0, len(stream)
-    if place < _EVERYWHERE:
-        begin = end * place // _EVERYWHERE
-        end = min(end, begin + _PIECES * size)
-    cuts = (0, *range(begin, end, size), end, len(stream))
-    return [stream[a:b] for a, b in itertools.pairwise(cuts) if a < b]
-
-
-Reader = TypeVar("Reader")
-UNTRACED: dict[type, type] = {}
-"""Of a fuzzed reader, the same without the fuzzer's probes. A stream is read twice, to see that its
-split does not matter: where the pieces have shown which branches there are, the whole need not."""
-
-
-def untraced(reader: type[Reader]) -> type[Reader]:
-    """The reader itself where nothing is traced."""
-    return UNTRACED.get(reader, reader)
-
-
-def _whole_and_cut(
-    reader: type[Reader], choice: int, stream: bytes
-) -> tuple[tuple[type[Reader], list[bytes]], ...]:
-    return (untraced(reader), [stream]), (reader, _pieces(choice, stream))
-
+__all__ = ["TARGETS", "UNTRACED"]
 
 # --------------------------------------------------------------------------- NMEA, UBX, RTCM 3
-
-
-def _mended(stream: bytes) -> bytes:
-    """Lines as sentences and what starts as a frame as one, with good checks."""
-    mended = []
-    for line in stream.split(b"\n"):
-        body, star, _ = line[1:].partition(b"*")
-        if line[:1] == b"$" and star:
-            mended.append(b"$%b*%02X\r\n" % (body, checksum(body)))
-        elif line[:2] == b"\xb5\x62" and len(line) > 6:
-            mended.append(ubx(line[2:4], line[6:]))
-        elif line[:1] == b"\xd3" and len(line) > 4:
-            frame = b"\xd3" + (len(line[3:]) & 0x3FF).to_bytes(2, "big") + line[3:1026]
-            mended.append(frame + crc24q(frame).to_bytes(3, "big"))
-        else:
-            mended.append(line + b"\n")
-    return b"".join(mended)
 
 
 def _split(
@@ -106,9 +55,9 @@ def _ends(data: bytes) -> int:
 def splitter(data: bytes) -> None:
     """Sentences and frames out of a stream: the same for any split, every byte accounted for."""
     choice, stream = input_of(data)
-    stream = _mended(stream) if choice & 8 else stream
+    stream = mended_lines(stream) if choice & 8 else stream
     (items, counters, summed), cut = (
-        _split(kind, pieces) for kind, pieces in _whole_and_cut(StreamSplitter, choice, stream)
+        _split(kind, pieces) for kind, pieces in whole_and_cut(StreamSplitter, choice, stream)
     )
     assert (items, counters) == cut[:2]
     used = b"".join(items)
@@ -125,16 +74,34 @@ DECODING = NmeaDecoding(earliest_date=EARLIEST, allow_simulator=True)
 def nmea(data: bytes) -> None:
     """Measurements out of NMEA: the same for any split, finite and plausible."""
     choice, stream = input_of(data)
-    stream = _mended(stream) if choice & 8 else stream
+    stream = mended_lines(stream) if choice & 8 else stream
     found = []
-    for kind, pieces in _whole_and_cut(NmeaDecoder, choice, stream):
+    for kind, pieces in whole_and_cut(NmeaDecoder, choice, stream):
         decoder = kind("fuzz", DECODING)
         events = [event for piece in pieces for event in decoder.feed(piece, 7)]
-        found.append((events + decoder.flush(), decoder.counters))
+        found.append((events + decoder.flush(), decoder.counters, decoder.cause))
         assert not decoder.epoch_open
+        assert all(decoder.cautions.values())
     assert found[0] == found[1]
-    for event in found[0][0]:
+    _check_fixes(found[0][0])
+    _check_fixes(_with_silences(pieces_of(choice, stream)))
+
+
+def _with_silences(pieces: list[bytes]) -> list[Measurement]:
+    """The same bytes off a line that pauses between the pieces, now shorter, now longer."""
+    decoder, now_ns, events = NmeaDecoder("fuzz", DECODING), 0, []
+    for number, piece in enumerate(pieces):
+        events += decoder.feed(piece, now_ns)
+        if number % 3:
+            events += decoder.silence()
+        now_ns += (number % 5) * 70_000_000
+    return events + decoder.flush()
+
+
+def _check_fixes(events: Sequence[Measurement]) -> None:
+    for event in events:
         if isinstance(event, PositionFix):
+            assert math.isfinite(sum(event.rounding_sd_ned_m) + event.geoid_sd_m)
             assert abs(event.lat_rad) <= math.pi / 2
             assert abs(event.lon_rad) <= math.pi
             assert event.height_m is None or within(event.height_m, HEIGHT_M)
@@ -167,9 +134,9 @@ _parse_rtcm = functools.lru_cache(4096)(load_pyrtcm())
 def raw(data: bytes) -> None:
     """UBX and RTCM 3 payloads: the same for any split, finite and plausible."""
     choice, stream = input_of(data)
-    stream = _mended(stream) if choice & 8 else stream
+    stream = mended_lines(stream) if choice & 8 else stream
     found = []
-    for kind, pieces in _whole_and_cut(RawDecoder, choice, stream):
+    for kind, pieces in whole_and_cut(RawDecoder, choice, stream):
         decoder = kind("fuzz", earliest=EARLIEST)
         decoder._rtcm._parse = _parse_rtcm  # type: ignore[union-attr]
         decoder.note_utc(1_500_000_000_000_000_000)
@@ -189,16 +156,29 @@ _WORDS: tuple[tuple[int, int, int, Callable[[int], list[int]]], ...] = (
 """gnssId, sigId, bytes of information, words with good parity."""
 
 
+def _cnav(length: int, words: int) -> Callable[[int], list[int]]:
+    return lambda information: with_crc(information & ((1 << length) - 1), length, words)
+
+
+_CNAV = (
+    (3, 6, 72, _cnav(576, 19)),
+    (3, 6, 30, _cnav(240, 9)),
+    (3, 8, 33, _cnav(264, 9)),
+    (3, 6, 9, _cnav(72, 3)),
+)
+"""The same of B-CNAV, whose words have one CRC."""
+
+
 _SFRBX = b"\xb5\x62\x02\x13\0\0"
 
 
 def words(data: bytes) -> None:
-    """LNAV, D1, D2 and I/NAV words, with good parities or bits turned: each frame ends in one
-    counter or is used."""
+    """LNAV, D1, D2, I/NAV and B-CNAV words, with good parities or bits turned: each frame is in one
+    counter, or used."""
     decoder = RawDecoder("fuzz", earliest=EARLIEST)
     while len(data) >= 2:
-        gnss, sig, size, make = _WORDS[data[0] & 3]
         prn, turned = 1 + (data[0] >> 2) % 37, data[1]
+        gnss, sig, size, make = (_CNAV if turned & 0x80 else _WORDS)[data[0] & 3]
         information = int.from_bytes(data[2 : 2 + size].ljust(size, b"\0"), "big")
         data = data[2 + size :]
         if make is beidou_words:
@@ -237,7 +217,7 @@ def ntrip(data: bytes) -> None:
     """A caster's answer: the same corrections and the same end for any split."""
     choice, stream = input_of(data)
     whole = _answer([stream])
-    assert whole == _answer(_pieces(choice, stream))
+    assert whole == _answer(pieces_of(choice, stream))
     assert len(whole[0]) <= len(stream)
 
 
@@ -270,7 +250,7 @@ def _watched(family: type[FrameDecoder]) -> Callable[[], Any]:
 
 def _rdss(family: type[FrameDecoder], between: bytes, stream: bytes, choice: int) -> None:
     found = []
-    for kind, pieces in _whole_and_cut(family, choice, stream):
+    for kind, pieces in whole_and_cut(family, choice, stream):
         decoder = _watched(kind)()
         messages = [message for piece in pieces for message in decoder.feed(piece)]
         while decoder.awaited_bytes:
@@ -302,7 +282,7 @@ def rdss_binary(data: bytes) -> None:
 def rdss_text(data: bytes) -> None:
     """RDSS family 2.1: the same for any split, every byte accounted for."""
     choice, stream = input_of(data)
-    _rdss(text_2_1.Decoder, b"\r\n", _mended(stream) if choice & 8 else stream, choice)
+    _rdss(text_2_1.Decoder, b"\r\n", mended_lines(stream) if choice & 8 else stream, choice)
 
 
 # --------------------------------------------------------------------------- CAN
@@ -359,7 +339,6 @@ def can(data: bytes) -> None:
     assert accounted + whole <= frames
 
 
-_STREAMS = (splitter, nmea, raw, words, rdss_binary, rdss_text, can, ntrip)
-TARGETS: dict[str, Callable[[bytes], None]] = {
-    one.__name__: one for one in (*_STREAMS, commands, hub, log, state, csv)
-}
+_STREAMS = (splitter, nmea, raw, words, ubx, bestpos, sbf, rinex)
+_MORE = (rdss_binary, rdss_text, can, ntrip, commands, hub, log, state, csv, can_log, dbc)
+TARGETS: dict[str, Callable[[bytes], None]] = {one.__name__: one for one in (*_STREAMS, *_MORE)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +36,23 @@ def test_across_the_turn_of_the_week(toe: float, week_off: int, tow: float) -> N
         assert abs(states.clock_s[k] - clock) < 1e-12, e.satellite
 
 
+def test_rates_of_the_axis_and_of_the_mean_motion() -> None:
+    """At tk the orbit is that of an axis and a mean anomaly that have moved on."""
+    (e, *_), tk = [x for x in examples(WEEK, TOE) if x.system == "C" and x.prn > 10], 1800.0
+    moving = replace(e, semi_major_rate=0.02, mean_motion_rate=3e-13)
+    moved = replace(
+        e,
+        sqrt_a=math.sqrt(e.sqrt_a**2 + 0.02 * tk),
+        mean_anomaly=e.mean_anomaly + 0.5 * 3e-13 * tk * tk,
+        mean_motion_correction=e.mean_motion_correction
+        + math.sqrt(3.986004418e14) * (e.sqrt_a**-3 - (e.sqrt_a**2 + 0.02 * tk) ** -1.5),
+    )
+    week, tow = gps_time("C", e.week, e.toe_s + tk)
+    a, b = (Orbits.of([x]).at(week, tow).position[0] for x in (moving, moved))
+    assert np.linalg.norm(a - b) < 1e-4
+    assert np.linalg.norm(a - Orbits.of([e]).at(week, tow).position[0]) > 10.0
+
+
 def test_toc_in_the_week_before_toe() -> None:
     """Clock of the last minutes of a week with an orbit of the next one."""
     e = replace(ephemeris("G", 5, week=WEEK, toe_s=0.0), toc_s=604784.0)
@@ -47,6 +65,8 @@ def test_toc_in_the_week_before_toe() -> None:
 @pytest.mark.parametrize("step", [0.5])
 def test_velocity_and_drift_are_the_derivatives(step: float) -> None:
     made = examples(WEEK, TOE)
+    # B-CNAV's rates: 0.06 m/s is its largest, 2^-57 * 2^22 semicircles/s^2 of the mean motion too
+    made += [replace(e, semi_major_rate=0.05, mean_motion_rate=9e-11) for e in made]
     orbits = Orbits.of(made)
     for tow in (TOE - 3600.0, TOE + 1234.5):
         v = orbits.at(WEEK, tow)

@@ -222,6 +222,15 @@ def test_group_delays() -> None:
     assert group_delay(c, "7I") == (c.group_delay_s[1], 0.0)
     for message, name in ((c, "1P"), (c, "5P"), (c, "7P"), (e, "6B"), (e, "8Q"), (f, "7Q")):
         assert group_delay(message, name) is None
+    one = replace(c, message="bcnav1", group_delay_s=(4e-9, -9e-9, 8e-10))
+    two = replace(one, message="bcnav2")
+    shares = {"1P": 4e-9, "1D": 4.8e-9, "1X": 4.2e-9, "5P": -9e-9, "6I": 0.0}
+    for name, delay in shares.items():
+        assert group_delay(one, name) == pytest.approx((delay, 0.0))
+    for name, delay in {"1P": 4e-9, "5P": -9e-9, "5D": -8.2e-9, "5X": -8.6e-9}.items():
+        assert group_delay(two, name) == pytest.approx((delay, 0.0))
+    for message, name in ((one, "5D"), (one, "5X"), (two, "1D"), (one, "2I"), (two, "7I")):
+        assert group_delay(message, name) is None
 
 
 def test_ionosphere_of_the_own_system_is_preferred() -> None:

@@ -20,7 +20,7 @@ from drivers.can.driver import CanDriver
 from fusiond.configuration.load import load_config
 from fusiond.configuration.schema import Source
 from fusiond.files.tables import read_imu
-from fusiond.offline.can_log import messages
+from fusiond.offline.can_frames import messages
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.clock.host_time import Host, S, utc
 from tests.places import DATA, REPOSITORY
@@ -39,9 +39,9 @@ class Bus(Rig):
     def __init__(self, folder: Path, begin_s: float, length_s: float) -> None:
         config = load_config(REPOSITORY / "config" / "css_164.toml")
         log = DATA / "css_164" / "can.log.gz"
-        began_s = next(messages(log, lambda _: None)).timestamp
+        began_s = next(messages(log)).timestamp
         begin_ns, end_ns = (round((began_s + s) * 1e9) for s in (begin_s, begin_s + length_s))
-        late = (m for m in messages(log, lambda _: None) if m.timestamp * 1e9 >= begin_ns)
+        late = (m for m in messages(log) if m.timestamp * 1e9 >= begin_ns)
         self._frames = takewhile(lambda m: m.timestamp * 1e9 < end_ns, late)
         self._next: can.Message | None = next(self._frames)
         host = Host(true_utc_at_zero=begin_ns - Host.mono)

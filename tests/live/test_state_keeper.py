@@ -87,6 +87,15 @@ async def test_rest_is_kept_and_serves_the_next_start(kept: Kept) -> None:
     assert math.isclose(state.sd_position_m, 5.0)
 
 
+async def test_a_place_whose_height_is_not_known_is_kept_without(kept: Kept) -> None:
+    unknown = replace(kept.at(0.0), height_m=math.nan, sd_ned_m=(3.0, 4.0, math.nan))
+    await kept.keeper.close(unknown, confirmed=True)
+    state = Kept(kept.path).keeper.load()
+    assert state is not None
+    assert state.position == (NAVIGATING.lat_rad, NAVIGATING.lon_rad, None)
+    assert math.isclose(state.sd_position_m, 5.0)
+
+
 async def test_a_heading_that_nothing_has_shown_is_kept_as_one(kept: Kept) -> None:
     kept.keeper.keep(kept.t_ns, kept.at(0.0, Mode.COASTING), confirmed=False)
     await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})

@@ -20,6 +20,7 @@ from fusiond.files.csv_tables import MissingPackageError, TableError
 from fusiond.files.tables import read_gnss, read_imu, read_wheel
 from fusiond.offline.aid_files import READERS, Arrival
 from fusiond.offline.can_log import CanLog, read_can_log
+from fusiond.offline.process import process
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from tests.places import DATA, REPOSITORY
 
@@ -140,8 +141,8 @@ def test_a_log_that_ends_in_the_middle_of_a_line(tmp_path: Path) -> None:
     log = read_can_log(path, configuration(tmp_path))
     assert 0.4 * SAMPLES < len(log.imu.t_s) < 0.6 * SAMPLES
     (cut,) = log.rejected["can"]
-    assert cut.reason == "cut"
-    assert "frames" in cut.detail
+    assert cut.reason == "unreadable"
+    assert cut.line == len(path.read_text().splitlines())
 
 
 def test_frames_of_no_device_and_times_that_run_backwards(tmp_path: Path) -> None:
@@ -179,10 +180,29 @@ def test_each_source_has_the_channel_of_its_name(tmp_path: Path) -> None:
         read_can_log(named, configuration(tmp_path, wheel_channel="can7"))
 
 
+def test_a_channel_whose_clock_is_a_little_behind(tmp_path: Path) -> None:
+    """As live: its frames have come by now, and are as old as their stamps say."""
+    messages = recorded("can0", "can1")
+    for m in messages:
+        m.timestamp -= 0.3 if m.channel == "can1" else 0.0
+    lines = [
+        f"({m.timestamp:.6f}) {m.channel} {m.arbitration_id:03X}#{m.data.hex()}" for m in messages
+    ]
+    path = tmp_path / "bus.log"
+    path.write_text("\n".join(lines))
+    log = read_can_log(path, configuration(tmp_path, wheel_channel="can1"))
+    assert log.rejected["can"] == []
+    assert len(log.imu.t_s) == SAMPLES
+    times = [m.stamp.t_ns * 1e-9 for m in (row.measurement for row in log.arrivals)]  # type: ignore[union-attr]
+    expected = START_S - 0.3 + 0.1 * np.arange(SAMPLES // 10) + 0.005
+    assert np.abs(np.array(times) - expected).max() < 2e-6
+    assert not [code for code, _ in log.events if code == "system_clock_stepped"]
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("bus.txt", b"x", r"no CAN log by its name: .log, .asc, .blf, .mf4 are read"),
+        ("bus.txt", b"x", r"no CAN log by its name: .log, .asc, .blf, .trc, .mf4 are read"),
         ("bus.mf4.gz", b"x", "no CAN log by its name"),
         ("bus.log", b"something else\n", "cannot be read as .log"),
         ("bus.log.gz", b"not zipped", "cannot be read as .log|Not a gzipped file"),
@@ -285,3 +305,22 @@ def test_the_drives_fixes_are_those_of_its_table(drive: CanLog) -> None:
     # The module takes 0.1 s by the configuration, and its bus no more than jitter beside it.
     assert min(behind_s) > 0.099
     assert np.median(behind_s) < 0.15
+
+
+def test_stamps_of_samples_that_go_back_a_little(tmp_path: Path) -> None:
+    """As a reader of two queues writes them: the run ends, and what goes back is named."""
+    lines = []
+    for k, m in enumerate(recorded()):
+        t_s = m.timestamp - (0.05 if k % 7 == 0 else 0.0)
+        lines.append(f"({t_s:.6f}) can0 {m.arbitration_id:03X}#{m.data.hex()}")
+    path = tmp_path / "bus.log"
+    path.write_text("\n".join(lines))
+    config = configuration(tmp_path)
+    log = read_can_log(path, config)
+    assert log.rejected["can"] == []
+    assert len(log.imu.t_s) > 0.9 * SAMPLES
+    for heading in (["gnss_course"], ["config"]):
+        section = {"heading": heading, "heading_deg": 10.0, "position_deg_m": (56.0, 10.0, 20.0)}
+        alignment = Config.model_validate({"alignment": section}).alignment
+        found = process(config.model_copy(update={"alignment": alignment}), None, [], can_log=path)
+        assert found["mode"] in {"aligning", "coasting", "navigating"}

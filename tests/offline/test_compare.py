@@ -89,6 +89,20 @@ def test_rows_without_position_are_no_solution() -> None:
     assert report["horizontal_max_m"] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_height_that_is_not_known_costs_the_vertical_alone() -> None:
+    t = np.arange(0.0, 10.0, 0.1)
+    solution = trajectory(t, north=3.0, down=2.0)
+    solution.height_m[:50] = np.nan
+    report = compare(solution, trajectory(t))
+    assert report["epochs"] == 100
+    assert report["horizontal_rms_m"] == pytest.approx(3.0, abs=1e-5)
+    assert report["down_rms_m"] == pytest.approx(2.0, abs=1e-9)
+    solution.height_m[:] = np.nan
+    report = compare(solution, trajectory(t))
+    assert (report["epochs"], report["down_rms_m"]) == (100, None)
+    assert report["horizontal_rms_m"] == pytest.approx(3.0, abs=1e-5)
+
+
 def test_after_counts_from_the_first_row_of_the_solution() -> None:
     t = np.arange(100.0, 200.0)
     solution = trajectory(t, north=np.where(t < 160.0, 50.0, 1.0))

@@ -7,7 +7,7 @@ import json
 import struct
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from math import cos, radians, sin
+from math import cos, nan, radians, sin
 from typing import Any
 
 import pytest
@@ -17,7 +17,12 @@ from websockets.exceptions import InvalidStatus
 
 from fusiond.configuration.outputs import Foxglove
 from fusiond.navigation.solution import Mode
-from fusiond.outputs.foxglove.channels import CHANNELS, frame_transforms, location_fix
+from fusiond.outputs.foxglove.channels import (
+    CHANNELS,
+    NO_HEIGHT_SD_M,
+    frame_transforms,
+    location_fix,
+)
 from fusiond.outputs.foxglove.server import FoxgloveServer
 from fusiond.outputs.foxglove.viewer import PROTOCOLS
 from fusiond.outputs.topics import EVENT, HEALTH, NAV
@@ -41,6 +46,8 @@ def test_a_location_is_east_north_up() -> None:
     assert (fix["latitude"], fix["longitude"]) == (31.025438871, 121.441209483)
     assert fix["position_covariance"] == pytest.approx([0.85**2, 0, 0, 0, 0.9**2, 0, 0, 0, 1.7**2])
     assert fix["position_covariance_type"] == 2
+    unknown = decoded(location_fix(nav(height_m=nan, sd_d_m=nan)))
+    assert (unknown["altitude"], unknown["position_covariance"][8]) == (0.0, NO_HEIGHT_SD_M**2)
     assert location_fix(nav(mode=Mode.INVALID)) is location_fix(nav(t_ms=None)) is None
 
 

@@ -208,6 +208,33 @@ async def test_a_client_without_semicolon_and_one_that_wants_nmea() -> None:
             assert json.loads(await kismet.line())["class"] == "TPV"
 
 
+async def test_a_client_that_names_no_format_gets_answers_alone() -> None:
+    """As gpsd 3.22 has it: gpsd-py3 enables, then takes the next line for the answer to a POLL."""
+    async with serving() as server, connected(server.server.port.address) as client:
+        lines = await watching(server, client, b'?WATCH={"enable":true}\n')
+        assert json.loads(lines[2]) == {
+            "class": "WATCH",
+            "enable": True,
+            "json": False,
+            "nmea": False,
+            "raw": 0,
+            "scaled": False,
+            "timing": False,
+            "split24": False,
+            "pps": False,
+        }
+        for _ in range(2):
+            server.take(NAV, nav())
+            await asyncio.sleep(0)
+            client.writer.write(b"?POLL;\n")
+            polled = json.loads(await client.line())
+            assert polled["class"] == "POLL"
+            assert polled["tpv"][0]["lat"] == nav().lat_deg
+        client.writer.write(b'?WATCH={"enable":true,"json":true};?WATCH={"enable":true};')
+        answers = [json.loads(await client.line()) for _ in range(4)]
+        assert answers[3]["json"] is True, "what was asked for once stays"
+
+
 async def test_clients_that_leave_at_once_or_ask_nonsense_harm_nobody() -> None:
     async with serving() as server, connected(server.server.port.address) as patient:
         await watching(server, patient, WATCH)

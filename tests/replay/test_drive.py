@@ -364,6 +364,20 @@ def test_a_track_over_the_date_line_is_one_that_gpx_knows(tmp_path: Path) -> Non
     assert understood is None or len(understood) == 2
 
 
+@pytest.mark.parametrize("kind", list(WRITERS))
+def test_a_height_that_is_not_known_is_none_in_a_track(tmp_path: Path, kind: str) -> None:
+    known = Point("2026-11-22T16:32:55.383Z", 0, -16.5, 12.0, 12.3, "navigating", 0.5)
+    out = tmp_path / f"track.{kind}"
+    with out.open("w") as file:
+        WRITERS[kind](file, "truck", [known, known._replace(height_m=None)])
+    text = out.read_text()
+    assert text.count("12.3") == 1
+    assert {"gpx": "<ele>", "kml": "0.000</gx:coord>", "geojson": "[12.0, -16.5]"}[kind] in text
+    assert text.count("<ele>") == (kind == "gpx")
+    if kind == "gpx":
+        assert len(gpx_points(out)) == 2
+
+
 def test_a_bag_for_ros_holds_fixes_and_samples(recorded: Recorded, tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader  # noqa: PLC0415 - heavy
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415

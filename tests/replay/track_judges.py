@@ -53,12 +53,12 @@ def gpx_points(path: Path) -> list[TrackPoint]:
     points = []
     for point in root.iter(f"{GPX}trkpt"):
         lat, lon = point.get("lat", ""), point.get("lon", "")
-        height, t_utc = (point.findtext(f"{GPX}{name}", "") for name in ("ele", "time"))
-        assert all(_DECIMAL.match(text) for text in (lat, lon, height)), (lat, lon, height)
+        height, t_utc = point.findtext(f"{GPX}ele"), point.findtext(f"{GPX}time", "")
+        assert all(_DECIMAL.match(text) for text in (lat, lon, height or "0")), (lat, lon, height)
         assert -90.0 <= float(lat) <= 90.0
         assert -180.0 <= float(lon) < 180.0
         assert _DATE_TIME.match(t_utc), t_utc
-        points.append(TrackPoint(float(lat), float(lon), float(height), t_utc))
+        points.append(TrackPoint(float(lat), float(lon), float(height or "nan"), t_utc))
     return points
 
 

@@ -18,7 +18,13 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
 from fusiond.navigator.alignment.options import AlignmentOptions
-from fusiond.navigator.alignment.start import Place, as_geodetic, velocity_of
+from fusiond.navigator.alignment.start import (
+    SLOPE_SD,
+    UNKNOWN_HEIGHT_SD_M,
+    Place,
+    as_geodetic,
+    velocity_of,
+)
 from fusiond.navigator.alignment.trend import NO_TREND, Offset
 from fusiond.navigator.saved_state import SavedState
 
@@ -317,25 +323,47 @@ class Collected:
         return False
 
     def place(self) -> Place | None:
-        """Position (rad, rad, m) to start at, the fix it came from, and its sigma."""
-        saved = self._saved
+        """Position (rad, rad, m) to start at, the fix it came from, and its sigmas."""
         if self._position is not None:
-            fix, where, sd = place_of(self._position)
-            if self._position.height_m is None:
-                known = self._options.position or (saved.position if saved else None)
-                where[2] = known[2] if known else 0.0
-            return fix, where, sd
+            return self.place_of(self._position)
+        told = self._told()
+        if told is None:
+            return None
+        (lat, lon, height), sd = told
+        if height is None:
+            return Place(None, np.array([lat, lon, 0.0]), sd, UNKNOWN_HEIGHT_SD_M)
+        return Place(None, np.array([lat, lon, height]), sd, sd)
+
+    def place_of(self, p: PositionOffer, velocity: VelocityOffer | None = None) -> Place:
+        """A fix's place; with a velocity, moved to the velocity's instant."""
+        height, sd_height = self._height_at(p)
+        where = np.array([p.lat_rad, p.lon_rad, height])
+        if velocity is not None:
+            moved = velocity_of(velocity)[0] * ((velocity.t_ns - p.t_ns) * 1e-9)
+            where += as_geodetic(moved, p.lat_rad)
+        return Place(p, where, max(p.sd[:2]), sd_height)
+
+    def _told(self) -> tuple[tuple[float, float, float | None], float] | None:
+        """Where (rad, rad, m) the configuration or the saved state says that the vehicle is, and
+        one sigma (m)."""
         if self._options.position is not None:
-            return None, np.array(self._options.position), self._options.position_sd_m
-        if saved is not None:
-            return None, np.array(saved.position), saved.sd_position_m
+            return self._options.position, self._options.position_sd_m
+        if self._saved is not None:
+            return self._saved.position, self._saved.sd_position_m
         return None
 
-
-def place_of(p: PositionOffer, velocity: VelocityOffer | None = None) -> Place:
-    """A fix's place; with a velocity, moved to the velocity's instant."""
-    where = np.array([p.lat_rad, p.lon_rad, p.height_m or 0.0])
-    if velocity is not None:
-        moved = velocity_of(velocity)[0] * ((velocity.t_ns - p.t_ns) * 1e-9)
-        where += as_geodetic(moved, p.lat_rad)
-    return p, where, max(p.sd[:2])
+    def _height_at(self, p: PositionOffer) -> tuple[float, float]:
+        """Height (m) of a fix and one sigma; where it has none, that of the place that was told, as
+        far as roads climb on the way from there; 0 where nothing has told any."""
+        if p.height_m is not None:
+            return p.height_m, p.sd[2]
+        told = self._told()
+        if told is None:
+            return 0.0, UNKNOWN_HEIGHT_SD_M
+        (lat, lon, height), sd = told
+        if height is None:
+            return 0.0, UNKNOWN_HEIGHT_SD_M
+        apart = np.array([p.lat_rad - lat, math.remainder(p.lon_rad - lon, 2.0 * math.pi)])
+        way_m = math.hypot(*(apart / as_geodetic(np.ones(3), lat)[:2]).tolist())
+        sd = math.hypot(sd, SLOPE_SD * way_m)
+        return (height, sd) if sd < UNKNOWN_HEIGHT_SD_M else (0.0, UNKNOWN_HEIGHT_SD_M)

@@ -35,7 +35,7 @@ from fusiond.navigation.rotation import (
 )
 from fusiond.navigator.alignment import motion, motion_fit
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.collected import Fix, Standing, place_of
+from fusiond.navigator.alignment.collected import Fix, Standing
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
     BACKWARD,
@@ -101,7 +101,7 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         known.why = "waiting until the positions of the fixes confirm their velocity"
         return None
     s = known.standing
-    here = place_of(latest.position, latest.velocity)
+    here = known.place_of(latest.position, latest.velocity)
     if (
         s is not None
         and s.seconds >= 1.0

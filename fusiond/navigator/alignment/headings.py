@@ -75,11 +75,11 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
     on a ferry, which the first fix tells."""
     if by.saved is None or by.known.ever_moved:
         return None
-    fix, where, sd = place
+    fix, where, sd, _ = place
     if fix is not None:
-        apart = where - np.array(by.saved.position)
+        apart = where[:2] - np.array(by.saved.position[:2])
         apart[1] = math.remainder(float(apart[1]), 2.0 * math.pi)
-        metres = apart[:2] / as_geodetic(np.ones(3), float(where[0]))[:2]
+        metres = apart / as_geodetic(np.ones(3), float(where[0]))[:2]
         away = math.hypot(*metres.tolist())
         if away > CONTRADICTION_SIGMAS * math.hypot(sd, by.saved.sd_position_m):
             text = (

@@ -123,7 +123,7 @@ class Track:
         """A start, once the heading is known."""
         until_ns = imu.latest_ns - LATE_NS
         if self._bank is None:
-            self._bank = self._begin(by, imu, place[1], until_ns)
+            self._bank = self._begin(by, imu, place, until_ns)
         bank = self._bank
         if bank is None:
             self._forget(imu, by.known.standing)
@@ -163,9 +163,11 @@ class Track:
         n = self._size
         return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, turns=True)
 
-    def _begin(self, by: Basis, imu: ImuBuffer, where: Array, until_ns: int) -> HeadingBank | None:
+    def _begin(self, by: Basis, imu: ImuBuffer, place: Place, until_ns: int) -> HeadingBank | None:
         """A bank, where there is something to begin with: the end of a rest, or the first fix."""
         known = by.known
+        if place.fix is not None and place.fix.height_m is not None:
+            place = place._replace(sd_height=ANYWHERE_M)  # the bank is told the fixes themselves
         left = self._left or known.left
         if left is not None and left.end_ns < max(imu.oldest_ns, self._begun_ns):
             left = None
@@ -175,23 +177,24 @@ class Track:
                 return None
             there = [a for a in self._aids if a.locates and left.start_ns <= a.t_ns <= left.end_ns]
             begin_ns, fixes = left.end_ns, len(there)
-            cells = self._from_rest(by, imu, where, left, there[-MOST_AT_REST:])
+            cells = self._from_rest(by, imu, place, left, there[-MOST_AT_REST:])
             if not known.confirmed_rest(left):
-                cells += self._on_the_move(imu, where, begin_ns, QUIET_AT_SPEED)
+                cells += self._on_the_move(imu, place, begin_ns, QUIET_AT_SPEED)
         else:
             first = next((a for a in self._aids if a.locates and a.t_ns >= imu.oldest_ns), None)
             if known.levelled() is not None or first is None or first.t_ns > until_ns:
                 return None
             begin_ns, fixes = first.t_ns - 1, 0
-            cells = self._on_the_move(imu, where, begin_ns, 1.0)
+            cells = self._on_the_move(imu, place, begin_ns, 1.0)
         self._left, self._begun_ns = None, begin_ns + 1
         self._aids = [aid for aid in self._aids if aid.t_ns > begin_ns]
         return HeadingBank(cells, begin_ns, fixes, self._options.max_reverse_m_s)
 
     def _from_rest(
-        self, by: Basis, imu: ImuBuffer, where: Array, left: Standing, there: Sequence[Aid]
+        self, by: Basis, imu: ImuBuffer, place: Place, left: Standing, there: Sequence[Aid]
     ) -> list[Cell]:
         """Cells of a vehicle that has stood until `left` ended; fixes `there` tell the place."""
+        place = place._replace(fix=None, sd=ANYWHERE_M)
         roll, pitch = level(left.mean_force)
         there = [replace(aid, t_ns=left.end_ns) for aid in there]
         cells = []
@@ -200,13 +203,13 @@ class Track:
             start = build_start(
                 self._model,
                 left.end_ns,
-                (None, where, ANYWHERE_M),
+                place,
                 dcm,
                 CELL_SD_RAD,
                 np.zeros(3),
                 REST_VELOCITY_SD,
                 HOW,
-                bias=rest_bias(by.noise, left, dcm, float(where[0])),
+                bias=rest_bias(by.noise, left, dcm, float(place.where[0])),
                 levelled=Levelled(dcm),
             )
             cell = self._cell(imu, start, 1.0)
@@ -215,18 +218,17 @@ class Track:
             cells.append(cell)
         return cells
 
-    def _on_the_move(self, imu: ImuBuffer, where: Array, t_ns: int, weight: float) -> list[Cell]:
+    def _on_the_move(self, imu: ImuBuffer, place: Place, t_ns: int, weight: float) -> list[Cell]:
         """Cells of a vehicle of unknown speed on a road of unknown slope."""
-        where, sd = self._place(where, t_ns)
+        where, sd = self._place(place.where, t_ns)
+        place = Place(None, where, sd, place.sd_height)
         cells = []
         for yaw in YAWS_RAD:
             dcm = dcm_from_rpy(0.0, 0.0, yaw)
             velocity, zero = ROAD_SPEED_M_S * dcm[:, 0], np.zeros(3)
-            place: Place = (None, where, sd)
             start = build_start(self._model, t_ns, place, dcm, CELL_SD_RAD, velocity, zero, HOW)
             p = start.covariance
             p[0, 0] = p[1, 1] = TILT_SD_RAD**2
-            p[8, 8] = ANYWHERE_M**2
             p[3:6, 3:6] = (
                 dcm * np.square((ROAD_SPEED_SD_M_S, ACROSS_SD_M_S, ACROSS_SD_M_S))
             ) @ dcm.T

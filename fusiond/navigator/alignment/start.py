@@ -43,8 +43,19 @@ BACKWARD = ", backward"
 # What the origin of a heading that was carried over a gap ends with.
 RESTARTED = ", restarted over "
 
-Place = tuple[PositionOffer | None, Array, float]
-"""The fix that a position came from, the position (rad, rad, m), one sigma horizontally (m)."""
+# One sigma of a height (m) that nothing has told: roads lead from the Dead Sea (-430 m) to Umling
+# La (5,900 m), and the geoid is within 107 m of the ellipsoid; uniform within 6 km of 0.
+UNKNOWN_HEIGHT_SD_M = 6000.0 / math.sqrt(3.0)
+
+
+class Place(NamedTuple):
+    """The fix that a position came from, the position (rad, rad, m), one sigma (m) horizontally
+    and of its height; a height that is not known is 0."""
+
+    fix: PositionOffer | None
+    where: Array
+    sd: float
+    sd_height: float
 
 
 def as_geodetic(metres: Array, lat: float) -> Array:
@@ -149,7 +160,7 @@ def build_start(
     `unexplained`: rates (3,) of a quiet vehicle beyond the data sheet, which may be biases.
     `moves`: what the velocity was measured of, `heading`: the yaw.
     """
-    fix, where, sd_position = place
+    fix, where, sd_position, sd_height = place
     lat, height = float(where[0]), float(where[2])
     nav = np.zeros(10)
     nav[:3] = where
@@ -157,13 +168,14 @@ def build_start(
     nav[6:] = quaternion_from_rpy(*rpy_from_dcm(dcm))
     if fix is not None:
         nav[:3] -= as_geodetic(dcm @ np.array(fix.lever), lat)
+    if model.hold_height and sd_height >= UNKNOWN_HEIGHT_SD_M:
+        nav[2] = nav[5] = 0.0  # HELD_UNKNOWN_M tells it from a height
     p = np.diag(model.initial**2)
     tilt_sd = MOTION_LEVEL_SD_RAD if levelled is None else levelled.sd
     p[0, 0] = p[1, 1] = tilt_sd**2
     p[2, 2] = sd_yaw**2
     p[3:6, 3:6] = np.diag(np.maximum(sd_velocity, LEAST_VELOCITY_SD) ** 2)
-    vertical = fix.sd[2] if fix is not None and fix.height_m is not None else sd_position
-    p[6:9, 6:9] = np.diag([sd_position**2, sd_position**2, vertical**2])
+    p[6:9, 6:9] = np.diag([sd_position**2, sd_position**2, sd_height**2])
     xi = np.zeros(model.size)
     if bias is not None:
         _start_biases(model, p, xi, *bias)

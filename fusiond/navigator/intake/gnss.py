@@ -71,6 +71,8 @@ class _Receiver(NamedTuple):
     lever: str
     bias: tuple[str, ...]
     wander: str
+    holds: bool
+    """Whether the model has states for what its fixes share: its section is configured."""
 
 
 def _receiver(source: str, sections: Sections) -> _Receiver:
@@ -79,7 +81,8 @@ def _receiver(source: str, sections: Sections) -> _Receiver:
     names = (sections.own(block, source, o) for block in (FIX_TIME, VELOCITY_TIME, ANTENNA_LEVER))
     time, velocity_time, lever = names
     bias, wander = _fix_bias(source, o, sections), _wander(source, o, sections)
-    return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander)
+    holds = bool(bias) and any(section is o for section in sections.aiding.values())
+    return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds)
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -109,6 +112,12 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     )
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
     by_phase = _by_phase(m, sections)
+    share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
+    height = m.height_m
+    if receiver.holds:
+        share = _with_geoid(share, m.geoid_sd_m, o)
+    elif m.geoid_sd_m > sd[2]:
+        height = None  # nothing holds what fixes share: sigma would shrink with their number
     motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
     wander = "" if by_phase else receiver.wander
     position = PositionAid(
@@ -117,14 +126,14 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         o.gate_probability,
         m.lat_rad,
         m.lon_rad,
-        m.height_m,
+        height,
         sd,
         o.lever_arm_m,
         sd_time_s,
         receiver.bias,
         receiver.time,
         receiver.lever,
-        _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0),
+        share,
         wander,
         _wandering(m, when, motion, o, sections, sd) if wander else 0.0,
     )
@@ -197,6 +206,12 @@ def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:
     (north, east, down), part = sd, math.sqrt(PHASE_SHARE)
     level, vertical = o.bias_sd_m, o.bias_down_sd_m
     return part * north / level, part * east / level, part * down / vertical
+
+
+def _with_geoid(share: Vector3, geoid_sd_m: float, o: GnssAiding) -> Vector3:
+    """The same with what is not known of the geoid in a height above the sea, which fixes share."""
+    north, east, down = share
+    return north, east, math.hypot(down, geoid_sd_m / o.bias_down_sd_m)
 
 
 def _fix_bias(source: str, section: GnssAiding, sections: Sections) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.topics import EVENT, EVENTS, NAV, REPLY, TOPICS, Topic
 
 _DIAGONAL_KNOWN = 2
+NO_HEIGHT_SD_M = 3464.0
+"""One sigma of an altitude of 0 where no height is known: roads are within 6 km of that."""
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
 _NUMBER = {"type": "number"}
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
@@ -100,13 +102,16 @@ def location_fix(message: Message) -> bytes | None:
     sd = [known(x) for x in (message.sd_e_m, message.sd_n_m, message.sd_d_m)]
     covariance = [0.0] * 9
     covariance[::4] = [0.0 if x is None else x * x for x in sd]
+    height = known(message.height_m)
+    if height is None:
+        height, covariance[8] = 0.0, NO_HEIGHT_SD_M**2  # the schema wants a number
     return _json(
         {
             "timestamp": _time(message.t_ms),
             "frame_id": "body",
             "latitude": message.lat_deg,
             "longitude": message.lon_deg,
-            "altitude": known(message.height_m) or 0.0,
+            "altitude": height,
             "position_covariance": covariance,
             "position_covariance_type": _DIAGONAL_KNOWN,
         }

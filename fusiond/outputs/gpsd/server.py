@@ -41,7 +41,8 @@ class Watch:
     def ask(self, wanted: dict[str, Any]) -> str | None:
         """Take a client's object over; what is wrong with it, if something is.
 
-        A client that names no format wants JSON; one that says no `enable` wants to watch.
+        One that says no `enable` wants to watch; one that names no format gets no reports, as from
+        gpsd 3.22: clients that then connect again and ask for JSON read the answer first.
         """
         asked = {k: v for k, v in wanted.items() if k in self.__slots__ and k != "raw"}
         wrong = [key for key, value in asked.items() if not isinstance(value, bool)]
@@ -49,8 +50,6 @@ class Watch:
             return f"{wrong[0]} must be true or false"
         for key, value in ({"enable": True} | asked).items():
             setattr(self, key, value)
-        if self.enable and not (self.json or self.nmea) and "json" not in asked:
-            self.json = True
         return None
 
     def report(self) -> Report:

@@ -150,11 +150,13 @@ async def test_wrong_baud_rate_is_named(device: Device) -> None:
         (b"", "silent", "no bytes for 0.3 s"),
         (b"\xb5\x62\x01\x07\x00\x00\x08\x19", "silent", "switch on NMEA output"),
         (wire(made("GPGSV,1,1,00,1")), "running", "switch on GGA"),
+        (gga(29).partition(b"*")[0] + b"\r\n", "silent", "without a checksum"),
+        (wire(made("IIRMC,021429.00,A,3958.12,N,11619.5,E,1,90,011226,,")), "running", "talker II"),
         (wire(made("GNGGA,,,,,,0,00,99.99,,,,,,")), "running", "no fix"),
         (gga(29, quality=6), "running", "dead reckoning"),
         (gga(29, quality=8), "running", "simulates"),
     ],
-    ids=["nothing", "ubx", "gsv", "no_fix", "dead_reckoning", "simulator"],
+    ids=["nothing", "ubx", "gsv", "no_checksum", "talker", "no_fix", "dead_reckoning", "simulator"],
 )
 async def test_status_says_what_is_wrong(
     device: Device, sent: bytes, state: str, words: str
@@ -168,6 +170,39 @@ async def test_status_says_what_is_wrong(
                 device.send(sent)
                 await asyncio.sleep(0.02)
     assert vehicle.fixes == []
+
+
+async def test_an_epoch_with_a_pause_in_it_is_one_fix(device: Device) -> None:
+    """GGA, more than 50 ms, RMC of the same hhmmss.ss (zephyrproject-rtos/zephyr#67669)."""
+    device.plug()
+    vehicle = Vehicle(device)
+    counters = vehicle.driver.counters
+    async with running(vehicle):
+        await until(lambda: opened(vehicle))
+        for second in range(20, 27):
+            device.send(gga(second))
+            await until(lambda n=second - 19: counters["sentences"] == 2 * n - 1)
+            await asyncio.sleep(0.12)
+            device.send(rmc(second))
+            await until(lambda n=second - 19: counters["sentences"] == 2 * n)
+        await until(lambda: len(vehicle.fixes) == 7)
+    velocities = [fix.v_ned_m_s for fix in vehicle.fixes]
+    assert None not in velocities[1:], "from the second epoch on"
+    assert [f.t_seen_ns for f in vehicle.fixes] == sorted(f.t_seen_ns for f in vehicle.fixes)
+
+
+async def test_what_makes_fixes_poorer_is_an_event_once(device: Device) -> None:
+    device.plug()
+    vehicle = Vehicle(device)
+    async with running(vehicle):
+        await until(lambda: opened(vehicle))
+        for second in range(20, 25):
+            device.send(gga(second).replace(b"-9.1", b"") + rmc(second))  # a wrong checksum now
+            device.send(wire(made(gga(second).decode()[1:-5].replace("-9.1", ""))) + rmc(second))
+            await until(lambda n=second - 20: len(vehicle.fixes) > n)
+    told = [m for m in vehicle.emitted if isinstance(m, DeviceEvent)]
+    assert [e.code for e in told].count("height_above_sea") == 1
+    assert vehicle.driver.cautions["height_above_sea"] in [e.text for e in told]
 
 
 async def test_a_receiver_that_hangs_is_named(device: Device) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.measurements import ArrivalStamp, Heading, Measurement, UtcStamp
 from tests.drivers.nmea.sentences import (
     GGA,
     GSA,
     GST,
+    HDT,
     RMC,
     VTG,
     ZDA,
@@ -142,3 +145,155 @@ def test_any_chunks_give_the_same_measurements(size: int) -> None:
     other = decoder()
     assert found + one.flush() == other.feed(stream, 1) + other.flush()
     assert one.counters == other.counters
+
+
+def test_a_time_with_other_decimals_is_the_same_time() -> None:
+    """Magellan 315 prints .76 in GGA and .758 elsewhere; a ZDA has whole seconds."""
+    one = decoder()
+    found = []
+    for gga, rmc, zda in seconds(10, 4, GGA, RMC, ZDA):
+        sentences = (
+            changed(gga, ".00,", ".76,"),
+            changed(rmc, ".00,", ".758,"),
+            changed(zda, ".00,", ","),
+        )
+        found += one.feed(wire(*sentences), 1)
+    found += one.flush()
+    assert [f.v_ned_m_s is not None for f in fixes(found)] == [True] * 4
+    assert one.counters["epochs"] == 4
+    assert one.counters["late_sentence"] == 0
+
+
+def test_epochs_a_step_of_the_last_digit_apart_are_two() -> None:
+    fine, _ = decode(*(changed(GGA, "29.00,", f"29.{i:02d},") for i in range(10)))
+    assert len(fixes(fine)) == 10
+    whole, _ = decode(*(changed(GGA, "021429.00,", f"0214{29 + i},") for i in range(10)))
+    assert len(fixes(whole)) == 10
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("29.76", "29.758", True),
+        ("29.76", "29.754", False),
+        ("29.76", "29.764", True),
+        ("29.76", "29.7699", True),
+        ("29", "29.90", True),
+        ("30", "29.90", False),
+        ("29.9", "29.95", True),
+        ("29.90", "29.91", False),
+        ("29.00", "29", True),
+    ],
+)
+def test_decimals_that_are_cut_or_rounded(one: str, other: str, same: bool) -> None:
+    for first, second in ((one, other), (other, one)):
+        pair = changed(GGA, "29.00", first), changed(RMC, "29.00", second)
+        (fix,) = fixes(decode(*pair)[0])
+        assert (fix.v_ned_m_s is not None) is same
+        if same:  # and the time with more decimals is that of the fix
+            assert isinstance(fix.stamp, UtcStamp)
+            finer = max(one, other, key=lambda text: len(text.partition(".")[2]))
+            assert fix.stamp.utc_ns % 60_000_000_000 == round(float(finer) * 1e9)
+
+
+class Line:
+    """A decoder on a line with a clock: bursts, and silences of more than 50 ms between them."""
+
+    def __init__(self) -> None:
+        self.decoder = decoder()
+        self.now_ms = 0
+        self.found: list[Measurement] = []
+
+    def burst(self, *sentences: str, after_ms: int) -> None:
+        """`sentences` come together, `after_ms` after what came before."""
+        if after_ms > 50:
+            self.found += self.decoder.silence()
+        self.now_ms += after_ms
+        self.found += self.decoder.feed(wire(*sentences), self.now_ms * 1_000_000)
+
+    @property
+    def velocities(self) -> list[bool]:
+        """Of each fix, whether it has one."""
+        return [f.v_ned_m_s is not None for f in fixes(self.found)]
+
+
+def test_a_pause_inside_an_epoch_is_learned_at_once() -> None:
+    """GGA, 120 ms, RMC of the same hhmmss.ss."""
+    line = Line()
+    for gga, rmc in seconds(10, 8, GGA, RMC):
+        line.burst(gga, after_ms=880)
+        line.burst(rmc, after_ms=120)
+    assert line.velocities == [False] + [True] * 7
+    assert line.decoder.counters["late_sentence"] == 1
+    assert line.decoder.counters["epochs"] == 9
+    seen_ms = [f.t_seen_ns // 1_000_000 for f in fixes(line.found)]
+    assert seen_ms[1:] == [1000 * i for i in range(2, 9)]
+
+
+def test_several_pauses_inside_an_epoch() -> None:
+    line = Line()
+    for gga, rmc, gst in seconds(10, 9, GGA, RMC, GST):
+        line.burst(gga, after_ms=700)
+        line.burst(rmc, after_ms=150)
+        line.burst(gst, after_ms=150)
+    assert line.velocities[2:] == [True] * 7
+    assert all(f.sd_ned_m is not None for f in fixes(line.found)[3:])
+
+
+def test_an_epoch_that_begins_with_rmc_and_pauses() -> None:
+    line = Line()
+    for rmc, gga in seconds(10, 8, RMC, GGA):
+        line.burst(rmc, after_ms=880)
+        line.burst(gga, after_ms=120)
+    assert line.velocities == [False] + [True] * 7
+    assert line.decoder.counters["rmc_alone"] == 0
+
+
+def test_a_velocity_without_a_time_after_a_pause_stays_with_its_own_epoch() -> None:
+    """VTG has no time: it belongs to the epoch that is nearer, before it or after."""
+    line = Line()
+    kmh = [changed(VTG, "19.438", f"{10 + i}.000") for i in range(8)]
+    for (gga,), vtg in zip(seconds(10, 8, GGA), kmh, strict=True):
+        line.burst(gga, after_ms=880)
+        line.burst(vtg, after_ms=120)
+    line.found += line.decoder.flush()
+    speeds = [f.v_ned_m_s and f.v_ned_m_s[1] * 3600 / 1852 for f in fixes(line.found)]
+    assert speeds[0] is None
+    assert [round(s or 0.0) for s in speeds[1:]] == [11, 12, 13, 14, 15, 16, 17]
+    ahead = Line()
+    for (gga,), vtg in zip(seconds(10, 8, GGA), kmh, strict=True):
+        ahead.burst(vtg, after_ms=880)
+        ahead.burst(gga, after_ms=120)
+    ahead.found += ahead.decoder.flush()
+    speeds = [f.v_ned_m_s and f.v_ned_m_s[1] * 3600 / 1852 for f in fixes(ahead.found)]
+    assert [round(s or 0.0) for s in speeds] == [10, 11, 12, 13, 14, 15, 16, 17]
+
+
+def test_a_burst_without_a_pause_loses_no_latency() -> None:
+    line = Line()
+    for i, epoch in enumerate(seconds(10, 4, GGA, RMC)):
+        line.burst(*epoch, after_ms=1000)
+        assert len(fixes(line.found)) == (i + 1 if i >= 2 else i)
+
+
+def test_headings_between_the_fixes_are_never_given_the_time_of_one() -> None:
+    """HDT at 5 Hz beside GGA and RMC at 1 Hz."""
+    line = Line()
+    for gga, rmc in seconds(10, 6, GGA, RMC):
+        line.burst(gga, rmc, after_ms=200)
+        for _ in range(4):
+            line.burst(HDT, after_ms=200)
+    line.found += line.decoder.flush()
+    assert line.velocities == [True] * 6
+    headings = [m for m in line.found if isinstance(m, Heading)]
+    assert len(headings) == 24
+    assert all(m.stamp == ArrivalStamp() for m in headings)
+
+
+def test_pauses_at_ever_new_places_are_bounded() -> None:
+    line = Line()
+    for i, (gga, rmc, gst) in enumerate(seconds(0, 59, GGA, RMC, GST)):
+        line.burst(*[GSA] * (i % 20), gga, after_ms=700)
+        line.burst(rmc, after_ms=100)
+        line.burst(gst, after_ms=200)
+    assert line.decoder.counters["fixes"] == 59

@@ -19,6 +19,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.fields import typed
+from drivers.nmea.geoid import GEOID_SD_M
 from tests.drivers.nmea.sentences import (
     GGA,
     GGA_NO_FIX,
@@ -70,12 +71,12 @@ def test_hemispheres_and_absent_separation() -> None:
     fix = fix_of(GGA_SW)
     assert math.degrees(fix.lat_rad) == pytest.approx(-(39 + 58.12345 / 60))
     assert math.degrees(fix.lon_rad) == pytest.approx(-(116 + 19.54321 / 60))
-    assert fix.height_m is None  # sea level alone is no ellipsoidal height
+    assert (fix.height_m, fix.geoid_sd_m) == (45.3, GEOID_SD_M)  # above the sea
     assert fix.stamp == TimeOfDayStamp(2 * 3600 + 14 * 60 + 29.0)
     assert (fix.v_ned_m_s, fix.sd_ned_m, fix.vdop) == (None, None, None)
 
 
-@pytest.mark.parametrize("talker", ["GP", "GN", "BD", "GB", "GL", "GA", "GQ"])
+@pytest.mark.parametrize("talker", ["GP", "GN", "BD", "GB", "GL", "GA", "GI", "GQ", "QZ"])
 def test_every_talker(talker: str) -> None:
     assert fix_of(changed(GGA, "GN", talker)).quality == 4
 
@@ -126,10 +127,128 @@ def test_velocity_needs_a_course_unless_at_rest() -> None:
     assert v[1] == pytest.approx(2.0 * 1852 / 3600)
 
 
-def test_two_dimensional_fix_has_no_height() -> None:
-    found, one = decode(GGA, GSA_2D)
-    assert fixes(found)[0].height_m is None
-    assert one.counters["height_not_measured"] == 1
+@pytest.mark.parametrize(
+    ("said", "height_m"),
+    [
+        ([changed(GGA, ",18,", ",04,"), GSA_2D], None),
+        ([changed(GGA, ",18,", ",,"), GSA_2D], None),
+        ([GGA, changed(GSA_2D, "1.50", "99.99")], None),
+        ([GGA, changed(GSA_2D, "1.50", "")], None),
+        ([GGA, GSA_2D], 36.2),  # Quectel, Telit: 14 satellites and GSA says 2
+        ([changed(GGA, ",18,", ",05,"), GSA_2D], 36.2),
+        # Quectel EG25-G: GGA counts GPS alone, GNS and GSA all.
+        ([changed(GGA, ",18,", ",04,"), changed(GNS, ",18,", ",08,"), GSA_2D], 36.2),
+        ([changed(GGA, ",18,", ",03,"), GSA_2D, changed(GSA_2D, "1.50,4", "1.50,1")], 36.2),
+        ([changed(GGA, ",18,", ",03,"), GSA_2D, changed(GSA_2D, "GN", "GP")], None),
+        ([changed(GGA, ",18,", ",04,"), GSA_2D, GSA], 36.2),  # another system's says 3
+        ([changed(GGA, ",18,", ",04,"), GSA], 36.2),
+    ],
+)
+def test_two_dimensional_fix_has_no_height(said: list[str], height_m: float | None) -> None:
+    found, one = decode(*said)
+    (fix,) = fixes(found)
+    assert fix.height_m == (None if height_m is None else pytest.approx(height_m))
+    assert one.counters["height_not_measured"] == (height_m is None)
+    assert fix.geoid_sd_m == 0.0
+
+
+def test_a_two_dimensional_fix_above_the_sea_has_no_height_either() -> None:
+    few = changed(changed(GGA, ",18,", ",03,"), "-9.100", "")
+    assert fix_of(few, GSA_2D).height_m is None
+    assert fix_of(few).height_m == 45.3
+
+
+def test_a_separation_that_was_printed_once_is_remembered() -> None:
+    """As far as the geoid is level: 1 m in 20 km; where the vehicle was shipped, not at all."""
+    later = changed(changed(changed(GGA, "-9.100", ""), "021429", "021430"), "3958.", "4008.")
+    elsewhere = changed(changed(changed(GGA, "-9.100", ""), "021429", "021431"), "N,116", "S,016")
+    found = fixes(decode(GGA, later, elsewhere)[0])
+    assert [f.height_m for f in found] == [pytest.approx(36.2), pytest.approx(36.2), 45.3]
+    assert [f.geoid_sd_m for f in found] == [0.0, pytest.approx(0.93, abs=0.01), GEOID_SD_M]
+
+
+@pytest.mark.parametrize(
+    ("status", "mode", "quality", "refusal"),
+    [
+        ("A", "A", 1, ""),
+        ("A", "", 1, ""),
+        ("D", "R", 4, ""),  # Unicore UM960: the mode is R
+        ("D", "", 2, ""),
+        ("F", "", 5, ""),
+        ("R", "", 4, ""),
+        ("P", "", 3, ""),
+        ("A", "N", None, "no_fix"),
+        ("V", "A", None, "no_fix"),
+        ("N", "", None, "no_fix"),
+        ("", "", None, "no_fix"),
+        ("E", "", None, "dead_reckoning_refused"),
+        ("A", "E", None, "dead_reckoning_refused"),
+        ("M", "", None, "manual_refused"),
+        ("S", "", None, "simulator_refused"),
+    ],
+)
+def test_rmc_alone(status: str, mode: str, quality: int | None, refusal: str) -> None:
+    rmc = changed(changed(RMC, ",A,", f",{status},"), "R,V", f"{mode},V")
+    epochs = [changed(rmc, "0214", f"02{minute}") for minute in range(14, 18)]
+    found, one = decode(*epochs)
+    assert [f.quality for f in fixes(found)] == ([] if quality is None else [quality] * 3)
+    assert one.refusal == refusal
+    for fix in fixes(found):
+        assert math.degrees(fix.lat_rad) == pytest.approx(39 + 58.12345 / 60, abs=1e-9)
+        assert math.degrees(fix.lon_rad) == pytest.approx(116 + 19.54321 / 60, abs=1e-9)
+        assert (fix.height_m, fix.geoid_sd_m, fix.sd_ned_m, fix.hdop) == (None, 0.0, None, None)
+        assert fix.v_ned_m_s == (
+            pytest.approx(0.0, abs=1e-9),
+            pytest.approx(19.438 * 1852 / 3600),
+            None,
+        )
+
+
+def test_rmc_before_mode_and_status_of_the_standard() -> None:
+    """NMEA 2.0 has neither mode nor what follows it."""
+    old = made(RMC[1:-3].removesuffix(",,,R,V") + ",003.1,W")
+    found, one = decode(*(changed(old, "0214", f"02{minute}") for minute in range(14, 17)))
+    assert [f.quality for f in fixes(found)] == [1, 1]
+    assert one.counters["rmc_alone"] == 2
+
+
+def test_a_lost_gga_is_not_replaced_by_rmc() -> None:
+    epochs = [[changed(s, "0214", f"02{m}") for s in (GGA, RMC)] for m in range(14, 20)]
+    del epochs[2][0]
+    found, one = decode(*(sentence for epoch in epochs for sentence in epoch))
+    assert [f.quality for f in fixes(found)] == [4] * 5
+    assert one.counters["rmc_alone"] == 0
+
+
+@pytest.mark.parametrize("status", ["D", "R", "F", "P"])
+def test_rmc_status_that_tells_the_mode_leaves_velocity_and_time(status: str) -> None:
+    report, fix = decode(GGA, changed(RMC, ",A,", f",{status},"))[0]
+    assert isinstance(report, TimeReport)
+    assert report.utc_ns == UTC_NS
+    assert isinstance(fix, PositionFix)
+    assert fix.v_ned_m_s is not None
+    assert fix.stamp == UtcStamp(UTC_NS)
+    assert fix.quality == 4
+
+
+def test_a_status_that_is_none_makes_rmc_count_for_nothing() -> None:
+    found, one = decode(GGA, changed(RMC, ",A,", ",Z,"))
+    (fix,) = fixes(found)
+    assert (fix.quality, fix.v_ned_m_s) == (4, None)
+    assert one.counters["unknown_status"] == 1
+
+
+def test_novatels_quality_of_a_fix_with_sbas() -> None:
+    assert fix_of(changed(GGA, "E,4", "E,9")).quality == 2
+
+
+def test_what_the_printed_digits_leave_out() -> None:
+    fix = fix_of(changed(GGA, "3958.12345,N,11619.54321", "3958.12,N,11619.5"))
+    step = 1852.0 / math.sqrt(12.0)
+    cos = math.cos(fix.lat_rad)
+    assert fix.rounding_sd_ned_m == pytest.approx(
+        (step * 1e-2, step * 1e-1 * cos, 2.9e-4), abs=1e-5
+    )
 
 
 def test_sigma_without_numbers_is_none() -> None:
@@ -153,7 +272,8 @@ def test_sigma_without_numbers_is_none() -> None:
         ([changed(GGA, "E,4", "E,7")], "manual_refused"),
         ([changed(GGA, "E,4", "E,8")], "simulator_refused"),
         ([GGA, changed(RMC, "R,V", "S,V")], "simulator_refused"),
-        ([changed(GGA, "E,4", "E,9")], "unknown_quality"),
+        ([changed(GGA, "E,4", "E,10")], "unknown_quality"),
+        ([changed(GGA, "E,4", "E,3"), changed(RMC, ",A,", ",E,")], "dead_reckoning_refused"),
         ([changed(GGA, "45.300", "1e300")], "height_implausible"),
         ([changed(GGA, "45.300", "-6371000")], "height_implausible"),
         ([changed(GGA, "-9.100", "100000")], "height_implausible"),

@@ -177,6 +177,46 @@ def inav(seed: int, prn: int = 7, issue: int = 77) -> list[list[int]]:
     return pages
 
 
+def with_crc(bits: int, length: int, words: int) -> list[int]:
+    """`length` bits, their CRC-24Q and zeros in so many words."""
+    whole = bits << 24 | crc24q(bits.to_bytes(length // 8, "big"))
+    whole <<= 32 * words - length - 24
+    return [whole >> (32 * (words - 1 - i)) & 0xFFFFFFFF for i in range(words)]
+
+
+def _bcnav_orbit(bits: int, total: int, at: int) -> int:
+    """A MEO's Ephemeris I, near its reference axis and with 0.0144 as above."""
+    bits = put(put(bits, total, at, 11, 1152), total, at + 11, 2, 3)
+    return put(put(bits, total, at + 13, 26, 12345), total, at + 137, 33, ECCENTRICITY << 1)
+
+
+def bcnav1(seed: int, issue: int = 77, health: int = 0) -> list[list[int]]:
+    """Subframes 2 and 3 of random bits."""
+    rng = random.Random(seed)
+    two = put(put(rng.getrandbits(576), 576, 0, 13, 1094), 576, 13, 8, 96)
+    two = put(put(two, 576, 21, 10, issue), 576, 31, 8, issue)
+    two = _bcnav_orbit(two, 576, 39)
+    three = put(rng.getrandbits(240), 240, 6, 4, health)
+    return [with_crc(two, 576, 19), with_crc(three, 240, 9)]
+
+
+def bcnav2(seed: int, prn: int = 21, issue: int = 77, sow_s: int = 345_600) -> list[list[int]]:
+    """Messages 10, 11 and 30 of random bits."""
+    rng, found = random.Random(seed), []
+    for number, kind in enumerate((10, 11, 30)):
+        bits = put(put(rng.getrandbits(264), 264, 0, 6, prn), 264, 6, 6, kind)
+        bits = put(bits, 264, 12, 18, sow_s // 3 + number)
+        if kind == 10:
+            bits = put(put(bits, 264, 30, 13, 1094), 264, 53, 8, issue)
+            bits = _bcnav_orbit(bits, 264, 61)
+        else:
+            bits = put(bits, 264, 30, 4, 0)
+        if kind == 30:
+            bits = put(bits, 264, 111, 10, issue)
+        found.append(with_crc(bits, 264, 9))
+    return found
+
+
 def oracle_fields(eph: Any) -> dict[str, float]:
     """Of an `eph_t` of RTKLIB, by our names."""
     return {

@@ -17,7 +17,7 @@ from tests.places import REPOSITORY
 PAGE = (REPOSITORY / "docs" / "gnss-raw.md").read_text()
 CODE = "".join(path.read_text() for path in sorted((REPOSITORY / "drivers" / "raw").glob("*.py")))
 COMPOSED = {
-    *(f"subframes_{message}" for message in ("lnav", "d1", "d2", "inav")),
+    *(f"subframes_{message}" for message in ("lnav", "d1", "d2", "bcnav1", "bcnav2", "inav")),
     *(f"measured_{system}" for system in "GEC"),
     *(f"measured_{system}" for system in ("sbas", "qzss", "glonass", "navic")),
     *(f"{system}_not_used" for system in ("sbas", "qzss", "glonass", "navic", "unknown_system")),
@@ -60,6 +60,7 @@ def test_counters_are_those_of_the_code() -> None:
     counted = set(re.findall(r'ounters\["(\w+)"\]', CODE)) | COMPOSED
     counted |= set(re.findall(r'RefusedError\("(\w+)"\)', CODE))
     counted |= set(re.findall(r'"(\w+_not_used)"', CODE))
+    counted |= set(re.findall(r'_refuse\("(\w+)"', CODE))
     known_of_nmea = {"epochs", "sentences"}
     assert counted - known_of_nmea <= documented
 

@@ -22,7 +22,7 @@ from drivers.raw.driver import GnssDecoder, GnssDriver, GnssOptions
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from tests.drivers.at_work import at_work
 from tests.drivers.nmea.sentences import gga, rmc
-from tests.drivers.raw.frames import d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
+from tests.drivers.raw.frames import bcnav1, d1, lnav, measurement, put, rawx, rtcm, sfrbx, ubx
 from tests.patience import until
 from tests.pty_device import Device
 
@@ -105,7 +105,7 @@ async def test_raw_alone_is_running_and_tells_the_time(device: Device) -> None:
     [
         (b"", "silent", "no bytes for 0.3 s"),
         (b"\xa5" * 50, "silent", "neither NMEA, UBX nor RTCM 3 verifies at 115200 baud"),
-        (ubx(b"\x01\x07", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
+        (ubx(b"\x0a\x04", b"\x00" * 92), "running", "switch on UBX-RXM-RAWX"),
         (rawx(measurement(), week=0), "running", "no time yet"),
         (gga(29, quality=0), "running", "no fix"),
     ],
@@ -120,6 +120,24 @@ async def test_status_says_what_is_wrong(
             device.send(sent)
             await asyncio.sleep(0.02)
     assert vehicle.of(RawGnssEpoch) == []
+
+
+async def test_b1c_without_its_group_delays_says_so_until_they_come(device: Device) -> None:
+    vehicle = Vehicle(device)
+    b1c = measurement(gnss=3, prn=21, sig=5)
+    async with running(vehicle):
+        device.send(b"".join(sfrbx(3, 21, 4, words) for words in d1(1)))
+        device.send(rawx(b1c))
+        await until(lambda: "no_group_delay" in vehicle.status()[1])
+        assert "1 BeiDou satellites on B1C or B2a" in vehicle.status()[1]
+        assert "switch on UBX-RXM-SFRBX" in vehicle.status()[1]
+        device.send(b"".join(sfrbx(3, 21, 6, words) for words in bcnav1(1)))
+        device.send(rawx(b1c, tow_s=345_601.0))
+        await until(lambda: vehicle.status() == ("running", ""))
+        # One that is tracked on B3I too, or another that has its delays, is no reason to complain.
+        device.send(rawx(measurement(gnss=3, prn=22, sig=5), b1c, tow_s=345_602.0))
+        await until(lambda: len(vehicle.of(RawGnssEpoch)) == 3)
+        assert vehicle.status() == ("running", "")
 
 
 async def test_unplugged_in_the_middle_of_a_frame(device: Device) -> None:
@@ -285,3 +303,35 @@ def test_old_logs_need_their_date() -> None:
     (found,) = decoder.feed(stream, 0)
     assert isinstance(found, Ephemeris)
     assert found.week == 2450 - 1024
+
+
+@pytest.mark.parametrize(
+    ("utc_s", "leap_s"),
+    [(1_459_975_092, 17), (1_341_100_799, 15), (1_341_100_800, 16), (1_136_073_599, 13)],
+)
+def test_stamps_of_an_old_log_have_the_leap_seconds_of_their_date(utc_s: int, leap_s: int) -> None:
+    decoder = RawDecoder("gnss", earliest=date(2000, 5, 1))
+    decoder.note_utc(utc_s * 1_000_000_000)
+    tow_ms = (utc_s - 315_964_800 + leap_s) % 604_800 * 1000
+    (epoch,) = decoder.feed(msm7(1077, tow_ms, 0, [GOOD]), 0)
+    assert isinstance(epoch, RawGnssEpoch)
+    assert epoch.stamp == UtcStamp(utc_s * 1_000_000_000)
+
+
+def system_parameters(day: int, second: int, leap: int) -> bytes:
+    fields = [(1013, 12), (0, 12), (day, 16), (second, 17), (0, 5), (leap, 8)]
+    value = total = 0
+    for field, length in fields:
+        value, total = value << length | field, total + length
+    return rtcm((value << -total % 8).to_bytes((total + 7) // 8, "big"))
+
+
+def test_1013_dates_a_stream_and_tells_its_leap_seconds() -> None:
+    decoder = RawDecoder("gnss")
+    assert decoder.feed(system_parameters(57_484, 74_292, 16), 0) == []  # 2016-04-06, a wrong count
+    (epoch,) = decoder.feed(msm7(1077, 333_509_000, 0, [GOOD]), 0)
+    assert isinstance(epoch, RawGnssEpoch)
+    assert (epoch.week, epoch.stamp) == (1891, UtcStamp(1_459_975_093_000_000_000))
+    assert decoder.counters["rtcm_system_parameters"] == 1
+    decoder.feed(system_parameters(57_484, 74_292, 255), 0)
+    assert decoder.counters["leap_seconds_implausible"] == 1

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from drivers.measurements import PositionFix
 from fusiond.configuration.load import load_config
-from fusiond.offline.can_log import CanLog, messages, read_can_log
+from fusiond.offline.can_frames import messages
+from fusiond.offline.can_log import CanLog, read_can_log
 from fusiond.offline.process import process
 from fusiond.studies.navigation_error import metres
 from tests.broker import Broker
@@ -79,7 +80,7 @@ def _across_m(log: CanLog, nav: list[dict[str, Any]]) -> NDArray[np.float64]:
 @pytest.mark.skipif(not LOG.is_file(), reason=f"{LOG} is missing: set FUSIOND_DATA")
 async def test_a_recorded_bus_drives_the_daemon(tmp_path: Path, broker: Broker) -> None:
     path = _minute(tmp_path / "minute.log")
-    frames = list(messages(path, lambda text: None))
+    frames = list(messages(path))
     config = _config(tmp_path / "css_164.toml", broker.port)
     log = read_can_log(path, load_config(config))
     offline = process(load_config(config), None, [], can_log=path)

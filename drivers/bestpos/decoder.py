@@ -1,0 +1,295 @@
+"""The BESTPOS family of NovAtel and Unicore in, measurements out: no I/O, no clock.
+
+    BESTPOS, BESTGNSSPOS, RTKPOS, PSRPOS   height above the sea + undulation = ellipsoidal height
+    BESTVEL, BESTGNSSVEL, RTKVEL, PSRVEL   speed over ground, track, vertical speed upwards
+    BESTNAV                                position, its sigmas, velocity and its two, in one log
+    HEADING, HEADING2, UNIHEADING, DUALANTENNAHEADING    with a sigma
+    TIME                                   UTC offset, where the header does not say leap seconds
+
+Of an epoch's positions the first of `POSITIONS` that the receiver itself believes serves. Status
+and type are words; a type that is not known is refused by name. Sources: NovAtel OEM7 Commands and
+Logs Reference Manual; Unicore Reference Commands Manual for N4 High Precision Products.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+from drivers.bestpos.framing import Log, LogSplitter
+from drivers.cycle import Cycle
+from drivers.measurements import Measurement
+from drivers.plausible import LEAP_SECONDS, within
+from drivers.raw.weeks import leap_seconds, utc_ns
+from drivers.solution import Solution, SolutionDecoding, SolutionJudge
+
+POSITIONS = ("BESTGNSSPOS", "BESTNAV", "BESTPOS", "RTKPOS", "PPPPOS", "PSRPOS")
+"""Best first: BESTPOS of a receiver with an IMU is its inertial solution, BESTGNSSPOS is not."""
+VELOCITIES = ("BESTGNSSVEL", "BESTNAV", "BESTVEL", "RTKVEL", "PPPVEL", "PSRVEL")
+HEADINGS = frozenset({"HEADING", "HEADING2", "UNIHEADING", "DUALANTENNAHEADING"})
+TYPES: dict[str, int | str] = {
+    "SINGLE": 1,
+    "FIXEDHEIGHT": 1,
+    "OPERATIONAL": 1,
+    "WARNING": 1,
+    "PSRDIFF": 2,
+    "WAAS": 2,
+    "SBAS": 2,
+    "CDGPS": 2,
+    "OMNISTAR": 2,
+    "OMNISTAR_HP": 2,
+    "OMNISTAR_XP": 2,
+    "PPP_BASIC_CONVERGING": 2,
+    "PPP_BASIC": 2,
+    "PPP_CONVERGING": 2,
+    "PPP": 2,
+    "L1_FLOAT": 5,
+    "IONOFREE_FLOAT": 5,
+    "NARROW_FLOAT": 5,
+    "L1_INT": 4,
+    "WIDE_INT": 4,
+    "NARROW_INT": 4,
+    "NONE": "no_fix",
+    "OUT_OF_BOUNDS": "no_fix",
+    "FIXEDPOS": "manual_refused",
+    "PROPAGATED": "dead_reckoning_refused",
+    "RTK_DIRECT_INS": "inertial_refused",
+}
+"""Position type: quality by NMEA, or the counter of its refusal. INS_... are inertial. Without
+ambiguities fixed PPP is as good as its sigma says."""
+DATUMS = frozenset({"WGS84", "61", "CGCS2000", "GTRF", "ITRF2008", "ITRF2014", "ITRF2020"})
+"""Names (61: WGS 84 by number) that agree with WGS 84 to some centimetres."""
+_POSITION, _BOTH, _VELOCITY_AT = 10, 28, 21
+
+
+class BadFieldError(ValueError):
+    """A log verified, but a field of it cannot be."""
+
+
+@dataclass(slots=True)
+class _Epoch:
+    week: int
+    tow_s: float
+    believed: bool
+    leap_seconds: int | None
+    t_seen_ns: int = 0
+    places: dict[str, Solution] = field(default_factory=dict)
+    velocities: dict[str, tuple[_Velocity, _VelocitySd | None]] = field(default_factory=dict)
+
+
+_Velocity = tuple[float, float, float]
+_VelocitySd = tuple[float, float, float]
+
+
+class BestposDecoder:
+    """`feed` bytes, get measurements; `flush` at the end of the file.
+
+    Beside those of `LogSplitter`, `Cycle` and `SolutionJudge` it counts `logs_used`,
+    `logs_not_used`, `bad_field`, `heading_not_valid`, `heading_not_fixed`,
+    `position_type_unknown`, `velocity_latent`.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        decoding: SolutionDecoding | None = None,
+        counters: Counter[str] | None = None,
+    ) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._decoding = decoding or SolutionDecoding()
+        self._splitter = LogSplitter(self.counters)
+        self._judge = SolutionJudge(source, self._decoding, self.counters)
+        self._cycle = Cycle(self.counters)
+        self._epoch: _Epoch | None = None
+        self._leap_seconds: int | None = None
+
+    @property
+    def refusal(self) -> str:
+        """Why the last epoch gave no fix, by counter name."""
+        return self._judge.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._judge.gga
+
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `silence` would close an epoch."""
+        return self._epoch is not None
+
+    def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
+        """The measurements that `data`, seen at `t_seen_ns`, completes."""
+        found: list[Measurement] = []
+        for log in self._splitter.feed(data):
+            self._take(log, t_seen_ns, found)
+        return found
+
+    def silence(self) -> list[Measurement]:
+        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        found: list[Measurement] = []
+        self._close(found, learn=True)
+        return found
+
+    def flush(self) -> list[Measurement]:
+        """The stream ended, or broke: everything that can still be had from what came."""
+        self._splitter.finish()
+        found: list[Measurement] = []
+        self._close(found, learn=False)
+        return found
+
+    # ----------------------------------------------------------------- logs to epochs
+
+    def _take(self, log: Log, t_seen_ns: int, found: list[Measurement]) -> None:
+        name = log.name
+        try:
+            if name in HEADINGS:
+                self._heading(log, t_seen_ns, found)
+            elif name == "TIME":
+                self._time(log)
+            elif name in POSITIONS or name in VELOCITIES:
+                self._group(log, t_seen_ns, found)
+            else:
+                self.counters["logs_not_used"] += 1
+                return
+        except BadFieldError:
+            self.counters["bad_field"] += 1
+            return
+        self.counters["logs_used"] += 1
+
+    def _group(self, log: Log, t_seen_ns: int, found: list[Measurement]) -> None:
+        key = log.week, log.tow_s
+        if self._cycle.begins_anew(key, log.name):
+            self._close(found, learn=True)
+        elif self._cycle.late(key, log.name):
+            return
+        epoch = self._epoch
+        place = self._place(log, t_seen_ns) if log.name in POSITIONS else None
+        velocity = self._velocity(log) if log.name in VELOCITIES else None
+        if epoch is None:
+            leap = log.leap_seconds if log.leap_seconds is not None else self._leap_seconds
+            epoch = self._epoch = _Epoch(log.week or 0, log.tow_s, log.believed, leap)
+        epoch.t_seen_ns = t_seen_ns
+        if place is not None:
+            epoch.places[log.name] = place
+        if velocity is not None:
+            epoch.velocities[log.name] = velocity
+        if self._cycle.add(key, log.name):
+            self._close(found, learn=False, at_once=True)
+
+    def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
+        epoch, self._epoch = self._epoch, None
+        if epoch is None:
+            return
+        self._cycle.close(learn=learn, at_once=at_once)
+        there = [epoch.places[name] for name in POSITIONS if name in epoch.places]
+        if not there:
+            return
+        best = next((s for s in there if s.refusal is None), there[0])
+        best.t_seen_ns = epoch.t_seen_ns
+        best.utc_ns, best.utc_known = self._utc(epoch), epoch.believed
+        moving = [epoch.velocities[name] for name in VELOCITIES if name in epoch.velocities]
+        if moving:
+            best.v_ned_m_s, best.sd_v_ned_m_s = moving[0]
+        found += self._judge.epoch(best)
+
+    def _utc(self, epoch: _Epoch) -> int | None:
+        if not epoch.week:
+            return None
+        leap = epoch.leap_seconds
+        if leap is None:
+            leap = leap_seconds(epoch.week, epoch.tow_s)
+        return utc_ns(epoch.week, epoch.tow_s, leap)
+
+    # ----------------------------------------------------------------- fields
+
+    def _place(self, log: Log, t_seen_ns: int) -> Solution:
+        f = log.fields
+        if len(f) < _POSITION:
+            raise BadFieldError("too few fields")
+        status, kind, datum = f[0], f[1], f[6].strip('"')
+        found = TYPES.get(kind, "inertial_refused" if kind.startswith("INS") else None)
+        if found is None:
+            self.counters["position_type_unknown"] += 1
+            found = "no_fix"
+        if found == "manual_refused" and self._decoding.allow_simulator:
+            found = 1
+        refusal = found if isinstance(found, str) else None
+        if status != "SOL_COMPUTED":
+            refusal = "no_fix"
+        elif refusal is None and datum not in DATUMS:
+            refusal = "datum_refused"
+        lat, lon, height, undulation, sd_n, sd_e, sd_d = (
+            _number(f[at]) for at in (2, 3, 4, 5, 7, 8, 9)
+        )
+        return Solution(
+            t_seen_ns,
+            refusal=refusal,
+            quality=found if isinstance(found, int) else 1,
+            lat_rad=math.radians(lat),
+            lon_rad=math.radians(lon),
+            height_m=None if kind == "FIXEDHEIGHT" else height + undulation,
+            sd_ned_m=(sd_n, sd_e, sd_d),
+            satellites=int(f[14]) if len(f) > 14 and f[14].isdecimal() else None,
+        )
+
+    def _velocity(self, log: Log) -> tuple[_Velocity, _VelocitySd | None] | None:
+        """None where the receiver has none, or BESTNAV is a firmware's that does not send it."""
+        f = log.fields
+        if log.name == "BESTNAV":
+            if len(f) < _BOTH:
+                return None
+            f = f[_VELOCITY_AT:]
+        if len(f) < 7:
+            raise BadFieldError("too few fields")
+        kind = f[1]
+        if f[0] != "SOL_COMPUTED" or kind in ("NONE", "PROPAGATED") or kind.startswith("INS"):
+            return None
+        latency, speed, track, up = (_number(f[at]) for at in (2, 4, 5, 6))
+        if latency:
+            # Its instant is an error that the filter estimates (time_offset_sd_s).
+            self.counters["velocity_latent"] += 1
+        course = math.radians(track)
+        v = speed * math.cos(course), speed * math.sin(course), -up
+        if log.name != "BESTNAV" or len(f) < 9:
+            return v, None
+        level, vertical = _number(f[7]), _number(f[8])
+        return v, (level, level, vertical)
+
+    def _heading(self, log: Log, t_seen_ns: int, found: list[Measurement]) -> None:
+        f = log.fields
+        if len(f) < 8:
+            raise BadFieldError("too few fields")
+        if f[0] != "SOL_COMPUTED" or f[1] == "NONE":
+            self.counters["heading_not_valid"] += 1
+            return
+        if not f[1].endswith("_INT"):
+            self.counters["heading_not_fixed"] += 1
+            return
+        heading, sd = _number(f[3]), _number(f[6])
+        at_ns = None
+        if log.week is not None:
+            leap = log.leap_seconds if log.leap_seconds is not None else self._leap_seconds
+            if leap is None:
+                leap = leap_seconds(log.week, log.tow_s)
+            at_ns = utc_ns(log.week, log.tow_s, leap)
+        found += self._judge.heading(t_seen_ns, at_ns, math.radians(heading), math.radians(sd))
+
+    def _time(self, log: Log) -> None:
+        f = log.fields
+        if len(f) < 11 or f[0] != "VALID" or f[10] != "VALID":
+            return
+        leap = -round(_number(f[3]))
+        if within(leap, LEAP_SECONDS):
+            self._leap_seconds = leap
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise BadFieldError(str(error)) from None
+    if not math.isfinite(value) or "_" in text:
+        raise BadFieldError(text)
+    return value

@@ -1,0 +1,205 @@
+"""What can be read of a DBC file that as a whole cannot: messages one by one, the others by name.
+
+Of public files one in six has a flaw somewhere: a standard identifier of more than 11 bits, a name
+that begins with a digit, a comma for a decimal point, a comment without its signal, values of a
+message that is not there. Mostly it stands beside what one wants of the file. Of each message its
+own statements are kept that decoding depends on, and nothing else of the file:
+
+    BO_, SG_              the message and its signals
+    SIG_VALTYPE_          which of them are floating-point numbers
+    SG_MUL_VAL_           which multiplexer's values select one
+    BA_ of `_ATTRIBUTES`  SAE J1939 or not; names longer than 32 characters
+
+They are read together, those that fail by halves. A message whose multiplexer or types cannot be
+read would be decoded wrongly, and is left out; of another one the flawed signals are.
+
+Source: Vector Informatik, DBC File Format Documentation 1.0.5.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import cantools
+from cantools.database.can import Database, Message
+
+_ATTRIBUTES = ("VFrameFormat", "SystemMessageLongSymbol", "SystemSignalLongSymbol")
+_STRING = r'"(?:\\"|[^"])*"'
+_COMMENT = re.compile(rf"^[ \t]*CM_\s[^\";]*{_STRING}\s*;", re.MULTILINE)
+_STATEMENT = re.compile(
+    r"^[ \t]*(?:SIG_VALTYPE_|SG_MUL_VAL_|BA_DEF_DEF_|BA_DEF_|BA_)[ \t]+"
+    rf"(?:{_STRING}|[^;\"\n]|\n(?!\s*[A-Z_]+_\s))*;?",
+    re.MULTILINE,
+)
+"""Up to its semicolon; one that has none ends where the next statement begins."""
+_MESSAGE = re.compile(r"\s*BO_\s+(?P<id>\d+)\s+(?P<name>[^\s:]+)\s*:")
+_SIGNAL = re.compile(r"\s*SG_\s+(?P<name>[^\s:]+)(?:\s+(?P<mux>[mM]\w*))?\s*:")
+_OWNER = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s+(\w+)")
+_ATTRIBUTE = re.compile(rf"\s*BA_\w*\s+(?:(?:BO_|SG_)\s+)?\"({'|'.join(_ATTRIBUTES)})\"")
+_ATTRIBUTE_OWNER = re.compile(r'\s*BA_\s+"\w+"\s+(BO_|SG_)\s+(\d+)(?:\s+(\w+))?')
+_AT_LINE = re.compile(r"at line \d+, column \d+: ")
+
+
+_END = '\nCM_ "";\n'
+"""The parser passes over a last statement that is cut, a signal or a type, without a word: so none
+is the last."""
+
+
+class UnreadableError(Exception):
+    """Not a single message can be read; the text is the first reason."""
+
+
+class SoundPart(Database):
+    """The messages that can be read; `left_out` says why of the others, by `Message` or
+    `Message.Signal`."""
+
+    def __init__(self, messages: list[Message], left_out: dict[str, str]) -> None:
+        super().__init__(messages, strict=False)
+        self.left_out = left_out
+
+
+@dataclass(slots=True)
+class _Unit:
+    """A message with its statements."""
+
+    name: str
+    head: str
+    signals: dict[str, str] = field(default_factory=dict)
+    """Lines by name of the signal."""
+    own: list[tuple[str | None, str]] = field(default_factory=list)
+    """Statements, with the signal that each is of."""
+
+    def text(self, without: Iterable[str] = ()) -> tuple[str, str]:
+        """The message, less some signals; and the statements of those that it has."""
+        left = set(self.signals) - set(without)
+        lines = [line for name, line in self.signals.items() if name in left]
+        own = [line for name, line in self.own if name is None or name in left]
+        return "\n".join((self.head, *lines)), "\n".join(own)
+
+    @property
+    def selectors(self) -> set[str]:
+        """Signals that select others."""
+        found = ((name, _SIGNAL.match(line)) for name, line in self.signals.items())
+        return {name for name, m in found if m is not None and (m["mux"] or "").endswith("M")}
+
+
+def read_whole(text: str) -> Database:
+    """A DBC file in which cantools finds no flaw. Raises what its parser does."""
+    found = cantools.database.load_string(text + _END, database_format="dbc", strict=False)
+    assert isinstance(found, Database)
+    return found
+
+
+def sound_part(text: str) -> SoundPart:
+    """The messages of a DBC file that can be read. Raises `UnreadableError`."""
+    left_out: dict[str, str] = {}
+    units, shared = _units(text, left_out)
+    reader = _Reader(_readable(shared, left_out), left_out)
+    messages = reader.read(units)
+    if not messages:
+        raise UnreadableError(next(iter(left_out.values()), "there is no message in it"))
+    return SoundPart(messages, left_out)
+
+
+def _readable(shared: Sequence[str], left_out: dict[str, str]) -> list[str]:
+    """Of the definitions that all messages share, those that can be read together."""
+    kept: list[str] = []
+    for statement in shared:
+        found = _read([*kept, statement])
+        if isinstance(found, str):
+            left_out[statement] = found
+        else:
+            kept.append(statement)
+    return kept
+
+
+class _Reader:
+    """Reads units; what none of is left notes why in `left_out`."""
+
+    def __init__(self, shared: Sequence[str], left_out: dict[str, str]) -> None:
+        self._shared = shared
+        self._left_out = left_out
+
+    def read(self, units: Sequence[_Unit]) -> list[Message]:
+        """The messages of the units, the flawed ones found by halves."""
+        if not units:
+            return []
+        found = self._together([unit.text() for unit in units])
+        if not isinstance(found, str):
+            return found
+        if len(units) == 1:
+            return self._partly(units[0], found)
+        middle = len(units) // 2
+        return [*self.read(units[:middle]), *self.read(units[middle:])]
+
+    def _together(self, texts: Sequence[tuple[str, str]]) -> list[Message] | str:
+        heads, own = zip(*texts, strict=True)
+        return _read([*heads, *self._shared, *own])
+
+    def _partly(self, unit: _Unit, reason: str) -> list[Message]:
+        """A message without the signals that cannot be read; none of it, where others hang on one
+        of them."""
+        bad: dict[str, str] = {}
+        selectors = unit.selectors
+        for name in unit.signals:
+            found = self._together([unit.text(unit.signals.keys() - {name} - selectors)])
+            if isinstance(found, str):
+                bad[name] = found
+        if not bad or bad.keys() >= unit.signals.keys() or bad.keys() & selectors:
+            self._left_out[unit.name] = reason
+            return []
+        rest = self._together([unit.text(bad)])
+        if isinstance(rest, str):
+            self._left_out[unit.name] = reason
+            return []
+        self._left_out |= {f"{unit.name}.{name}": why for name, why in bad.items()}
+        return rest
+
+
+def _read(parts: Iterable[str]) -> list[Message] | str:
+    """The messages of a file of these parts, or why it cannot be read."""
+    try:
+        database = read_whole("\n".join(('VERSION ""', *(part for part in parts if part))))
+    except Exception as error:  # its parser raises what its parts raise: KeyError, bitstruct.Error
+        said = _AT_LINE.sub("", str(error)).removeprefix("DBC: ").strip('"')
+        return " ".join(said.split()) or type(error).__name__
+    return list(database.messages)
+
+
+def _units(text: str, left_out: dict[str, str]) -> tuple[list[_Unit], list[str]]:
+    """The file's messages with their statements, and definitions that all share."""
+    text = _COMMENT.sub("", text)
+    own: dict[str, list[tuple[str | None, str]]] = defaultdict(list)
+    shared: list[str] = []
+    for match in _STATEMENT.finditer(text):
+        statement = match[0].strip()
+        if (owner := _OWNER.match(statement)) is not None:
+            own[owner[1]].append((owner[2], statement))
+        elif _ATTRIBUTE.match(statement) is None:
+            continue
+        elif (owner := _ATTRIBUTE_OWNER.match(statement)) is not None:
+            own[owner[2]].append((owner[3] if owner[1] == "SG_" else None, statement))
+        else:
+            shared.append(statement)
+    units: list[_Unit] = []
+    unit: _Unit | None = None
+    for line in text.splitlines():
+        words = line.split(None, 2)
+        if words[:1] == ["BO_"]:
+            unit = None
+            message = _MESSAGE.match(line)
+            if message is None:
+                name = words[2].partition(":")[0].strip() if len(words) > 2 else line.strip()
+                left_out[name] = f"no message: {line.strip()!r}"
+                continue
+            unit = _Unit(message["name"], line.strip(), own=own[message["id"]])
+            units.append(unit)
+        elif words[:1] == ["SG_"] and unit is not None:
+            signal = _SIGNAL.match(line)
+            unit.signals[signal["name"] if signal else line.strip()] = line.strip()
+        elif words and not line.lstrip().startswith("//"):
+            unit = None
+    return units, shared

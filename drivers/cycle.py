@@ -1,0 +1,69 @@
+"""Which messages make an epoch, and when its last one has come: no I/O, no clock.
+
+An epoch is closed by a message of another instant, by one that repeats, by its last one, or by
+silence. Which one is the last is learned: the same cycle seen twice in a row.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable
+
+MAX_UNLEARNED = 8
+"""Cycles remembered as too short; a receiver mixes at most a few output rates."""
+MAX_CYCLE = 24
+"""Messages that one epoch may hold; a receiver sends a dozen kinds."""
+
+Name = int | str
+
+
+class Cycle:
+    """The names of the epoch that is open, and what earlier ones have shown.
+
+    Counts `late_message`: more of an epoch that was closed because its last one had come.
+    """
+
+    def __init__(self, counters: Counter[str]) -> None:
+        self._counters = counters
+        self._key: Hashable = None
+        self._names: list[Name] = []
+        self._at_once = False
+        self._last: tuple[Name, ...] = ()
+        self._learned: tuple[Name, ...] = ()
+        self._too_short: set[tuple[Name, ...]] = set()
+
+    @property
+    def open(self) -> bool:
+        """Whether an epoch has begun."""
+        return bool(self._names)
+
+    def begins_anew(self, key: Hashable, name: Name) -> bool:
+        """Whether a message belongs to another epoch than the one that is open."""
+        if not self._names:
+            return False
+        return key != self._key or name in self._names or len(self._names) >= MAX_CYCLE
+
+    def late(self, key: Hashable, name: Name) -> bool:
+        """Whether a message is of the epoch that was closed just now: what was learned is too
+        short. One that this epoch had is none: the receiver repeats itself."""
+        if self._names or not self._at_once or key != self._key or name in self._last:
+            return False
+        self._counters["late_message"] += 1
+        if self._learned and len(self._too_short) < MAX_UNLEARNED:
+            self._too_short.add(self._learned)
+        self._learned = self._last = ()
+        return True
+
+    def add(self, key: Hashable, name: Name) -> bool:
+        """Take a message in; whether it was the last one of its epoch."""
+        self._key = key
+        self._names.append(name)
+        return tuple(self._names) == self._learned
+
+    def close(self, *, learn: bool, at_once: bool) -> None:
+        """The epoch is over; `at_once`: by its last message, so that no more is expected."""
+        cycle = tuple(self._names)
+        self._names.clear()
+        if learn and cycle == self._last and cycle not in self._too_short:
+            self._learned = cycle
+        self._last, self._at_once = cycle, at_once

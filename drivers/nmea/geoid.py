@@ -1,0 +1,47 @@
+"""How high the geoid is above the ellipsoid, where a receiver does not say it.
+
+    h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
+
+N lies between -107 and 85 m everywhere: uniform in +-107 m where nothing is known of it. A receiver
+that has printed it once is remembered: on the way since it has changed by the slope of the geoid.
+Source: Lemoine et al., The development of EGM96, NASA/TP-1998-206861.
+"""
+
+from __future__ import annotations
+
+import math
+
+from drivers.plausible import HEIGHT_M, within
+
+BOUND_M = 107.0
+GEOID_SD_M = BOUND_M / math.sqrt(3.0)
+SLOPE_SD = 5e-5
+"""One sigma of the slope of the geoid: deflections of the vertical are 5 to 10 arc seconds outside
+of high mountains."""
+EARTH_M = 6_371_000.0
+
+
+class Geoid:
+    """What one receiver has said of the geoid."""
+
+    def __init__(self) -> None:
+        self._known: tuple[float, float, float] | None = None
+
+    def height(
+        self, altitude_m: float, separation_m: float | None, lat_deg: float, lon_deg: float
+    ) -> tuple[float, float]:
+        """Height above the ellipsoid (m), and one sigma (m) of N in it, 0 where it is printed; that
+        above the sea where nothing is known of N."""
+        if separation_m is not None:
+            if abs(separation_m) <= BOUND_M:
+                self._known = separation_m, lat_deg, lon_deg
+            return altitude_m + separation_m, 0.0
+        if self._known is None:
+            return altitude_m, GEOID_SD_M
+        separation_m, lat, lon = self._known
+        north = math.radians(lat_deg - lat)
+        east = math.radians(math.remainder(lon_deg - lon, 360.0)) * math.cos(math.radians(lat))
+        sd_m = SLOPE_SD * EARTH_M * math.hypot(north, east)
+        if sd_m > GEOID_SD_M or not within(altitude_m + separation_m, HEIGHT_M):
+            return altitude_m, GEOID_SD_M
+        return altitude_m + separation_m, sd_m

@@ -1,0 +1,149 @@
+"""Which protocol bytes are of that are not NMEA, UBX or RTCM 3: named, not read.
+
+A name is given where two messages in it verify, by their checksum where it is cheap, else by what
+must stand at their end. Sources: u-blox, Septentrio (SBF reference guide), NovAtel OEM7 and Unicore
+command manuals, SiRF Binary Protocol Reference Manual, Trimble (TSIP) and Garmin (device interface
+specification), SkyTraq AN0003, Allystar, CASIC and MTK protocol specifications, Rockwell Zodiac
+interface guide, gpsd_json(5).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import reduce
+from operator import xor
+
+FEWEST = 2
+"""Messages that must verify; of those by their ends alone one is found in noise now and then."""
+MOST_TRIES = 100
+"""Beginnings that are looked at: each may ask for a sum of all bytes."""
+
+_NOVATEL_TEXT = re.compile(rb"#[A-Z][A-Z0-9]{3,15},[^\r\n#$]{20,600}\*[0-9a-fA-F]{8}\r?\n?")
+_TSIP = re.compile(rb"(?<!\x10)\x10[^\x03\x10](?:[^\x10]|\x10\x10){1,250}\x10\x03")
+_GPSD = re.compile(rb'\{"class":"[A-Z]+"')
+_BARE = re.compile(rb"(?:^|[\r\n])[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG),[^\r\n$]*[\r\n]")
+
+
+def _framed(sync: bytes, whole: Callable[[bytes, int], int]) -> Callable[[bytes], int]:
+    """How many messages behind `sync` verify: `whole(data, at)` is the length of one, 0 of none."""
+
+    def count(data: bytes) -> int:
+        at, found, tries = data.find(sync), 0, 0
+        while at >= 0 and found < FEWEST and tries < MOST_TRIES:
+            length = whole(data, at)
+            found, tries = found + (length > 0), tries + 1
+            at = data.find(sync, at + max(length, 1))
+        return found
+
+    return count
+
+
+def _sirf(d: bytes, at: int) -> int:
+    """A0 A2 length16 payload sum15 B0 B3."""
+    n = int.from_bytes(d[at + 2 : at + 4], "big")
+    payload, end = d[at + 4 : at + 4 + n], d[at + 4 + n : at + 8 + n]
+    good = end[2:] == b"\xb0\xb3" and sum(payload) & 0x7FFF == int.from_bytes(end[:2], "big")
+    return n + 8 if good else 0
+
+
+def _skytraq(d: bytes, at: int) -> int:
+    """A0 A1 length16 payload xor CR LF."""
+    n = int.from_bytes(d[at + 2 : at + 4], "big")
+    payload, end = d[at + 4 : at + 4 + n], d[at + 4 + n : at + 7 + n]
+    return n + 7 if end[1:] == b"\r\n" and end[0] == reduce(xor, payload, 0) else 0
+
+
+def _sbf(d: bytes, at: int) -> int:
+    """$@ crc16 id16 length16 ...: the length, a multiple of 4, leads to the next."""
+    n = int.from_bytes(d[at + 6 : at + 8], "little")
+    return n if n >= 8 and n % 4 == 0 and d[at + n : at + n + 2] == b"$@" else 0
+
+
+def _novatel(d: bytes, at: int) -> int:
+    """AA 44 and 12 (header length8, message length16 at 8), 13 (length8) or Unicore's B5 (length16
+    at 6), crc32 behind: the length leads to the next."""
+    kind = d[at + 2 : at + 3]
+    if kind == b"\x12":
+        n = int.from_bytes(d[at + 3 : at + 4], "little")
+        n += int.from_bytes(d[at + 8 : at + 10], "little")
+    elif kind == b"\x13":
+        n = 12 + int.from_bytes(d[at + 3 : at + 4], "little")
+    elif kind == b"\xb5":
+        n = 24 + int.from_bytes(d[at + 6 : at + 8], "little")
+    else:
+        return 0
+    return n + 4 if d[at + n + 4 : at + n + 6] == b"\xaa\x44" else 0
+
+
+def _allystar(d: bytes, at: int) -> int:
+    """F1 D9 class id length16 payload ck_a ck_b, as UBX."""
+    n = int.from_bytes(d[at + 4 : at + 6], "little")
+    a = b = 0
+    for byte in d[at + 2 : at + 6 + n]:
+        a = (a + byte) & 0xFF
+        b = (b + a) & 0xFF
+    return n + 8 if d[at + 6 + n : at + 8 + n] == bytes((a, b)) else 0
+
+
+def _casic(d: bytes, at: int) -> int:
+    """BA CE length16 class id payload sum32: the length leads to the next."""
+    n = int.from_bytes(d[at + 2 : at + 4], "little")
+    return n + 10 if d[at + n + 10 : at + n + 12] == b"\xba\xce" else 0
+
+
+def _mtk(d: bytes, at: int) -> int:
+    """04 24 length16 command16 ... xor CR LF."""
+    n = int.from_bytes(d[at + 2 : at + 4], "little")
+    return n if 9 <= n <= 600 and d[at + n - 2 : at + n] == b"\r\n" else 0
+
+
+def _zodiac(d: bytes, at: int) -> int:
+    """FF 81 id16 words16 flags16 checksum16 data words, checksum16: the sum of the first five."""
+    words = [int.from_bytes(d[at + i : at + i + 2], "little") for i in range(0, 10, 2)]
+    return 10 if len(d) >= at + 10 and -sum(words[:4]) & 0xFFFF == words[4] else 0
+
+
+def _oncore(d: bytes, at: int) -> int:
+    """@@ and two letters, an xor and CR LF at the end."""
+    end = d.find(b"\r\n", at + 4, at + 300)
+    good = end > 0 and d[at + 2 : at + 4].isalpha()
+    return end + 2 - at if good and reduce(xor, d[at + 2 : end], 0) == 0 else 0
+
+
+_SWITCH = "switch on NMEA (GGA, RMC, GST) at the receiver"
+_KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
+    ("Septentrio's SBF", _framed(b"$@", _sbf), f'{_SWITCH}, or have it read: driver = "sbf"'),
+    ("binary logs of NovAtel or Unicore", _framed(b"\xaa\x44", _novatel), _SWITCH),
+    (
+        "text logs of NovAtel or Unicore (#...)",
+        lambda d: len(_NOVATEL_TEXT.findall(d)),
+        f'{_SWITCH}, or have it read: driver = "bestpos"',
+    ),
+    ("SiRF's binary protocol", _framed(b"\xa0\xa2", _sirf), _SWITCH),
+    ("SkyTraq's binary protocol", _framed(b"\xa0\xa1", _skytraq), _SWITCH),
+    ("Allystar's binary protocol", _framed(b"\xf1\xd9", _allystar), _SWITCH),
+    ("CASIC's binary protocol", _framed(b"\xba\xce", _casic), _SWITCH),
+    ("MTK's binary protocol", _framed(b"\x04\x24", _mtk), _SWITCH),
+    ("Zodiac's binary protocol", _framed(b"\xff\x81", _zodiac), _SWITCH),
+    ("Motorola's OnCore protocol", _framed(b"@@", _oncore), _SWITCH),
+    ("Trimble's TSIP or Garmin's binary protocol", lambda d: len(_TSIP.findall(d)), _SWITCH),
+    (
+        "gpsd's JSON",
+        lambda d: len(_GPSD.findall(d)),
+        "set port to gpsd://HOST, which asks gpsd for what the receiver says",
+    ),
+    (
+        "NMEA without its $",
+        lambda d: len(_BARE.findall(d)),
+        "the line loses bytes, or a terminal program strips them",
+    ),
+)
+
+
+def named(data: bytes) -> str:
+    """What these bytes are and what would do, as a sentence; "" where nobody knows them."""
+    for name, count, remedy in _KNOWN:
+        if count(data) >= FEWEST:
+            return f"{name} arrives, which is not read here: {remedy}"
+    return ""

@@ -1,0 +1,159 @@
+"""Why a receiver's bytes give no fix, or a poorer one than they could: one sentence each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import date, timedelta
+
+from drivers.nmea.protocols import named
+
+REFUSALS = {
+    "no_fix": "the receiver has no fix",
+    "dead_reckoning_refused": "only the receiver's own dead reckoning, which is not fused",
+    "manual_refused": "the receiver repeats a position that was put in by hand",
+    "simulator_refused": "the receiver simulates: allow_simulator would accept it",
+    "duplicate_epoch": "the receiver repeats an epoch or goes back in time",
+    "unknown_quality": "the receiver states a GGA quality that NMEA does not know",
+    "height_implausible": "the receiver states a height at which no vehicle can be",
+    "speed_implausible": "the receiver states a speed that no vehicle has",
+    "sigma_too_large": "the receiver states that it does not know where it is (GST)",
+}
+"""By the counter of a refused epoch."""
+TALKERS_NOT_READ = {
+    "II": "integrated instrumentation",
+    "IN": "integrated navigation",
+    "EC": "a chart display",
+    "EI": "a chart display",
+    "AI": "AIS",
+    "LC": "Loran-C",
+    "SN": "an electronic positioning system",
+}
+"""NMEA 0183 4.11, table of talker identifiers."""
+POSITIONS = frozenset({"GGA", "GNS", "RMC"})
+MOST_NAMES = 8
+"""Talkers and formatters that are remembered; the first ones are enough to name."""
+ROLLOVER = timedelta(weeks=1024)
+ROLLOVER_SPAN = timedelta(days=3653)
+"""A date that is right but for the rollover is of the ten years from this software's on."""
+MANY = 3
+"""Sentences without a checksum before anybody hears of it: one may have lost its own."""
+FIRST_FIXES = 10
+"""Of a cold receiver, which may be two-dimensional for a while."""
+CHECKSUMS = (
+    "sentences come without a checksum and are not used, for a damaged digit would pass: switch "
+    "checksums on at the receiver"
+)
+
+
+@dataclass(slots=True)
+class Heard:
+    """What a decoder has heard that it does not use, beside its counters."""
+
+    talkers: Counter[str] = field(default_factory=Counter)
+    """Of sentences with a position."""
+    unused: Counter[str] = field(default_factory=Counter)
+    """Formatters that are not read."""
+    used: Counter[str] = field(default_factory=Counter)
+    """Those that are."""
+    statuses: Counter[str] = field(default_factory=Counter)
+    """Of RMC, that are no letter of the standard."""
+    implausible_date: date | None = None
+
+
+def note(names: Counter[str], name: str) -> None:
+    """Count a name; of a stream of nonsense the first few."""
+    if name in names or len(names) < MOST_NAMES:
+        names[name] += 1
+
+
+def wrong_checksums(counters: Counter[str]) -> str:
+    """Why no sentence verifies, where it is for their checksums; "" where it is not."""
+    if counters["checksum_missing"] >= MANY > counters["sentences"]:
+        return f"NMEA {CHECKSUMS}"
+    if counters["checksum_bad"] >= MANY > counters["sentences"]:
+        return (
+            f"{counters['checksum_bad']} wrong checksums against 0 sound: check ground, cable "
+            "length and that nobody else reads this port, or has edited this file"
+        )
+    return ""
+
+
+def nothing_verified(counters: Counter[str], unread: bytes) -> str:
+    """Why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
+    if wrong := wrong_checksums(counters):
+        return wrong
+    if counters["ubx_frames"]:
+        return (
+            "UBX frames arrive, but no NMEA: switch on NMEA output on this port, or have UBX read: "
+            'driver = "ubx" (process: --aid ubx=FILE)'
+        )
+    if counters["rtcm_frames"]:
+        return "RTCM 3 frames arrive, but no NMEA: switch on NMEA output on this port"
+    return named(unread)
+
+
+def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
+    """Why sentences arrive and no fix comes of them. `refusal`: why the last epoch was refused."""
+    if refusal:
+        return REFUSALS.get(refusal, refusal)
+    if heard.talkers and not POSITIONS & set(heard.used):
+        talker = heard.talkers.most_common(1)[0][0]
+        what = TALKERS_NOT_READ.get(talker)
+        kind = f" ({what})" if what else ""
+        return (
+            f"positions of talker {talker}{kind} arrive, which are not read: set the receiver to "
+            "talker GP or GN"
+        )
+    if counters["checksum_missing"] >= MANY:
+        return CHECKSUMS
+    if counters["bad_field"] and not POSITIONS & set(heard.used):
+        return "the positions that arrive have fields that cannot be true (bad_field)"
+    names = [*heard.used, *heard.unused]
+    which = f" ({', '.join(names[:MOST_NAMES])})" if names else ""
+    if not counters["epochs"]:
+        return f"sentences arrive{which}, but none that counts: switch on GGA and RMC"
+    return f"epochs arrive{which}, but none has a position: switch on GGA"
+
+
+def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, str]:
+    """By counter: what makes the fixes poorer than the receiver could, and what was done."""
+    found = {}
+    day = heard.implausible_date
+    if day is not None:
+        found["implausible_date"] = implausible_date(day, earliest)
+    if counters["checksum_missing"] >= MANY and counters["sentences"]:
+        found["checksum_missing"] = CHECKSUMS
+    if counters["height_above_sea"] > counters["fixes"] // 2:
+        found["height_above_sea"] = (
+            "the receiver does not say how high the geoid is: its altitude above the sea is used, "
+            "with one sigma of 62 m (GGA's separation is empty)"
+        )
+    if counters["height_not_measured"] > max(counters["fixes"] // 2, FIRST_FIXES):
+        found["height_not_measured"] = (
+            "GSA says that fixes are two-dimensional: they are used without their height; give the "
+            "antenna more sky, or set the receiver to three dimensions"
+        )
+    if counters["height_missing"] > counters["fixes"] // 2:
+        found["height_missing"] = "the altitude in GGA is empty: fixes are used without a height"
+    if counters["rmc_alone"]:
+        found["rmc_alone"] = (
+            "only RMC has a position: it is used without height and with the sigma of a poor sky; "
+            "switch on GGA and GST"
+        )
+    if counters["unknown_status"]:
+        status = heard.statuses.most_common(1)[0][0]
+        found["unknown_status"] = (
+            f"RMC has the status {status!r}, which NMEA does not know: its velocity is not used"
+        )
+    return found
+
+
+def implausible_date(day: date, earliest: date) -> str:
+    """The sentence on a date that cannot be."""
+    wrong = f"before {earliest}" if day < earliest else "too far ahead"
+    text = f"the receiver's date is {day}, {wrong}: its dates are not used, its times of day are"
+    later = day + ROLLOVER if day < earliest else day
+    if earliest <= later <= earliest + ROLLOVER_SPAN and later != day:
+        return f"{text}; if {later} is right, 1024 weeks later, its GPS week has rolled over"
+    return text

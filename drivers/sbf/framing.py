@@ -1,0 +1,106 @@
+"""Blocks of the Septentrio Binary Format out of a byte stream: no I/O.
+
+    $ @ crc16 id16 length16 body     CRC-16-CCITT (1021 hex, from 0) from id to the end
+    id       bits 0 to 12 the block's number, 13 to 15 its revision
+    length   of the whole block, a multiple of 4
+
+NMEA and all else on the line is passed over. A header that is none, or a block that does not
+verify, costs its two sync bytes. Source: Septentrio AsteRx SB3 Reference Guide, section 4.1.
+"""
+
+from __future__ import annotations
+
+import binascii
+from collections import Counter
+from typing import NamedTuple
+
+MAX_BLOCK = 8192
+"""MeasEpoch of 80 channels takes 5 kB; a longer length is a false header."""
+SLICE = 4096
+"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
+SYNC = b"$@"
+_HEADER = 8
+
+
+class Block(NamedTuple):
+    """A verified block: number, revision, and what follows the header."""
+
+    number: int
+    revision: int
+    body: bytes
+
+
+class BlockSplitter:
+    """Bytes in, verified blocks out, whatever the splits.
+
+    Counts `sbf_blocks`; refused `sbf_damaged`, `sbf_cut` (the stream ended inside it); and
+    `other_bytes`, all that belonged to no good block.
+    """
+
+    def __init__(self, counters: Counter[str]) -> None:
+        self.counters = counters
+        self._buffer = bytearray()
+
+    @property
+    def waiting(self) -> int:
+        """Bytes kept until more come."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> list[Block]:
+        """The blocks that `data` completes, in order."""
+        found: list[Block] = []
+        for start in range(0, len(data), SLICE):
+            self._buffer += data[start : start + SLICE]
+            self._scan(found, final=False)
+        return found
+
+    def finish(self) -> list[Block]:
+        """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
+        found: list[Block] = []
+        self._scan(found, final=True)
+        return found
+
+    def _scan(self, found: list[Block], *, final: bool) -> None:
+        buffer, at = self._buffer, 0
+        while True:
+            start = buffer.find(SYNC, at)
+            if start < 0:
+                # The last byte may be the first of a sync.
+                end = len(buffer) - (not final and buffer[-1:] == SYNC[:1])
+                self.counters["other_bytes"] += max(0, end - at)
+                at = max(at, end)
+                break
+            self.counters["other_bytes"] += start - at
+            at = start
+            length = _length(buffer, at)
+            if length is None or (length and len(buffer) < at + length):
+                if not final:
+                    break
+                self.counters["sbf_cut"] += 1
+                length = 0
+            elif length and not _verifies(buffer, at, at + length):
+                self.counters["sbf_damaged"] += 1
+                length = 0
+            if not length:
+                self.counters["other_bytes"] += len(SYNC)
+                at += len(SYNC)
+                continue
+            identity = int.from_bytes(buffer[at + 4 : at + 6], "little")
+            body = bytes(buffer[at + _HEADER : at + length])
+            self.counters["sbf_blocks"] += 1
+            found.append(Block(identity & 0x1FFF, identity >> 13, body))
+            at += length
+        del buffer[:at]
+
+
+def _length(buffer: bytearray, at: int) -> int | None:
+    """Of the block at `at`; 0 when it is none, None when that is not known yet."""
+    if len(buffer) < at + _HEADER:
+        return None
+    length = int.from_bytes(buffer[at + 6 : at + 8], "little")
+    return length if _HEADER + 6 <= length <= MAX_BLOCK and length % 4 == 0 else 0
+
+
+def _verifies(buffer: bytearray, at: int, end: int) -> bool:
+    told = int.from_bytes(buffer[at + 2 : at + 4], "little")
+    return binascii.crc_hqx(memoryview(buffer)[at + 4 : end].tobytes(), 0) == told

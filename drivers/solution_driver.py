@@ -1,0 +1,84 @@
+"""What the drivers `ubx`, `bestpos` and `sbf` share: a receiver whose own solutions are read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from drivers.base import Emit, Now, monotonic_ns
+from drivers.nmea.framing import StreamSplitter
+from drivers.nmea.protocols import named
+from drivers.receiver import ReceiverDriver, ReceiverOptions
+from drivers.solution import REFUSALS, SolutionDecoding
+
+KEPT_BYTES = 4096
+"""What is looked at for its protocol: an epoch or two of anything."""
+
+
+class SolutionOptions(ReceiverOptions, SolutionDecoding):
+    """Options of a receiver whose own solutions are read."""
+
+
+class SolutionDriver(ReceiverDriver):
+    """Reads the line, hands over fixes, headings and times; says in `status` what is wrong."""
+
+    Options: ClassVar[type[SolutionOptions]] = SolutionOptions
+    Decoder: ClassVar[Callable[..., Any]]
+    kind: ClassVar[str]
+    """The driver's name."""
+    wanted: ClassVar[str]
+    """What verifies, as in "bytes arrive, but no ... verifies"."""
+    switch_on: ClassVar[str]
+    """What to do where nothing that arrives has a position."""
+
+    def __init__(
+        self, name: str, options: SolutionOptions, emit: Emit, now_ns: Now = monotonic_ns
+    ) -> None:
+        self._options = options
+        self._foreign = bytearray()
+        super().__init__(name, options, emit, now_ns)
+
+    def _make_decoder(self) -> Any:
+        self._solutions = type(self).Decoder(self.name, self._options, self.counters)
+        return self._solutions
+
+    def _on_bytes(self, data: bytes, t_seen_ns: int) -> None:
+        super()._on_bytes(data, t_seen_ns)
+        if self._signs_of_life():
+            self._foreign.clear()
+        else:
+            self._foreign += data[-KEPT_BYTES:]
+            del self._foreign[:-KEPT_BYTES]
+
+    @property
+    def cause(self) -> str:
+        """What the line carries instead, as a sentence; "" where nothing that arrives tells."""
+        if not self._foreign:
+            return ""
+        counters = Counter[str]()
+        splitter = StreamSplitter(counters)
+        splitter.feed(bytes(self._foreign))
+        splitter.finish()
+        for counter, what, driver in (
+            ("sentences", "NMEA", "nmea"),
+            ("ubx_frames", "UBX", "ubx"),
+            ("rtcm_frames", "RTCM 3", "gnss"),
+        ):
+            if counters[counter] and driver != self.kind:
+                return (
+                    f"{what} arrives, but no {self.wanted}: {self.switch_on}, or have {what} "
+                    f'read: driver = "{driver}"'
+                )
+        found = named(bytes(self._foreign))
+        return "" if f'driver = "{self.kind}"' in found else found
+
+    def _useless_detail(self) -> str:
+        if self.counters["position_type_unknown"]:
+            return "the receiver names a kind of position that is not known here: please report it"
+        nothing = f"{self.wanted} arrives, but none with a position: {self.switch_on}"
+        return REFUSALS.get(self._solutions.refusal, nothing)
+
+    def _unintelligible_detail(self) -> str:
+        nothing = f"bytes arrive, but no {self.wanted} verifies{self._where_to_look()}"
+        return self.cause or nothing

@@ -1,0 +1,238 @@
+"""UBX-NAV frames of a receiver in, measurements out: epochs by iTOW, judged. No I/O, no clock.
+
+An epoch closes with NAV-EOE, or as `drivers.cycle` finds.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+
+from drivers.cycle import Cycle
+from drivers.measurements import Measurement, Vector3
+from drivers.nmea.framing import Frame, Item, StreamSplitter
+from drivers.solution import Solution, SolutionDecoding, SolutionJudge
+from drivers.ubx.messages import (
+    CLASS_NAV,
+    COMBINED,
+    DEAD_RECKONING,
+    END_OF_EPOCH,
+    MESSAGES,
+    RELPOSNED,
+    THREE_D,
+    TWO_D,
+    NavEpoch,
+    UnreadableError,
+    parse_relposned,
+)
+
+WEEK_MS = 604_800_000
+RTK = {1: 5, 2: 4}
+"""Quality of NMEA by carrSoln."""
+
+
+class UbxNavDecoder:
+    """`take` verified frames; `silence` and `flush` end an epoch.
+
+    Every NAV frame ends in one counter: `nav_messages`, `nav_unreadable`, `late_message` (its epoch
+    was closed), `relposned`, or `ubx_not_used`, which takes all other classes too. Of baselines
+    `baseline_of_a_station`, `heading_not_valid`, `heading_not_fixed`; the rest is
+    `SolutionJudge`'s.
+    """
+
+    def __init__(self, source: str, decoding: SolutionDecoding, counters: Counter[str]) -> None:
+        self.counters = counters
+        self._judge = SolutionJudge(source, decoding, counters)
+        self._epoch: NavEpoch | None = None
+        self._cycle = Cycle(counters)
+        self._known: tuple[int, int] | None = None
+        """An iTOW, and the UTC that it is."""
+
+    @property
+    def refusal(self) -> str:
+        """Why the last epoch gave no fix, by counter name."""
+        return self._judge.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._judge.gga
+
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `silence` would close an epoch."""
+        return self._epoch is not None
+
+    def take(self, raw: bytes, t_seen_ns: int) -> list[Measurement]:
+        """What a frame that `StreamSplitter` verified completes."""
+        kind, payload = raw[3], raw[6:-2]
+        found: list[Measurement] = []
+        if raw[2] != CLASS_NAV:
+            self.counters["ubx_not_used"] += 1
+        elif kind == END_OF_EPOCH and len(payload) == 4:
+            self.counters["nav_messages"] += 1
+            epoch = self._epoch
+            if epoch is not None and epoch.itow_ms == int.from_bytes(payload, "little"):
+                self._close(found, learn=False, at_once=True)
+        elif kind == RELPOSNED:
+            self._baseline(payload, t_seen_ns, found)
+        elif kind in MESSAGES:
+            self._group(kind, payload, t_seen_ns, found)
+        else:
+            self.counters["ubx_not_used"] += 1
+        return found
+
+    def silence(self) -> list[Measurement]:
+        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        found: list[Measurement] = []
+        self._close(found, learn=True)
+        return found
+
+    def flush(self) -> list[Measurement]:
+        """The stream ended, or broke."""
+        found: list[Measurement] = []
+        self._close(found, learn=False)
+        return found
+
+    # ----------------------------------------------------------------- messages to epochs
+
+    def _group(self, kind: int, payload: bytes, t_seen_ns: int, found: list[Measurement]) -> None:
+        _, least, itow_at, take = MESSAGES[kind]
+        if len(payload) < least:
+            self.counters["nav_unreadable"] += 1
+            return
+        (itow_ms,) = struct.unpack_from("<I", payload, itow_at)
+        if self._cycle.begins_anew(itow_ms, kind):
+            self._close(found, learn=True)
+        elif self._cycle.late(itow_ms, kind):
+            return
+        epoch = self._epoch or NavEpoch(itow_ms)
+        try:
+            take(epoch, payload)
+        except UnreadableError:
+            self.counters["nav_unreadable"] += 1
+            return
+        self._epoch = epoch
+        self.counters["nav_messages"] += 1
+        epoch.t_seen_ns = t_seen_ns
+        if self._cycle.add(itow_ms, kind):
+            self._close(found, learn=False, at_once=True)
+
+    def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
+        epoch, self._epoch = self._epoch, None
+        if epoch is None:
+            return
+        self._cycle.close(learn=learn, at_once=at_once)
+        epoch.whole()
+        if epoch.utc_ns is not None:
+            self._known = epoch.itow_ms, epoch.utc_ns
+        elif self._known is not None:
+            epoch.utc_ns = self._utc_of(epoch.itow_ms)
+        if epoch.rank or epoch.fix is not None:
+            found += self._judge.epoch(_solution(epoch))
+
+    def _utc_of(self, itow_ms: int) -> int | None:
+        """UTC of an iTOW by the last one of which it was told; None before one."""
+        if self._known is None:
+            return None
+        since_ms = (itow_ms - self._known[0] + WEEK_MS // 2) % WEEK_MS - WEEK_MS // 2
+        return self._known[1] + since_ms * 1_000_000
+
+    def _baseline(self, payload: bytes, t_seen_ns: int, found: list[Measurement]) -> None:
+        baseline = parse_relposned(payload)
+        if baseline is None:
+            self.counters["nav_unreadable"] += 1
+            return
+        self.counters["relposned"] += 1
+        if baseline.refusal is not None:
+            self.counters[baseline.refusal] += 1
+            return
+        # It comes when the base's observations have: of an older epoch than the one that is open.
+        utc_ns = self._utc_of(baseline.itow_ms)
+        epoch = self._epoch
+        if epoch is not None and epoch.itow_ms == baseline.itow_ms and epoch.utc_ns is not None:
+            utc_ns = epoch.utc_ns
+        found += self._judge.heading(t_seen_ns, utc_ns, baseline.heading_rad, baseline.sd_rad)
+
+
+def _refusal(epoch: NavEpoch) -> str | None:
+    if epoch.fix is None:
+        return "status_missing"
+    if epoch.fix == DEAD_RECKONING:
+        return "dead_reckoning_refused"
+    good = epoch.fix_ok and epoch.fix in (TWO_D, THREE_D, COMBINED)
+    return None if good and epoch.position_valid and epoch.rank else "no_fix"
+
+
+def _solution(e: NavEpoch) -> Solution:
+    plane = e.fix == TWO_D
+    v = e.v_ned_m_s
+    sd_v: Vector3 | None = e.covariance_v_m_s
+    if sd_v is None and e.sd_v_m_s is not None:
+        sd_v = (e.sd_v_m_s,) * 3
+    return Solution(
+        e.t_seen_ns,
+        e.utc_ns,
+        e.utc_known,
+        _refusal(e),
+        RTK.get(e.carrier, 2 if e.differential else 1),
+        e.lat_rad,
+        e.lon_rad,
+        None if plane else e.height_m,
+        e.covariance_ned_m or e.sd_ned_m,
+        (v[0], v[1], None) if plane and v is not None else v,
+        (sd_v[0], sd_v[1], None) if plane and sd_v is not None else sd_v,
+        e.satellites,
+        e.hdop,
+        e.vdop,
+    )
+
+
+class UbxDecoder:
+    """Bytes in, measurements out: `UbxNavDecoder` behind the splitter of a line."""
+
+    def __init__(
+        self,
+        source: str,
+        decoding: SolutionDecoding | None = None,
+        counters: Counter[str] | None = None,
+    ) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._nav = UbxNavDecoder(source, decoding or SolutionDecoding(), self.counters)
+        self._splitter = StreamSplitter(self.counters)
+        self._t_seen_ns = 0
+
+    @property
+    def refusal(self) -> str:
+        """Why the last epoch gave no fix, by counter name."""
+        return self._nav.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._nav.gga
+
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `silence` would close an epoch."""
+        return self._nav.epoch_open
+
+    def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
+        """The measurements that `data`, seen at `t_seen_ns`, completes."""
+        self._t_seen_ns = t_seen_ns
+        return self._all(self._splitter.feed(data))
+
+    def silence(self) -> list[Measurement]:
+        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        return self._nav.silence()
+
+    def flush(self) -> list[Measurement]:
+        """The stream ended, or broke: everything that can still be had from what came."""
+        return [*self._all(self._splitter.finish()), *self._nav.flush()]
+
+    def _all(self, items: list[Item]) -> list[Measurement]:
+        found: list[Measurement] = []
+        for item in items:
+            if isinstance(item, Frame) and item.kind == "ubx":
+                found += self._nav.take(item.raw, self._t_seen_ns)
+        return found

@@ -1,0 +1,193 @@
+"""Monotonic time out of a recorder's stamps, whose clock may be set while it records.
+
+A recorder stamps frames by a clock that somebody sets: NTP, a receiver, an operator, once the
+computer is up. Between two frames the stamps then advance by what passed and by what it was set:
+
+    s(k) - s(k-1) = passed + set,    d = s - utc advances by `set` alone
+
+What a device says of UTC tells the two apart. Without it, stamps that go back were set, since time
+does not, and stamps that leap ahead are a pause: whoever takes a pause for a step navigates on
+through it, who takes a step for a pause aligns anew.
+
+A stamp alone among others, which come from where it left, is damage: `time_backwards`,
+`time_ahead`. Stamps of another channel that lie a little behind are its controller's own clock, or
+were written late: those frames have come by now, and their stamps stand.
+
+All times are integer nanoseconds; a pure function of its inputs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Hashable, Sequence
+from statistics import median_low
+from typing import Literal, NamedTuple
+
+from fusiond.clock.host import MILLISECOND_NS, SECOND_NS
+
+AHEAD_NS = SECOND_NS
+"""A stamp that is later than those that follow by more is damaged: a recorder writes as frames
+come, and two controllers' clocks agree better."""
+LEAP_NS = 200 * MILLISECOND_NS
+"""A receiver's reports of UTC are at most so late on a healthy line (fusiond.clock.utc_envelope):
+of a smaller step they say nothing, and the envelope follows it."""
+ASKED_AGAIN_NS = 20 * SECOND_NS
+"""How long a bus whose controllers disagree is not asked once more whether its clock was set."""
+ORDINARY = 3
+"""A pause of so many of the longest lately is one of a sparse bus."""
+FOLLOWING = 8
+"""Frames by which damage is told from a clock that was set: most must agree."""
+_LATELY = 64
+_OWN_PERIOD = 512
+"""Frames among which the last two of the same identifier are looked for."""
+REPORTS = 5
+"""Reports of UTC whose median is taken, on either side."""
+ENOUGH_REPORTS = 3
+"""As many as UTC itself is followed by (`utc_envelope`): two may be one queue's."""
+
+Verdict = Literal["taken", "time_backwards", "time_ahead"]
+SetOff = Callable[[], int | None]
+Of = tuple[Hashable, int]
+"""Channel and identifier of a frame."""
+
+
+class Step(NamedTuple):
+    """The recorder's clock was set by `set_ns` when its stamp was `stamp_ns`."""
+
+    stamp_ns: int
+    set_ns: int
+
+
+class RecorderClock:
+    """Takes the stamps in their order. `t_ns` is monotonic time, which begins at the first of them;
+    `stamp_ns` the latest stamp taken; `steps` what the clock was set by."""
+
+    def __init__(self) -> None:
+        self.t_ns = 0
+        self.stamp_ns = 0
+        self.steps: list[Step] = []
+        self._begun = False
+        self._went_back = False
+        """Time itself did, as UTC says: what was recorded before is refused until it is over."""
+        self._denied_ns: int | None = None
+        self._spacings: deque[int] = deque(maxlen=_LATELY)
+        self._frames: deque[tuple[Of, int]] = deque(maxlen=_OWN_PERIOD)
+        self._of_channel: dict[Hashable, int] = {}
+        """Its last stamp."""
+
+    @property
+    def set_ns(self) -> int:
+        """All steps together: the last stamps less monotonic time."""
+        return sum(step.set_ns for step in self.steps)
+
+    def is_odd(self, stamp_ns: int, of: Of) -> bool:
+        """Whether `take` has to look at what follows."""
+        change = stamp_ns - self.stamp_ns
+        if 0 <= change < LEAP_NS:
+            return not self._begun
+        own_ns = self._of_channel.get(of[0], stamp_ns)
+        return not (-AHEAD_NS < change < 0 and stamp_ns > own_ns - LEAP_NS)
+
+    def next(self, stamp_ns: int, of: Of) -> None:
+        """The stamp of a frame, which is not odd."""
+        if stamp_ns >= self.stamp_ns:
+            self._on(stamp_ns, stamp_ns - self.stamp_ns, of)
+        self._of_channel[of[0]] = stamp_ns
+
+    def take(self, stamp_ns: int, of: Of, following: Sequence[int], set_by_utc: SetOff) -> Verdict:
+        """The stamp of a frame before those that follow (`FOLLOWING`).
+
+        `set_by_utc()`: by how much reports of UTC say that the clock was set here; None where they
+        say nothing. It is asked where a step is possible.
+        """
+        if not self._begun:
+            if 2 * sum(f < stamp_ns - AHEAD_NS for f in following) > len(following):
+                return "time_ahead"
+            self._begun = True
+            self.t_ns = self.stamp_ns = stamp_ns
+        change = stamp_ns - self.stamp_ns
+        if change < 0:
+            if self._went_back or self._alone(stamp_ns, following):
+                return "time_backwards"
+            if change > -AHEAD_NS:
+                return self._little_back(stamp_ns, of, set_by_utc)
+            if stamp_ns > self._of_channel.get(of[0], stamp_ns) - AHEAD_NS:
+                return "time_backwards"  # of another channel, which was written too late
+            set_ns = set_by_utc()
+            if set_ns is not None and change - set_ns < -AHEAD_NS:
+                self._went_back = True
+                return "time_backwards"
+            self._step(stamp_ns, change if set_ns is None else set_ns, of)
+            return "taken"
+        if change > AHEAD_NS and self._is_ahead(stamp_ns, following):
+            return "time_ahead"
+        if change >= max(LEAP_NS, ORDINARY * max(self._spacings, default=0)):
+            set_ns = set_by_utc()
+            if set_ns is not None and abs(set_ns) >= LEAP_NS // 2 and change - set_ns > -AHEAD_NS:
+                self._step(stamp_ns, set_ns, of)
+                return "taken"
+        self._on(stamp_ns, change, of)
+        return "taken"
+
+    def _little_back(self, stamp_ns: int, of: Of, set_by_utc: SetOff) -> Verdict:
+        """By so little that controllers of one channel may disagree: UTC must say more."""
+        change = stamp_ns - self.stamp_ns
+        denied = self._denied_ns is not None and stamp_ns - self._denied_ns < ASKED_AGAIN_NS
+        set_ns = None if denied or change > -LEAP_NS else set_by_utc()
+        if set_ns is not None and abs(set_ns - change) < LEAP_NS:
+            self._step(stamp_ns, set_ns, of)
+            return "taken"
+        if change <= -LEAP_NS and not denied:
+            self._denied_ns = stamp_ns
+        return "time_backwards"
+
+    def _on(self, stamp_ns: int, passed_ns: int, of: Of) -> None:
+        self._went_back = False
+        self._of_channel[of[0]] = stamp_ns
+        self.t_ns += passed_ns
+        self.stamp_ns = stamp_ns
+        self._spacings.append(passed_ns)
+        self._frames.append((of, self.t_ns))
+
+    def _step(self, stamp_ns: int, set_ns: int, of: Of) -> None:
+        """Reports of UTC come with jitter: where they say that no time passed, or as good as none,
+        so much did as passes between frames of this identifier."""
+        change = stamp_ns - self.stamp_ns
+        passed = change - set_ns
+        if passed < LEAP_NS:
+            passed = self._due_ns(of)
+        self.steps.append(Step(stamp_ns, change - passed))
+        self._of_channel.clear()
+        self._on(stamp_ns, passed, of)
+
+    def _due_ns(self, of: Of) -> int:
+        """How long after the last frame the next of this channel and identifier is due."""
+        times = [t_ns for each, t_ns in self._frames if each == of][-2:]
+        spacing = median_low(self._spacings) if self._spacings else 0
+        if len(times) < 2:
+            return spacing
+        due_ns = 2 * times[1] - times[0] - self.t_ns
+        return due_ns if 0 <= due_ns < LEAP_NS else spacing
+
+    def _alone(self, stamp_ns: int, following: Sequence[int]) -> bool:
+        """Of a stamp that went back: whether most of what follows has not, or does not go on from
+        it."""
+        on = [f for f in following if stamp_ns - AHEAD_NS <= f < self.stamp_ns]
+        return 2 * len(on) <= len(following)
+
+    def _is_ahead(self, stamp_ns: int, following: Sequence[int]) -> bool:
+        """Of a stamp that leapt: whether most of what follows has not."""
+        behind = [f for f in following if self.stamp_ns - AHEAD_NS < f < stamp_ns - AHEAD_NS]
+        return 2 * len(behind) > len(following)
+
+
+def set_by(before: Sequence[int], after: Sequence[int]) -> int | None:
+    """By how much a clock was set, from stamp less reported UTC before and after (ns).
+
+    None where there are too few reports, or where their scatter would hide it.
+    """
+    if not before or len(after) < ENOUGH_REPORTS:
+        return None
+    found = median_low(after) - median_low(before)
+    scatter = max(max(before) - min(before), max(after) - min(after))
+    return found if scatter < LEAP_NS or abs(found) > 2 * scatter else None

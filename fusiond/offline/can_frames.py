@@ -1,0 +1,287 @@
+"""Frames of a recorded CAN bus, by python-can's readers: what cannot be read costs itself.
+
+    .log   candump -L, -l, and its terminal form with stamps     .blf   Vector, binary
+    .asc   Vector, text                                          .mf4   ASAM MDF 4 (asammdf)
+    .trc   PEAK, versions 1.0 to 2.1
+
+Each but the last may end in .gz as well. Dates without a zone are taken as python-can does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import gzip
+import importlib.util
+import logging
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple, cast
+
+from drivers.can.python_can import can, with_mf4
+from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
+from fusiond.offline.can_blf import DAY_S, Containers
+from fusiond.offline.can_text import (
+    HEADER_ENDS,
+    Asc,
+    Candump,
+    TextLines,
+    candump_of,
+    dated,
+    first_stamps,
+    stamp_s,
+)
+
+FORMATS = (".log", ".asc", ".blf", ".trc", ".mf4")
+_TOLD = 20
+"""Refusals that are kept in words; of the others the number."""
+_STRAY = 1000
+"""A channel with less than one of so many frames is damage in a name: what a device sends but once
+in a while, a bus of its own sends more often."""
+_ZONES = {
+    ".asc": "the dates of an ASC log have no zone: taken as local time of this computer, {zone}",
+    ".blf": "the date of a BLF log has no zone: taken as UTC",
+    ".trc": "the date of a TRC log has no zone: taken as UTC",
+}
+_UNDATED = "the log has no date that is understood: its times count from its beginning"
+_DATED_LOG = "the dates of candump -t A have no zone: taken as local time of this computer, {zone}"
+
+
+class Refusals:
+    """What of a log is not read: the first of it with line and text, of the rest the number."""
+
+    def __init__(self) -> None:
+        self._told: list[Rejection] = []
+        self._more = Counter[str]()
+
+    def add(self, line: int, reason: str, detail: str) -> None:
+        """One more; `line` 0 where there are none."""
+        if len(self._told) < _TOLD:
+            self._told.append(Rejection(line, reason, detail))
+        else:
+            self._more[reason] += 1
+
+    def count(self, refused: Counter[str]) -> None:
+        """What is counted by its reason alone."""
+        self._more.update(refused)
+
+    @property
+    def first(self) -> str:
+        """The first one, in words."""
+        return str(self._told[0]) if self._told else ""
+
+    def all(self) -> list[Rejection]:
+        """Of each reason what is told and how many more there are."""
+        told = Counter(each.reason for each in self._told)
+        more = [
+            Rejection(0, name, f"{n} {'more' if told[name] else 'times'}", n)
+            for name, n in self._more.items()
+            if n
+        ]
+        return [*self._told, *more]
+
+
+def messages(
+    path: Path,
+    refusals: Refusals | None = None,
+    told: Callable[[str, str], None] = lambda code, text: None,
+) -> Iterator[can.Message]:
+    """The messages of a log in its order. `told(code, text)` hears which zone its dates are of.
+
+    Raises `TableError` where there is no message to be read, `MissingPackageError` for MF4 without
+    asammdf, OSError for a file that cannot be opened.
+    """
+    log, lost = _format(path), Refusals() if refusals is None else refusals
+    read = {".blf": _binary, ".mf4": _mf4}.get(log.suffix, _text)
+    count = 0
+    with contextlib.ExitStack() as stack:
+        for message in read(log, lost, stack, told):
+            count += 1
+            yield message
+    if not count and lost.first:
+        hint = "; candump writes logs with -L or -l" if log.suffix == ".log" else ""
+        raise TableError(f"{path}: cannot be read as {log.suffix}: {lost.first}{hint}")
+
+
+def channels(path: Path) -> set[Any]:
+    """The channels of a log, less those that damage has made. Raises as `messages` does."""
+    frames: Counter[Any] = Counter(_channel_words(path))
+    frames = frames or Counter(m.channel for m in messages(path))
+    return {name for name, n in frames.items() if n * _STRAY >= frames.total()}
+
+
+# --------------------------------------------------------------------------- formats
+
+
+class _Log(NamedTuple):
+    path: Path
+    suffix: str
+    zipped: bool
+
+    def open(self) -> BinaryIO:
+        opened = gzip.open if self.zipped else open
+        return cast(BinaryIO, opened(self.path, "rb"))
+
+
+def _format(path: Path) -> _Log:
+    """By the name. Raises `TableError`."""
+    suffixes = [s.lower() for s in path.suffixes]
+    zipped = suffixes[-1:] == [".gz"]
+    suffix = "".join(suffixes[-2:-1] if zipped else suffixes[-1:])
+    if suffix not in FORMATS or (zipped and suffix == ".mf4"):
+        raise TableError(f"{path}: no CAN log by its name: {', '.join(FORMATS)} are read")
+    return _Log(path, suffix, zipped)
+
+
+def _channel_words(path: Path) -> Iterator[str | int]:
+    """Channels by the second word of the lines that `candump -L` wrote: to parse every frame for
+    that takes as long as to parse it for the drivers. None of a log of another form."""
+    log = _format(path)
+    if log.suffix != ".log":
+        return
+    with log.open() as stream:
+        for line in TextLines(stream, lambda line: line, lambda number, text: None):
+            words = line.split(None, 3)
+            if len(words) >= 3 and "#" in words[2] and words[0].startswith("("):
+                yield int(words[1]) if words[1].isdigit() else words[1]
+
+
+def _text(
+    log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
+) -> Iterator[can.Message]:
+    """Of a text log. A reader that a line has stopped goes on behind it."""
+    stream = stack.enter_context(log.open())
+    asc = Asc()
+    candump = Candump([])
+    if log.suffix == ".log":
+        with log.open() as first:
+            stamps = first_stamps(first)
+        candump = candump_of(stamps)
+        if stamps and dated(stamps[0]):
+            told("recorder_zone", _DATED_LOG.format(zone=_zone(stamp_s(stamps[0]))))
+    plain = {".log": candump.plain, ".asc": asc.plain}.get(log.suffix, lambda line: line)
+    lines = TextLines(stream, plain, lambda line, text: lost.add(line, "unreadable", text))
+    source = cast(Any, lines)
+    reader: Any
+    if log.suffix == ".asc":
+        reader = can.ASCReader(source, relative_timestamp=False)
+    else:
+        reader = (can.TRCReader if log.suffix == ".trc" else can.CanutilsLogReader)(source)
+    if log.suffix == ".trc":
+        stack.enter_context(_warned(lines.refuse))
+    began = False
+    while True:
+        pulled = lines.number
+        try:
+            for message in reader:
+                if asc.before_trigger_s:
+                    message.timestamp -= 2.0 * asc.before_trigger_s
+                if not began:
+                    began = True
+                    _tell_zone(log, getattr(reader, "start_time", None), told)
+                yield message
+            break
+        except Exception:  # whatever a reader raises for a line that is none
+            lines.refuse()
+            if lines.number == pulled:  # not for a line: for what its header lacks, at the end
+                break
+            if asc.in_frames:
+                lines.put_before(HEADER_ENDS)
+    if lines.damage is not None:
+        lost.add(0, "cut", f"the log ends in damage: {lines.damage}")
+    if candump.unstamped and not began:
+        raise TableError(
+            f"{log.path}: candump's terminal form without times: record with candump -L"
+        )
+
+
+def _binary(
+    log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
+) -> Iterator[can.Message]:
+    stream = stack.enter_context(log.open())
+    containers = Containers(stream, lambda text: lost.add(0, "unreadable", text))
+    try:
+        reader = can.BLFReader(cast(BinaryIO, containers))
+    except Exception as error:  # whatever it raises for a file that is none
+        lost.add(0, "unreadable", f"its header: {error}")
+        return
+    containers.body()
+    _tell_zone(log, reader.start_timestamp, told)
+    reader.start_timestamp -= DAY_S
+    try:
+        yield from reader
+    except Exception as error:
+        lost.add(0, "cut", f"the log ends in damage: {error}")
+    if containers.damage is not None:
+        lost.add(0, "cut", f"the log ends in damage: {containers.damage}")
+
+
+def _mf4(
+    log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
+) -> Iterator[can.Message]:
+    if importlib.util.find_spec("asammdf") is None:
+        raise MissingPackageError("MF4 logs need the package asammdf: pip install 'fusiond[mf4]'")
+    with_mf4()
+    log.path.open("rb").close()
+    failure = ""
+    try:
+        yield from can.MF4Reader(log.path)
+    except Exception as error:  # whatever asammdf raises for a file that is none
+        failure = f"{type(error).__name__}: {error}"
+    if failure:
+        lost.add(0, "cut", f"the log ends in damage: {failure}")
+        with _deleted_in_silence():
+            gc.collect()
+
+
+def _tell_zone(log: _Log, start: Any, told: Callable[[str, str], None]) -> None:
+    """In which zone the log's date was taken, or that it has none."""
+    if log.suffix in _ZONES and not start:
+        told("recorder_zone", _UNDATED)
+    elif log.suffix in _ZONES:
+        zone = _zone(start) if log.suffix == ".asc" else ""
+        told("recorder_zone", _ZONES[log.suffix].format(zone=zone))
+
+
+def _zone(t_s: float | None) -> str:
+    """This computer's zone at an instant, such as "CEST (UTC+0200)"."""
+    try:
+        local = time.localtime(t_s)
+    except (ValueError, OverflowError, OSError):
+        local = time.localtime()
+    return time.strftime("%Z (UTC%z)", local)
+
+
+@contextlib.contextmanager
+def _warned(call: Callable[[], None]) -> Iterator[None]:
+    """Hear of the lines that python-can only warns of, and keep that from the terminal."""
+    logger, handler = logging.getLogger("can.io"), _Heard(call)
+    propagated, logger.propagate = logger.propagate, False
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagated
+
+
+@contextlib.contextmanager
+def _deleted_in_silence() -> Iterator[None]:
+    """asammdf's file, where it could not be opened, fails once more as it is deleted."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+
+
+class _Heard(logging.Handler):
+    def __init__(self, call: Callable[[], None]) -> None:
+        super().__init__(logging.WARNING)
+        self._call = call
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._call()

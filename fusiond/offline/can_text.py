@@ -1,0 +1,285 @@
+r"""Lines of a CAN log in text, made plain for the readers of python-can: a bad one costs itself.
+
+A reader pulls line after line. Before it sees one, encoding and blocks of zeros (what a file system
+leaves where a logger lost its power) are dealt with here, and what the formats know beside what
+python-can reads is said in its words:
+
+    candump's terminal form    (t) can0  7E8  [8]  03 41 ...    ->  (t) can0 7E8#0341...
+    stamps as differences      candump -t d, ASC "timestamps relative": summed
+    stamps before the trigger  ASC -0.5: without the sign, which `before_trigger_s` remembers
+    CANFD without a channel    ASC "CANFD   Start of measurement" and the like: no frame
+
+Sources: can-utils, candump.c and lib.c (`snprintf_long_canframe`); Vector, ASC format description.
+"""
+
+from __future__ import annotations
+
+import codecs
+import gzip
+import io
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from itertools import islice, pairwise
+from typing import BinaryIO
+
+LONGEST = 16_384
+"""Bytes of a line. A frame of CAN XL, the longest there is, has 2048 bytes: 6144 characters in the
+terminal's form."""
+SHOWN = 60
+"""Characters of a refused line that are told."""
+_BOMS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_ERROR_FRAME = 0x2000_0000
+"""CAN_ERR_FLAG of the identifier of an error frame (linux/can.h)."""
+
+Plain = Callable[[str], str | None]
+
+
+class TextLines:
+    """The lines of a log, as a file that a reader of python-can iterates over.
+
+    `plain(line)` says a line in words that the reader knows; None: it holds no frame.
+    `refused(line, text)` hears of what is lost, once a line.
+    """
+
+    def __init__(self, stream: BinaryIO, plain: Plain, refused: Callable[[int, str], None]) -> None:
+        self._stream = _decoded(stream)
+        self._plain = plain
+        self._refused = refused
+        self._refused_line = 0
+        self._line = ""
+        self._again: str | None = None
+        self.number = 0
+        """Of the line that was pulled last, from 1."""
+        self.damage: Exception | None = None
+        """What ended the file before its end: a zipped one that is cut."""
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        if self._again is not None:
+            line, self._again = self._again, None
+            return line
+        while raw := self._read():
+            self.number += 1
+            self._line = text = self._text(raw)
+            if not text or text.isspace():
+                continue
+            if (plain := self._plain(text)) is not None:
+                return plain
+        raise StopIteration
+
+    def close(self) -> None:
+        """For the reader, which closes what it has read: whoever opened it does."""
+
+    def refuse(self) -> None:
+        """The line that was pulled last is not read."""
+        if self.number > self._refused_line:
+            self._refused_line = self.number
+            told = self._line.strip()
+            cut = repr(told[:SHOWN] + ("..." if told[SHOWN:] else ""))
+            self._refused(self.number, cut if told else "a block of zeros")
+
+    def put_before(self, line: str) -> None:
+        """The next line that is pulled is this one, which is not of the file."""
+        self._again = line
+
+    def _read(self) -> bytes:
+        """The next line; of one that is too long, or has zeros in it, what follows them."""
+        try:
+            raw = self._stream.readline(LONGEST)
+            if b"\0" not in raw and len(raw) < LONGEST:
+                return raw
+            kept, more = raw, raw
+            while len(more) == LONGEST and not more.endswith(b"\n"):
+                more = self._stream.readline(LONGEST)
+                kept = (kept + more).rpartition(b"\0")[2][-LONGEST:]
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            self.damage = error
+            return b""
+        self.number += 1
+        self._line = self._text(raw.partition(b"\0")[0])
+        self.refuse()
+        self.number -= 1
+        return kept.rpartition(b"\0")[2] or b"\n" if b"\0" in raw else b"\n"
+
+    def _text(self, raw: bytes) -> str:
+        """UTF-8, or what else a Windows of Western Europe writes."""
+        if self.number == 1:
+            raw = raw.removeprefix(codecs.BOM_UTF8)
+        try:
+            return raw.decode()
+        except UnicodeDecodeError:
+            return raw.decode("cp1252", "replace")
+
+
+def _decoded(stream: BinaryIO) -> BinaryIO:
+    """The bytes in UTF-8, where the file says that they are UTF-16 (PowerShell's `>`)."""
+    try:
+        first = stream.read(2)
+        if first not in _BOMS:
+            stream.seek(0)
+            return stream
+        whole = first + stream.read()
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        stream.seek(0)  # the first line will say so
+        return stream
+    return io.BytesIO(whole.decode(_BOMS[first], "replace").encode())
+
+
+# --------------------------------------------------------------------------- candump
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_TERMINAL = re.compile(
+    r"\s*(?:\((?P<t>[^()]*)\)\s+)?(?P<channel>[^\s()]+)\s+(?:(?:RX|TX)(?:\s+[-A-Z])*\s+)?"
+    r"(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[(?P<length>\d{1,4})\](?P<data>(?:\s+[0-9A-Fa-f]{2})*)"
+    r"(?P<rest>\s.*|$)"
+)
+_FIRST_LINES = 1000
+"""By so many lines it is judged whether stamps are differences: what is zero-based never falls."""
+_BEGINS = 1.0
+"""Seconds: a log whose first stamp is below counts from its beginning, and no clock says it."""
+
+
+class Candump:
+    """Lines of candump as `candump -L` writes them. Its terminal form is told by the `[length]`."""
+
+    def __init__(self, stamps: list[float]) -> None:
+        """`stamps` of the first lines of the terminal's form."""
+        self._differences = bool(stamps) and stamps[0] < _BEGINS and _fall_or_stand(stamps)
+        self._sum_s = 0.0
+        self.unstamped = False
+        """Whether there was a frame without its time."""
+
+    def plain(self, line: str) -> str:
+        """The line in the form of a log."""
+        if "\x1b" in line:
+            line = _COLOUR.sub("", line)
+        if "[" not in line:
+            hash_at = line.find("#")
+            if hash_at >= 8 and line[hash_at - 8 : hash_at - 7] in "2367":
+                return _with_error_flag(line, hash_at)
+            return line
+        found = _TERMINAL.fullmatch(line.rstrip())
+        if found is None:
+            return line
+        if found["t"] is None:
+            self.unstamped = True
+            return line
+        stamp = stamp_s(found["t"])
+        if stamp is None:
+            return line
+        if self._differences:
+            self._sum_s += max(0.0, stamp)
+            stamp = self._sum_s
+        head = f"({stamp:.6f}) {found['channel']} {found['id']}#"
+        length, data = int(found["length"]), found["data"].split()
+        if int(found["id"], 16) & _ERROR_FRAME:
+            return _with_error_flag(head, len(head) - 1)
+        if "remote request" in found["rest"]:
+            return f"{head}R{length}"
+        if len(data) < length:
+            return line
+        # Two digits are CAN FD's, whose flags this form does not say.
+        fd = "#0" if len(found["length"]) > 1 else ""
+        return head + fd + "".join(data[:length])
+
+
+def _with_error_flag(line: str, hash_at: int) -> str:
+    """Of an error frame's line, one that python-can knows for one: by CAN_ERR_BUSERROR."""
+    return f"{line[: hash_at - 8]}20000080{line[hash_at:]}"
+
+
+def stamp_s(text: str) -> float | None:
+    """Seconds of a stamp in brackets: a number, or a date in local time (`candump -t A`)."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.fromisoformat(text.strip()).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def dated(stamp: str) -> bool:
+    """Whether a stamp in brackets is a date."""
+    return "-" in stamp.strip()[1:] and stamp_s(stamp) is not None
+
+
+def first_stamps(stream: BinaryIO) -> list[str]:
+    """Of the first lines in the terminal's form."""
+    lines = TextLines(stream, lambda line: line, lambda line, text: None)
+    first = islice(lines, _FIRST_LINES)
+    found = (_TERMINAL.fullmatch(_COLOUR.sub("", line).rstrip()) for line in first)
+    return [each["t"] for each in found if each is not None and each["t"] is not None]
+
+
+def candump_of(stamps: list[str]) -> Candump:
+    """The reader of lines for a log whose first stamps these are."""
+    seconds = [stamp_s(stamp) for stamp in stamps]
+    return Candump([s for s in seconds if s is not None])
+
+
+def _fall_or_stand(stamps: list[float]) -> bool:
+    """Whether the stamps are differences: they fall, or are all alike from the second on."""
+    falls = any(after < before for before, after in pairwise(stamps))
+    return falls or (len(stamps) > 3 and stamps[1] > 0.0 and len(set(stamps[1:])) == 1)
+
+
+# --------------------------------------------------------------------------- Vector's ASC
+
+_STAMPED = re.compile(r"\s*(-?)(\d+)\.(\d+)(?=\s)")
+_RELATIVE = re.compile(r"\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
+_HEADER = re.compile(
+    r"\s*(date\s+\w+\s|base\s|//|(no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE
+)
+_HEADER_OVER = re.compile(r"\s*((no\s*)?internal\s+events\s+logged|begin\s)", re.IGNORECASE)
+_FD_EVENT = re.compile(r"\s*-?\d+\.\d+\s+CANFD\s+[^\d\s]", re.IGNORECASE)
+HEADER_ENDS = "internal events logged"
+"""A line after which python-can's reader of ASC looks for frames."""
+
+
+class Asc:
+    """Lines of an ASC file as python-can knows them."""
+
+    def __init__(self) -> None:
+        self.in_frames = False
+        """Whether the header is over: stamped lines have come."""
+        self.before_trigger_s = 0.0
+        """By how much the last line lies before the beginning of the measurement."""
+        self._relative = False
+        self._sum_ns = 0
+
+    def plain(self, line: str) -> str | None:
+        """The line with its stamp counted from the beginning and without sign; None for an event of
+        no channel."""
+        self.before_trigger_s = 0.0
+        found = _STAMPED.match(line)
+        if found is None:
+            return line if self.in_frames else self._of_header(line)
+        self.in_frames = True
+        if _FD_EVENT.match(line):
+            return None if not self._relative else self._counted(found, "")
+        if self._relative:
+            return self._counted(found, line[found.end() :])
+        if found[1]:
+            self.before_trigger_s = float(f"{found[2]}.{found[3]}")
+            return f"{found[2]}.{found[3]}{line[found.end() :]}"
+        return line
+
+    def _of_header(self, line: str) -> str | None:
+        """A line before the first frame. The reader ends the header at one that it does not know, a
+        date in another language among them, and misses what stands behind it."""
+        self._relative |= _RELATIVE.match(line) is not None
+        self.in_frames |= _HEADER_OVER.match(line) is not None
+        return line if _HEADER.match(line) else None
+
+    def _counted(self, found: re.Match[str], rest: str) -> str | None:
+        """A difference to the event before, of whatever kind that was: summed."""
+        ns = int(found[2]) * 10**9 + int(found[3][:9].ljust(9, "0"))
+        self._sum_ns += -ns if found[1] else ns
+        seconds, fraction = divmod(max(0, self._sum_ns), 10**9)
+        return f"{seconds}.{fraction:09d}{rest}" if rest else None

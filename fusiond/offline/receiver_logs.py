@@ -1,0 +1,195 @@
+"""Logs of receivers as measurements with their arrivals: UBX-NAV, BESTPOS, SBF, and RINEX."""
+
+from __future__ import annotations
+
+import gzip
+import importlib
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from drivers.bestpos.decoder import BestposDecoder
+from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
+from drivers.raw.messages import RawGnssEpoch
+from drivers.raw.rinex import (
+    COMPRESSED_LABEL,
+    FIRST_LABEL,
+    LABEL,
+    ObservationReader,
+    RinexError,
+    version_and_type,
+)
+from drivers.raw.rinex_nav import Broadcast, navigation
+from drivers.raw.weeks import GPS_EPOCH_S, WEEK_S, leap_seconds
+from drivers.sbf.decoder import SbfDecoder
+from drivers.solution import REFUSALS, SolutionDecoding
+from drivers.ubx.decoder import UbxDecoder
+from fusiond.configuration.load import driver_entry_points
+from fusiond.configuration.schema import Config
+from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
+from fusiond.files.tables import ImuTable
+from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
+from fusiond.offline.aid_files import SECONDS_OF_WEEK, Arrival
+from fusiond.offline.nmea_file import EARLIEST_DATE
+
+Read = tuple[list[Arrival], list[Rejection]]
+
+
+class _Decoder(Protocol):
+    counters: Counter[str]
+
+    @property
+    def refusal(self) -> str: ...
+
+    def feed(self, data: bytes, t_seen_ns: int) -> Sequence[Measurement]: ...
+
+    def flush(self) -> Sequence[Measurement]: ...
+
+
+_DECODERS: dict[str, Callable[[str, SolutionDecoding], _Decoder]] = {
+    "ubx": UbxDecoder,
+    "bestpos": BestposDecoder,
+    "sbf": SbfDecoder,
+}
+_NAMES = {
+    "ubx": "UBX navigation message (UBX-NAV-PVT)",
+    "bestpos": "log of the BESTPOS family (#BESTPOSA, #BESTNAVA)",
+    "sbf": "SBF position (PVTGeodetic)",
+}
+_USED = frozenset(
+    {"epochs", "fixes", "headings", "sentences", "ubx_frames", "rtcm_frames", "nav_messages"}
+    | {"relposned", "logs", "logs_used", "sbf_blocks", "blocks_used", "garbage_bytes"}
+    | {"other_bytes", "ubx_not_used", "logs_not_used", "blocks_not_used", "velocity_latent"}
+)
+"""Counters of what was taken, or is no fix at all; all others are refusals."""
+_COMPRESSED = (b"\x1f\x9d", b"PK", b"BZ")
+"""What a RINEX file may be packed by but gzip: compress, zip, bzip2."""
+
+
+def content(path: Path) -> bytes:
+    """A file's bytes, unpacked where it is a gzip file, whatever it is called. TableError."""
+    data = path.read_bytes()
+    if data[:2] != b"\x1f\x8b":
+        return data
+    try:
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise TableError(f"{path}: no gzip file that can be unpacked ({error})") from error
+
+
+def decoding_of(source: str, config: Config) -> SolutionDecoding:
+    """The options of the configured receiver, as of the daemon's; a log may be of any date."""
+    points = driver_entry_points()
+    found: dict[str, Any] = {}
+    for name, section in config.sources.items():
+        options = points[section.driver].load().Options(**section.options)
+        fields = set(type(options).model_fields)
+        if set(SolutionDecoding.model_fields) <= fields and (not found or name == source):
+            found = {key: getattr(options, key) for key in SolutionDecoding.model_fields}
+    return SolutionDecoding(**{**found, "earliest_date": EARLIEST_DATE})
+
+
+def read_solutions(
+    kind: str, path: Path, imu: ImuTable, source: str, decoding: SolutionDecoding
+) -> Read:
+    """Fixes and headings as a receiver's own protocol states them. The bytes hold UTC, so the IMU's
+    `t_s` must be GPS second of week or POSIX seconds. TableError where there is no fix."""
+    decoder = _DECODERS[kind](source, decoding)
+    found = [*decoder.feed(content(path), 0), *decoder.flush()]
+    of_week = is_of_week(imu)
+    rows = []
+    undated = 0
+    for m in found:
+        if not isinstance(m, PositionFix | Heading):
+            continue
+        if not isinstance(m.stamp, UtcStamp):
+            undated += 1
+            continue
+        utc_ns = t_ns = m.stamp.utc_ns
+        if of_week:
+            t_ns = round(utc_ns_to_gps_week_seconds(utc_ns) * 1e9)
+        valid = replace(m, t_seen_ns=t_ns, stamp=MonotonicStamp(t_ns))
+        rows.append(Arrival(t_ns, valid, utc_ns=utc_ns))
+    if not rows:
+        why = REFUSALS.get(decoder.refusal)
+        raise TableError(f"{path}: no fix: {why}" if why else f"{path}: no {_NAMES[kind]}")
+    refused = {name: n for name, n in decoder.counters.items() if name not in _USED}
+    return rows, counted({**refused, "undated": undated})
+
+
+def is_of_week(imu: ImuTable) -> bool:
+    """Whether the IMU's times are seconds of a week."""
+    return bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
+
+
+# --------------------------------------------------------------------------- RINEX
+
+
+def rinex_text(path: Path, data: bytes) -> str | None:
+    """The file's text, unpacked (Hatanaka, compress, zip); None where it is no RINEX file.
+    MissingPackageError, TableError."""
+    label = data[:80].partition(b"\n")[0][LABEL].decode("ascii", "replace").strip()
+    if label == FIRST_LABEL:
+        return data.decode("ascii", "replace")
+    if label != COMPRESSED_LABEL and not data.startswith(_COMPRESSED):
+        return None
+    try:
+        hatanaka: Any = importlib.import_module("hatanaka")
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{path}: RINEX packed by Hatanaka's or another way needs the package hatanaka: "
+            "pip install 'fusiond[rinex]'"
+        ) from error
+    try:
+        return str(hatanaka.decompress(data).decode("ascii", "replace"))
+    except Exception as error:  # it hands on what zip, ncompress and crx2rnx raise
+        raise TableError(f"{path}: cannot be unpacked as RINEX ({error})") from error
+
+
+def read_rinex(path: Path, text: str, imu: ImuTable, source: str) -> Read:
+    """Epochs of an observation file, or what satellites sent of a navigation file.
+
+    An ephemeris arrives when it was sent; the first of each satellite is known from the start, as
+    to a receiver that has been on. TableError where it is neither."""
+    counters = Counter[str]()
+    try:
+        if version_and_type(text)[1] == "N":
+            rows = _broadcast(navigation(source, text, counters), imu)
+        else:
+            rows = [_arrival(e, imu) for e in ObservationReader(source, text, counters).epochs()]
+    except RinexError as error:
+        raise TableError(f"{path}: {error}") from None
+    if not rows:
+        raise TableError(f"{path}: a RINEX file without a record that is read")
+    taken = ("epochs_raw", "ephemerides", "ionospheres", "events_passed")
+    refused = {
+        name: n
+        for name, n in counters.items()
+        if name not in taken and not name.startswith("measured_")
+    }
+    return rows, counted(refused)
+
+
+def _arrival(epoch: RawGnssEpoch, imu: ImuTable) -> Arrival:
+    now = round(epoch.tow_s * 1e9)
+    if not is_of_week(imu) and isinstance(epoch.stamp, UtcStamp):
+        now = epoch.stamp.utc_ns
+    return Arrival(now, replace(epoch, t_seen_ns=now, stamp=MonotonicStamp(now)))
+
+
+def _broadcast(records: list[Broadcast], imu: ImuTable) -> list[Arrival]:
+    start_ns = round(float(imu.t_s[0]) * 1e9) if len(imu.t_s) else 0
+    of_week = is_of_week(imu)
+    known = set[tuple[str, str]]()
+    rows = []
+    for gps_s, message in sorted(records, key=lambda r: r.gps_s):
+        week, tow_s = divmod(gps_s, WEEK_S)
+        t_s = tow_s if of_week else gps_s + GPS_EPOCH_S - leap_seconds(int(week), tow_s)
+        kind = getattr(message, "satellite", message.system), getattr(message, "message", "")
+        t_ns = start_ns if kind not in known else max(start_ns, round(t_s * 1e9))
+        known.add(kind)
+        rows.append(Arrival(t_ns, message))
+    return rows

@@ -1,0 +1,267 @@
+"""The BESTPOS family: logs of real receivers by their CRC, made ones by what they come to."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.bestpos.decoder import TYPES, BestposDecoder
+from drivers.bestpos.framing import LogSplitter, log_crc
+from drivers.measurements import Heading, Measurement, PositionFix, TimeReport, UtcStamp
+from drivers.solution import SolutionDecoding
+from tests.drivers.bestpos.logs import (
+    PLACE,
+    bestnav,
+    bestpos,
+    bestvel,
+    heading,
+    log,
+    novatel,
+    unicore,
+)
+
+UTC_NS = 1_796_091_269_000_000_000
+OLD = SolutionDecoding(earliest_date=date(2010, 1, 1))
+GOLDEN = Path(__file__).with_name("golden.log")
+# From NovAtel's and Unicore's manuals and forums of users: the CRC is the receiver's.
+REAL = (
+    b"#BESTPOSA,USB1,0,51.5,FINESTEERING,2404,603797.000,03000800,cdba,18018;SOL_COMPUTED,"
+    b"NARROW_INT,51.07899643518,-114.13251416136,1114.2977,-16.6000,WGS84,0.0079,0.0056,0.0141,"
+    b'"3920",1.000,0.000,34,31,31,30,00,21,7f,37*a5cec5c7\r\n',
+    b"#BESTVELA,COM2,0,82.5,FINESTEERING,1836,317693.000,00000000,827b,6588;SOL_COMPUTED,"
+    b"DOPPLER_VELOCITY,0.150,0.000,0.1395,183.354399,-0.0699,0.0*9e374c71\r\n",
+    b"#HEADING2A,COM1,0,39.5,FINESTEERING,1622,422892.200,02040000,f9bf,6521;SOL_COMPUTED,"
+    b'NARROW_INT,0.927607417,178.347869873,-1.3037414550,0,0.261901051,0.391376048,"R222","AAAA",'
+    b"18,17,17,16,0,01,0,33*8c48d77c\r\n",
+    b"#TIMEA,COM1,0,86.5,FINESTEERING,1930,428348.000,02000020,9924,32768;VALID,1.667187222e-10,"
+    b"9.641617960e-10,-18.00000000000,2017,1,5,22,58,50000,VALID*2a066e78\r\n",
+    b"#UNIHEADINGA,78,GPS,FINE,2428,116060000,0,0,18,11;SOL_COMPUTED,NARROW_INT,1.4773,179.0284,"
+    b'-2.4202,0.0000,0.8259,1.0921,"999",27,21,21,15,3,01,3,f3*5d424350\r\n',
+    b"#BESTPOSA,COM2,0,91.0,FINE,2164,52077.000,420887,32,18;SOL_COMPUTED,FIXEDPOS,32.02245993006,"
+    b'118.85899391094,68.5505,2.0115,WGS84,0.0000,0.0000,0.0000,"",0.000,0.000,40,28,28,16,0,06,03,'
+    b"53*17b29c25\r\n",
+)
+
+
+def decoded(
+    *logs: bytes, decoding: SolutionDecoding | None = None
+) -> tuple[list[Measurement], BestposDecoder]:
+    decoder = BestposDecoder("gnss", decoding)
+    found = [m for each in logs for m in decoder.feed(each, 7)]
+    return found + decoder.flush(), decoder
+
+
+def fixes(found: list[Any]) -> list[PositionFix]:
+    return [m for m in found if isinstance(m, PositionFix)]
+
+
+def test_logs_of_real_receivers_verify() -> None:
+    found, decoder = decoded(*REAL, decoding=OLD)
+    assert decoder.counters["logs"] == decoder.counters["logs_used"] == len(REAL)
+    assert decoder.counters["crc_bad"] == 0
+    (fix,) = fixes(found)
+    assert math.degrees(fix.lat_rad) == pytest.approx(51.07899643518, abs=1e-11)
+    assert fix.height_m == pytest.approx(1114.2977 - 16.6)
+    assert fix.sd_ned_m == (0.0079, 0.0056, 0.0141)
+    assert decoder.refusal == "manual_refused"
+    assert [math.degrees(m.yaw_rad) for m in found if isinstance(m, Heading)] == [
+        pytest.approx(178.347869873),
+        pytest.approx(179.0284),
+    ]
+
+
+def test_bestpos_and_bestvel_are_one_epoch() -> None:
+    time, fix = decoded(bestpos(), bestvel())[0]
+    assert time == TimeReport("gnss", 7, UTC_NS, False)
+    east = 5.0 * math.sin(math.radians(120.0))
+    assert fix == PositionFix(
+        "gnss", 7, UtcStamp(UTC_NS), math.radians(39.9687242), math.radians(116.3257202),
+        pytest.approx(36.2), 4, 31, None, None, (0.014, 0.012, 0.031),
+        pytest.approx((-2.5, east, -0.1)), None,
+    )  # fmt: skip
+    assert len(fixes(decoded(bestvel(), bestpos())[0])) == 1
+    assert decoded(bestpos(), bestvel(latency="0.150"))[1].counters["velocity_latent"] == 1
+
+
+@pytest.mark.parametrize("base", ["GPS", "BDS"])
+def test_bestnav_has_all(base: str) -> None:
+    (fix,) = fixes(decoded(bestnav(base=base))[0])
+    assert fix.stamp == UtcStamp(UTC_NS)
+    assert fix.sd_v_ned_m_s == (0.02, 0.02, 0.03)
+    assert fix.v_ned_m_s is not None
+    assert fix.satellites == 28
+    short = "INSUFFICIENT_OBS,NONE,0.000,0.000,0.0000,0.000000,0.0000,0.0,0.0"
+    (still,) = fixes(decoded(bestnav(velocity=short))[0])
+    assert still.v_ned_m_s is None
+
+
+def test_leap_seconds_of_header_time_log_and_date() -> None:
+    (fix,) = fixes(decoded(bestnav(leap=19))[0])
+    assert fix.stamp == UtcStamp(UTC_NS - 1_000_000_000)
+    (fix,) = fixes(decoded(bestnav(leap=99))[0])  # implausible: that of the date
+    assert fix.stamp == UtcStamp(UTC_NS)
+    time = novatel("TIMEA", "VALID,0.0,0.0,-19.00000000000,2026,12,1,2,14,28000,VALID")
+    (fix,) = fixes(decoded(time, bestpos())[0])
+    assert fix.stamp == UtcStamp(UTC_NS - 1_000_000_000)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "quality"),
+    [
+        (bestpos(name="PSRPOSA", kind="SINGLE"), bestpos(), 4),
+        (bestpos(), bestpos(name="PSRPOSA", kind="SINGLE"), 4),
+        (bestpos(kind="INS_RTKFIXED"), bestpos(name="BESTGNSSPOSA", kind="NARROW_FLOAT"), 5),
+        (bestpos(kind="INS_RTKFIXED"), bestpos(name="PSRPOSA", kind="SINGLE"), 1),
+    ],
+)
+def test_best_of_an_epoch(first: bytes, second: bytes, quality: int) -> None:
+    (fix,) = fixes(decoded(first, second)[0])
+    assert fix.quality == quality
+
+
+@pytest.mark.parametrize(
+    ("each", "name"),
+    [
+        (bestpos(status="INSUFFICIENT_OBS", kind="NONE"), "no_fix"),
+        (bestpos(status="COLD_START"), "no_fix"),
+        (bestpos(kind="NONE"), "no_fix"),
+        (bestpos(kind="FIXEDPOS"), "manual_refused"),
+        (bestpos(kind="PROPAGATED"), "dead_reckoning_refused"),
+        (bestpos(kind="INS_PSRSP"), "inertial_refused"),
+        (bestpos(kind="INSPVA"), "inertial_refused"),
+        (bestpos(kind="TELEPATHY"), "no_fix"),
+        (bestpos(place=PLACE.replace("WGS84", "NAD27")), "datum_refused"),
+        (bestpos(clock="UNKNOWN"), "untimed_epoch"),
+        (bestpos(place=PLACE.replace("39.9", "99.9")), "position_implausible"),
+        (bestpos(place=PLACE.replace("45.3000", "450000.0")), "height_implausible"),
+        (bestpos(place=PLACE.replace("0.0140", "999999.0")), "sigma_too_large"),
+        (bestpos() + bestvel() + bestpos(), "duplicate_epoch"),
+    ],
+)
+def test_refused_by_name(each: bytes, name: str) -> None:
+    found, decoder = decoded(each)
+    assert len(fixes(found)) == (name == "duplicate_epoch")
+    assert decoder.counters[name] == 1
+    assert decoder.refusal == name
+
+
+@pytest.mark.parametrize(
+    ("each", "name"),
+    [
+        (bestpos().replace(b"NARROW", b"NARROX"), "crc_bad"),
+        (bestpos()[:80] + bestpos(1), "log_cut"),
+        (b"#" + b"A" * 3000 + bestpos(1), "log_too_long"),
+        (log("BESTPOSA,COM1,0", "SOL_COMPUTED"), "header_bad"),
+        (log("BESTPOSA,COM1,0,83.5,FINESTEERING,week,1.0,0,0,0", "SOL_COMPUTED"), "header_bad"),
+        (novatel("BESTPOSA", "SOL_COMPUTED,SINGLE,1.0"), "bad_field"),
+        (bestpos(place=PLACE.replace("45.3000", "4x")), "bad_field"),
+        (bestpos(place=PLACE.replace("45.3000", "nan")), "bad_field"),
+        (bestpos(place=PLACE.replace("45.3000", "1_0")), "bad_field"),
+        (novatel("RANGEA", "1,2"), "logs_not_used"),
+        (heading(kind="NARROW_FLOAT"), "heading_not_fixed"),
+        (unicore("UNIHEADINGA", "INSUFFICIENT_OBS,NONE,0,0,0,0,0,0"), "heading_not_valid"),
+    ],
+)
+def test_counted_by_name_and_the_next_one_is_read(each: bytes, name: str) -> None:
+    found, decoder = decoded(each, bestpos(2), bestpos(3))
+    assert decoder.counters[name] == 1
+    assert {m.stamp for m in fixes(found)} >= {
+        UtcStamp(UTC_NS + 2_000_000_000),
+        UtcStamp(UTC_NS + 3_000_000_000),
+    }
+
+
+def test_types_are_those_of_nmea() -> None:
+    qualities = {quality for quality in TYPES.values() if isinstance(quality, int)}
+    assert qualities == {1, 2, 4, 5}
+    for kind, quality in TYPES.items():
+        if isinstance(quality, int):
+            (fix,) = fixes(decoded(bestpos(kind=kind))[0])
+            assert fix.quality == quality
+            assert (fix.height_m is None) == (kind == "FIXEDHEIGHT")
+
+
+def test_the_last_log_of_an_epoch_is_learned() -> None:
+    decoder = BestposDecoder("gnss")
+    counts = [len(fixes(decoder.feed(bestpos(k) + bestvel(k), 0))) for k in range(5)]
+    assert counts == [0, 1, 2, 1, 1]
+
+
+def test_golden_log() -> None:
+    """Ten seconds of a UM982 with two antennas and of an OEM7, with NMEA, answers and damage."""
+    found, decoder = decoded(GOLDEN.read_bytes())
+    assert {name: n for name, n in decoder.counters.items() if n} == {
+        "logs": 28,
+        "logs_used": 27,
+        "logs_not_used": 1,
+        "epochs": 14,
+        "fixes": 13,
+        "headings": 8,
+        "heading_not_fixed": 1,
+        "no_fix": 1,
+        "crc_bad": 1,
+        "log_cut": 1,
+        "other_bytes": decoder.counters["other_bytes"],
+    }
+    made = fixes(found)
+    assert [m.quality for m in made] == [1, 5, 5, 4, 4, 4, 4, 4, 4, 2, 2, 2, 2]
+    assert all(m.v_ned_m_s is not None for m in made)
+    seconds = [(m.stamp.utc_ns - UTC_NS) * 1e-9 for m in made if isinstance(m.stamp, UtcStamp)]
+    assert seconds == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 20.0, 21.0, 22.0, 23.0]
+
+
+def test_split_anywhere_gives_the_same() -> None:
+    stream = GOLDEN.read_bytes()
+    whole = decoded(stream)
+    for size in (1, 2, 7, 61, 300):
+        pieces = decoded(*(stream[k : k + size] for k in range(0, len(stream), size)))
+        assert pieces[0] == whole[0]
+        assert pieces[1].counters == whole[1].counters
+
+
+SEEDS = (bestpos(), bestvel(), bestnav(), heading(), *REAL)
+
+
+def mended(each: bytes) -> bytes:
+    text = each[1:].rpartition(b"*")[0]
+    return b"#%b*%08x\r\n" % (text, log_crc(text))
+
+
+@given(st.lists(st.sampled_from(SEEDS), max_size=6), st.randoms(use_true_random=False))
+@settings(max_examples=300, deadline=None)
+def test_mutated_logs_with_a_good_crc_never_raise(seeds: list[bytes], rng: random.Random) -> None:
+    decoder = BestposDecoder("gnss", OLD)
+    for seed in seeds:
+        changed = bytearray(seed)
+        for _ in range(rng.randrange(4)):
+            changed[rng.randrange(1, len(seed) - 11)] = rng.randrange(256)
+        for m in decoder.feed(mended(bytes(changed)), 0):
+            assert m.source == "gnss"
+    decoder.flush()
+    assert decoder.counters["other_bytes"] >= 0
+    later = [m for k in range(4) for m in decoder.feed(bestpos(k) + bestvel(k), 0)]
+    assert fixes(later + decoder.flush())
+
+
+@given(st.binary(max_size=400), st.integers(1, 50))
+def test_every_byte_is_accounted_for(stream: bytes, size: int) -> None:
+    counters = Counter[str]()
+    splitter = LogSplitter(counters)
+    for k in range(0, len(stream), size):
+        assert splitter.feed(stream[k : k + size]) == []
+    splitter.finish()
+    assert counters["other_bytes"] == len(stream)
+    assert splitter.waiting == 0
+
+
+def test_body_below_the_sigmas_may_be_cut() -> None:
+    (fix,) = fixes(decoded(novatel("BESTPOSA", f"SOL_COMPUTED,SINGLE,{PLACE}"))[0])
+    assert fix.satellites is None

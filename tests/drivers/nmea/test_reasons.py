@@ -1,0 +1,253 @@
+"""Why a receiver's bytes give no fix: the right cause, and what to switch on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import date
+from functools import reduce
+from operator import xor
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.nmea.decoder import NmeaDecoder
+from drivers.nmea.protocols import named
+from drivers.nmea.reasons import MANY, MOST_NAMES, implausible_date
+from tests.drivers.nmea.sentences import (
+    GGA,
+    GGA_NO_FIX,
+    GGA_SW,
+    GSA,
+    GSA_2D,
+    RMC,
+    VTG,
+    ZDA,
+    changed,
+    decode,
+    decoder,
+    made,
+    wire,
+)
+
+UBX = b"\xb5\x62\x05\x01\x02\x00\x06\x01\x0f\x38"
+"""ACK-ACK of CFG-MSG."""
+RTCM = b"\xd3\x00\x02\x3e\xd0\x9b\xdc\x0b"
+
+
+def fed(data: bytes) -> NmeaDecoder:
+    one = decoder()
+    one.feed(data, 1)
+    one.flush()
+    return one
+
+
+def minutes(sentence: str, count: int) -> list[str]:
+    return [changed(sentence, "0214", f"02{14 + i}") for i in range(count)]
+
+
+def two_dimensional(minute: int) -> list[str]:
+    return [changed(changed(GGA, ",18,", ",03,"), "0214", f"02{minute}"), GSA_2D]
+
+
+# ------------------------------------------------------------------ nothing verifies
+
+
+def test_sentences_without_checksums_are_not_another_baud_rate() -> None:
+    bare = "".join(s.partition("*")[0] + "\r\n" for s in (GGA, ZDA, VTG)).encode()
+    assert "without a checksum" in fed(bare).cause
+    # One that lost its own says nothing yet.
+    assert fed(bare[: bare.index(b"\r\n") + 2]).cause == ""
+
+
+def test_other_frames_on_the_wire_are_named() -> None:
+    cause = fed(UBX * 3).cause
+    assert cause.startswith("UBX frames arrive, but no NMEA: switch on NMEA output on this port")
+    assert 'driver = "ubx"' in cause
+    assert fed(bytes(range(128, 192)) * 20).cause == ""
+
+
+def sirf(payload: bytes) -> bytes:
+    total = (sum(payload) & 0x7FFF).to_bytes(2, "big")
+    return b"\xa0\xa2" + len(payload).to_bytes(2, "big") + payload + total + b"\xb0\xb3"
+
+
+def skytraq(payload: bytes) -> bytes:
+    check = bytes([reduce(xor, payload, 0)])
+    return b"\xa0\xa1" + len(payload).to_bytes(2, "big") + payload + check + b"\r\n"
+
+
+def allystar(payload: bytes) -> bytes:
+    body = b"\x06\x01" + len(payload).to_bytes(2, "little") + payload
+    a = b = 0
+    for byte in body:
+        a = (a + byte) & 0xFF
+        b = (b + a) & 0xFF
+    return b"\xf1\xd9" + body + bytes((a, b))
+
+
+def sbf(payload: bytes) -> bytes:
+    size = 8 + len(payload) + -len(payload) % 4
+    return b"$@\x12\x34\xa7\x0f" + size.to_bytes(2, "little") + payload.ljust(size - 8, b"\x00")
+
+
+def novatel(payload: bytes) -> bytes:
+    head = b"\xaa\x44\x12\x1c" + bytes(4) + len(payload).to_bytes(2, "little") + bytes(18)
+    return head + payload + b"\x01\x02\x03\x04"
+
+
+def unicore(payload: bytes) -> bytes:
+    head = b"\xaa\x44\xb5\x00\x11\x00" + len(payload).to_bytes(2, "little") + bytes(16)
+    return head + payload + b"\x01\x02\x03\x04"
+
+
+def casic(payload: bytes) -> bytes:
+    return b"\xba\xce" + len(payload).to_bytes(2, "little") + b"\x01\x03" + payload + bytes(4)
+
+
+def mtk(payload: bytes) -> bytes:
+    return (
+        b"\x04\x24" + (len(payload) + 9).to_bytes(2, "little") + b"\x00\x00" + payload + b"\x07\r\n"
+    )
+
+
+def zodiac(payload: bytes) -> bytes:
+    words = [0x81FF, 1000, len(payload) // 2, 0]
+    head = b"".join(w.to_bytes(2, "little") for w in (*words, -sum(words) & 0xFFFF))
+    return head + payload + b"\x00\x00"
+
+
+def oncore(payload: bytes) -> bytes:
+    body = b"Ha" + payload
+    return b"@@" + body + bytes([reduce(xor, body, 0)]) + b"\r\n"
+
+
+def tsip(payload: bytes) -> bytes:
+    return b"\x10\x8f" + payload.replace(b"\x10", b"\x10\x10") + b"\x10\x03"
+
+
+def novatel_text(payload: bytes) -> bytes:
+    return (
+        b"#BESTPOSA,COM1,0,83.5,FINESTEERING,2171,123456.000,02000000,cdba,32768;SOL_COMPUTED,"
+        b"SINGLE,51.1,-114.0,1064.9*0a1b2c3d\r\n"
+    )
+
+
+def gpsd(payload: bytes) -> bytes:
+    return b'{"class":"TPV","device":"/dev/ttyS0","mode":3}\r\n'
+
+
+def stripped(payload: bytes) -> bytes:
+    return GGA[1:].encode() + b"\r\n"
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (sbf, "SBF"),
+        (novatel, "NovAtel or Unicore"),
+        (unicore, "NovAtel or Unicore"),
+        (novatel_text, "text logs of NovAtel"),
+        (sirf, "SiRF"),
+        (skytraq, "SkyTraq"),
+        (allystar, "Allystar"),
+        (casic, "CASIC"),
+        (mtk, "MTK"),
+        (zodiac, "Zodiac"),
+        (oncore, "OnCore"),
+        (tsip, "TSIP"),
+        (gpsd, "gpsd's JSON"),
+        (stripped, "without its $"),
+    ],
+)
+def test_a_protocol_that_is_not_read_is_named(make: Callable[[bytes], bytes], name: str) -> None:
+    payload = bytes([0x41, 0, 0xC3, 7, 0x55, 0x81, 0x2C, 0x3F] * 3)
+    stream = make(payload) * 6
+    assert name in named(stream)
+    cause = fed(b"\x00\x7f" + stream).cause
+    assert name in cause
+    assert ": " in cause, "what would do"
+    one = decoder()
+    for i in range(len(stream)):
+        one.feed(stream[i : i + 1], i)
+    assert one.cause == fed(stream).cause
+
+
+@given(st.binary(max_size=4000))
+def test_noise_is_no_protocol_and_costs_little(data: bytes) -> None:
+    assert isinstance(named(data), str)
+    assert isinstance(fed(data).cause, str)
+
+
+@pytest.mark.parametrize(
+    "sync", [b"\xa0\xa2", b"\xf1\xd9", b"\xaa\x44\x12", b"$@", b"#AAAA,", b"@@AA"]
+)
+def test_a_stream_of_beginnings_is_none(sync: bytes) -> None:
+    assert named((sync + b"\x0f\xff\x0f") * 400) == ""
+
+
+# ------------------------------------------------------------------ sentences, and no fix
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ([changed(GGA, "GN", "II"), changed(RMC, "GN", "II")], "talker II (integrated instrumen"),
+        ([changed(GGA, "GN", "IN")], "talker IN (integrated navigation)"),
+        ([changed(RMC, "GN", "XY")], "talker XY arrive"),
+        ([made("GPGLL,3958.1,N,11619.5,E,021429,A"), made("GPGSV,1,1,00")], "(GLL, GSV)"),
+        ([made("GPGLL,3958.1,N,11619.5,E,021429,A")], "switch on GGA and RMC"),
+        ([VTG, GSA, ZDA], "(VTG, GSA, ZDA), but none has a position: switch on GGA"),
+        ([GGA_NO_FIX], "the receiver has no fix"),
+        ([changed(GGA, "N,116", "X,116")] * 4, "fields that cannot be true"),
+        ([VTG, *["$GPGGA,1,2"] * MANY], "without a checksum"),
+    ],
+)
+def test_why_there_is_no_fix(said: list[str], words: str) -> None:
+    assert words in fed(wire(*said, *said)).cause
+
+
+def test_names_of_nonsense_are_bounded() -> None:
+    one = fed(wire(*(made(f"GP{a}{b}X,1") for a in "ABCDEFGH" for b in "ABCDEFGH")))
+    assert len(one.heard.unused) == MOST_NAMES
+    assert len(one.cause) < 200
+
+
+# ------------------------------------------------------------------ fixes, but poorer ones
+
+
+def test_an_implausible_date_is_told_with_what_was_done() -> None:
+    rolled = [changed(changed(RMC, "190625", "030501"), "0214", f"02{m}") for m in (14, 15)]
+    found, one = decode(GGA, rolled[0])
+    assert one.cautions == {
+        "implausible_date": "the receiver's date is 2001-05-03, before 2025-01-01: its dates are "
+        "not used, its times of day are"
+    }
+    assert len(found) == 1, "the fix is used, and tells no UTC"
+
+
+def test_the_rollover_of_the_gps_week_is_told() -> None:
+    text = implausible_date(date(2007, 8, 11), date(2026, 11, 20))
+    assert text.endswith("; if 2027-03-27 is right, 1024 weeks later, its GPS week has rolled over")
+    assert "rolled" not in implausible_date(date(1980, 1, 6), date(2026, 11, 20))
+    assert "too far ahead" in implausible_date(date(2150, 1, 6), date(2026, 11, 20))
+
+
+@pytest.mark.parametrize(
+    ("said", "caution"),
+    [
+        ([GGA_SW, changed(GGA_SW, "021429", "021430")], "height_above_sea"),
+        (minutes(RMC, 3), "rmc_alone"),
+        ([changed(GGA, "45.300", ""), RMC], "height_missing"),
+        ([s for m in range(14, 26) for s in two_dimensional(m)], "height_not_measured"),
+        ([s for m in range(14, 20) for s in two_dimensional(m)], None),
+        ([GGA, changed(RMC, ",A,", ",Z,")], "unknown_status"),
+        ([GGA, RMC, *["$GPVTG,1,2"] * MANY], "checksum_missing"),
+        ([GGA, RMC], None),
+    ],
+)
+def test_what_makes_fixes_poorer_is_told(said: list[str], caution: str | None) -> None:
+    one = fed(wire(*said))
+    assert one.counters["fixes"] >= 1
+    assert list(one.cautions) == ([] if caution is None else [caution])
+    assert all(len(text) < 200 for text in one.cautions.values())

@@ -1,0 +1,136 @@
+"""A station's RINEX files, as published, through `fusiond process`: it stands where it is."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fusiond.commands.app import app
+from fusiond.files.tables import read_imu, read_solution
+from fusiond.gnss.ecef import to_geodetic
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity
+from fusiond.offline.aid_files import READERS
+from tests.drivers.raw.test_rinex import BEIDOU, NOW, header, nav4, observed
+from tests.gnss.test_station import NAVIGATION, OBSERVATIONS, PLACE, STATION
+
+pytestmark = pytest.mark.skipif(
+    not STATION.is_dir(), reason=f"station_esbc is absent: {STATION} (set FUSIOND_DATA)"
+)
+CONFIG = """
+[imu]
+axes = ["+x", "+y", "+z"]
+rate_hz = 10.0
+sensor_class = "tactical"
+[aiding.raw]
+lever_arm_m = [0.0, 0.0, 0.0]
+[alignment]
+heading = ["config"]
+heading_deg = 0.0
+heading_sd_deg = 1.0
+[mqtt]
+enabled = false
+"""
+FROM_S, SECONDS = 345_590.0, 900.0
+POSIX_S = 315_964_800 + 2111 * 604_800 - 18
+
+
+def standing(path: Path, begin_s: float) -> Path:
+    """Ten samples a second of an IMU that faces north, without error."""
+    lat, _, height = to_geodetic(*PLACE)
+    t = begin_s + np.arange(0.0, SECONDS, 0.1)
+    rate = (EARTH_RATE_RAD_S * math.cos(lat), 0.0, -EARTH_RATE_RAD_S * math.sin(lat))
+    row = np.array([*rate, 0.0, 0.0, -float(gravity(lat, height))])
+    noise = np.random.default_rng(3).normal(size=(len(t), 6)) * ([1e-5] * 3 + [1e-3] * 3)
+    names = "t_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2"
+    np.savetxt(path, np.column_stack([t, row + noise]), "%.9f", ",", header=names, comments="")
+    return path
+
+
+def run(tmp_path: Path, imu: Path, *aids: Path) -> tuple[int, str]:
+    (tmp_path / "c.toml").write_text(CONFIG)
+    command = ["process", str(tmp_path / "c.toml"), "--imu", str(imu)]
+    for aid in aids:
+        command += ["--aid", f"raw={aid}"]
+    done = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "out.csv")])
+    return done.exit_code, done.output
+
+
+@pytest.mark.parametrize("begin_s", [FROM_S, POSIX_S + FROM_S], ids=["of the week", "posix"])
+def test_a_station_stands_where_it_is(tmp_path: Path, begin_s: float) -> None:
+    imu = standing(tmp_path / "imu.csv", begin_s)
+    code, output = run(tmp_path, imu, OBSERVATIONS, NAVIGATION)
+    assert code == 0, output
+    assert "no time in common" not in output
+    solution = read_solution(tmp_path / "out.csv")
+    lat, lon, height = to_geodetic(*PLACE)
+    off = np.array(
+        [
+            (solution.lat_rad[-1] - lat) * 6.37e6,
+            (solution.lon_rad[-1] - lon) * 6.37e6 * math.cos(lat),
+            solution.height_m[-1] - height,
+        ]
+    )
+    assert np.linalg.norm(off) < 3.0, off
+    assert (np.abs(off) < 3.0 * solution.sd_position[-1]).all(), (off, solution.sd_position[-1])
+
+
+def test_what_was_sent_comes_when_it_was_sent(tmp_path: Path) -> None:
+    """The first of each satellite and message at the start, the others not before their time."""
+    imu = read_imu(standing(tmp_path / "imu.csv", FROM_S))
+    rows, _ = READERS["raw"](NAVIGATION, imu, "raw")
+    start_ns = round(FROM_S * 1e9)
+    assert min(row.t_arrival_ns for row in rows) == start_ns
+    first, later = 0, 0
+    for row in rows:
+        toe_ns = round(getattr(row.measurement, "toe_s", 0.0) * 1e9)
+        if row.t_arrival_ns == start_ns:
+            first += 1
+        else:
+            later += 1
+            assert abs(row.t_arrival_ns - toe_ns) < 4 * 3600 * 10**9
+    assert first >= 90
+    assert later > 1500
+
+
+def test_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    imu = standing(tmp_path / "imu.csv", FROM_S)
+    code, output = run(tmp_path, imu, OBSERVATIONS)
+    assert code == 65
+    assert "no_ephemeris" in output
+    old = tmp_path / "old.rnx"
+    old.write_text(header("2.11"))
+    code, output = run(tmp_path, imu, old)
+    assert (code, "RINEX 2.11; versions 3 and 4 are read" in output) == (65, True)
+    cut = tmp_path / "cut.crx.gz"
+    cut.write_bytes(gzip.compress(gzip.decompress(OBSERVATIONS.read_bytes())[:60_000]))
+    code, output = run(tmp_path, imu, cut, NAVIGATION)
+    assert code in (0, 65)
+    assert "Traceback" not in output
+    monkeypatch.setitem(sys.modules, "hatanaka", None)
+    code, output = run(tmp_path, imu, OBSERVATIONS)
+    assert code == 69
+    assert "pip install 'fusiond[rinex]'" in output
+
+
+def test_b1c_of_a_rinex_file_without_cnav_says_so(tmp_path: Path) -> None:
+    """An observation file of B1C alone beside D1's ephemerides: RINEX 4 has CNV1, 3 has not."""
+    imu = standing(tmp_path / "imu.csv", FROM_S)
+    lines = "".join(f"C{prn:02d}{observed(2.2e7 + 1e5 * prn)}\n" for prn in (19, 20, 23, 32, 37))
+    at = NOW.replace("2026 12 01 02 14 47", "2020 06 25 00 {m:02d} 00")
+    text = header("3.05", "OBSERVATION DATA", BEIDOU)
+    text += "".join(at.format(flag=0, n=5, m=m) + lines for m in range(10))
+    only = tmp_path / "b1c.rnx"
+    only.write_text(text)
+    code, output = run(tmp_path, imu, only, NAVIGATION)
+    assert code == 65
+    assert "no_group_delay" in output
+    empty = tmp_path / "empty.rnx"
+    empty.write_text(nav4())
+    code, output = run(tmp_path, imu, empty)
+    assert (code, "without a record that is read" in output) == (65, True)
