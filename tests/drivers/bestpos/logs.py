@@ -7,7 +7,7 @@ from drivers.bestpos.framing import log_crc
 WEEK, TOW_S = 2447, 180_887.0
 """2026-12-01 02:14:29 UTC, with 18 leap seconds."""
 PLACE = "39.96872420000,116.32572020000,45.3000,-9.1000,WGS84,0.0140,0.0120,0.0310"
-BELOW = '"0",1.000,0.000,34,31,31,30,00,21,7f,37'
+BELOW = '"7",0.800,0.000,33,31,29,26,00,01,3d,15'
 
 
 def log(head: str, body: str) -> bytes:
@@ -17,7 +17,7 @@ def log(head: str, body: str) -> bytes:
 
 def novatel(name: str, body: str, second: float = 0.0, status: str = "FINESTEERING") -> bytes:
     when = f"{status},{WEEK},{TOW_S + second:.3f}"
-    return log(f"{name},COM1,0,83.5,{when},02000000,b1f6,65535", body)
+    return log(f"{name},COM1,0,83.5,{when},02000000,5a3c,16248", body)
 
 
 def unicore(name: str, body: str, second: float = 0.0, leap: int = 18, base: str = "GPS") -> bytes:
@@ -52,5 +52,5 @@ def bestnav(second: float = 0.0, *, leap: int = 18, base: str = "GPS", velocity:
 
 
 def heading(second: float = 0.0, *, name: str = "UNIHEADINGA", kind: str = "NARROW_INT") -> bytes:
-    body = f'SOL_COMPUTED,{kind},1.4773,179.0284,-2.4202,0.0000,0.8259,1.0921,"999",27,21,21,15'
+    body = f'SOL_COMPUTED,{kind},1.2040,143.6120,0.8450,0.0000,0.4180,0.6350,"7",24,19,19,12'
     return unicore(name, body, second)
