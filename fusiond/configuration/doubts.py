@@ -126,7 +126,8 @@ def _filter(config: Config) -> Iterator[str]:
     if name != "kalman":
         yield (
             f"estimator.filter = {name!r} has no bank of fault hypotheses: what is wrong of a "
-            "sensor is not named, and the inertial unit's faults are not corrected (docs/diagnosis.md)"
+            "sensor is not named, and faults of the inertial unit are not corrected "
+            "(docs/diagnosis.md)"
         )
 
 

@@ -100,6 +100,12 @@ class Kind:
         """Whether the filter goes on without it: it is one of its states."""
         return self.signature in (STATES, TURNED, SHIFTED)
 
+    def spoils(self, device: str, locates: bool, moves: bool) -> bool:
+        """Whether a series of such a device is no measurement any more."""
+        if self.corrected or self.device not in (TOGETHER, device):
+            return False
+        return self.of == OWN or (self.locates and locates) or (self.moves and moves)
+
 
 def sensor_kinds(model: Model) -> list[Kind]:
     """Of the inertial unit, as steps of those states that the model has for it."""

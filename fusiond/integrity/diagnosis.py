@@ -44,7 +44,7 @@ from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, FAULTY, RIV
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
-from fusiond.integrity.catalogue import OWN, TOGETHER, Kind
+from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN
@@ -252,9 +252,9 @@ class Diagnosis:
         others = [f for f in self.findings if f.kind.text != kind.text]
         self.findings = (*others, finding)
         if not kind.corrected:
-            self._exclude(t_ns, finding.text, lambda s: _spoils(kind, s))
-            of = {n: finding for n, s in self._series.items() if s.out and _spoils(kind, s)}
-            self._lasting = {**self._lasting, **of}
+            self._exclude(t_ns, finding.text, lambda s: kind.spoils(s.device, s.locates, s.moves))
+            out = [n for n, s in self._series.items() if s.out and s.reason == finding.text]
+            self._lasting = {**self._lasting, **dict.fromkeys(out, finding)}
         return Correction(mean, spread)
 
     def lasting(self, aid: Aid, one: Series) -> Array | None:
@@ -295,12 +295,6 @@ class Diagnosis:
             return
         known = self._agreement.get(aid.device, Agreement())
         self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}
-
-
-def _spoils(kind: Kind, one: Series) -> bool:
-    if kind.device not in (TOGETHER, one.device):
-        return False
-    return kind.of == OWN or (kind.locates and one.locates) or (kind.moves and one.moves)
 
 
 def _open_by_mounting(estimator: Estimator) -> None:

@@ -76,6 +76,8 @@ class Series:
     reason: str = ""
     failed: int = 0
     passed: int = 0
+    out_ns: int = 0
+    """When (ns) it left service last."""
     proven_ns: int = 0
     """Until when (ns) it is on probation: for as long as it was out."""
     over: float = 0.0
@@ -110,7 +112,7 @@ class Series:
 
     def exclude(self, t_ns: int, reason: str) -> None:
         """It leaves service."""
-        self.state, self.since_ns, self.reason = Service.OUT, t_ns, reason
+        self.state, self.since_ns, self.reason, self.out_ns = Service.OUT, t_ns, reason, t_ns
         forget_lately(self.noise)
         self.failed = self.passed = 0
 
@@ -150,7 +152,7 @@ class Series:
             if self.over + prior < RETURNS:
                 return
         if self.passed >= READMIT_COUNT:
-            self.proven_ns = 2 * t_ns - self.since_ns
+            self.proven_ns = 2 * t_ns - self.out_ns
             self.state, self.since_ns = Service.PROBATION, t_ns
             self.failed = self.passed = 0
 

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from fusiond.estimators.federated.options import local_of
-from fusiond.integrity.catalogue import OWN
 from fusiond.integrity.diagnosis import Finding
 from fusiond.integrity.service import Series, Service
 from fusiond.navigator.timeline import Timeline
@@ -80,7 +79,5 @@ def _suffers(finding: Finding, one: Series) -> bool:
     """Whether a series is out or on probation, and was out when that was found."""
     if one.state not in (Service.OUT, Service.PROBATION):
         return False
-    out_ns = one.since_ns - (one.was_out_ns if one.state is Service.PROBATION else 0)
-    kind = finding.kind
-    spoils = kind.of == OWN or (kind.locates and one.locates) or (kind.moves and one.moves)
-    return one.device == kind.device and spoils and out_ns <= finding.t_ns
+    spoils = finding.kind.spoils(one.device, one.locates, one.moves)
+    return spoils and one.out_ns <= finding.t_ns

@@ -24,6 +24,7 @@ from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
+from fusiond.navigator.alignment.lateness import Lateness
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
 from fusiond.navigator.calibration import CalibrationWatch
@@ -43,7 +44,7 @@ from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
 from fusiond.navigator.protection import ProtectionWatch
-from fusiond.navigator.readout import solution_of
+from fusiond.navigator.readout import publish_by_own_clock, solution_of
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.service_events import ServiceEvents
 from fusiond.navigator.state_file import RefusedStateError
@@ -112,6 +113,7 @@ class Navigator:
         self.calibration: SavedCalibration | None = None
         """What an earlier drive has shown, taken up by each alignment until it is refuted."""
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
+        self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
         self._status = NavigationStatus(config, self.estimator, self.imu, self._door, self._units)
         self._aligner = self._new_aligner()
 
@@ -189,6 +191,7 @@ class Navigator:
             return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
+        aids = self._lateness.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
         self._units.fix(m, t_ns, self.imu, aids)
@@ -199,6 +202,7 @@ class Navigator:
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
+        self._lateness.stop()
         self.timeline.clear()
         self._protection.restart()
         self.started, self._saved, self.warm = None, saved, None
@@ -221,7 +225,7 @@ class Navigator:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
-            if start is None:
+            if start is None or self._late() or self._aligner.waits(start, self._lateness):
                 return
             if self.calibration is not None and not self.on_trial:
                 start = self.calibration.taken_up(start, self.model)
@@ -281,6 +285,17 @@ class Navigator:
         self._event(*wrong)
         self.reset(wrong[1])
         self._aligner.known.told.add(wrong[0])
+        return True
+
+    def _late(self) -> bool:
+        """Whether a receiver is found to be late; alignment then begins anew, by its last fixes at
+        the instants at which they were true."""
+        found = self._lateness.look(self.imu)
+        if found is None:
+            return False
+        publish_by_own_clock(self.estimator, found.sd_s)  # it has said when the fixes were
+        self.reset(found.why)
+        self._aligner.aids(self._lateness.kept())
         return True
 
     def _warm_start(self) -> Start | None:

@@ -56,3 +56,16 @@ def solution_of(
         (bias[3], bias[4], bias[5]),
         bound,
     )
+
+
+def publish_by_own_clock(estimator: Estimator, sd_s: float) -> None:
+    """A receiver's clock has shown to be none to publish by: from the next start on it is the
+    filter's own, the IMU's.
+
+    That is known as well as what lies between it and the clock of a receiver that is on time: what
+    the model takes for granted of that before anything shows it, or `sd_s`, one sigma of how late
+    the fixes are, where it has no offset in time.
+    """
+    slot = estimator.model.time_slot
+    clock_sd_s = float(estimator.model.initial[slot]) if slot >= 0 else sd_s
+    estimator.publish_by(estimator.published._replace(time_slot=-1, clock_sd_s=clock_sd_s))

@@ -198,7 +198,7 @@ def test_weights_are_a_distribution() -> None:
 
 def test_a_snapshot_keeps_the_bank_to_the_bit() -> None:
     """Going on from a snapshot is going on."""
-    times, samples, start = drive()
+    _, samples, start = drive()
     buffer = buffer_of(samples)
     rng = np.random.default_rng(7)
     made = KalmanEstimator(MODEL, IMU.gap_s, faults=table_of(KINDS))
@@ -224,7 +224,7 @@ def test_a_snapshot_keeps_the_bank_to_the_bit() -> None:
 
 def test_a_look_in_passing_leaves_the_bank_as_it_is() -> None:
     """What is asked between two aids changes nothing of what comes later."""
-    times, samples, start = drive()
+    _, samples, start = drive()
     buffer = buffer_of(samples)
     found = []
     for asked in (False, True):
@@ -272,7 +272,7 @@ def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
     model = make_model("ins15", imu_noise(IMU), *blocks)
     kinds = kinds_of(model, {"gnss": "gnss"}, slips=False)
     truth = runs.town_truth(30.0, IMU.rate_hz)
-    times, samples, start = drive()
+    _, samples, start = drive()
     found = []
     for late_s in (0.0, tau_s):
         made = KalmanEstimator(model, IMU.gap_s, faults=table_of(kinds))

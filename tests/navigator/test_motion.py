@@ -155,6 +155,15 @@ def test_rate_before_motion() -> None:
     assert not motion.rate_before_motion(imu, moving).any()
 
 
+def test_a_span_is_felt_as_the_buffer_it_was_taken_from(imu: ImuBuffer) -> None:
+    at, none = instants(imu), np.zeros(3)
+    span = motion.span_since(imu, int(at[0]))
+    assert len(span.times) < imu.end
+    there, here = motion.felt(span, at, none), motion.felt(imu, at, none)
+    assert np.array_equal(there.gained, here.gained)
+    assert there.rates == pytest.approx(here.rates, abs=1e-12)
+
+
 @pytest.mark.parametrize("seed", range(24))
 def test_gyros_that_nobody_calibrated_lead_no_fit_astray(seed: int) -> None:
     """Straight on at 6 m/s for 17 s, of which a gyro with 6 deg/s of bias makes 100 deg."""

@@ -25,6 +25,7 @@ from fusiond.navigator.alignment.headings import (
     from_gyrocompass,
     from_saved,
 )
+from fusiond.navigator.alignment.lateness import Lateness
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.positions import Track, from_positions
 from fusiond.navigator.alignment.start import Place, Start
@@ -55,6 +56,7 @@ class Aligner:
         on_event: Callable[[str, str], None],
     ) -> None:
         self.reason = "waiting for IMU data"
+        self._found: Start | None = None
         self.known = Collected(options, noise, saved, on_event)
         self._track = Track(options, model)
         self._journal = Journal(on_event)
@@ -71,11 +73,21 @@ class Aligner:
             self.known.window(window)
         self._track.hear(aids)
 
+    def waits(self, start: Start, lateness: Lateness) -> bool:
+        """Whether a start that was found must wait: while it is looked whether the fixes that it is
+        made of are late, and longer where one is suspected, until others come."""
+        self._found = start if lateness.looking else None
+        if lateness.suspects:
+            self.reason = lateness.suspects
+        return self._found is not None or bool(lateness.suspects)
+
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""
         if not imu.end:
             self.reason = "waiting for IMU data"
             return None
+        if self._found is not None:
+            return self._found
         start = None
         place = None if self.known.upside_down else self.known.place()
         if place is not None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from drivers.immutable import immutable
 from fusiond.aiding.offers import VelocityOffer
 from fusiond.navigation.felt import integrate_felt
+from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment.start import velocity_of
 
 Array = NDArray[np.float64]
@@ -106,6 +107,12 @@ class Felt(NamedTuple):
         bias: those of the velocity by force bias."""
         turns: Array = self.slopes[-1][:, :3]
         return turns
+
+
+def span_since(imu: ImuBuffer, t_ns: int) -> Span:
+    """A copy of the samples from an instant on, and of what `samples_at` it looks at."""
+    first = max(0, imu.index_after(t_ns - AROUND_NS) - 1)
+    return Span(imu.times[first : imu.end].copy(), imu.samples[first : imu.end].copy())
 
 
 def measured(fixes: Sequence[VelocityOffer], most: int) -> Measured:

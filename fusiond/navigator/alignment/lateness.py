@@ -1,0 +1,377 @@
+r"""How much later than its stamps a receiver's fixes are valid, told by the IMU alone.
+
+The velocities of the last seconds are compared with what the IMU has felt
+(fusiond.navigator.alignment.motion_fit), as if each had been true by tau before its stamp.
+Attitude, sensor errors and the first velocity are free within their priors, so that
+
+    J(tau) = min cost,   J(tau) - J(tau*) = (tau - tau*)^2 / s^2    near the best tau*
+
+is the profile of twice the negative log likelihood, s^2 = 2 h^2 / (J(tau* + h) - 2 J(tau*) +
+J(tau* - h)). Neither the filter nor a position is asked: what has followed late fixes agrees with
+them. What shows tau is a change of velocity. At constant velocity J is flat, and late positions on
+a straight are the same as ones that have jumped along the track: nobody can tell.
+
+It is looked for where a start is found: what begins later is a hypothesis of the bank
+(fusiond.integrity.catalogue). A receiver is late by tau*
+where
+
+    J(tau*) <= chi-square of its degrees    the IMU is sound; one that has turned fits at no tau
+    J(now) - J(tau*) > EVIDENCE             chi-square of one: 4.5 sigma, one in 130,000
+    |tau* - now| > PRIOR_SIGMAS s_0         s_0 of the filter's own state for it
+
+in some looks that agree, by fixes of one lateness, unless the positions have followed the
+velocities all the way since it was known (fusiond.navigator.alignment.leaps). On drive_0708 and
+css_164, which have no late fixes, two of 452 looks met all but the first; the smoothing of
+receivers moves tau* by 0.1 s.
+
+What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
+fixes that are late, and not the vehicle that is ahead. From then on that clock is what solutions
+are published by (fusiond.estimators.reading).
+
+Source: Wu and Pan (as motion); profile likelihood: Venzon, Moolgavkar, Applied Statistics 37
+(1988), 87; the offset in time as a parameter of alignment: Li, Mourikis, Online temporal
+calibration for camera-IMU systems, IJRR 33 (2014), 947.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import compress
+from typing import NamedTuple
+
+import numpy as np
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import PositionOffer, VelocityOffer
+from fusiond.estimators.base import gate_threshold
+from fusiond.models.blocks import ImuNoise
+from fusiond.models.model import Model
+from fusiond.navigation.earth import gravity
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigator.alignment import motion
+from fusiond.navigator.alignment.course import ways
+from fusiond.navigator.alignment.leaps import (
+    LOOKED_NS,
+    Epoch,
+    since_leap,
+    unchanged,
+    velocities_alone,
+)
+from fusiond.navigator.alignment.motion import MOST_FIXES
+from fusiond.navigator.alignment.options import AlignmentOptions
+
+MOST_LATE_S = 3.0
+"""The longest that is searched."""
+# What is searched (s): a change of course at 10 deg/s is still one valley at twice the step.
+SEARCHED_S = tuple(0.2 * k for k in range(16))
+# Half a step (s) of the two parabolas that follow it.
+NEAR_S = (0.1, 0.04)
+# Probability with which fixes that are on time fit. Those that do are looked at once more as if
+# they were late by GLANCE_S (s), where half the evidence for twice that would show.
+FITS, GLANCE_S = 0.999, 0.4
+EVIDENCE = 20.0
+PRIOR_SIGMAS = 3.0
+# Of a receiver whose offset in time the filter does not estimate (s).
+LEAST_PRIOR_S = 0.05
+# Fixes of so long are looked at, and so many at least; kept are a minute's of a receiver of 10 Hz,
+# and handed on the last of them.
+KEPT_NS, MOST_KEPT, HANDED_ON, FEWEST = 15_000_000_000, 600, 300, 5
+# The valley is sought with `motion.MOST_FIXES`, its bottom with all of a receiver of 5 Hz.
+ALL_FIXES = 75
+# A lateness that is known worse (s) is waited for so long (ns) to be known better: half the sigma
+# of the filter's own state for it, which takes over.
+SETTLED_SD_S, PATIENCE_NS = 0.05, 10_000_000_000
+# So many looks must have seen it, within so many sigmas of each other.
+SEEN, AGREED = 3, 4.0
+# A look is 6 fits of 0.3 ms of a fast computer each, one that searches 45: as often is looked, and
+# so long nothing is searched for again where nothing was found.
+EVERY_NS, SEARCHED_NS = 1_000_000_000, 10_000_000_000
+# Looks of the last minute, and some more, are remembered.
+MOST_LOOKS = 100
+# One fit at a time: no tick waits for many. A tenth of a processor, whatever the rate of ticks.
+FIT_EVERY_NS = 10_000_000
+
+
+# Twice the negative log likelihood of a lateness and its degrees of freedom, a fit at a time.
+Fitting = Generator[None, None, tuple[float, int]]
+
+
+class Late(NamedTuple):
+    """How much later than stamped (s), and one sigma."""
+
+    seconds: float
+    sd: float
+
+    def agrees(self, other: Late) -> bool:
+        """Whether both may be the same."""
+        return abs(self.seconds - other.seconds) <= AGREED * math.hypot(self.sd, other.sd)
+
+
+class Found(NamedTuple):
+    """A receiver is late: why all that was made of its fixes must be made anew, and one sigma (s)
+    of what their instants are known to."""
+
+    why: str
+    sd_s: float
+
+
+@dataclass(slots=True)
+class _Heard:
+    """The aids of a measurement as they were stamped, and its velocities once they were asked
+    for."""
+
+    aids: tuple[Aid, ...]
+    found: list[Epoch] | None = None
+
+    def epochs(self) -> list[Epoch]:
+        """Its velocities, each with its position."""
+        if self.found is None:
+            offers = [offer for aid in self.aids for offer in aid.offers()]
+            position = next((o for o in offers if isinstance(o, PositionOffer)), None)
+            self.found = [Epoch(o, position) for o in offers if isinstance(o, VelocityOffer)]
+        return self.found
+
+
+@dataclass(slots=True)
+class _Receiver:
+    """The last measurements of a receiver, how late they are taken to be (ns), and what speaks for
+    another lateness since when (ns)."""
+
+    heard: deque[_Heard] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
+    late_ns: int = 0
+    suspected: Late | None = None
+    since_ns: int = 0
+    seen: int = 0
+
+    def suspect(self, late: Late, t_ns: int) -> None:
+        """What the fixes until `t_ns` say; what looks agree upon counts, the best known of it."""
+        before = self.suspected
+        if before is None or not late.agrees(before):
+            self.suspected, self.since_ns, self.seen = late, t_ns, 1
+            return
+        self.seen += 1
+        if late.sd < before.sd:
+            self.suspected = late
+
+    def settled(self, t_ns: int) -> Late | None:
+        """How late it is, once that is known; a suspicion that has not lasted ends."""
+        late = self.suspected
+        if late is None:
+            return None
+        waited = t_ns - self.since_ns >= PATIENCE_NS
+        if self.seen >= SEEN and (waited or late.sd <= SETTLED_SD_S):
+            self.late_ns, self.suspected = round(late.seconds * 1e9), None
+            return late
+        if waited:
+            self.suspected = None
+        return None
+
+
+class Lateness:
+    """Keeps the last fixes of each receiver as they were stamped, and how late each was found to
+    be; `on_event(code, text)` hears of it."""
+
+    def __init__(
+        self,
+        options: AlignmentOptions,
+        noise: ImuNoise,
+        model: Model,
+        on_event: Callable[[str, str], None],
+    ) -> None:
+        self._options, self._noise, self._model = options, noise, model
+        self._event = on_event
+        self._receivers: dict[str, _Receiver] = {}
+        self._due_ns = self._fitted_ns = 0
+        self._looking: Generator[None, None, Found | None] | None = None
+        self._looks: deque[int] = deque(maxlen=MOST_LOOKS)
+
+    def hear(self, source: str, aids: Sequence[Aid]) -> Sequence[Aid]:
+        """A measurement has come, as the aids it stands for; the same at the instants at which it
+        was true."""
+        receiver = self._receivers.get(source)
+        if receiver is None:
+            if not any(aid.moves and not aid.screened for aid in aids):
+                return aids
+            receiver = self._receivers[source] = _Receiver()
+        receiver.heard.append(_Heard(tuple(aids)))
+        late_ns = receiver.late_ns
+        return [_earlier(aid, late_ns) for aid in aids] if late_ns else aids
+
+    def kept(self) -> list[Aid]:
+        """The last aids of all receivers, at the instants at which they were true."""
+        return [
+            _earlier(aid, receiver.late_ns)
+            for receiver in self._receivers.values()
+            for heard in tuple(receiver.heard)[-HANDED_ON:]
+            for aid in heard.aids
+        ]
+
+    def due(self, t_ns: int) -> bool:
+        """Whether it is time to look again, or to go on with it."""
+        return self._looking is not None or not 0 < self._due_ns - t_ns <= SEARCHED_NS
+
+    @property
+    def looking(self) -> bool:
+        """Whether a look has begun and not ended."""
+        return self._looking is not None
+
+    def stop(self) -> None:
+        """A look that has not ended is given up: what was made of the fixes is."""
+        self._looking, self._due_ns = None, 0
+
+    @property
+    def suspects(self) -> str:
+        """Which receiver is late by as much as is not known yet, or may be, in words; empty where
+        none is."""
+        for source, receiver in self._receivers.items():
+            if receiver.suspected is not None:
+                late = receiver.suspected
+                return (
+                    f"{source} is about {late.seconds:.1f} s later than its stamps: brake, "
+                    "accelerate or take a bend, to tell by how much"
+                )
+        return ""
+
+    def look(self, imu: ImuBuffer) -> Found | None:
+        """Begin or go on to look; what is found by the samples and fixes of the last seconds before
+        the look began."""
+        t_ns = imu.latest_ns
+        if not self.due(t_ns):
+            return None
+        if self._looking is None:
+            self._looking, self._fitted_ns = self._look(imu), t_ns
+            self._looks.append(t_ns)
+        due = (t_ns - self._fitted_ns) // FIT_EVERY_NS
+        self._fitted_ns = t_ns
+        for _ in range(max(1, due)):
+            try:
+                next(self._looking)
+            except StopIteration as end:
+                self._looking = None
+                found: Found | None = end.value
+                return found
+        return None
+
+    def _doubted_ns(self, t_ns: int) -> int:
+        """The last instant, before what the looks of now go by, at which something did not fit."""
+        return max((look for look in self._looks if look <= t_ns - LOOKED_NS), default=0)
+
+    def _look(self, imu: ImuBuffer) -> Generator[None, None, Found | None]:
+        """`look` at all that there is now, a fit at a time."""
+        t_ns = imu.latest_ns
+        self._due_ns = t_ns + EVERY_NS
+        earliest_ns = round((MOST_LATE_S + NEAR_S[0]) * 1e9)
+        first_ns = max(imu.oldest_ns + earliest_ns, t_ns - KEPT_NS)
+        past = motion.span_since(imu, first_ns - earliest_ns)
+        # What was not felt, gravity neither, shows in a fix that falls there, and in none that
+        # would be earlier.
+        lost = np.flatnonzero(np.diff(past.times) > imu.hold_ns)
+        if lost.size:
+            first_ns = max(first_ns, int(past.times[lost[-1] + 1]) + earliest_ns)
+        for source, receiver in tuple(self._receivers.items()):
+            yield from self._weigh(receiver, past, first_ns, t_ns)
+            late = receiver.settled(t_ns)
+            if late is None:
+                continue
+            text = (
+                f"{source} is {late.seconds:.2f} s later than its stamps, sigma {late.sd:.2f}: "
+                "its fixes count as of then"
+            )
+            self._event("fixes_late", text)
+            return Found(text, late.sd)
+        return None
+
+    def _weigh(
+        self, receiver: _Receiver, past: motion.Past, first_ns: int, t_ns: int
+    ) -> Generator[None, None, None]:
+        """What the fixes of a span say of a receiver's lateness; the best that they have said
+        counts."""
+        of_each = (epoch for heard in receiver.heard for epoch in heard.epochs())
+        epochs = sorted(of_each, key=lambda epoch: epoch.velocity.t_ns)
+        looked = [e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns]
+        fixes, place = _fixes(looked)
+        # The last must have a course.
+        while fixes and math.hypot(*fixes[-1].v_ned[:2]) < self._options.course_speed_m_s:
+            fixes.pop()
+        if len(fixes) < FEWEST or place is None:
+            return
+        by = fixes[-1], self._options, self._noise, gravity(place.lat_rad, place.height_m or 0.0)
+        said = {most: motion.measured(fixes, most) for most in (ALL_FIXES, MOST_FIXES)}
+        # Of each lateness (ns) and share of the fixes: some are asked for twice or three times.
+        known: dict[tuple[int, int], tuple[float, int]] = {}
+
+        def cost(late_s: float, most: int = ALL_FIXES) -> Fitting:
+            asked = round(late_s * 1e9), math.ceil(len(fixes) / most)
+            if asked not in known:
+                m = said[most]
+                either = ways(past, m._replace(instants=m.instants - asked[0]), *by)
+                forward = either.fit(backward=False)
+                yield
+                backward = either.fit(backward=True)
+                yield
+                known[asked] = min((fit.cost, fit.degrees) for fit in (forward, backward))
+            return known[asked]
+
+        now_s, suspected = receiver.late_ns * 1e-9, receiver.suspected
+        now, degrees = yield from cost(now_s)
+        some = yield from cost(now_s, MOST_FIXES)
+        later = yield from cost(now_s + GLANCE_S, MOST_FIXES)
+        if now <= gate_threshold(FITS, degrees) and some[0] - later[0] <= 0.5 * EVIDENCE:
+            return
+        if suspected is not None:
+            about_s = suspected.seconds
+        else:
+            self._due_ns = t_ns + SEARCHED_NS
+            costs = []
+            for s in SEARCHED_S:
+                costs.append(((yield from cost(s, MOST_FIXES))[0], s))
+            about_s = min(costs)[1]
+        late = yield from _bottom(cost, about_s)
+        if late is None or late.seconds > MOST_LATE_S:
+            return
+        least, _ = yield from cost(late.seconds)
+        time = self._model.slots_of(fixes[-1].time)
+        prior = max([LEAST_PRIOR_S, *(float(self._model.initial[slot]) for slot in time)])
+        if (
+            least > gate_threshold(FITS, degrees)
+            or now - least <= EVIDENCE
+            or abs(late.seconds - now_s) <= PRIOR_SIGMAS * prior
+            or unchanged(epochs, abs(late.seconds - now_s), self._doubted_ns(t_ns))
+            or velocities_alone(since_leap(looked), late.seconds - now_s)
+        ):
+            return
+        self._due_ns = t_ns + EVERY_NS
+        receiver.suspect(Late(max(0.0, late.seconds), late.sd), t_ns)
+
+
+def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityOffer], PositionOffer | None]:
+    """Velocities of one lateness, and a position. What repeats the one before to the bit is no
+    measurement, but of a vehicle that stands."""
+    left = since_leap(epochs)
+    found = [epoch.velocity for epoch in left]
+    place = next((e.position for e in reversed(left) if e.position is not None), None)
+    new = (not k or o.v_ned != found[k - 1].v_ned or not any(o.v_ned) for k, o in enumerate(found))
+    return list(compress(found, new)), place
+
+
+def _bottom(cost: Callable[[float], Fitting], about_s: float) -> Generator[None, None, Late | None]:
+    """The bottom of a valley of costs by parabolas, and the sigma that its bend means; None where
+    it is none."""
+    sd = math.inf
+    for h in NEAR_S:
+        before, _ = yield from cost(about_s - h)
+        here, _ = yield from cost(about_s)
+        after, _ = yield from cost(about_s + h)
+        bent = before - 2.0 * here + after
+        if bent <= 0.0:
+            return None
+        about_s += max(-h, min(h, 0.5 * h * (before - after) / bent))
+        sd = h * math.sqrt(2.0 / bent)
+    return Late(about_s, sd)
+
+
+def _earlier(aid: Aid, late_ns: int) -> Aid:
+    return replace(aid, t_ns=aid.t_ns - late_ns)
