@@ -46,7 +46,7 @@ REPEATS, DISAGREES = "repeats itself", "disagrees"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2
-# Speeds are printed coarser: so rare a run of equal ones is none, by the probability that one
+# Speeds and velocities are printed coarser: so rare a run of equal ones is none, by the probability that one
 # repeats the one before, as this series has shown it (average of so many).
 CHANCE, REPEATS_KEPT = 1e-9, 100.0
 # What has not been heard of for so long (ns) is judged anew.
@@ -161,7 +161,7 @@ class Series:
         it is no measurement. What stands may repeat."""
         same = moving and value == self.value
         self.value, self.repeats = value, self.repeats + 1 if same else 0
-        if self.locates or self.moves:
+        if self.locates:
             return self.repeats >= REPEATED
         chance = min(max(self.repeating, 0.01), 1.0 - 1e-12)
         if moving and not same:

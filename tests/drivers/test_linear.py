@@ -21,6 +21,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import drivers
+from drivers.bestpos.decoder import BestposDecoder
+from drivers.bestpos.framing import LogSplitter
 from drivers.nmea.compass import CompassDecoder, CompassDecoding
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
 from drivers.nmea.framing import NmeaSplitter, StreamSplitter
@@ -29,6 +31,9 @@ from drivers.ntrip.reply import CasterRefusedError, CasterReply
 from drivers.raw.decoder import RawDecoder
 from drivers.raw.driver import GnssDecoder
 from drivers.rdss import binary_4_0, text_2_1
+from drivers.sbf.decoder import SbfDecoder
+from drivers.sbf.framing import BlockSplitter
+from drivers.ubx.decoder import UbxDecoder
 
 Feed = Callable[[bytes], object]
 
@@ -60,6 +65,11 @@ STREAMS: dict[type, Callable[[], Feed]] = {
     text_2_1.Decoder: lambda: text_2_1.Decoder().feed,
     client._Frames: lambda: client._Frames(Counter()).feed,
     CasterReply: _reply,
+    LogSplitter: lambda: LogSplitter(Counter()).feed,
+    BlockSplitter: lambda: BlockSplitter(Counter()).feed,
+    BestposDecoder: lambda: _stamped(BestposDecoder("a")),
+    SbfDecoder: lambda: _stamped(SbfDecoder("a")),
+    UbxDecoder: lambda: _stamped(UbxDecoder("a")),
 }
 """What is fed with bytes. What is fed with CAN frames gets eight bytes and has done with them."""
 

@@ -91,7 +91,7 @@ def test_a_sensor_that_steps_moves_the_state_as_its_hypothesis_says(
     wrong, _, _ = driven()
     onset_ns = right.t_ns
     assert right.hypotheses is not None
-    right.hypotheses.begin(onset_ns)
+    right.hypotheses.begin(onset_ns, right.nav, right.step)
     wrong.xi[slot + axis] -= amount  # true minus estimated is larger by it
     for estimator in (right, wrong):
         town_drive.run(estimator, buffer, aids)
@@ -111,7 +111,7 @@ def test_a_receiver_that_is_off_moves_the_state_as_its_hypothesis_says(
     wrong, _, _ = driven()
     onset_ns, north = right.t_ns, 1e-3
     assert right.hypotheses is not None
-    right.hypotheses.begin(onset_ns)
+    right.hypotheses.begin(onset_ns, right.nav, right.step)
     shifted: list[list[Linearised]] = []
     for epoch in aids:
         position, velocity = cast("PositionAid", epoch[0]), cast("VelocityAid", epoch[1])

@@ -36,7 +36,7 @@ ROWS = [
     ("two_carried_off_0.5_m_s", "navigating", "isolated", None),
     ("two_carried_off_1_m_s_wheels", "navigating", "isolated", 20.0),
     ("wheels_frozen", "coasting", "isolated", 5.0),
-    ("gyro_bias_1_deg_s", "navigating", "isolated", None),
+    ("gyro_bias_1_deg_s", "navigating", "sensor_fault", None),
     ("gyro_spike_in_range", "navigating", "imu_spike", 3.0),
     ("imu_stuck_15s", "navigating", "imu_repeated", 20.0),
     ("imu_stamps_reversed", "aligning", "imu_time", None),
