@@ -153,4 +153,5 @@ def test_a_start_by_a_bent_compass_is_put_right_by_the_way() -> None:
         assert "heading_contradicted" in codes
     error, sd = yaw_error(navigator)
     assert abs(error) < 4.0 * sd
-    assert not navigator.timeline.diagnosis.excluded
+    # The compass itself is still bent: to leave it out is right.
+    assert navigator.timeline.diagnosis.excluded.keys() <= {"compass"}

@@ -12,7 +12,6 @@ from pydantic import ValidationError
 from drivers.measurements import Measurement, PositionFix
 from fusiond.configuration.load import ConfigError
 from fusiond.configuration.schema import Config
-from fusiond.integrity.service import DISAGREES
 from fusiond.navigation.solution import BoundState
 from fusiond.navigator.navigator import Navigator
 from tests.navigator import vehicle
@@ -110,7 +109,7 @@ def test_a_receiver_that_is_left_out_raises_the_level_beyond_its_error() -> None
     the other then."""
     sound, _ = driven(20.0, two=True)
     wrong, heard = driven(20.0, two=True, off_m=8.0)
-    assert wrong.timeline.diagnosis.excluded == {"gnss": DISAGREES}
+    assert wrong.timeline.diagnosis.excluded.keys() == {"gnss"}
     assert north_of(sound, wrong) < 0.5
     a, b = (n.solution(n.imu.latest_ns).bound.hpl_m for n in (sound, wrong))
     assert b >= a
