@@ -46,8 +46,8 @@ REPEATS, DISAGREES = "repeats itself", "disagrees"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2
-# Speeds and velocities are printed coarser: so rare a run of equal ones is none, by the probability that one
-# repeats the one before, as this series has shown it (average of so many).
+# Speeds and velocities are printed coarser: so rare a run of equal ones is none, by the probability
+# that one repeats the one before, as this series has shown it (average of so many).
 CHANCE, REPEATS_KEPT = 1e-9, 100.0
 # What has not been heard of for so long (ns) is judged anew.
 FORGET_NS = 10_000_000_000

@@ -164,6 +164,7 @@ def test_a_heading_that_nothing_has_shown_is_not_shown_by_a_restart() -> None:
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.NAVIGATING
 
 
+@pytest.mark.xfail(strict=True, reason="a velocity is accused within seconds of one start in 28")
 def test_precise_velocities_do_not_tell_which_way_it_went_in_the_gap() -> None:
     """Two seconds of fixes at 10 Hz, 1 m and 0.05 m/s, after gaps of 3.5 s in bends, braking and
     setting off: where the way is taken to follow from the velocity, a third is beyond 3 sigma."""

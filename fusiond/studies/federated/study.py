@@ -6,7 +6,7 @@ start to the end of the run, 70 s after its end, so that the return counts too. 
 is the median over the runs; a run in which it is not detected counts as later than any.
 
 `centralised` is the daemon's default: one filter, and sources judged by their innovations over time
-(`fusiond.integrity.isolation`). `rms_centralised_gate_only_m` has the gate alone.
+(`fusiond.integrity.diagnosis`). `rms_centralised_gate_only_m` has the gate alone.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
         raise ValueError("runs must be at least 2")
     step = step_counter(progress, count * (len(FAULTS) + 3))
     honest = {
-        name: _honesty(monte_carlo(FILTERS, "", sd_m, count, seed, step))
+        name: _honesty(monte_carlo((*FILTERS, Filter(_GATE_ONLY)), "", sd_m, count, seed, step))
         for name, sd_m in (("equal", EQUAL_M), ("unequal", UNEQUAL_M))
     }
     faults, series = {}, {}
