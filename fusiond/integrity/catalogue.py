@@ -5,10 +5,10 @@ a fault begins, each with its source; by which signature it enters the motion or
 (fusiond.estimators.fault_bank); and which measurements it spoils.
 
 Rates are an engineer's, of devices on vehicles in streets, where no standard counts them, and the
-same for all kinds for that reason: one an hour; but a device that is late by whole seconds from an
-instant on is one in a thousand hours. Ten times the rate is what a chi-square of 4.6 is: it moves
-no decision by an epoch. Sizes are one sigma of a normal prior: a fault of four times that is told
-as soon.
+same for all kinds for that reason: one an hour; but a device that is late by half a second or more
+from an instant on, that is carried off, or a wheel whose scale changes is one in a thousand hours.
+Ten times the rate is what a chi-square of 4.6 is: it moves no decision by an epoch. Sizes are one
+sigma of a normal prior: a fault of four times that is told as soon.
 """
 
 from __future__ import annotations

@@ -124,6 +124,21 @@ def test_sigma_of_the_matched_filter_is_honest() -> None:
             assert s["rho_pass_rate"] > 0.9
 
 
+@pytest.mark.xfail(strict=True, reason="the noise is estimated, and never below what is stated")
+def test_innovations_of_the_matched_filter_have_their_variance() -> None:
+    for found in (static(), dynamic()):
+        for name in ("rewind", "optimal_prediction"):
+            assert found["strategies"][name]["nis_mean"] == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.xfail(strict=True, reason="the estimated noise takes up half of what is late")
+def test_fixes_taken_as_of_their_arrival_are_far_from_honest() -> None:
+    found = dynamic()
+    for case in (found, *found["variants"].values()):
+        none = case["strategies"]["none"]
+        assert none["nees_mean"] > 2.0 * none["nees_interval"][1]
+
+
 def test_a_shared_error_that_is_ignored_shows_in_nees_not_in_the_innovations() -> None:
     case = next(c for c in rdss_correlated.CASES if c.name == "shared 15 m, 600 s")
     filters = tuple(f for f in case.filters if f.bias_sd_m in (0.0, 15.0))
