@@ -1,13 +1,11 @@
 r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
 
-    log odds            log(rate T) + boost + e^T M e / 2 - log det(I + S L) / 2
+    log odds            log(rate T) + e^T M e / 2 - log det(I + S L) / 2
     weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
                         a hypothesis does not explain what has come
     left unexplained    J - l against N - p by chi-square's mean and variance
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
-
-`boost` (k,) is what is known of a kind beyond its rate: what was wrong of a source may last.
 
 Source: as of fusiond.estimators.fault_bank; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for
 the moments of a mixture.
@@ -104,10 +102,8 @@ def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> fl
     return gained - 0.5 * logarithm if share == 1.0 else 2.0 * gained
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1])", allocates=True)
-def judge(
-    bank: Array, ints: Indices, numbers: Array, boost: Array, epoch_s: float, found: Array
-) -> None:
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8, f8[::1])", allocates=True)
+def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Array) -> None:
     """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
     epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
     been likely, and has explained all, for `LASTS_S`.
@@ -124,7 +120,7 @@ def judge(
                 continue
             gained = solve(group, size, numbers[kind], 1.0, m)
             rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
-            group[LOG_ODDS] = rate + boost[kind] + gained
+            group[LOG_ODDS] = rate + gained
             off = (m[9] - numbers[kind, MEAN]) / numbers[kind, PRIOR]
             explained = solve(group, size, numbers[kind], _TINY, m)
             degrees = max(group[N_AT] - size, 1.0)

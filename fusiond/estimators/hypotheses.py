@@ -53,8 +53,6 @@ class Hypotheses:
         self.bank, self.table = bank, table
         self.n, self.width = model.size, model.width
         kinds = table.ints.shape[0]
-        self.boost = np.zeros(kinds)
-        """Log odds (k,) that a kind has beyond its rate."""
         self.found = np.full(FOUND, -np.inf)
         """What the last `judge` has found."""
         self.columns = chunks_of(table.columns, model.width) * model.width
@@ -85,7 +83,7 @@ class Hypotheses:
     def judge(self, t_ns: int) -> Array:
         """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""
         table = self.table
-        judge(self.bank, table.ints, table.numbers, self.boost, t_ns * 1e-9, self.found)
+        judge(self.bank, table.ints, table.numbers, t_ns * 1e-9, self.found)
         return self.found
 
     def opened(self) -> Array:
