@@ -28,11 +28,11 @@ from fusiond.estimators.propagation import (
     PASSING,
     RECORD,
     propagate_for,
-    sensor_estimates,
 )
 from fusiond.estimators.reading import Published, sigmas, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
+from fusiond.estimators.sensors import sensor_estimates
 from fusiond.estimators.update import feed_back, normalised_innovation_squared
 from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model

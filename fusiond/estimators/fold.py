@@ -13,11 +13,10 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SIZE,
     WEIGHT,
-    account,
-    restart_due,
-    sensitivity_rows,
 )
 from fusiond.estimators.fault_odds import LEAST_WEIGHT, solve
+from fusiond.estimators.fault_onsets import restart_due
+from fusiond.estimators.fault_rows import account, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
 from fusiond.navigation.compiled import compiled
 

@@ -24,10 +24,10 @@ from fusiond.estimators.fault_bank import (
     UNEXPLAINED,
     WEIGHT,
     FaultTable,
-    begin_all,
     chunks_of,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
+from fusiond.estimators.fault_onsets import begin_all
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]

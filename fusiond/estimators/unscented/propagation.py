@@ -37,8 +37,8 @@ from fusiond.estimators.covariance import (
     propagate_parameters,
 )
 from fusiond.estimators.crossing import shake, widen_for_gap
-from fusiond.estimators.propagation import compensate, sensor_estimates, slopes
 from fusiond.estimators.reading import in_fix_time, sigmas
+from fusiond.estimators.sensors import compensate, sensor_estimates, slopes
 from fusiond.estimators.unscented.sigma_points import NO_PIVOT
 from fusiond.estimators.update import feed_back
 from fusiond.navigation.compiled import compiled

@@ -1,0 +1,144 @@
+"""Compiled kernels: when the hypotheses of a bank begin, and with which step of states.
+
+As fusiond.estimators.fault_bank says.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.fault_bank import (
+    BEGINS_AT,
+    FIRST,
+    GROUP,
+    GROUPS,
+    LEVEL_OF,
+    LIKELY,
+    LOG_ODDS,
+    ONSET,
+    PERIODS_NS,
+    PROMOTED,
+    RESTARTED,
+    RESTARTS,
+    SENSITIVITIES,
+    SHIFTED,
+    SIGNATURE,
+    SIZE,
+    SLOTS,
+    SLOTS_OF,
+    STATES,
+    TURNED,
+)
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.earth import gravity
+from fusiond.navigation.strapdown import HEIGHT, LAT, STEP_DCM, STEP_SMOOTH_N, VN
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8, f8[::1], f8[::1])")
+def _begin_group(
+    bank: Array,
+    ints: Indices,
+    n: int,
+    width: int,
+    kind: int,
+    restart: int,
+    t_s: float,
+    nav: Array,
+    step: Array,
+) -> None:
+    """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`."""
+    at = GROUPS + (RESTARTS * kind + restart) * GROUP
+    for j in range(GROUP):
+        bank[at + j] = 0.0
+    bank[at + ONSET] = t_s
+    bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
+    v = bank[int(bank[SENSITIVITIES]) :]
+    size = ints[kind, SIZE]
+    for c in range(size):
+        column = ints[kind, FIRST] + restart * size + c
+        first = column // width * n * width + column % width
+        for i in range(n):
+            v[first + i * width] = 0.0
+        of, slots = ints[kind, SIGNATURE], ints[kind, SLOTS : SLOTS + 3]
+        if of == STATES:
+            for j in range(3):
+                if (j == c or size == 1) and slots[j] >= 0:
+                    v[first + slots[j] * width] = 1.0
+        elif of == TURNED:
+            for i in range(3):
+                v[first + i * width] = step[STEP_DCM + 3 * i + c]
+            if slots[c] >= 0:
+                v[first + slots[c] * width] = 1.0
+        elif of == SHIFTED:
+            # It began at fixes that were stamped by tau too late: p - v tau, v - a tau.
+            for i in range(3):
+                force = step[STEP_SMOOTH_N + i]
+                if i == 2:
+                    force += gravity(nav[LAT], nav[HEIGHT])
+                v[first + (3 + i) * width] = -force
+                v[first + (6 + i) * width] = -nav[VN + i]
+            for j in range(3):
+                if slots[j] >= 0:
+                    v[first + slots[j] * width] = -1.0
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
+def begin_all(
+    bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
+) -> None:
+    """Begin all hypotheses anew; what the path was remains."""
+    for kind in range(ints.shape[0]):
+        for restart in range(RESTARTS):
+            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step)
+    for level in range(len(PERIODS_NS)):
+        bank[RESTARTED + level] = t_ns // PERIODS_NS[level]
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8)")
+def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart: int) -> None:
+    """A restart that is about to begin anew takes the place of the less likely one of the level
+    above, if that is much less likely."""
+    level = LEVEL_OF[restart] + 1
+    if level >= len(SLOTS_OF):
+        return
+    at = GROUPS + RESTARTS * kind * GROUP
+    odds, least, found = bank[at + restart * GROUP + LOG_ODDS], np.inf, -1
+    for slot in range(BEGINS_AT[level], BEGINS_AT[level] + SLOTS_OF[level]):
+        if bank[at + slot * GROUP + LOG_ODDS] < least:
+            least, found = bank[at + slot * GROUP + LOG_ODDS], slot
+    if found < 0 or not odds > least + PROMOTED:
+        return
+    for j in range(GROUP):
+        bank[at + found * GROUP + j] = bank[at + restart * GROUP + j]
+    v = bank[int(bank[SENSITIVITIES]) :]
+    size = ints[kind, SIZE]
+    for c in range(size):
+        own = ints[kind, FIRST] + restart * size + c
+        other = ints[kind, FIRST] + found * size + c
+        first = own // width * n * width + own % width
+        second = other // width * n * width + other % width
+        for i in range(n):
+            v[second + i * width] = v[first + i * width]
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
+def restart_due(
+    bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
+) -> None:
+    """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
+    one that has just been handed on is not the next to begin."""
+    for back in range(len(PERIODS_NS)):
+        level = len(PERIODS_NS) - 1 - back
+        turn = t_ns // PERIODS_NS[level]
+        if bank[RESTARTED + level] != turn:
+            bank[RESTARTED + level] = turn
+            slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
+            for kind in range(ints.shape[0]):
+                if ints[kind, SIGNATURE] == SHIFTED:  # it is so from the start on
+                    continue
+                _promote(bank, ints, n, width, kind, slot)
+                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step)
