@@ -56,11 +56,11 @@ PROMOTED = 3.0
 """Log odds by which an onset must be likelier than one of the level above to take its place when
 its own turn to begin anew has come: twenty to one."""
 
-STATES, TURNED, SHIFTED = range(3)
+STATES, TURNED, SHIFTED, FOLLOWED = range(4)
 """Signatures that are a step of states: of one number in all of them or of as many numbers; of the
 attitude, about body axes, and of the mounting; of all that moves, as if it were another instant,
-from the start on."""
-POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(3, 11)
+from the start on; of what a source's faults, as they are weighed, have done to the filter."""
+POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = range(4, 12)
 """Signatures in rows: an offset of a position, one that grows with time, the same of a velocity;
 positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's
 rows."""
@@ -84,9 +84,10 @@ RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES, HEAD = 0, 4, 5, 8, 9, 16
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 # A group: L (9), e (3), J, N, onset (s), log odds, weight, what is left unexplained beyond chance,
-# since which epoch (s) it has been likely and explained all, or never.
-L_AT, E_AT, J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY, GROUP = (
-    *(0, 9, 12, 13, 14, 15, 16, 17, 18),
+# since which epoch (s) it has been likely and explained all, or never; log of what its rate counts
+# by.
+L_AT, E_AT, J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY, COUNTS_BY, GROUP = (
+    *(0, 9, 12, 13, 14, 15, 16, 17, 18, 19),
     20,
 )
 UNEXPLAINED_SIGMAS = 4.0

@@ -1,11 +1,15 @@
 r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
 
-    log odds            log(rate T) + e^T M e / 2 - log det(I + S L) / 2
+    log odds            log of the sum over c of rate T / c exp(e^T M e / 2) det(I + c^2 S L)^(-1/2)
     weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
                         a hypothesis does not explain what has come
     left unexplained    J - l against N - p by chi-square's mean and variance
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
+
+Sizes of faults have no one scale, and small ones are more frequent: how many exceed a size falls
+with it. The prior of a size is a mixture of normals, of sigma c S^(1/2) at rate / c for each c of
+`SCALES`; b and M are those of the likeliest.
 
 Source: as of fusiond.estimators.fault_bank; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for
 the moments of a mixture.
@@ -20,6 +24,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     CLASS,
+    COUNTS_BY,
     DECIDED,
     DEVICE,
     E_AT,
@@ -49,8 +54,12 @@ from fusiond.navigation.compiled import compiled
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+SCALES = (1.0, 0.3, 0.1)
+"""Half a decade apart: between two of them the log odds are 0.2 less than those of the best c."""
 _TINY = 1e-9
 """A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
+SOLVED = 13
+"""What `solve` writes."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the amount of a kind that has one of its own may differ."""
 LEAST_WEIGHT = 1e-7
@@ -60,13 +69,13 @@ LEAST_WEIGHT = 1e-7
 BEST, BEST_ODDS, RIVAL_ODDS, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
 
 
-@compiled("f8(f8[::1], i8, f8[::1], f8, f8[::1])", allocates=True)
-def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> float:
-    """M = (L + share S^-1)^-1 of a group into m (9,) and behind it b (3,); `numbers` (6,) of its
-    kind. Returns what the log odds gain by it, where `share` is 1, or else what it explains, l; by
-    Gauss and Jordan with a positive matrix."""
+@compiled("f8(f8[::1], i8, f8[::1], f8, f8, f8[::1])", allocates=True)
+def solve(group: Array, size: int, numbers: Array, mean: float, share: float, m: Array) -> float:
+    """M = (L + share S^-1)^-1 of a group into m (9,), behind it b (3,) for a prior about `mean`,
+    and log det(I + S L / share); `numbers` (6,) of its kind. Returns by how much b explains the
+    evidence better than nothing wrong does, as log likelihood; by Gauss and Jordan with a positive
+    matrix."""
     a = np.empty((3, 6))
-    mean = numbers[MEAN] if share == 1.0 else 0.0
     for i in range(size):
         for j in range(size):
             a[i, j] = group[L_AT + 3 * i + j]
@@ -75,7 +84,7 @@ def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> fl
     logarithm = 0.0
     for k in range(size):
         pivot = a[k, k]
-        logarithm += math.log(pivot * numbers[PRIOR + k] * numbers[PRIOR + k])
+        logarithm += math.log(pivot * numbers[PRIOR + k] * numbers[PRIOR + k] / share)
         for j in range(2 * size):
             a[k, j] /= pivot
         for i in range(size):
@@ -99,7 +108,27 @@ def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> fl
             beyond -= group[L_AT + 3 * i + k] * mean
             along -= 0.5 * mean * group[L_AT + 3 * i + k] * mean
         gained += 0.5 * beyond * (m[9 + i] - mean) + along
-    return gained - 0.5 * logarithm if share == 1.0 else 2.0 * gained
+    m[12] = logarithm
+    return gained
+
+
+@compiled("f8(f8[::1], i8, f8[::1], f8[::1])", allocates=True)
+def solve_likeliest(group: Array, size: int, numbers: Array, m: Array) -> float:
+    """As `solve` with the likeliest of the scales of a prior, which is the one of a kind that has
+    an amount of its own; what the log odds gain by all."""
+    scaled, best, total = np.empty(SOLVED), -np.inf, 0.0
+    for scale in SCALES:
+        if scale < 1.0 and numbers[MEAN] != 0.0:
+            break
+        gained = solve(group, size, numbers, numbers[MEAN], 1.0 / (scale * scale), scaled)
+        gained -= 0.5 * scaled[12] + math.log(scale)
+        if gained > best:
+            total = 1.0 + total * math.exp(best - gained)
+            best = gained
+            m[:] = scaled
+        else:
+            total += math.exp(gained - best)
+    return best + math.log(total)
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8, f8[::1])", allocates=True)
@@ -109,7 +138,7 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
     been likely, and has explained all, for `LASTS_S`.
     """
     kinds = ints.shape[0]
-    m = np.empty(12)
+    m = np.empty(SOLVED)
     largest = 0.0
     for kind in range(kinds):
         size = ints[kind, SIZE]
@@ -118,11 +147,11 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
             group[LOG_ODDS], group[WEIGHT], group[UNEXPLAINED] = -np.inf, 0.0, 0.0
             if group[N_AT] == 0.0:
                 continue
-            gained = solve(group, size, numbers[kind], 1.0, m)
+            gained = solve_likeliest(group, size, numbers[kind], m)
             rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
-            group[LOG_ODDS] = rate + gained
+            group[LOG_ODDS] = rate + group[COUNTS_BY] + gained
             off = (m[9] - numbers[kind, MEAN]) / numbers[kind, PRIOR]
-            explained = solve(group, size, numbers[kind], _TINY, m)
+            explained = 2.0 * solve(group, size, numbers[kind], 0.0, _TINY, m)
             degrees = max(group[N_AT] - size, 1.0)
             most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
             group[UNEXPLAINED] = group[J_AT] - explained - most
@@ -169,7 +198,7 @@ def mixture(bank: Array, ints: Indices, numbers: Array, n: int, width: int, open
     kinds, q = ints.shape[0], opened.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
     opened[:] = 0.0
-    m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
+    m, x, rows = np.empty(SOLVED), np.empty((3, 3)), np.empty((3, q))
     for kind in range(kinds):
         size = ints[kind, SIZE]
         for restart in range(RESTARTS):
@@ -177,7 +206,7 @@ def mixture(bank: Array, ints: Indices, numbers: Array, n: int, width: int, open
             weight = group[WEIGHT]
             if weight < LEAST_WEIGHT:
                 continue
-            solve(group, size, numbers[kind], 1.0, m)
+            solve_likeliest(group, size, numbers[kind], m)
             for c in range(size):
                 for d in range(size):
                     x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
@@ -210,8 +239,8 @@ def estimate(
     size = ints[kind, SIZE]
     group = bank[GROUPS + number * GROUP :]
     v = bank[int(bank[SENSITIVITIES]) :]
-    m = np.empty(12)
-    solve(group, size, numbers[kind], 1.0, m)
+    m = np.empty(SOLVED)
+    solve_likeliest(group, size, numbers[kind], m)
     size_and_variance[:] = 0.0
     effect[:] = 0.0
     rows = np.empty((3, n))

@@ -1,21 +1,31 @@
-"""Compiled kernels: when the hypotheses of a bank begin, and with which step of states.
+r"""Compiled kernels: when the hypotheses of a bank begin, and with which step of states.
 
-As fusiond.estimators.fault_bank says.
+As fusiond.estimators.fault_bank says. One of them is that a source's fault is over, which the
+filter has followed: its error is then what those faults f have done to it, as they are weighed,
+
+    V = sum w_f V_f b_f / w,   w = sum w_f,   which is as likely to begin as w
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ANY,
     BEGINS_AT,
+    COUNTS_BY,
+    DEVICE,
     FIRST,
+    FOLLOWED,
     GROUP,
     GROUPS,
     LEVEL_OF,
     LIKELY,
     LOG_ODDS,
+    MOVES,
     ONSET,
     PERIODS_NS,
     PROMOTED,
@@ -29,7 +39,9 @@ from fusiond.estimators.fault_bank import (
     SLOTS_OF,
     STATES,
     TURNED,
+    WEIGHT,
 )
+from fusiond.estimators.fault_odds import SOLVED, solve_likeliest
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.strapdown import HEIGHT, LAT, STEP_DCM, STEP_SMOOTH_N, VN
@@ -38,7 +50,41 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8, f8[::1], f8[::1])")
+UNLIKELY = 1e-12
+"""Of what is followed by no fault that counts."""
+COUNTS = 1e-3
+"""Weight of a fault below which what it has done is not looked at."""
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[::1])", allocates=True)
+def _followed(
+    bank: Array, ints: Indices, numbers: Array, n: int, width: int, followed: Array
+) -> None:
+    """Write what faults of sources have done to the filter (n,), and behind it their weight."""
+    followed[:] = 0.0
+    v, m = bank[int(bank[SENSITIVITIES]) :], np.empty(SOLVED)
+    for kind in range(ints.shape[0]):
+        if ints[kind, SIGNATURE] <= FOLLOWED:
+            continue
+        size = ints[kind, SIZE]
+        for restart in range(RESTARTS):
+            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
+            weight = group[WEIGHT]
+            if weight < COUNTS:
+                continue
+            solve_likeliest(group, size, numbers[kind], m)
+            followed[n] += weight
+            for c in range(size):
+                column = ints[kind, FIRST] + restart * size + c
+                first = column // width * n * width + column % width
+                for i in range(n):
+                    followed[i] += weight * m[9 + c] * v[first + i * width]
+    if followed[n] > 0.0:
+        for i in range(n):
+            followed[i] /= followed[n]
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8, f8[::1], f8[::1], f8[::1])")
 def _begin_group(
     bank: Array,
     ints: Indices,
@@ -49,13 +95,17 @@ def _begin_group(
     t_s: float,
     nav: Array,
     step: Array,
+    followed: Array,
 ) -> None:
-    """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`."""
+    """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`;
+    `followed` (n + 1,) as `_followed` leaves it."""
     at = GROUPS + (RESTARTS * kind + restart) * GROUP
     for j in range(GROUP):
         bank[at + j] = 0.0
     bank[at + ONSET] = t_s
     bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
+    if ints[kind, SIGNATURE] == FOLLOWED:
+        bank[at + COUNTS_BY] = math.log(max(followed[n], UNLIKELY))
     v = bank[int(bank[SENSITIVITIES]) :]
     size = ints[kind, SIZE]
     for c in range(size):
@@ -84,16 +134,20 @@ def _begin_group(
             for j in range(3):
                 if slots[j] >= 0:
                     v[first + slots[j] * width] = -1.0
+        elif of == FOLLOWED:
+            for i in range(n):
+                v[first + i * width] = followed[i]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])", allocates=True)
 def begin_all(
     bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
 ) -> None:
     """Begin all hypotheses anew; what the path was remains."""
+    followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
-            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step)
+            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step, followed)
     for level in range(len(PERIODS_NS)):
         bank[RESTARTED + level] = t_ns // PERIODS_NS[level]
 
@@ -125,20 +179,61 @@ def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart:
             v[second + i * width] = v[first + i * width]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[::1])", allocates=True)
 def restart_due(
-    bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    n: int,
+    width: int,
+    t_ns: int,
+    nav: Array,
+    step: Array,
 ) -> None:
     """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
     one that has just been handed on is not the next to begin."""
+    followed = np.zeros(0)
     for back in range(len(PERIODS_NS)):
         level = len(PERIODS_NS) - 1 - back
         turn = t_ns // PERIODS_NS[level]
         if bank[RESTARTED + level] != turn:
             bank[RESTARTED + level] = turn
+            if followed.shape[0] == 0:
+                followed = np.zeros(n + 1)
+                _followed(bank, ints, numbers, n, width, followed)
             slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
             for kind in range(ints.shape[0]):
                 if ints[kind, SIGNATURE] == SHIFTED:  # it is so from the start on
                     continue
                 _promote(bank, ints, n, width, kind, slot)
-                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step)
+                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step, followed)
+
+
+@compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
+def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
+    """Whether a kind is of a device, or of any and this one locates or moves."""
+    if ints[kind, DEVICE] == ANY:
+        return bool(measures <= MOVES)
+    of_this: bool = ints[kind, DEVICE] == device
+    return of_this
+
+
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, i8, f8[::1], f8[::1])", allocates=True)
+def begin_again(
+    bank: Array,
+    ints: Indices,
+    n: int,
+    width: int,
+    measures: int,
+    device: int,
+    t_ns: int,
+    nav: Array,
+    step: Array,
+) -> None:
+    """Begin those hypotheses anew that are of rows which return to service."""
+    followed = np.zeros(n + 1)
+    for kind in range(ints.shape[0]):
+        if ints[kind, SIGNATURE] <= FOLLOWED or not concerns(ints, kind, measures, device):
+            continue
+        for restart in range(RESTARTS):
+            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step, followed)

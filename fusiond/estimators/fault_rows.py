@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
-    ANY,
     CARRIED,
     DELAY,
-    DEVICE,
     E_AT,
     ENTRIES,
     FIRST,
+    FOLLOWED,
     GROUP,
     GROUPS,
     HEAD,
@@ -42,13 +41,13 @@ from fusiond.estimators.fault_bank import (
     ROLLS,
     ROWS,
     SENSITIVITIES,
-    SHIFTED,
     SIGNATURE,
     SIZE,
     SPEED,
     VELOCITY,
     VELOCITY_RAMP,
 )
+from fusiond.estimators.fault_onsets import concerns
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.strapdown import VN
 
@@ -90,15 +89,6 @@ def _past(bank: Array, t_s: float, component: int) -> float:
     return math.nan
 
 
-@compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
-def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """Whether a kind is of a device, or of any and this one locates or moves."""
-    if ints[kind, DEVICE] == ANY:
-        return bool(measures <= MOVES)
-    of_this: bool = ints[kind, DEVICE] == device
-    return of_this
-
-
 @compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")
 def _signature(
     bank: Array,
@@ -115,7 +105,7 @@ def _signature(
 ) -> float:
     """D of a row for a component of a kind that has run for `age_s`."""
     of, d = ints[kind, SIGNATURE], 0.0
-    if of <= SHIFTED or not concerns(ints, kind, measures, device):
+    if of <= FOLLOWED or not concerns(ints, kind, measures, device):
         return 0.0
     if measures == PLACES and not ints[kind, LOCATES]:
         return 0.0
@@ -193,7 +183,7 @@ def sensitivity_rows(
                     for j in range(width):
                         part[j] += c * rows[j]
         for kind in range(kinds):
-            if ints[kind, SIGNATURE] <= SHIFTED or not concerns(ints, kind, measures, device):
+            if ints[kind, SIGNATURE] <= FOLLOWED or not concerns(ints, kind, measures, device):
                 continue
             size = ints[kind, SIZE]
             for restart in range(RESTARTS):

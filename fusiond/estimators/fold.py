@@ -8,13 +8,15 @@ from numpy.typing import NDArray
 from fusiond.estimators.fault_bank import (
     CLASS,
     FIRST,
+    FOLLOWED,
     GROUP,
     GROUPS,
     RESTARTS,
+    SIGNATURE,
     SIZE,
     WEIGHT,
 )
-from fusiond.estimators.fault_odds import LEAST_WEIGHT, solve
+from fusiond.estimators.fault_odds import LEAST_WEIGHT, SOLVED, solve_likeliest
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
@@ -29,11 +31,12 @@ def nis_if_sensors_fail(
     bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Array
 ) -> float:
     """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
-    leave open, as they are weighed; `work` as `sensitivity_rows` leaves it."""
+    and those of sources that are over leave open, as they are weighed; `work` as
+    `sensitivity_rows` leaves it."""
     rows = y.shape[0]
-    c, m = np.eye(rows), np.empty(12)
+    c, m = np.eye(rows), np.empty(SOLVED)
     for kind in range(ints.shape[0]):
-        if ints[kind, CLASS] != 0:
+        if ints[kind, CLASS] != 0 and ints[kind, SIGNATURE] != FOLLOWED:
             continue
         size = ints[kind, SIZE]
         for restart in range(RESTARTS):
@@ -41,7 +44,7 @@ def nis_if_sensors_fail(
             weight = group[WEIGHT]
             if weight < LEAST_WEIGHT:
                 continue
-            solve(group, size, numbers[kind], 1.0, m)
+            solve_likeliest(group, size, numbers[kind], m)
             first = ints[kind, FIRST] + restart * size
             for a in range(rows):
                 for b in range(rows):
@@ -96,7 +99,7 @@ def fold_and_account(
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
-    restart_due(bank, ints, n, width, t_ns, nav, step)
+    restart_due(bank, ints, numbers, n, width, t_ns, nav, step)
     columns = sensitivity_rows(
         bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work
     )
@@ -136,6 +139,6 @@ def account_for(
     """What the bank makes of rows that were `fused` or not, as `whiten` has left y (m,) and g (m,
     w): of a filter that keeps its estimate."""
     n = h.shape[1]
-    restart_due(bank, ints, n, width, t_ns, nav, step)
+    restart_due(bank, ints, numbers, n, width, t_ns, nav, step)
     sensitivity_rows(bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work)
     account(bank, ints, n, width, y, g, fused, work)

@@ -27,7 +27,7 @@ from fusiond.estimators.fault_bank import (
     chunks_of,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
-from fusiond.estimators.fault_onsets import begin_all
+from fusiond.estimators.fault_onsets import begin_again, begin_all
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -79,6 +79,12 @@ class Hypotheses:
     def begin(self, t_ns: int, nav: Array, step: Array) -> None:
         """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
+
+    def begin_again(self, aid: Linearised, nav: Array, step: Array) -> None:
+        """An aid's series returns to service: what was shown of it before is why it was out, and
+        its hypotheses begin anew."""
+        n, width = self.n, self.width
+        begin_again(self.bank, self.table.ints, n, width, *self.of(aid), aid.t_ns, nav, step)
 
     def judge(self, t_ns: int) -> Array:
         """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""

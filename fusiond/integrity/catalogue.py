@@ -27,6 +27,7 @@ from fusiond.estimators.fault_bank import (
     DELAY,
     DEVICE,
     FIRST,
+    FOLLOWED,
     KIND_INTS,
     KIND_NUMBERS,
     LAG,
@@ -50,19 +51,22 @@ from fusiond.estimators.fault_bank import (
     VELOCITY_RAMP,
     FaultTable,
 )
+from fusiond.integrity.service import LASTS_S
 from fusiond.models.model import Model
 from fusiond.models.vehicle import FIX_TIME, MOUNTING, VELOCITY_TIME
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 
 DEG = math.degrees(1.0)
 BODY = ("x", "y", "z")
-SENSOR, PLACE, MOTION, TIME, OWN = range(5)
+SENSOR, PLACE, MOTION, TIME, OWN, OVER = range(6)
 """Classes: between kinds of one class nobody has to choose before something is done."""
 RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1.0
 TOGETHER = "all receivers"
 """The device of a kind that is of all of them."""
 LAGGED_S = 0.5
 """One sigma of a lag that nobody knows of."""
+FOLLOWED_SPREAD = 0.3
+"""One sigma of a share of what a fault has done: it is told from noise at three sigma or so."""
 LAGS_S, LAG_SPREAD = (0.5, 1.0, 2.0, 4.0), 0.3
 """Delays, each of which stands for those around it, by so much of it at one sigma: a delay that is
 no longer than what the state for it admits is that state's."""
@@ -98,7 +102,7 @@ class Kind:
     @property
     def corrected(self) -> bool:
         """Whether the filter goes on without it: it is one of its states."""
-        return self.signature in (STATES, TURNED, SHIFTED)
+        return self.signature in (STATES, TURNED, SHIFTED, FOLLOWED)
 
     def spoils(self, device: str, locates: bool, moves: bool) -> bool:
         """Whether a series of such a device is no measurement any more."""
@@ -258,6 +262,17 @@ def row_kinds(
     return [of]
 
 
+def over_kind() -> Kind:
+    """That a source's fault is over, which the solution has followed until then: as likely as that
+    fault, which lasts a minute in the mean. Its size is the share of what was followed."""
+    return Kind(
+        *("over", "a source's fault that the solution followed is over:", "%", FOLLOWED, OVER),
+        *((FOLLOWED_SPREAD,), 3600.0 / LASTS_S, 100.0),
+        mean=1.0,
+        axes=("",),
+    )
+
+
 def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]:
     """All of a model and the devices of `aiding`, name to kind of section; with a vehicle that does
     not slip where `slips`."""
@@ -280,6 +295,7 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
     receivers = [device for device, kind in aiding.items() if kind == "gnss"]
     if len(receivers) > 1:
         found += carried_kinds(TOGETHER)
+    found.append(over_kind())
     # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
     found += row_kinds("zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY)
     return found

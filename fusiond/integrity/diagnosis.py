@@ -208,6 +208,8 @@ class Diagnosis:
         if one.out:
             passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
             one.looked_at(t_ns, passes and one.repeats == 0, outcome.lasting - outcome.nis)
+            if not one.out and bank is not None:
+                bank.begin_again(aid, estimator.nav, estimator.step)
             self._agrees(aid, one)
         else:
             if bank is not None and not aid.constraint:

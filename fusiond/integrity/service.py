@@ -8,10 +8,11 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
     probation    fused again, after they were out
 
     from                  to           when
-    nominal, probation    suspected    `gate`: a measurement fails
-    suspected             nominal, probation   one passes
+    nominal               suspected    `gate`: a measurement fails
+    suspected             nominal      one passes
     suspected             out          the third in a row fails, and no fault of the inertial unit
                                        explains it
+    probation             out          a measurement fails: what was wrong comes again
     any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
                                        itself to the bit while the vehicle moves
     out                   probation    `READMIT_COUNT` in a row pass against what is published, and
@@ -119,7 +120,8 @@ class Series:
     def gated(self, t_ns: int, explained: bool) -> None:
         """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
         self.failed += 1
-        if self.failed >= REFUSED_IN_A_ROW and not explained:
+        proven = t_ns > self.proven_ns
+        if not proven or (self.failed >= REFUSED_IN_A_ROW and not explained):
             self.exclude(t_ns, DISAGREES)
         elif self.state is not Service.SUSPECTED:
             self.state, self.since_ns = Service.SUSPECTED, t_ns
@@ -131,11 +133,8 @@ class Series:
             y0, y1, y2 = (*whitened, 0.0, 0.0)[:3]
             learn(self.noise, t_ns * 1e-9, y0, y1, y2, rows)
         self.failed = 0
-        if t_ns > self.proven_ns:
-            if self.state is not Service.NOMINAL:
-                self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
-        elif self.state is Service.SUSPECTED:
-            self.state, self.since_ns = Service.PROBATION, t_ns
+        if t_ns > self.proven_ns and self.state is not Service.NOMINAL:
+            self.state, self.since_ns, self.reason = Service.NOMINAL, t_ns, ""
 
     def looked_at(self, t_ns: int, passes: bool, lasting: float = math.nan) -> None:
         """One that is out was compared with what is published. `lasting`: by how much more

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from fusiond.integrity.catalogue import OVER
 from fusiond.navigator.timeline import Timeline
 
 
@@ -18,7 +19,8 @@ class ServiceEvents:
         """By kind and device: the last finding that was seen."""
 
     def tell(self) -> bool:
-        """`sensor_fault` for each step that was corrected, `isolated` and `readmitted` for each
+        """`sensor_fault` for each step that was corrected, `fault_over` for a source's fault that
+        the solution had followed, `isolated` and `readmitted` for each
         series that has left or is back in service; whether there are new findings."""
         diagnosis, found = self._timeline.diagnosis, False
         for finding in diagnosis.findings:
@@ -27,7 +29,8 @@ class ServiceEvents:
                 continue
             self._found_ns[key], found = finding.t_ns, True
             if finding.kind.corrected:
-                self._event("sensor_fault", finding.text)
+                over = finding.kind.of == OVER
+                self._event("fault_over" if over else "sensor_fault", finding.text)
         now = self._timeline.estimator.isolated | diagnosis.excluded
         for source, reason in now.items():
             if source not in self._out:
