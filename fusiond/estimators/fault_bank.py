@@ -85,11 +85,9 @@ RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 # A group: L (9), e (3), J, N, onset (s), log odds, weight, what is left unexplained beyond chance,
 # since which epoch (s) it has been likely and explained all, or never; log of what its rate counts
-# by.
-L_AT, E_AT, J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY, COUNTS_BY, GROUP = (
-    *(0, 9, 12, 13, 14, 15, 16, 17, 18, 19),
-    20,
-)
+# by; what it explains, l.
+L_AT, E_AT, J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY = 0, 9, *range(12, 19)
+COUNTS_BY, EXPLAINED, GROUP = 19, 20, 21
 UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0

@@ -28,6 +28,7 @@ from fusiond.estimators.fault_bank import (
     DECIDED,
     DEVICE,
     E_AT,
+    EXPLAINED,
     FIRST,
     GROUP,
     GROUPS,
@@ -154,6 +155,7 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
             explained = 2.0 * solve(group, size, numbers[kind], 0.0, _TINY, m)
             degrees = max(group[N_AT] - size, 1.0)
             most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
+            group[EXPLAINED] = explained
             group[UNEXPLAINED] = group[J_AT] - explained - most
             if numbers[kind, MEAN] != 0.0 and abs(off) > MOST_OFF:
                 group[UNEXPLAINED] = np.inf  # it is of another amount than this kind has

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
+    EXPLAINED,
     GROUP,
     GROUPS,
     LOG_ODDS,
@@ -34,12 +35,14 @@ Array = NDArray[np.float64]
 
 
 class Estimated(NamedTuple):
-    """A hypothesis as it stands: number of its kind, onset (s), log odds against nothing wrong,
-    size b (p,), M (p, p), and its effect on the error state: V b (n,), V M V^T (n, n)."""
+    """A hypothesis as it stands: number of its kind, onset (s), log odds against nothing wrong, log
+    of the largest likelihood ratio, size b (p,), M (p, p), and its effect on the error state: V b
+    (n,), V M V^T (n, n)."""
 
     kind: int
     onset_s: float
     log_odds: float
+    log_likelihood: float
     size: Array
     covariance: Array
     mean: Array
@@ -115,6 +118,7 @@ class Hypotheses:
             kind,
             float(group[ONSET]),
             float(group[LOG_ODDS]),
+            0.5 * float(group[EXPLAINED]),
             found[:p],
             found[3:].reshape(3, 3)[:p, :p],
             effect[0],

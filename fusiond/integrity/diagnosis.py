@@ -10,8 +10,9 @@ A fault that is a step of states (the inertial unit's, a clock's) is taken out o
 with the covariance V M V^T, and navigation goes on. One of a source is taken out likewise, from its
 onset on, and the series that it spoils leave service (fusiond.integrity.service). Hypotheses of one
 class and device that are nearly as likely are taken together, by the moments of their mixture:
-kinds as well as onsets. Where two classes explain it nobody is accused, and what is published
-covers both.
+kinds as well as onsets. There they are weighed by how well they fit alone: what nobody can tell
+apart is not told apart by a rate and a size that are an engineer's. Where two classes explain it
+nobody is accused, and what is published covers both.
 
 Where positions and velocities of a device fit each other and both are out, it is the filter that is
 wrong, by more than any hypothesis says: after `FITS_NS` where nothing has explained why they are
@@ -237,7 +238,8 @@ class Diagnosis:
         if best < 0.0 or odds - rival <= APART:
             return None
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
-        weights = np.exp([each.log_odds - odds for each in taken])
+        fits = np.array([each.log_likelihood for each in taken])
+        weights = np.exp(fits - fits.max())
         weights /= weights.sum()
         mean, spread = np.zeros(bank.n), np.zeros((bank.n, bank.n))
         for w, each in zip(weights, taken, strict=True):
