@@ -74,9 +74,10 @@ SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS, LOCATES, MOVES_TOO = 0, 1, 2, 3, 4
 ANY = -3
 """In the place of a device: all that send positions or velocities."""
 KIND_INTS = 10
-# And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean.
-PRIOR, LOG_RATE, LAG, MEAN = 0, 3, 4, 5
-KIND_NUMBERS = 6
+# And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean,
+# whether its size is known to be of that prior (1 or 0).
+PRIOR, LOG_RATE, LAG, MEAN, BOUNDED = 0, 3, 4, 5, 6
+KIND_NUMBERS = 7
 
 # The bank's array: head, ring of the path, groups, sensitivities. The head holds which restart each
 # age is at (4), the instant (s), place (m) and number of entries of the path, where V begins.
@@ -97,7 +98,7 @@ LASTS_S = 1.0
 
 
 class FaultTable(NamedTuple):
-    """Kinds of faults as the kernels read them, `ints` (k, 10) and `numbers` (k, 6), how many
+    """Kinds of faults as the kernels read them, `ints` (k, 10) and `numbers` (k, 7), how many
     columns they have in all, and the devices whose numbers they name."""
 
     ints: Indices

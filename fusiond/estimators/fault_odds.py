@@ -1,18 +1,22 @@
 r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
 
-    log odds            log of the sum over c of rate T / c exp(e^T M e / 2) det(I + c^2 S L)^(-1/2)
+    log odds            log(rate T) + l / 2 - p log(N) / 2
+                        of a kind that is known to be of a size
+                        log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
+                        + e^T m - m^T L m / 2
     weight              w_f = odds_f / (1 + sum of all odds): the posterior probability; none where
                         a hypothesis does not explain what has come
     left unexplained    J - l against N - p by chi-square's mean and variance
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
 
-Sizes of faults have no one scale, and small ones are more frequent: how many exceed a size falls
-with it. The prior of a size is a mixture of normals, of sigma c S^(1/2) at rate / c for each c of
-`SCALES`; b and M are those of the likeliest.
+Sizes of faults have no one scale, and of kinds that fit alike none is to be accused for the size
+that it was expected to have: what p unknowns gain by chance is taken off by the number of rows
+alone (Schwarz). The prior of a size bounds its estimate.
 
-Source: as of fusiond.estimators.fault_bank; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for
-the moments of a mixture.
+Source: as of fusiond.estimators.fault_bank; Schwarz, Estimating the dimension of a model, Annals of
+Statistics 6 (1978), 461; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for the moments of a
+mixture.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    BOUNDED,
     CLASS,
     COUNTS_BY,
     DECIDED,
@@ -30,6 +35,7 @@ from fusiond.estimators.fault_bank import (
     E_AT,
     EXPLAINED,
     FIRST,
+    FOLLOWED,
     GROUP,
     GROUPS,
     J_AT,
@@ -45,6 +51,7 @@ from fusiond.estimators.fault_bank import (
     PRIOR,
     RESTARTS,
     SENSITIVITIES,
+    SIGNATURE,
     SIZE,
     UNEXPLAINED,
     UNEXPLAINED_SIGMAS,
@@ -55,25 +62,27 @@ from fusiond.navigation.compiled import compiled
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SCALES = (1.0, 0.3, 0.1)
-"""Half a decade apart: between two of them the log odds are 0.2 less than those of the best c."""
+MISSED = 0.1
+"""Of what a hypothesis explains, so much may be lost by an onset that lies between two restarts: a
+drift that began a seventh of its age before or after it loses a twentieth."""
 _TINY = 1e-9
 """A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
 SOLVED = 13
 """What `solve` writes."""
 MOST_OFF = 3.0
-"""Sigmas of its prior by which the amount of a kind that has one of its own may differ."""
+"""Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
 LEAST_WEIGHT = 1e-7
 """What is as unlikely opens nothing: of a kilometre a third of a metre."""
-# What `judge` writes: the group with the largest odds of those that explain, its log odds, the
-# largest of another class or device, the largest of any that explains, and the weight of all.
-BEST, BEST_ODDS, RIVAL_ODDS, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
+# What `judge` writes: the group with the largest odds of those that explain, its log odds, by how
+# much it is ahead of any of another class or device, the largest of any that explains, and the
+# weight of all.
+BEST, BEST_ODDS, AHEAD, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
 
 
 @compiled("f8(f8[::1], i8, f8[::1], f8, f8, f8[::1])", allocates=True)
 def solve(group: Array, size: int, numbers: Array, mean: float, share: float, m: Array) -> float:
     """M = (L + share S^-1)^-1 of a group into m (9,), behind it b (3,) for a prior about `mean`,
-    and log det(I + S L / share); `numbers` (6,) of its kind. Returns by how much b explains the
+    and log det(I + S L / share); `numbers` (7,) of its kind. Returns by how much b explains the
     evidence better than nothing wrong does, as log likelihood; by Gauss and Jordan with a positive
     matrix."""
     a = np.empty((3, 6))
@@ -113,30 +122,15 @@ def solve(group: Array, size: int, numbers: Array, mean: float, share: float, m:
     return gained
 
 
-@compiled("f8(f8[::1], i8, f8[::1], f8[::1])", allocates=True)
-def solve_likeliest(group: Array, size: int, numbers: Array, m: Array) -> float:
-    """As `solve` with the likeliest of the scales of a prior, which is the one of a kind that has
-    an amount of its own; what the log odds gain by all."""
-    scaled, best, total = np.empty(SOLVED), -np.inf, 0.0
-    for scale in SCALES:
-        if scale < 1.0 and numbers[MEAN] != 0.0:
-            break
-        gained = solve(group, size, numbers, numbers[MEAN], 1.0 / (scale * scale), scaled)
-        gained -= 0.5 * scaled[12] + math.log(scale)
-        if gained > best:
-            total = 1.0 + total * math.exp(best - gained)
-            best = gained
-            m[:] = scaled
-        else:
-            total += math.exp(gained - best)
-    return best + math.log(total)
-
-
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8, f8[::1])", allocates=True)
 def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Array) -> None:
     """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
     epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
     been likely, and has explained all, for `LASTS_S`.
+
+    It is ahead of another by odds. Between a step of states, which changes what is published, and a
+    fault of a source that is likelier than nothing wrong it counts how well each fits, if that is
+    less: what fits as well is not told apart by rates alone.
     """
     kinds = ints.shape[0]
     m = np.empty(SOLVED)
@@ -148,17 +142,19 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
             group[LOG_ODDS], group[WEIGHT], group[UNEXPLAINED] = -np.inf, 0.0, 0.0
             if group[N_AT] == 0.0:
                 continue
-            gained = solve_likeliest(group, size, numbers[kind], m)
-            rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
-            group[LOG_ODDS] = rate + group[COUNTS_BY] + gained
-            off = (m[9] - numbers[kind, MEAN]) / numbers[kind, PRIOR]
             explained = 2.0 * solve(group, size, numbers[kind], 0.0, _TINY, m)
             degrees = max(group[N_AT] - size, 1.0)
             most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
             group[EXPLAINED] = explained
             group[UNEXPLAINED] = group[J_AT] - explained - most
-            if numbers[kind, MEAN] != 0.0 and abs(off) > MOST_OFF:
-                group[UNEXPLAINED] = np.inf  # it is of another amount than this kind has
+            gained = 0.5 * explained - 0.5 * size * math.log(group[N_AT])
+            mean = numbers[kind, MEAN]
+            if numbers[kind, BOUNDED] != 0.0:
+                gained = solve(group, size, numbers[kind], mean, 1.0, m) - 0.5 * m[12]
+                if abs(m[9] - mean) > MOST_OFF * numbers[kind, PRIOR]:
+                    group[UNEXPLAINED] = np.inf  # it is of another size than this kind has
+            rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
+            group[LOG_ODDS] = rate + group[COUNTS_BY] + gained
             if group[UNEXPLAINED] <= 0.0:
                 largest = max(largest, group[LOG_ODDS])
     total = math.exp(-largest)
@@ -168,8 +164,9 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
             if bank[at + UNEXPLAINED] <= 0.0:
                 total += math.exp(bank[at + LOG_ODDS] - largest)
     found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
-    found[BEST_ODDS] = found[RIVAL_ODDS] = found[EXPLAINS] = -np.inf
-    of, device = -1, -1
+    found[BEST_ODDS] = found[EXPLAINS] = -np.inf
+    found[AHEAD] = np.inf
+    of, device, signature, fit = -1, -1, -1, 0.0
     for turn in range(2):
         for kind in range(kinds):
             for restart in range(RESTARTS):
@@ -189,9 +186,14 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
                     if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
                         found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
                         of, device = ints[kind, CLASS], ints[kind, DEVICE]
+                        signature, fit = ints[kind, SIGNATURE], 0.5 * group[EXPLAINED]
                     found[EXPLAINS] = max(found[EXPLAINS], group[LOG_ODDS])
                 elif ints[kind, CLASS] != of or ints[kind, DEVICE] != device:
-                    found[RIVAL_ODDS] = max(found[RIVAL_ODDS], group[LOG_ODDS])
+                    ahead = found[BEST_ODDS] - group[LOG_ODDS]
+                    step = ints[kind, SIGNATURE] <= FOLLOWED
+                    if group[LOG_ODDS] > 0.0 and step != (signature <= FOLLOWED):
+                        ahead = min(ahead, (1.0 - MISSED) * fit - 0.5 * group[EXPLAINED])
+                    found[AHEAD] = min(found[AHEAD], ahead)
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)
@@ -208,7 +210,7 @@ def mixture(bank: Array, ints: Indices, numbers: Array, n: int, width: int, open
             weight = group[WEIGHT]
             if weight < LEAST_WEIGHT:
                 continue
-            solve_likeliest(group, size, numbers[kind], m)
+            solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
             for c in range(size):
                 for d in range(size):
                     x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
@@ -242,7 +244,7 @@ def estimate(
     group = bank[GROUPS + number * GROUP :]
     v = bank[int(bank[SENSITIVITIES]) :]
     m = np.empty(SOLVED)
-    solve_likeliest(group, size, numbers[kind], m)
+    solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
     size_and_variance[:] = 0.0
     effect[:] = 0.0
     rows = np.empty((3, n))

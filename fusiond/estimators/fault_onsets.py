@@ -24,10 +24,14 @@ from fusiond.estimators.fault_bank import (
     GROUPS,
     LEVEL_OF,
     LIKELY,
+    LOCATES,
     LOG_ODDS,
+    MEAN,
     MOVES,
+    MOVES_TOO,
     ONSET,
     PERIODS_NS,
+    PLACES,
     PROMOTED,
     RESTARTED,
     RESTARTS,
@@ -41,7 +45,7 @@ from fusiond.estimators.fault_bank import (
     TURNED,
     WEIGHT,
 )
-from fusiond.estimators.fault_odds import SOLVED, solve_likeliest
+from fusiond.estimators.fault_odds import SOLVED, solve
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.strapdown import HEIGHT, LAT, STEP_DCM, STEP_SMOOTH_N, VN
@@ -72,7 +76,7 @@ def _followed(
             weight = group[WEIGHT]
             if weight < COUNTS:
                 continue
-            solve_likeliest(group, size, numbers[kind], m)
+            solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
             followed[n] += weight
             for c in range(size):
                 column = ints[kind, FIRST] + restart * size + c
@@ -211,7 +215,11 @@ def restart_due(
 
 @compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """Whether a kind is of a device, or of any and this one locates or moves."""
+    """Whether a kind is in such rows of a device, or of any that locate or move."""
+    if measures == PLACES and not ints[kind, LOCATES]:
+        return False
+    if measures == MOVES and not ints[kind, MOVES_TOO]:
+        return False
     if ints[kind, DEVICE] == ANY:
         return bool(measures <= MOVES)
     of_this: bool = ints[kind, DEVICE] == device

@@ -23,9 +23,7 @@ from fusiond.estimators.fault_bank import (
     J_AT,
     L_AT,
     LAG,
-    LOCATES,
     MOVES,
-    MOVES_TOO,
     N_AT,
     ONSET,
     OTHER,
@@ -106,10 +104,6 @@ def _signature(
     """D of a row for a component of a kind that has run for `age_s`."""
     of, d = ints[kind, SIGNATURE], 0.0
     if of <= FOLLOWED or not concerns(ints, kind, measures, device):
-        return 0.0
-    if measures == PLACES and not ints[kind, LOCATES]:
-        return 0.0
-    if measures == MOVES and not ints[kind, MOVES_TOO]:
         return 0.0
     if of == DELAY:
         lag = numbers[kind, LAG]

@@ -11,12 +11,13 @@ from fusiond.estimators.fault_bank import (
     FOLLOWED,
     GROUP,
     GROUPS,
+    MEAN,
     RESTARTS,
     SIGNATURE,
     SIZE,
     WEIGHT,
 )
-from fusiond.estimators.fault_odds import LEAST_WEIGHT, SOLVED, solve_likeliest
+from fusiond.estimators.fault_odds import LEAST_WEIGHT, SOLVED, solve
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
@@ -44,7 +45,7 @@ def nis_if_sensors_fail(
             weight = group[WEIGHT]
             if weight < LEAST_WEIGHT:
                 continue
-            solve_likeliest(group, size, numbers[kind], m)
+            solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
             first = ints[kind, FIRST] + restart * size
             for a in range(rows):
                 for b in range(rows):

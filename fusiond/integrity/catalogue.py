@@ -22,6 +22,7 @@ import numpy as np
 from drivers.immutable import immutable
 from fusiond.estimators.fault_bank import (
     ANY,
+    BOUNDED,
     CARRIED,
     CLASS,
     DELAY,
@@ -90,6 +91,7 @@ class Kind:
     slots: tuple[int, ...] = ()
     lag_s: float = 0.0
     mean: float = 0.0
+    bounded: bool = False
     axes: tuple[str, ...] = ("north", "east", "down")
     locates: bool = True
     moves: bool = True
@@ -198,6 +200,7 @@ def delay_kinds(device: str) -> list[Kind]:
             device=device,
             lag_s=lag_s,
             mean=1.0,
+            bounded=True,
             axes=("",),
             locates=locates,
         )
@@ -220,6 +223,7 @@ def time_kinds(device: str, model: Model) -> list[Kind]:
         *((max(float(model.initial[slot]) for slot in slots),), RECEIVER_PER_H),
         device=device,
         slots=tuple(slots),
+        bounded=True,
         axes=("",),
     )
     # From the start on, so that the filter itself lags: as long as a line may delay a fix.
@@ -228,6 +232,7 @@ def time_kinds(device: str, model: Model) -> list[Kind]:
         *((LAGGED_S,), RECEIVER_PER_H),
         device=device,
         slots=tuple(slots),
+        bounded=True,
         axes=("",),
     )
     return [step, shifted]
@@ -269,6 +274,7 @@ def over_kind() -> Kind:
         *("over", "a source's fault that the solution followed is over:", "%", FOLLOWED, OVER),
         *((FOLLOWED_SPREAD,), 3600.0 / LASTS_S, 100.0),
         mean=1.0,
+        bounded=True,
         axes=("",),
     )
 
@@ -318,5 +324,6 @@ def table_of(kinds: Sequence[Kind]) -> FaultTable:
         numbers[row, PRIOR : PRIOR + kind.size] = kind.sd
         numbers[row, LOG_RATE] = math.log(kind.per_hour / 3600.0)
         numbers[row, LAG], numbers[row, MEAN] = kind.lag_s, kind.mean
+        numbers[row, BOUNDED] = kind.bounded
         columns += RESTARTS * kind.size
     return FaultTable(ints, numbers, columns, devices)

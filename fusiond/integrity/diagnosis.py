@@ -4,7 +4,8 @@ A hypothesis is identified where
 
     log odds > DECIDED for a second                 the probability that it is false, 1 in 1,000
     what it leaves unexplained is no more than chance leaves
-    log odds - those of every other class > APART   nobody else explains it nearly as well
+    log odds and log likelihood - those of every other class > APART
+                                                    nobody else explains it nearly as well
 
 A fault that is a step of states (the inertial unit's, a clock's) is taken out of the state, V b
 with the covariance V M V^T, and navigation goes on. One of a source is taken out likewise, from its
@@ -41,7 +42,7 @@ from fusiond.estimators.fault_bank import (
     VELOCITY,
     VELOCITY_RAMP,
 )
-from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, FAULTY, RIVAL_ODDS
+from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
@@ -234,8 +235,8 @@ class Diagnosis:
         return not aid.constraint or bank.found.item(FAULTY) > COUNTS
 
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
-        best, odds, rival = found.item(BEST), found.item(BEST_ODDS), found.item(RIVAL_ODDS)
-        if best < 0.0 or odds - rival <= APART:
+        best, odds = found.item(BEST), found.item(BEST_ODDS)
+        if best < 0.0 or found.item(AHEAD) <= APART:
             return None
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         fits = np.array([each.log_likelihood for each in taken])

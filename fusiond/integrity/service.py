@@ -120,8 +120,8 @@ class Series:
     def gated(self, t_ns: int, explained: bool) -> None:
         """One in service has failed its gate; `explained`: by a fault of the inertial unit."""
         self.failed += 1
-        proven = t_ns > self.proven_ns
-        if not proven or (self.failed >= REFUSED_IN_A_ROW and not explained):
+        again = self.state is Service.PROBATION
+        if again or (self.failed >= REFUSED_IN_A_ROW and not explained):
             self.exclude(t_ns, DISAGREES)
         elif self.state is not Service.SUSPECTED:
             self.state, self.since_ns = Service.SUSPECTED, t_ns

@@ -15,7 +15,7 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.fault_bank import E_AT, GROUP, GROUPS, L_AT, LEVEL_OF, N_AT, RESTARTS
-from fusiond.estimators.fault_odds import solve
+from fusiond.estimators.fault_odds import LOG_ALL, SCALES, SOLVED, solve, solve_likeliest
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.models.catalogue import make_model
@@ -141,7 +141,7 @@ def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
     """Of each kind of three numbers, over 60 runs: mean within 4.5 of its own sigmas."""
     names = ("gyro", "accelerometer", "position", "velocity", "velocity_drift")
     found: dict[str, list[float]] = {name: [] for name in names}
-    m = np.empty(12)
+    m = np.empty(SOLVED)
     for seed in range(60):
         made = run(seed=100 + seed)
         bank = made.hypotheses
@@ -150,7 +150,8 @@ def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
             at = GROUPS + (RESTARTS * row_of(name) + RESTART) * GROUP
             group = bank.bank[at : at + GROUP]
             assert group[N_AT] == 24.0  # four epochs of six rows
-            found[name].append(solve(group, 3, bank.table.numbers[row_of(name)], 1e-9, m))
+            numbers = bank.table.numbers[row_of(name)]
+            found[name].append(2.0 * solve(group, 3, numbers, 0.0, 1e-9, m))
             assert group[E_AT : E_AT + 3].any()
             assert group[L_AT] > 0.0
     for name, values in found.items():
@@ -181,6 +182,79 @@ def test_a_fault_is_found_with_its_size(fault: str, size: tuple[float, ...]) -> 
     apart = (best.size - np.array(size)) / np.sqrt(np.diagonal(best.covariance))
     assert np.abs(apart).max() < 4.0
     assert odds[row, restart] > 7.0
+
+
+def test_sizes_are_a_mixture_of_scales() -> None:
+    """Odds of a position's group against the sum of normal priors, each by dense products; the
+    likeliest of them gives size and variance."""
+    made = run("position", np.array([4.0, 0.0, 0.0]))
+    bank = made.hypotheses
+    assert bank is not None
+    at = GROUPS + (RESTARTS * row_of("position") + RESTART) * GROUP
+    group, numbers = bank.bank[at : at + GROUP], bank.table.numbers[row_of("position")]
+    information, e = group[L_AT : L_AT + 9].reshape(3, 3), group[E_AT : E_AT + 3]
+    gained, sizes = [], []
+    for scale in SCALES:
+        prior = np.diag((scale * numbers[:3]) ** 2)
+        m = np.linalg.inv(information + np.linalg.inv(prior))
+        _, logarithm = np.linalg.slogdet(np.eye(3) + prior @ information)
+        gained.append(0.5 * e @ m @ e - 0.5 * logarithm - math.log(scale) - LOG_ALL)
+        sizes.append((m, m @ e))
+    solved = np.empty(SOLVED)
+    odds = solve_likeliest(group, 3, numbers, solved)
+    assert math.isclose(odds, np.logaddexp.reduce(gained), rel_tol=1e-9)
+    covariance, size = sizes[int(np.argmax(gained))]
+    assert np.allclose(solved[:9].reshape(3, 3), covariance, rtol=1e-9)
+    assert np.allclose(solved[9:12], size, rtol=1e-9)
+
+
+def test_the_end_of_a_fault_that_was_followed_is_found() -> None:
+    """A position runs away for eight seconds and is right again: the fault is over, and what it has
+    done to the filter is taken out."""
+    times, samples, start = drive()
+    del times
+    rng = np.random.default_rng(3)
+    made = KalmanEstimator(MODEL, IMU.gap_s, faults=table_of(KINDS))
+    p = np.diag(INITIAL**2)
+    p[9:, 9:] = 1e-16 * np.eye(MODEL.size - 9)
+    made.initialise(0, 0, start.copy(), np.zeros(MODEL.size), p)
+    buffer, over = buffer_of(samples), row_of("over")
+    bank = made.hypotheses
+    assert bank is not None
+    for second in range(1, 28):
+        t_ns = second * runs.SECOND
+        made.propagate(buffer, t_ns)
+        fault = "position_drift" if t_ns < 24 * runs.SECOND else ""
+        for aid in aids(t_ns, rng, fault, np.array([0.5, 0.0, 0.0])):
+            made.update(aid)
+        bank.judge(t_ns)
+        likely = np.where(bank.explains, bank.log_odds, -np.inf).max(axis=1)
+        if t_ns < 24 * runs.SECOND:
+            assert likely[over] < 0.0, second
+    assert int(np.argmax(likely)) == over, dict(zip(KINDS, likely, strict=True))
+    found = bank.estimated(RESTARTS * over + int(np.argmax(bank.log_odds[over])))
+    assert abs(found.size[0] - 1.0) < 4.0 * math.sqrt(found.covariance[0, 0])
+    truth = runs.true_nav(runs.town_truth(30.0, IMU.rate_hz), np.array([27.0]))[0]
+    before = np.abs(runs.nav_error(made.nav, truth)[6])
+    made.adopt(found.mean, found.spread)
+    after = np.abs(runs.nav_error(made.nav, truth)[6])
+    assert after < 0.5 * before
+
+
+def test_what_returns_to_service_begins_anew() -> None:
+    """Its own hypotheses, not those of the inertial unit."""
+    made = run("position", np.array([20.0, 0.0, 0.0]))
+    bank, t_ns = made.hypotheses, LAST_NS
+    assert bank is not None
+    bank.judge(t_ns)
+    unit = bank.log_odds[row_of("gyro")].copy()
+    position = aids(t_ns, np.random.default_rng(1), "", np.zeros(3))[0]
+    bank.begin_again(position, made.nav, made.step)
+    bank.judge(t_ns)
+    assert np.array_equal(bank.log_odds[row_of("gyro")], unit)
+    for name in ("position", "position_drift", "delay", "carried_off"):
+        assert (bank.log_odds[row_of(name)] == -np.inf).all()
+    assert (bank.log_odds[row_of("velocity")] > -np.inf).any()
 
 
 def test_weights_are_a_distribution() -> None:

@@ -78,6 +78,17 @@ def test_it_is_back_after_five_that_pass_in_a_row_and_proves_itself() -> None:
     assert not one.reason
 
 
+def test_on_probation_one_failure_ends_service() -> None:
+    one = series()
+    one.exclude(10 * S, "gnss position is off")
+    for k in range(READMIT_COUNT):
+        one.looked_at((20 + k) * S, passes=True)
+    assert one.state is Service.PROBATION
+    one.gated(26 * S, explained=True)
+    assert one.out
+    assert one.reason == DISAGREES
+
+
 def test_time_alone_readmits_nothing() -> None:
     one = series()
     one.exclude(0, "gnss position is off")
