@@ -131,6 +131,11 @@ class Hypotheses:
         return self._groups[:, :, LOG_ODDS]
 
     @property
+    def log_likelihood(self) -> Array:
+        """Log of the largest likelihood ratios (k, restarts), of the last `judge`."""
+        return 0.5 * self._groups[:, :, EXPLAINED]
+
+    @property
     def explains(self) -> NDArray[np.bool_]:
         """(k, restarts): no more is left than chance leaves."""
         found: NDArray[np.bool_] = self._groups[:, :, UNEXPLAINED] <= 0.0

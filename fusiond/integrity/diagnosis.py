@@ -42,7 +42,7 @@ from fusiond.estimators.fault_bank import (
     VELOCITY,
     VELOCITY_RAMP,
 )
-from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY
+from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY, MISSED
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
@@ -219,14 +219,20 @@ class Diagnosis:
                 correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
-            if outcome.name == "fused":
-                one.fused(t_ns, () if aid.constraint else outcome.whitened)
-            elif outcome.name == "gated" and not one.out and (not aid.constraint or aid.no_slip):
-                one.gated(t_ns, explained)
+            if not one.out:  # by that decision
+                self._counts(aid, one, outcome, explained)
         if correction is None and bank is not None and self._widens(aid, bank):
             opened_variances(bank.opened(), estimator.step, estimator.wider)
             _open_by_mounting(estimator)
         return correction
+
+    @staticmethod
+    def _counts(aid: Aid, one: Series, outcome: Outcome, explained: bool) -> None:
+        """One in service has passed or failed its gate."""
+        if outcome.name == "fused":
+            one.fused(aid.t_ns, () if aid.constraint else outcome.whitened)
+        elif outcome.name == "gated" and (not aid.constraint or aid.no_slip):
+            one.gated(aid.t_ns, explained)
 
     @staticmethod
     def _widens(aid: Aid, bank: Hypotheses) -> bool:
@@ -257,7 +263,12 @@ class Diagnosis:
         others = [f for f in self.findings if f.kind.text != kind.text]
         self.findings = (*others, finding)
         if not kind.corrected:
-            self._exclude(t_ns, finding.text, lambda s: kind.spoils(s.device, s.locates, s.moves))
+            spoiling = self._fitting(bank, kind, told.log_likelihood)
+            self._exclude(
+                t_ns,
+                finding.text,
+                lambda s: any(each.spoils(s.device, s.locates, s.moves) for each in spoiling),
+            )
             out = [n for n, s in self._series.items() if s.out and s.reason == finding.text]
             self._lasting = {**self._lasting, **dict.fromkeys(out, finding)}
         return Correction(mean, spread)
@@ -285,6 +296,15 @@ class Diagnosis:
             for restart in range(RESTARTS)
             if explains[row, restart] and log_odds[row, restart] > odds - ALIKE
         ]
+
+    def _fitting(self, bank: Hypotheses, kind: Kind, fit: float) -> list[Kind]:
+        """Faults of the device of a kind that fit as well as it: what any of them spoils is not to
+        be trusted before it is told apart. A fix of 60 m behind on a straight may be off, or late,
+        and the velocity with it."""
+        least = (1.0 - MISSED) * fit - APART
+        fits = bank.explains & (bank.log_odds > 0.0) & (bank.log_likelihood >= least)
+        found = [k for k, alike in zip(self._kinds, fits.any(axis=1), strict=True) if alike]
+        return [k for k in found if k.device == kind.device and not k.corrected]
 
     def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
         """What is spoiled leaves service."""
