@@ -13,6 +13,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -161,7 +162,7 @@ class Estimator(Protocol):
 
     def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in.
-        `lasting` (3,): what a fault adds to it, if it lasts."""
+        `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -328,7 +329,7 @@ class ErrorStateFilter:
 
     def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
         """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in.
-        `lasting` (3,): what a fault adds to it, if it lasts."""
+        `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
@@ -344,8 +345,10 @@ class ErrorStateFilter:
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
         if lasting is None:
             return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
-        left = z - h @ dx - lasting[: z.shape[0]]
-        lasts = normalised_innovation_squared(cov, left, h, r, np.zeros(z.shape[0]))
+        lasts = math.inf
+        for added in lasting:
+            left = z - h @ dx - added[: z.shape[0]]
+            lasts = min(lasts, normalised_innovation_squared(cov, left, h, r, y.copy()))
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts)
 
     def adopt(self, mean: Array, spread: Array) -> None:

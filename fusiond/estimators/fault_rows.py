@@ -88,7 +88,7 @@ def _past(bank: Array, t_s: float, component: int) -> float:
 
 
 @compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")
-def _signature(
+def signature(
     bank: Array,
     ints: Indices,
     numbers: Array,
@@ -183,7 +183,7 @@ def sensitivity_rows(
             for restart in range(RESTARTS):
                 age_s = t_s - bank[GROUPS + (RESTARTS * kind + restart) * GROUP + ONSET]
                 for c in range(size):
-                    s[ints[kind, FIRST] + restart * size + c] += _signature(
+                    s[ints[kind, FIRST] + restart * size + c] += signature(
                         bank, ints, numbers, kind, measures, device, t_s, age_s, nav, a, c
                     )
         for b in range(a):

@@ -29,6 +29,7 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
+from fusiond.estimators.fault_rows import signature
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -82,6 +83,16 @@ class Hypotheses:
     def begin(self, t_ns: int, nav: Array, step: Array) -> None:
         """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
+
+    def adds(self, aid: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
+        """D b (3,): what a fault of size `b`, of such an age, does to an aid's rows."""
+        ints, numbers, (measures, device) = *self.table[:2], self.of(aid)
+        found = np.zeros(3)
+        for row in range(3):
+            for c, size in enumerate(b):
+                at = (kind, measures, device, aid.t_ns * 1e-9, age_s, nav, row, c)
+                found[row] += size * signature(self.bank, ints, numbers, *at)
+        return found
 
     def begin_again(self, aid: Linearised, nav: Array, step: Array) -> None:
         """An aid's series returns to service: what was shown of it before is why it was out, and

@@ -32,15 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Estimator, Outcome, gate_threshold
 from fusiond.estimators.fault_bank import (
-    CARRIED,
     DECIDED,
-    POSITION,
-    POSITION_RAMP,
     RESTARTS,
-    VELOCITY,
-    VELOCITY_RAMP,
 )
 from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY, MISSED
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
@@ -49,24 +45,19 @@ from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
 from fusiond.models.vehicle import MOUNTING
-from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN
+from fusiond.navigation.earth import meridian_radius, transverse_radius
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON, STEP_RESTS_S, VE, VN
 
 Array = NDArray[np.float64]
 
 APART = 4.0
 """Log odds between two classes: fifty to one."""
+PLACE_ROW = 6
+"""First row of the position in the error state."""
 COUNTS = 1e-3
 """Probability of any fault below which what is open is not computed between two measurements."""
 ALIKE = 7.0
 """Hypotheses of the class that are less likely by more than this count nothing."""
-GROWS: dict[int, tuple[int | None, int | None]] = {
-    POSITION: (0, None),
-    POSITION_RAMP: (1, None),
-    VELOCITY: (None, 0),
-    VELOCITY_RAMP: (None, 1),
-    CARRIED: (1, 0),
-}
-"""With which power of its age a fault grows in positions and in velocities."""
 RARE = 10.83
 """Chi-square of one that chance exceeds in one vehicle of a thousand."""
 MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
@@ -115,7 +106,7 @@ class Memory(NamedTuple):
     series: dict[str, Series]
     findings: tuple[Finding, ...]
     agreement: Mapping[str, Agreement]
-    lasting: Mapping[str, Finding]
+    lasting: Mapping[str, tuple[Finding, ...]]
 
 
 class Diagnosis:
@@ -128,7 +119,7 @@ class Diagnosis:
         """Series that a checkpoint has too: copied before they are changed."""
         self._agreement: Mapping[str, Agreement] = {}
         """By device that is out; replaced, never changed."""
-        self._lasting: Mapping[str, Finding] = {}
+        self._lasting: Mapping[str, tuple[Finding, ...]] = {}
         """By series, why it left service last; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
         """What has been identified since the start, the last of each kind and device."""
@@ -174,8 +165,10 @@ class Diagnosis:
         if not self.positions_out:
             return None
         for device, agreement in self._agreement.items():
-            out = [s for s in self._series.values() if s.device == device and s.out]
-            unexplained = all(s.reason == DISAGREES for s in out)
+            own = [s for s in self._series.values() if s.device == device]
+            if not all(s.out for s in own):
+                continue
+            unexplained = all(s.reason == DISAGREES for s in own)
             if agreement.lasted_ns > (FITS_NS if unexplained else FITS_AGAINST_NS):
                 return device
         return None
@@ -207,12 +200,18 @@ class Diagnosis:
     ) -> Correction | None:
         """Take in how an aid ended; what to take out of the filter's state, if anything."""
         bank, t_ns, correction, explained = estimator.hypotheses, aid.t_ns, None, False
+        if one.out or one.device in self._agreement:
+            self._agrees(aid, one)
         if one.out:
             passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
             one.looked_at(t_ns, passes and one.repeats == 0, outcome.lasting - outcome.nis)
-            if not one.out and bank is not None:
-                bank.begin_again(aid, estimator.nav, estimator.step)
-            self._agrees(aid, one)
+            if self._goes_its_own_way(one):
+                correction = _somewhere_else(aid, estimator)
+                one.readmit(t_ns)
+            if not one.out:
+                self._is_over(one)
+                if bank is not None:
+                    bank.begin_again(aid, estimator.nav, estimator.step)
         else:
             if bank is not None and not aid.constraint:
                 found = bank.judge(t_ns)
@@ -254,37 +253,62 @@ class Diagnosis:
         for w, each in zip(weights, taken, strict=True):
             apart = each.mean - mean
             spread += w * (each.spread + np.outer(apart, apart))
-        told = max(taken, key=lambda each: each.log_odds)
-        kind = self._kinds[told.kind]
-        per = kind.per_unit * (kind.lag_s or 1.0)
-        size = tuple((told.size * per).tolist())
-        sd = tuple((np.sqrt(np.diagonal(told.covariance)) * per).tolist())
-        finding = Finding(kind, t_ns, told.onset_s, size, sd, told.log_odds)
-        others = [f for f in self.findings if f.kind.text != kind.text]
+        finding = self._finding(t_ns, max(taken, key=lambda each: each.log_odds))
+        others = [f for f in self.findings if f.kind.text != finding.kind.text]
         self.findings = (*others, finding)
-        if not kind.corrected:
-            spoiling = self._fitting(bank, kind, told.log_likelihood)
-            self._exclude(
-                t_ns,
-                finding.text,
-                lambda s: any(each.spoils(s.device, s.locates, s.moves) for each in spoiling),
-            )
-            out = [n for n, s in self._series.items() if s.out and s.reason == finding.text]
-            self._lasting = {**self._lasting, **dict.fromkeys(out, finding)}
+        if not finding.kind.corrected:
+            self._leave_out(finding, bank, fits.max())
         return Correction(mean, spread)
 
-    def lasting(self, aid: Aid, one: Series) -> Array | None:
-        """What the fault for which a series is out adds to its innovation (3,), if it lasts; None
-        where none is known."""
-        finding = self._lasting.get(one.source)
-        if finding is None:
+    def _finding(self, t_ns: int, told: Estimated) -> Finding:
+        kind = self._kinds[told.kind]
+        size = tuple((told.size * kind.per_unit).tolist())
+        sd = tuple((np.sqrt(np.diagonal(told.covariance)) * kind.per_unit).tolist())
+        return Finding(kind, t_ns, told.onset_s, size, sd, told.log_odds)
+
+    def _leave_out(self, finding: Finding, bank: Hypotheses, fit: float) -> None:
+        """What a fault spoils leaves service, and what those of its device spoil that fit as well:
+        nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a straight
+        may be off, or late, and the velocity with it."""
+        least = (1.0 - MISSED) * fit - APART
+        fits = bank.explains & (bank.log_odds > 0.0) & (bank.log_likelihood >= least)
+        found = []
+        for row in np.flatnonzero(fits.any(axis=1)).tolist():
+            kind = self._kinds[row]
+            if kind.device == finding.kind.device and not kind.corrected:
+                restart = int(np.argmax(np.where(fits[row], bank.log_odds[row], -np.inf)))
+                told = bank.estimated(RESTARTS * row + restart)
+                found.append(self._finding(finding.t_ns, told))
+        self._exclude(
+            finding.t_ns,
+            finding.text,
+            lambda s: any(f.kind.spoils(s.device, s.locates, s.moves) for f in found),
+        )
+        lasting = dict(self._lasting)
+        for name, s in self._series.items():
+            if s.out and s.reason == finding.text:
+                of = (f for f in found if f.kind.spoils(s.device, s.locates, s.moves))
+                lasting[name] = tuple(of)
+        self._lasting = lasting
+
+    def _is_over(self, one: Series) -> None:
+        """A series has returned: of the faults for which it was out none lasts, for others too."""
+        over = self._lasting.get(one.source, ())
+        self._lasting = {
+            name: tuple(f for f in lasting if f not in over)
+            for name, lasting in self._lasting.items()
+        }
+
+    def lasting(self, aid: Aid, one: Series, estimator: Estimator) -> Array | None:
+        """What each fault for which a series may be out adds to its innovation (k, 3), if it lasts;
+        None where none is known."""
+        bank, added = estimator.hypotheses, []
+        if bank is None:
             return None
-        kind, b = finding.kind, np.array(finding.size) / finding.kind.per_unit
-        age_s = aid.t_ns * 1e-9 - finding.since_s
-        if len(b) != 3 or kind.signature not in GROWS:
-            return None
-        grows = GROWS[kind.signature][0 if one.locates else 1]
-        return None if grows is None else -b * age_s**grows
+        for f in self._lasting.get(one.source, ()):
+            b, age_s = np.array(f.size) / f.kind.per_unit, aid.t_ns * 1e-9 - f.since_s
+            added.append(bank.adds(aid, self._kinds.index(f.kind), b, age_s, estimator.nav))
+        return np.array(added) if added else None
 
     def _alike(self, bank: Hypotheses, kind: Kind, odds: float) -> list[Estimated]:
         """Those of the class and device of a kind that explain it nearly as well."""
@@ -297,15 +321,6 @@ class Diagnosis:
             if explains[row, restart] and log_odds[row, restart] > odds - ALIKE
         ]
 
-    def _fitting(self, bank: Hypotheses, kind: Kind, fit: float) -> list[Kind]:
-        """Faults of the device of a kind that fit as well as it: what any of them spoils is not to
-        be trusted before it is told apart. A fix of 60 m behind on a straight may be off, or late,
-        and the velocity with it."""
-        least = (1.0 - MISSED) * fit - APART
-        fits = bank.explains & (bank.log_odds > 0.0) & (bank.log_likelihood >= least)
-        found = [k for k, alike in zip(self._kinds, fits.any(axis=1), strict=True) if alike]
-        return [k for k in found if k.device == kind.device and not k.corrected]
-
     def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
         """What is spoiled leaves service."""
         for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
@@ -314,12 +329,35 @@ class Diagnosis:
                 self._series[name] = self._series[name].copied()
             self._series[name].exclude(t_ns, reason)
 
+    def _goes_its_own_way(self, one: Series) -> bool:
+        """Whether a position is out for nothing that lasts, and goes the way that the velocity of
+        its device says, which is in service: it is the filter that is somewhere else."""
+        if not (one.out and one.locates and one.reason == DISAGREES):
+            return False
+        moves = [s for s in self._series.values() if s.device == one.device and s.moves]
+        known = self._agreement.get(one.device)
+        return bool(known and known.lasted_ns > FITS_NS and moves and not any(s.out for s in moves))
+
     def _agrees(self, aid: Aid, one: Series) -> None:
-        """One that is out has come: does its device fit itself?"""
+        """One of a device that is out, or was, has come: does the device fit itself?"""
         if not (one.locates or one.moves) or aid.screened:
             return
         known = self._agreement.get(aid.device, Agreement())
         self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}
+
+
+def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
+    """The filter's position is open by how far a position is from it."""
+    spread = np.zeros((estimator.model.size, estimator.model.size))
+    nav = estimator.nav
+    lat, lon, height = nav.item(LAT), nav.item(LON), nav.item(HEIGHT)
+    for offer in aid.offers():
+        if isinstance(offer, PositionOffer):
+            north = (offer.lat_rad - lat) * meridian_radius(lat)
+            east = (offer.lon_rad - lon) * transverse_radius(lat) * math.cos(lat)
+            for row, apart in enumerate((north, east, offer.height_m - height)):
+                spread[PLACE_ROW + row, PLACE_ROW + row] = apart * apart
+    return Correction(np.zeros(len(spread)), spread)
 
 
 def _open_by_mounting(estimator: Estimator) -> None:

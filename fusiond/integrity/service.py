@@ -150,10 +150,16 @@ class Series:
             prior = math.log(math.expm1(max(t_ns - self.since_ns, 1) * 1e-9 / LASTS_S))
             if self.over + prior < RETURNS:
                 return
+            if not passes:  # what was wrong is over, and it is not where the filter is
+                self.reason = DISAGREES
         if self.passed >= READMIT_COUNT:
-            self.proven_ns = 2 * t_ns - self.out_ns
-            self.state, self.since_ns = Service.PROBATION, t_ns
-            self.failed = self.passed = 0
+            self.readmit(t_ns)
+
+    def readmit(self, t_ns: int) -> None:
+        """It is back in service."""
+        self.proven_ns = 2 * t_ns - self.out_ns
+        self.state, self.since_ns = Service.PROBATION, t_ns
+        self.failed = self.passed = 0
 
     def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
         """Whether a new value makes so many alike to the bit, of a vehicle that is `moving`, that

@@ -233,7 +233,7 @@ class Timeline:
             return estimator.update(aid)
         one = diagnosis.comes(aid, estimator)
         if one.out:
-            outcome = estimator.look(aid, diagnosis.lasting(aid, one))
+            outcome = estimator.look(aid, diagnosis.lasting(aid, one, estimator))
         else:
             outcome = estimator.update(aid, one.noise)
         if aid.rests_s:
