@@ -150,6 +150,8 @@ class InvariantFilter(TiltAxesFilter):
         self.turns = False
         """Whether updates run in xi: the heading may be far off."""
         self._mounts = model.indices[MOUNTING]
+        self._bent = False
+        """Whether the bank has missed updates: of a heading so wide that no effect is linear."""
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
         that fails its gate counts as one at the gate: it may be the measurement's fault."""
@@ -217,7 +219,7 @@ class InvariantFilter(TiltAxesFilter):
     def initialise(self, t_ns: int, sample: int, nav: Array, xi: Array, covariance: Array) -> None:
         """Start at `t_ns` with nav (10,), parameters (n,), P (n, n), in dx."""
         super().initialise(t_ns, sample, nav, xi, covariance)
-        self.turns = False
+        self.turns = self._bent = False
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -232,14 +234,13 @@ class InvariantFilter(TiltAxesFilter):
         outcome = self._update(aid)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:
             self.turns = False
-            if self.hypotheses is not None:  # their effects were of other coordinates
-                self.hypotheses.begin(self.t_ns, self.nav, self.step)
         return outcome
 
     def _update(self, aid: Linearised) -> Outcome:
         rows = aid.innovation(self.state)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
+        own = Innovation(rows.z.copy(), rows.h.copy(), rows.r.copy())
         before = self.of_vehicle(self.nav, self.xi, -1.0)
         p = before @ self.covariance @ before.T
         prior = float(p[PHI + 2, PHI + 2])
@@ -259,6 +260,7 @@ class InvariantFilter(TiltAxesFilter):
         self.log_likelihood = found.log_likelihood
         if not math.isfinite(found.nis):
             return Outcome("not_finite", found.nis, found.degrees)
+        self._hypothesise(aid, own, found, prior)
         if not found.passed:
             return Outcome("gated", found.nis, found.degrees, (), found.rows)
         nav, xi = self.without(self.nav, self.xi, found.error, turning)
@@ -272,6 +274,20 @@ class InvariantFilter(TiltAxesFilter):
         self.nav[:], self.xi[:], self.turned = nav, xi, float(found.error[PHI + 2])
         turn_step(self.step, self.turned)
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
+
+    def _hypothesise(self, aid: Linearised, rows: Innovation, found: Sought, prior: float) -> None:
+        """What the bank makes of an update, which is to first order that of dx while the heading's
+        variance before it is not wide; else its hypotheses begin anew afterwards."""
+        bank = self.hypotheses
+        if bank is None or prior > WIDE_SD_RAD**2:
+            self._bent = True
+            return
+        if self._bent:
+            self._bent = False
+            bank.begin(self.t_ns, self.nav, self.step)
+        kept = np.array(found.rows) == KEPT if found.rows else np.ones(len(rows.z), dtype=np.bool_)
+        if kept.any():
+            self._account_for(aid, rows, kept, found.passed)
 
     def _unfelt(self, p: Array) -> None:
         """Let a v_t that is no more than noise not turn in P (n, n): F counts what is felt at rest
@@ -336,11 +352,11 @@ class InvariantFilter(TiltAxesFilter):
         return Sought(gain @ nu, after, nis, nis <= threshold, log, whitened)
 
     def _own_snapshot(self) -> object:
-        return self.turns, self.undoubted
+        return self.turns, self.undoubted, self._bent
 
     def _own_restore(self, extra: object) -> None:
         assert isinstance(extra, tuple)
-        self.turns, self.undoubted = extra
+        self.turns, self.undoubted, self._bent = extra
 
 
 def _way(a: Array, b: Array) -> Array:

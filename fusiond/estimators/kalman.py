@@ -82,7 +82,7 @@ class KalmanEstimator(ErrorStateFilter):
         if not kept:
             return Outcome("gated", s.nis, 0, (), codes)
         if self.hypotheses is not None:
-            self._account_for(aid, rows, s.codes == KEPT)
+            self._account_for(aid, rows, s.codes == KEPT, True)
         cov[:] = s.cov
         dx[:] = s.dx
         if not self._holding:
@@ -90,8 +90,10 @@ class KalmanEstimator(ErrorStateFilter):
             dx[:] = 0.0
         return Outcome("fused", s.nis, kept, tuple(s.y.tolist()), codes)
 
-    def _account_for(self, aid: Linearised, rows: Innovation, kept: NDArray[np.bool_]) -> None:
-        """What the bank makes of those rows of a screened aid that are about to be folded in."""
+    def _account_for(
+        self, aid: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
+    ) -> None:
+        """What the bank makes of rows of an aid that are about to be folded in, or have failed."""
         bank, count = self.hypotheses, int(kept.sum())
         assert bank is not None
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
@@ -99,7 +101,7 @@ class KalmanEstimator(ErrorStateFilter):
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
             told = bank.bank, *bank.table[:2], bank.width, aid.t_ns, *bank.of(aid)
             space = np.empty(count * bank.columns)
-            account_for(self.nav, self.step, h, r, y, g, True, *told, space)
+            account_for(self.nav, self.step, h, r, y, g, fused, *told, space)
 
     def hold(self) -> None:
         """From now on estimate without feedback: errors are carried along with the state."""

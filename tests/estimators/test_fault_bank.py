@@ -15,7 +15,7 @@ from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
 from fusiond.estimators.fault_bank import E_AT, GROUP, GROUPS, L_AT, LEVEL_OF, N_AT, RESTARTS
-from fusiond.estimators.fault_odds import LOG_ALL, SCALES, SOLVED, solve, solve_likeliest
+from fusiond.estimators.fault_odds import SOLVED, solve
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.models.catalogue import make_model
@@ -184,28 +184,36 @@ def test_a_fault_is_found_with_its_size(fault: str, size: tuple[float, ...]) -> 
     assert odds[row, restart] > 7.0
 
 
-def test_sizes_are_a_mixture_of_scales() -> None:
-    """Odds of a position's group against the sum of normal priors, each by dense products; the
-    likeliest of them gives size and variance."""
+def test_odds_are_those_of_schwarz_or_of_a_size_that_is_known() -> None:
+    """Of a position's group and of a delay's, each by dense products."""
     made = run("position", np.array([4.0, 0.0, 0.0]))
     bank = made.hypotheses
     assert bank is not None
-    at = GROUPS + (RESTARTS * row_of("position") + RESTART) * GROUP
-    group, numbers = bank.bank[at : at + GROUP], bank.table.numbers[row_of("position")]
-    information, e = group[L_AT : L_AT + 9].reshape(3, 3), group[E_AT : E_AT + 3]
-    gained, sizes = [], []
-    for scale in SCALES:
-        prior = np.diag((scale * numbers[:3]) ** 2)
-        m = np.linalg.inv(information + np.linalg.inv(prior))
-        _, logarithm = np.linalg.slogdet(np.eye(3) + prior @ information)
-        gained.append(0.5 * e @ m @ e - 0.5 * logarithm - math.log(scale) - LOG_ALL)
-        sizes.append((m, m @ e))
-    solved = np.empty(SOLVED)
-    odds = solve_likeliest(group, 3, numbers, solved)
-    assert math.isclose(odds, np.logaddexp.reduce(gained), rel_tol=1e-9)
-    covariance, size = sizes[int(np.argmax(gained))]
-    assert np.allclose(solved[:9].reshape(3, 3), covariance, rtol=1e-9)
-    assert np.allclose(solved[9:12], size, rtol=1e-9)
+    bank.judge(LAST_NS)
+
+    def group_of(row: int) -> tuple[Array, Array, Array, float]:
+        at = GROUPS + (RESTARTS * row + RESTART) * GROUP
+        group, p = bank.bank[at : at + GROUP], KINDS[row].size
+        information = group[L_AT : L_AT + 9].reshape(3, 3)[:p, :p]
+        return (
+            information,
+            group[E_AT : E_AT + p],
+            group,
+            math.log(2.0 * KINDS[row].per_hour / 3600),
+        )
+
+    row = row_of("position")
+    information, e, group, rate = group_of(row)
+    gained = 0.5 * e @ np.linalg.solve(information, e)
+    expected = rate + gained - 1.5 * math.log(group[N_AT])
+    assert math.isclose(bank.log_odds[row, RESTART], expected, rel_tol=1e-6)
+    assert math.isclose(bank.log_likelihood[row, RESTART], gained, rel_tol=1e-6)
+    row = next(k for k, kind in enumerate(KINDS) if kind.name == "delay" and kind.lag_s == 1.0)
+    information, e, group, rate = group_of(row)
+    of, beyond, about = information.item(), e.item() - information.item(), KINDS[row].sd[0] ** 2
+    gained = e.item() - 0.5 * of + 0.5 * beyond**2 / (of + 1.0 / about)
+    expected = rate + gained - 0.5 * math.log1p(about * of)
+    assert math.isclose(bank.log_odds[row, RESTART], expected, rel_tol=1e-9)
 
 
 def test_the_end_of_a_fault_that_was_followed_is_found() -> None:
@@ -225,7 +233,7 @@ def test_the_end_of_a_fault_that_was_followed_is_found() -> None:
         t_ns = second * runs.SECOND
         made.propagate(buffer, t_ns)
         fault = "position_drift" if t_ns < 24 * runs.SECOND else ""
-        for aid in aids(t_ns, rng, fault, np.array([0.5, 0.0, 0.0])):
+        for aid in aids(t_ns, rng, fault, np.array([1.5, 0.0, 0.0])):
             made.update(aid)
         bank.judge(t_ns)
         likely = np.where(bank.explains, bank.log_odds, -np.inf).max(axis=1)
