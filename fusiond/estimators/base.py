@@ -13,7 +13,6 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -67,14 +66,14 @@ class Outcome(NamedTuple):
     """How an aid ended: its name, and the innovation that led to it (NIS, dimension, and L^-1 nu
     with S = L L^T). `rows`: of a screened aid, what became of each row
     (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `lasting`: of one
-    that is out, the NIS if the fault for which it is out lasts."""
+    that is out, the NIS if each of the faults for which it may be out lasts."""
 
     name: str
     nis: float = float("nan")
     degrees: int = 0
     whitened: tuple[float, ...] = ()
     rows: tuple[int, ...] = ()
-    lasting: float = float("nan")
+    lasting: tuple[float, ...] = ()
 
 
 class Snapshot(NamedTuple):
@@ -345,10 +344,8 @@ class ErrorStateFilter:
         nis = normalised_innovation_squared(cov, z - h @ dx, h, r, y)
         if lasting is None:
             return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()))
-        lasts = math.inf
-        for added in lasting:
-            left = z - h @ dx - added[: z.shape[0]]
-            lasts = min(lasts, normalised_innovation_squared(cov, left, h, r, y.copy()))
+        lefts = [z - h @ dx - added[: z.shape[0]] for added in lasting]
+        lasts = tuple(normalised_innovation_squared(cov, nu, h, r, y.copy()) for nu in lefts)
         return Outcome("isolated", nis, z.shape[0], tuple(y.tolist()), (), lasts)
 
     def adopt(self, mean: Array, spread: Array) -> None:

@@ -43,6 +43,7 @@ from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
+from fusiond.integrity.finding import Finding, Lasting
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
 from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
@@ -67,32 +68,6 @@ FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
 within a hundred metres."""
 
 
-class Finding(NamedTuple):
-    """An identified hypothesis: its kind, when (ns) it was, and since when (s); its size and one
-    sigma of each number in the kind's unit; log odds."""
-
-    kind: Kind
-    t_ns: int
-    since_s: float
-    size: tuple[float, ...]
-    sd: tuple[float, ...]
-    log_odds: float
-
-    @property
-    def largest(self) -> int:
-        """Which number is most."""
-        return max(range(len(self.size)), key=lambda i: abs(self.size[i]))
-
-    @property
-    def text(self) -> str:
-        """For people."""
-        k, row = self.kind, self.largest
-        axis = f", {k.axes[row]}" if k.axes[row] else ""
-        amount = f"{self.size[row]:.3g} {k.unit}, {self.sd[row]:.2g} at one sigma{axis}"
-        done = "corrected" if k.corrected else "left out"
-        return f"{k.text} by {amount}, since {self.t_ns * 1e-9 - self.since_s:.0f} s: {done}"
-
-
 class Correction(NamedTuple):
     """What to take out of the error state, mean (n,), and its covariance (n, n)."""
 
@@ -106,7 +81,7 @@ class Memory(NamedTuple):
     series: dict[str, Series]
     findings: tuple[Finding, ...]
     agreement: Mapping[str, Agreement]
-    lasting: Mapping[str, tuple[Finding, ...]]
+    lasting: Mapping[str, Lasting]
 
 
 class Diagnosis:
@@ -119,7 +94,7 @@ class Diagnosis:
         """Series that a checkpoint has too: copied before they are changed."""
         self._agreement: Mapping[str, Agreement] = {}
         """By device that is out; replaced, never changed."""
-        self._lasting: Mapping[str, tuple[Finding, ...]] = {}
+        self._lasting: Mapping[str, Lasting] = {}
         """By series, why it left service last; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
         """What has been identified since the start, the last of each kind and device."""
@@ -204,7 +179,11 @@ class Diagnosis:
             self._agrees(aid, one)
         if one.out:
             passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-            one.looked_at(t_ns, passes and one.repeats == 0, outcome.lasting - outcome.nis)
+            if outcome.lasting:
+                known = self._lasting[one.source].judged(outcome.lasting)
+                self._lasting = {**self._lasting, one.source: known}
+            lasts = min(outcome.lasting, default=math.nan)
+            one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis)
             if self._goes_its_own_way(one):
                 correction = _somewhere_else(aid, estimator)
                 one.readmit(t_ns)
@@ -288,16 +267,15 @@ class Diagnosis:
         for name, s in self._series.items():
             if s.out and s.reason == finding.text:
                 of = (f for f in found if f.kind.spoils(s.device, s.locates, s.moves))
-                lasting[name] = tuple(of)
+                lasting[name] = Lasting.of(of)
         self._lasting = lasting
 
     def _is_over(self, one: Series) -> None:
         """A series has returned: of the faults for which it was out none lasts, for others too."""
-        over = self._lasting.get(one.source, ())
-        self._lasting = {
-            name: tuple(f for f in lasting if f not in over)
-            for name, lasting in self._lasting.items()
-        }
+        over = self._lasting.get(one.source)
+        if over is not None:
+            known = self._lasting.items()
+            self._lasting = {name: lasting.without(over) for name, lasting in known}
 
     def lasting(self, aid: Aid, one: Series, estimator: Estimator) -> Array | None:
         """What each fault for which a series may be out adds to its innovation (k, 3), if it lasts;
@@ -305,7 +283,7 @@ class Diagnosis:
         bank, added = estimator.hypotheses, []
         if bank is None:
             return None
-        for f in self._lasting.get(one.source, ()):
+        for f in self._lasting.get(one.source, Lasting()).findings:
             b, age_s = np.array(f.size) / f.kind.per_unit, aid.t_ns * 1e-9 - f.since_s
             added.append(bank.adds(aid, self._kinds.index(f.kind), b, age_s, estimator.nav))
         return np.array(added) if added else None

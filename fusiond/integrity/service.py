@@ -16,7 +16,8 @@ A series is what one source says of one thing (`gnss`, `gnss_velocity`).
     any in service        out          a hypothesis is `identified` that spoils it; it `repeats`
                                        itself to the bit while the vehicle moves
     out                   probation    `READMIT_COUNT` in a row pass against what is published, and
-                                       the fault for which it is out is likelier over than not
+                                       the fault for which it is out is likelier over than not; one
+                                       that repeated itself says something new each time
     probation             nominal      it has been in service for as long as it was out
 
 Three failures of a gate of 0.9999 in a row are 1e-12 by chance; five that pass while a fault of
@@ -85,6 +86,8 @@ class Series:
     """Log likelihood that the fault for which it is out is over, against that it lasts."""
     value: tuple[float, ...] | None = None
     repeats: int = 0
+    unchanged: bool = False
+    """Whether the last value was that before it, to the bit."""
     noise: Array = field(default_factory=unlearned)
     repeating: float = 1.0
     """Probability that a value repeats the one before it, as shown so far in motion."""
@@ -143,6 +146,8 @@ class Series:
 
         A fault is over with probability 1 - exp(-t / `LASTS_S`), and what comes says which.
         """
+        if self.unchanged and self.reason == REPEATS:
+            passes = False
         self.passed = self.passed + 1 if passes else 0
         if math.isfinite(lasting):
             self.over += 0.5 * max(-MOST_TOLD, min(lasting, MOST_TOLD))
@@ -164,7 +169,8 @@ class Series:
     def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
         """Whether a new value makes so many alike to the bit, of a vehicle that is `moving`, that
         it is no measurement. What stands may repeat."""
-        same = moving and value == self.value
+        self.unchanged = value == self.value
+        same = moving and self.unchanged
         self.value, self.repeats = value, self.repeats + 1 if same else 0
         if self.locates:
             return self.repeats >= REPEATED

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from fusiond.estimators.federated.options import local_of
-from fusiond.integrity.diagnosis import Finding
+from fusiond.integrity.finding import Finding
 from fusiond.integrity.service import Series, Service
 from fusiond.navigator.timeline import Timeline
 

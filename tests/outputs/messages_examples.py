@@ -8,7 +8,7 @@ from typing import Any
 from fusiond.clock.answers import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
-from fusiond.integrity.diagnosis import Finding
+from fusiond.integrity.finding import Finding
 from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Bound, BoundState, Mode, Solution
 from fusiond.navigator.calibration import CalibrationState, Parameter
