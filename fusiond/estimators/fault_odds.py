@@ -47,6 +47,7 @@ from fusiond.estimators.fault_bank import (
     LOG_RATE,
     MEAN,
     N_AT,
+    ONSET,
     PERIODS_S,
     PRIOR,
     RESTARTS,
@@ -62,11 +63,12 @@ from fusiond.navigation.compiled import compiled
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-MISSED = 0.1
-"""Of what a hypothesis explains, so much may be lost by an onset that lies between two restarts: a
-drift that began a seventh of its age before or after it loses a twentieth."""
 _TINY = 1e-9
 """A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
+MISSED, ALIKE_S = 0.1, 0.25
+"""Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
+drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
+missed is as near as half the youngest period."""
 SOLVED = 13
 """What `solve` writes."""
 MOST_OFF = 3.0
@@ -122,6 +124,29 @@ def solve(group: Array, size: int, numbers: Array, mean: float, share: float, m:
     return gained
 
 
+@compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
+def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
+    """By how much a group is ahead of those of a kind; infinite where nobody need choose."""
+    own, group = best // RESTARTS, bank[GROUPS + best * GROUP :]
+    if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
+        return np.inf
+    step = ints[kind, SIGNATURE] <= FOLLOWED
+    alike = step == (ints[own, SIGNATURE] <= FOLLOWED)
+    fit, ahead, same = 0.0, np.inf, False
+    for restart in range(RESTARTS):
+        other = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
+        if other[UNEXPLAINED] > 0.0:
+            continue
+        ahead = min(ahead, group[LOG_ODDS] - other[LOG_ODDS])
+        if other[LOG_ODDS] > 0.0:
+            fit = max(fit, other[EXPLAINED])
+            same = same or abs(other[ONSET] - group[ONSET]) < ALIKE_S
+    if fit > 0.0 and not alike:
+        missed = 0.0 if same else MISSED * group[EXPLAINED]
+        ahead = min(ahead, 0.5 * (group[EXPLAINED] - fit - missed))
+    return ahead
+
+
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8, f8[::1])", allocates=True)
 def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Array) -> None:
     """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
@@ -130,7 +155,8 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
 
     It is ahead of another by odds. Between a step of states, which changes what is published, and a
     fault of a source that is likelier than nothing wrong it counts how well each fits, if that is
-    less: what fits as well is not told apart by rates alone.
+    less: what fits as well is not told apart by rates alone. Compared are those of one onset; else
+    the source's may have lost something.
     """
     kinds = ints.shape[0]
     m = np.empty(SOLVED)
@@ -165,35 +191,26 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
                 total += math.exp(bank[at + LOG_ODDS] - largest)
     found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
     found[BEST_ODDS] = found[EXPLAINS] = -np.inf
+    for kind in range(kinds):
+        for restart in range(RESTARTS):
+            number = RESTARTS * kind + restart
+            group = bank[GROUPS + number * GROUP :]
+            if group[UNEXPLAINED] > 0.0:
+                group[LIKELY] = np.inf
+                continue
+            group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
+            if not group[LOG_ODDS] > DECIDED:
+                group[LIKELY] = np.inf
+            elif not group[LIKELY] <= epoch_s:
+                group[LIKELY] = epoch_s
+            lasted = epoch_s - group[LIKELY] > LASTS_S - 1e-3
+            if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
+                found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
+            found[EXPLAINS] = max(found[EXPLAINS], group[LOG_ODDS])
     found[AHEAD] = np.inf
-    of, device, signature, fit = -1, -1, -1, 0.0
-    for turn in range(2):
+    if found[BEST] >= 0.0:
         for kind in range(kinds):
-            for restart in range(RESTARTS):
-                number = RESTARTS * kind + restart
-                group = bank[GROUPS + number * GROUP :]
-                if turn == 0 and group[UNEXPLAINED] <= 0.0:
-                    group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
-                if group[UNEXPLAINED] > 0.0:
-                    group[LIKELY] = np.inf
-                    continue
-                if turn == 0:
-                    if not group[LOG_ODDS] > DECIDED:
-                        group[LIKELY] = np.inf
-                    elif not group[LIKELY] <= epoch_s:
-                        group[LIKELY] = epoch_s
-                    lasted = epoch_s - group[LIKELY] > LASTS_S - 1e-3
-                    if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
-                        found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
-                        of, device = ints[kind, CLASS], ints[kind, DEVICE]
-                        signature, fit = ints[kind, SIGNATURE], 0.5 * group[EXPLAINED]
-                    found[EXPLAINS] = max(found[EXPLAINS], group[LOG_ODDS])
-                elif ints[kind, CLASS] != of or ints[kind, DEVICE] != device:
-                    ahead = found[BEST_ODDS] - group[LOG_ODDS]
-                    step = ints[kind, SIGNATURE] <= FOLLOWED
-                    if group[LOG_ODDS] > 0.0 and step != (signature <= FOLLOWED):
-                        ahead = min(ahead, (1.0 - MISSED) * fit - 0.5 * group[EXPLAINED])
-                    found[AHEAD] = min(found[AHEAD], ahead)
+            found[AHEAD] = min(found[AHEAD], _ahead(bank, ints, int(found[BEST]), kind))
 
 
 @compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)

@@ -38,7 +38,7 @@ from fusiond.estimators.fault_bank import (
     DECIDED,
     RESTARTS,
 )
-from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY, MISSED
+from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
@@ -249,8 +249,7 @@ class Diagnosis:
         """What a fault spoils leaves service, and what those of its device spoil that fit as well:
         nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a straight
         may be off, or late, and the velocity with it."""
-        least = (1.0 - MISSED) * fit - APART
-        fits = bank.explains & (bank.log_odds > 0.0) & (bank.log_likelihood >= least)
+        fits = bank.explains & (bank.log_odds > 0.0) & (bank.log_likelihood >= fit - APART)
         found = []
         for row in np.flatnonzero(fits.any(axis=1)).tolist():
             kind = self._kinds[row]
