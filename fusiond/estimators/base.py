@@ -214,7 +214,7 @@ class ErrorStateFilter:
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
-        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.columns else None
+        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.groups else None
         self._holding = False
         self._carrying = False
         self.turned = 0.0

@@ -19,30 +19,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ALL,
     CLASS,
+    CONSTANTS,
     DECIDED,
     DEVICE,
+    E1,
+    E2,
     E_AT,
-    FIRST,
-    GROUP,
+    E_ROWS,
     GROUPS,
     J_AT,
+    L10,
+    L11,
+    L20,
+    L21,
+    L22,
     L_AT,
+    L_ROWS,
+    LANES,
     LASTS_S,
-    LEVEL_OF,
+    LENGTH,
     LIKELY,
     LOG_ODDS,
-    LOG_RATE,
     MEAN,
+    MEAN_AT,
     N_AT,
-    PERIODS_S,
+    ODDS_AT,
+    OF_ONE,
+    OF_THREE,
+    P_AT,
     PRIOR,
     RESTARTS,
     SENSITIVITIES,
-    SIZE,
+    THREES,
     UNEXPLAINED,
     UNEXPLAINED_SIGMAS,
     WEIGHT,
+    column_of,
+    group_at,
 )
 from fusiond.navigation.compiled import compiled
 
@@ -55,27 +70,27 @@ MOST_OFF = 3.0
 """Sigmas of its prior by which the amount of a kind that has one of its own may differ."""
 LEAST_WEIGHT = 1e-7
 """What is as unlikely opens nothing: of a kilometre a third of a metre."""
+_NOTHING = -40.0
+"""Log of what counts nothing beside one: a sum of doubles does not show it."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, the
 # largest of another class or device, the largest of any that explains, and the weight of all.
 BEST, BEST_ODDS, RIVAL_ODDS, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
 
 
-@compiled("f8(f8[::1], i8, f8[::1], f8, f8[::1])", allocates=True)
-def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> float:
-    """M = (L + share S^-1)^-1 of a group into m (9,) and behind it b (3,); `numbers` (6,) of its
-    kind. Returns what the log odds gain by it, where `share` is 1, or else what it explains, l; by
-    Gauss and Jordan with a positive matrix."""
+@compiled("f8(f8[::1], i8, i8, f8[::1], f8, f8[::1])", allocates=True)
+def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Array) -> float:
+    """M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,), with the mean
+    of its kind's `numbers` (6,) where `share` is 1; by Gauss and Jordan with a positive matrix.
+    Returns e^T b: without a mean what it explains, l."""
     a = np.empty((3, 6))
     mean = numbers[MEAN] if share == 1.0 else 0.0
     for i in range(size):
         for j in range(size):
-            a[i, j] = group[L_AT + 3 * i + j]
+            a[i, j] = bank[at + L_ROWS[i, j]]
             a[i, size + j] = 1.0 if i == j else 0.0
         a[i, i] += share / (numbers[PRIOR + i] * numbers[PRIOR + i])
-    logarithm = 0.0
     for k in range(size):
         pivot = a[k, k]
-        logarithm += math.log(pivot * numbers[PRIOR + k] * numbers[PRIOR + k])
         for j in range(2 * size):
             a[k, j] /= pivot
         for i in range(size):
@@ -88,116 +103,161 @@ def solve(group: Array, size: int, numbers: Array, share: float, m: Array) -> fl
         m[9 + i] = mean
         for j in range(size):
             m[3 * i + j] = a[i, size + j]
-            beyond = group[E_AT + j]  # e - L m
+            beyond = bank[at + E_ROWS[j]]  # e - L m
             for k in range(size):
-                beyond -= group[L_AT + 3 * j + k] * mean
+                beyond -= bank[at + L_ROWS[j, k]] * mean
             m[9 + i] += a[i, size + j] * beyond
-    for i in range(size):
-        beyond = group[E_AT + i]
-        along = group[E_AT + i] * mean
-        for k in range(size):
-            beyond -= group[L_AT + 3 * i + k] * mean
-            along -= 0.5 * mean * group[L_AT + 3 * i + k] * mean
-        gained += 0.5 * beyond * (m[9 + i] - mean) + along
-    return gained - 0.5 * logarithm if share == 1.0 else 2.0 * gained
+        gained += bank[at + E_ROWS[i]] * m[9 + i]
+    return gained
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8, f8[::1])", allocates=True)
-def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Array) -> None:
+@compiled("void(f8[::1], f8[::1])")
+def _gains(bank: Array, lanes: Array) -> None:
+    """Write, of all groups, what the log odds gain by what has come, for log odds; the determinant
+    of L + S^-1, for the weight; and J less what chance leaves, for what is left unexplained."""
+    length = int(bank[LENGTH])
+    threes = (int(bank[THREES]) + LANES - 1) // LANES
+    ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
+    unsigned = np.uint64
+    for row in range(threes + ones):
+        at = unsigned(GROUPS + min(row, threes) * OF_THREE + max(row - threes, 0) * OF_ONE)
+        constants = unsigned(row * CONSTANTS)
+        size = 3.0 if row < threes else 1.0
+        for k in range(length):
+            j = at + unsigned(k)
+            degrees = max(bank[j + unsigned(N_AT)] - size, 1.0)
+            most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
+            bank[j + unsigned(UNEXPLAINED)] = bank[j + unsigned(J_AT)] - most
+        if row < threes:
+            for k in range(length):
+                j, c = at + unsigned(k), constants + unsigned(k)
+                d_0 = bank[j + unsigned(L_AT)] + lanes[c + unsigned(P_AT)]
+                a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
+                l_1, l_2 = a_1 / d_0, a_2 / d_0
+                d_1 = bank[j + unsigned(L11)] + lanes[c + unsigned(P_AT + LANES)] - l_1 * a_1
+                a_3 = bank[j + unsigned(L21)] - l_2 * a_1
+                l_3 = a_3 / d_1
+                d_2 = bank[j + unsigned(L22)] + lanes[c + unsigned(P_AT + 2 * LANES)]
+                d_2 -= l_2 * a_2 + l_3 * a_3
+                e_0 = bank[j + unsigned(E_AT)]
+                e_1 = bank[j + unsigned(E1)] - l_1 * e_0
+                e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
+                gained = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
+                bank[j + unsigned(LOG_ODDS)] = 0.5 * gained
+                bank[j + unsigned(WEIGHT)] = d_0 * d_1 * d_2
+        else:
+            for k in range(length):
+                j, c = at + unsigned(k), constants + unsigned(k)
+                information, mean = bank[j + unsigned(L_AT)], lanes[c + unsigned(MEAN_AT)]
+                a = information + lanes[c + unsigned(P_AT)]
+                e = bank[j + unsigned(E_AT)]
+                beyond = e - information * mean
+                along = mean * (e - 0.5 * mean * information)
+                bank[j + unsigned(LOG_ODDS)] = 0.5 * beyond * beyond / a + along
+                bank[j + unsigned(WEIGHT)] = a
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1])", allocates=True)
+def judge(
+    bank: Array, ints: Indices, numbers: Array, lanes: Array, epoch_s: float, found: Array
+) -> None:
     """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
     epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
     been likely, and has explained all, for `LASTS_S`.
     """
-    kinds = ints.shape[0]
+    groups, threes = int(bank[ALL]), int(bank[THREES])
+    beyond = -threes % LANES
     m = np.empty(12)
+    _gains(bank, lanes)
     largest = 0.0
-    for kind in range(kinds):
-        size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            group[LOG_ODDS], group[WEIGHT], group[UNEXPLAINED] = -np.inf, 0.0, 0.0
-            if group[N_AT] == 0.0:
-                continue
-            gained = solve(group, size, numbers[kind], 1.0, m)
-            rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
-            group[LOG_ODDS] = rate + gained
-            off = (m[9] - numbers[kind, MEAN]) / numbers[kind, PRIOR]
-            explained = solve(group, size, numbers[kind], _TINY, m)
-            degrees = max(group[N_AT] - size, 1.0)
-            most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
-            group[UNEXPLAINED] = group[J_AT] - explained - most
-            if numbers[kind, MEAN] != 0.0 and abs(off) > MOST_OFF:
-                group[UNEXPLAINED] = np.inf  # it is of another amount than this kind has
-            if group[UNEXPLAINED] <= 0.0:
-                largest = max(largest, group[LOG_ODDS])
-    total = math.exp(-largest)
-    for kind in range(kinds):
-        for restart in range(RESTARTS):
-            at = GROUPS + (RESTARTS * kind + restart) * GROUP
-            if bank[at + UNEXPLAINED] <= 0.0:
-                total += math.exp(bank[at + LOG_ODDS] - largest)
-    found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
+    for number in range(groups):
+        at, size = group_at(bank, number), 3 if number < threes else 1
+        determinant, bank[at + WEIGHT] = bank[at + WEIGHT], 0.0
+        if bank[at + N_AT] == 0.0:
+            bank[at + LOG_ODDS], bank[at + UNEXPLAINED] = -np.inf, 0.0
+            continue
+        place = number if number < threes else number + beyond
+        constants = place // LANES * CONSTANTS + place % LANES
+        bank[at + LOG_ODDS] += lanes[constants + ODDS_AT] - 0.5 * math.log(determinant)
+        kind = number // RESTARTS
+        if bank[at + UNEXPLAINED] > 0.0:
+            bank[at + UNEXPLAINED] -= solve(bank, at, size, numbers[kind], _TINY, m)
+        mean = numbers[kind, MEAN]
+        if mean != 0.0:
+            off = (bank[at + E_AT] - bank[at + L_AT] * mean) / determinant
+            if abs(off) > MOST_OFF * numbers[kind, PRIOR]:
+                bank[at + UNEXPLAINED] = np.inf  # it is of another amount than this kind has
+        if bank[at + UNEXPLAINED] <= 0.0:
+            largest = max(largest, bank[at + LOG_ODDS])
+    nothing = math.exp(-largest)
+    total = nothing
+    for number in range(groups):
+        at = group_at(bank, number)
+        if bank[at + UNEXPLAINED] <= 0.0:
+            less = bank[at + LOG_ODDS] - largest
+            if less > _NOTHING:
+                bank[at + WEIGHT] = math.exp(less)
+                total += bank[at + WEIGHT]
+    found[BEST], found[FAULTY] = -1.0, 1.0 - nothing / total
     found[BEST_ODDS] = found[RIVAL_ODDS] = found[EXPLAINS] = -np.inf
-    of, device = -1, -1
-    for turn in range(2):
-        for kind in range(kinds):
-            for restart in range(RESTARTS):
-                number = RESTARTS * kind + restart
-                group = bank[GROUPS + number * GROUP :]
-                if turn == 0 and group[UNEXPLAINED] <= 0.0:
-                    group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
-                if group[UNEXPLAINED] > 0.0:
-                    group[LIKELY] = np.inf
-                    continue
-                if turn == 0:
-                    if not group[LOG_ODDS] > DECIDED:
-                        group[LIKELY] = np.inf
-                    elif not group[LIKELY] <= epoch_s:
-                        group[LIKELY] = epoch_s
-                    lasted = epoch_s - group[LIKELY] > LASTS_S - 1e-3
-                    if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
-                        found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
-                        of, device = ints[kind, CLASS], ints[kind, DEVICE]
-                    found[EXPLAINS] = max(found[EXPLAINS], group[LOG_ODDS])
-                elif ints[kind, CLASS] != of or ints[kind, DEVICE] != device:
-                    found[RIVAL_ODDS] = max(found[RIVAL_ODDS], group[LOG_ODDS])
+    for number in range(groups):
+        at = group_at(bank, number)
+        bank[at + WEIGHT] /= total
+        if bank[at + UNEXPLAINED] > 0.0:
+            bank[at + LIKELY] = np.inf
+            continue
+        odds = bank[at + LOG_ODDS]
+        if not odds > DECIDED:
+            bank[at + LIKELY] = np.inf
+        elif not bank[at + LIKELY] <= epoch_s:
+            bank[at + LIKELY] = epoch_s
+        lasted = epoch_s - bank[at + LIKELY] > LASTS_S - 1e-3
+        if lasted and odds > found[BEST_ODDS]:
+            found[BEST], found[BEST_ODDS] = number, odds
+        found[EXPLAINS] = max(found[EXPLAINS], odds)
+    if found[BEST] < 0.0:
+        return
+    best = int(found[BEST]) // RESTARTS
+    for number in range(groups):
+        at, kind = group_at(bank, number), number // RESTARTS
+        if bank[at + UNEXPLAINED] <= 0.0 and (
+            ints[kind, CLASS] != ints[best, CLASS] or ints[kind, DEVICE] != ints[best, DEVICE]
+        ):
+            found[RIVAL_ODDS] = max(found[RIVAL_ODDS], bank[at + LOG_ODDS])
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)
-def mixture(bank: Array, ints: Indices, numbers: Array, n: int, width: int, opened: Array) -> None:
+@compiled("void(f8[::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)
+def mixture(bank: Array, numbers: Array, n: int, width: int, opened: Array) -> None:
     """Write what the weighed hypotheses leave open of the first rows of the error state (q, q)."""
-    kinds, q = ints.shape[0], opened.shape[0]
+    q = opened.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
     opened[:] = 0.0
     m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
-    for kind in range(kinds):
-        size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            weight = group[WEIGHT]
-            if weight < LEAST_WEIGHT:
-                continue
-            solve(group, size, numbers[kind], 1.0, m)
-            for c in range(size):
-                for d in range(size):
-                    x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
-                column = ints[kind, FIRST] + restart * size + c
-                first = column // width * n * width + column % width
-                for i in range(q):
-                    rows[c, i] = v[first + i * width]
+    for number in range(int(bank[ALL])):
+        at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
+        weight = bank[at + WEIGHT]
+        if weight < LEAST_WEIGHT:
+            continue
+        solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
+        for c in range(size):
+            for d in range(size):
+                x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
+            column = column_of(bank, width, number, c)
+            first = column // width * n * width + column % width
             for i in range(q):
-                for c in range(size):
-                    along = 0.0
-                    for d in range(size):
-                        along += x[c, d] * rows[d, i]
-                    for j in range(q):
-                        opened[i, j] += rows[c, j] * along
+                rows[c, i] = v[first + i * width]
+        for i in range(q):
+            for c in range(size):
+                along = 0.0
+                for d in range(size):
+                    along += x[c, d] * rows[d, i]
+                for j in range(q):
+                    opened[i, j] += rows[c, j] * along
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1])", allocates=True)
+@compiled("void(f8[::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1])", allocates=True)
 def estimate(
     bank: Array,
-    ints: Indices,
     numbers: Array,
     n: int,
     width: int,
@@ -206,18 +266,16 @@ def estimate(
     effect: Array,
 ) -> None:
     """Write b (3,) and M (9,) of a group, and what V b and V M V^T are: `effect` (1 + n, n)."""
-    kind, restart = number // RESTARTS, number % RESTARTS
-    size = ints[kind, SIZE]
-    group = bank[GROUPS + number * GROUP :]
+    at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
     v = bank[int(bank[SENSITIVITIES]) :]
     m = np.empty(12)
-    solve(group, size, numbers[kind], 1.0, m)
+    solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
     size_and_variance[:] = 0.0
     effect[:] = 0.0
     rows = np.empty((3, n))
     for c in range(size):
         size_and_variance[c] = m[9 + c]
-        column = ints[kind, FIRST] + restart * size + c
+        column = column_of(bank, width, number, c)
         first = column // width * n * width + column % width
         for i in range(n):
             rows[c, i] = v[first + i * width]

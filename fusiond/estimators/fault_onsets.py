@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     BEGINS_AT,
-    FIRST,
-    GROUP,
-    GROUPS,
+    LANES,
     LEVEL_OF,
     LIKELY,
     LOG_ODDS,
+    OF_ONE,
+    OF_THREE,
     ONSET,
     PERIODS_NS,
     PROMOTED,
@@ -29,6 +29,8 @@ from fusiond.estimators.fault_bank import (
     SLOTS_OF,
     STATES,
     TURNED,
+    column_of,
+    group_at,
 )
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
@@ -51,15 +53,15 @@ def _begin_group(
     step: Array,
 ) -> None:
     """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`."""
-    at = GROUPS + (RESTARTS * kind + restart) * GROUP
-    for j in range(GROUP):
+    number, size = RESTARTS * kind + restart, ints[kind, SIZE]
+    at = group_at(bank, number)
+    for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
         bank[at + j] = 0.0
     bank[at + ONSET] = t_s
     bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
     v = bank[int(bank[SENSITIVITIES]) :]
-    size = ints[kind, SIZE]
     for c in range(size):
-        column = ints[kind, FIRST] + restart * size + c
+        column = column_of(bank, width, number, c)
         first = column // width * n * width + column % width
         for i in range(n):
             v[first + i * width] = 0.0
@@ -105,20 +107,22 @@ def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart:
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
         return
-    at = GROUPS + RESTARTS * kind * GROUP
-    odds, least, found = bank[at + restart * GROUP + LOG_ODDS], np.inf, -1
+    number, size = RESTARTS * kind + restart, ints[kind, SIZE]
+    at = group_at(bank, number)
+    odds, least, found = bank[at + LOG_ODDS], np.inf, -1
     for slot in range(BEGINS_AT[level], BEGINS_AT[level] + SLOTS_OF[level]):
-        if bank[at + slot * GROUP + LOG_ODDS] < least:
-            least, found = bank[at + slot * GROUP + LOG_ODDS], slot
+        above = bank[group_at(bank, RESTARTS * kind + slot) + LOG_ODDS]
+        if above < least:
+            least, found = above, slot
     if found < 0 or not odds > least + PROMOTED:
         return
-    for j in range(GROUP):
-        bank[at + found * GROUP + j] = bank[at + restart * GROUP + j]
+    to = RESTARTS * kind + found
+    there = group_at(bank, to)
+    for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
+        bank[there + j] = bank[at + j]
     v = bank[int(bank[SENSITIVITIES]) :]
-    size = ints[kind, SIZE]
     for c in range(size):
-        own = ints[kind, FIRST] + restart * size + c
-        other = ints[kind, FIRST] + found * size + c
+        own, other = column_of(bank, width, number, c), column_of(bank, width, to, c)
         first = own // width * n * width + own % width
         second = other // width * n * width + other % width
         for i in range(n):

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ALL,
     CLASS,
-    FIRST,
-    GROUP,
-    GROUPS,
     RESTARTS,
     SIZE,
     WEIGHT,
+    column_of,
+    group_at,
 )
 from fusiond.estimators.fault_odds import LEAST_WEIGHT, solve
 from fusiond.estimators.fault_onsets import restart_due
@@ -24,32 +24,29 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])", allocates=True)
+@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1], i8, f8[::1])", allocates=True)
 def nis_if_sensors_fail(
-    bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Array
+    bank: Array, ints: Indices, numbers: Array, width: int, y: Array, columns: int, work: Array
 ) -> float:
     """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
     leave open, as they are weighed; `work` as `sensitivity_rows` leaves it."""
     rows = y.shape[0]
     c, m = np.eye(rows), np.empty(12)
-    for kind in range(ints.shape[0]):
-        if ints[kind, CLASS] != 0:
+    for number in range(int(bank[ALL])):
+        kind, at = number // RESTARTS, group_at(bank, number)
+        weight = bank[at + WEIGHT]
+        if ints[kind, CLASS] != 0 or weight < LEAST_WEIGHT:
             continue
         size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            weight = group[WEIGHT]
-            if weight < LEAST_WEIGHT:
-                continue
-            solve(group, size, numbers[kind], 1.0, m)
-            first = ints[kind, FIRST] + restart * size
-            for a in range(rows):
-                for b in range(rows):
-                    for i in range(size):
-                        for j in range(size):
-                            x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
-                            s = work[a * columns + first + i] * work[b * columns + first + j]
-                            c[a, b] += s * x
+        solve(bank, at, size, numbers[kind], 1.0, m)
+        for a in range(rows):
+            for b in range(rows):
+                for i in range(size):
+                    s_a = work[a * columns + column_of(bank, width, number, i)]
+                    for j in range(size):
+                        x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
+                        s_b = work[b * columns + column_of(bank, width, number, j)]
+                        c[a, b] += s_a * s_b * x
     # y^T C^-1 y by elimination.
     left, nis = y.copy(), 0.0
     for k in range(rows):
@@ -102,8 +99,8 @@ def fold_and_account(
     )
     judged = nis
     if nis > threshold:
-        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-    account(bank, ints, n, width, y, g, judged <= threshold, work)
+        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, width, y, columns, work))
+    account(bank, n, width, y, g, judged <= threshold, work)
     if judged <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
@@ -138,4 +135,4 @@ def account_for(
     n = h.shape[1]
     restart_due(bank, ints, n, width, t_ns, nav, step)
     sensitivity_rows(bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work)
-    account(bank, ints, n, width, y, g, fused, work)
+    account(bank, n, width, y, g, fused, work)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
-    GROUP,
-    GROUPS,
+    ALL,
     LOG_ODDS,
     MOVES,
     NOTHING,
@@ -21,10 +20,13 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     ROLLS,
     SENSITIVITIES,
+    SIZE,
     UNEXPLAINED,
     WEIGHT,
     FaultTable,
-    chunks_of,
+    blocks_of,
+    column_of,
+    group_at,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_all
@@ -52,14 +54,12 @@ class Hypotheses:
     def __init__(self, bank: Array, table: FaultTable, model: Model) -> None:
         self.bank, self.table = bank, table
         self.n, self.width = model.size, model.width
-        kinds = table.ints.shape[0]
         self.found = np.full(FOUND, -np.inf)
         """What the last `judge` has found."""
-        self.columns = chunks_of(table.columns, model.width) * model.width
+        self.columns = blocks_of(table, model.width) * model.width
         self.work = np.zeros(LENT_ROWS * self.columns)
-        self._groups = bank[GROUPS : GROUPS + RESTARTS * kinds * GROUP].reshape(
-            kinds, RESTARTS, GROUP
-        )
+        numbers = range(int(bank[ALL]))
+        self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
         n, w, v = self.n, self.width, bank[int(bank[SENSITIVITIES]) :]
         self.sensitivities = v.reshape(-1, n, w)
         """V, a block (n, w) of columns after another."""
@@ -83,53 +83,63 @@ class Hypotheses:
     def judge(self, t_ns: int) -> Array:
         """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""
         table = self.table
-        judge(self.bank, table.ints, table.numbers, t_ns * 1e-9, self.found)
+        judge(self.bank, *table[:3], t_ns * 1e-9, self.found)
         return self.found
 
     def opened(self) -> Array:
         """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
         anew by the next call."""
-        mixture(self.bank, *self.table[:2], self.n, self.width, self._nine)
+        mixture(self.bank, self.table.numbers, self.n, self.width, self._nine)
         return self._nine
 
     def opened_of_all(self) -> Array:
         """The same of all states (n, n)."""
         out = np.zeros((self.n, self.n))
-        mixture(self.bank, *self.table[:2], self.n, self.width, out)
+        mixture(self.bank, self.table.numbers, self.n, self.width, out)
         return out
 
     def estimated(self, number: int) -> Estimated:
         """The hypothesis of a group."""
         kind = number // RESTARTS
-        group = self._groups[kind, number % RESTARTS]
+        at = self._at[kind, number % RESTARTS]
         found, effect = np.zeros(12), np.zeros((1 + self.n, self.n))
-        estimate(self.bank, *self.table[:2], self.n, self.width, number, found, effect)
-        p = int(self.table.ints[kind, 2])
+        estimate(self.bank, self.table.numbers, self.n, self.width, number, found, effect)
+        p = int(self.table.ints[kind, SIZE])
         return Estimated(
             kind,
-            float(group[ONSET]),
-            float(group[LOG_ODDS]),
+            float(self.bank[at + ONSET]),
+            float(self.bank[at + LOG_ODDS]),
             found[:p],
             found[3:].reshape(3, 3)[:p, :p],
             effect[0],
             effect[1:],
         )
 
+    def each(self, which: int) -> Array:
+        """One of the numbers of all groups (k, restarts), as of fusiond.estimators.fault_bank."""
+        return self.bank[self._at + which]
+
+    def effect(self, number: int) -> Array:
+        """V of a group (n, p)."""
+        count = int(self.table.ints[number // RESTARTS, SIZE])
+        columns = [column_of(self.bank, self.width, number, c) for c in range(count)]
+        return np.array([self.sensitivities[c // self.width, :, c % self.width] for c in columns]).T
+
     @property
     def log_odds(self) -> Array:
         """Log odds (k, restarts) of the last `judge`."""
-        return self._groups[:, :, LOG_ODDS]
+        return self.each(LOG_ODDS)
 
     @property
     def explains(self) -> NDArray[np.bool_]:
         """(k, restarts): no more is left than chance leaves."""
-        found: NDArray[np.bool_] = self._groups[:, :, UNEXPLAINED] <= 0.0
+        found: NDArray[np.bool_] = self.each(UNEXPLAINED) <= 0.0
         return found
 
     @property
     def weights(self) -> Array:
         """Posterior probabilities (k, restarts) of the last `judge`."""
-        return self._groups[:, :, WEIGHT]
+        return self.each(WEIGHT)
 
 
 def _measures(aid: Linearised, known: bool) -> int:

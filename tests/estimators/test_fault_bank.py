@@ -14,7 +14,7 @@ from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.fault_bank import E_AT, GROUP, GROUPS, L_AT, LEVEL_OF, N_AT, RESTARTS
+from fusiond.estimators.fault_bank import E_AT, L_AT, LEVEL_OF, N_AT, RESTARTS, group_at
 from fusiond.estimators.fault_odds import solve
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
@@ -126,10 +126,7 @@ def test_the_filter_is_off_by_v_b(fault: str, size: tuple[float, ...]) -> None:
     bank = sound.hypotheses
     assert bank is not None
     row = row_of(fault)
-    first = int(bank.table.ints[row, 3]) + RESTART * 3
-    columns = [divmod(first + c, MODEL.width) for c in range(3)]
-    v = np.array([bank.sensitivities[block, :, j] for block, j in columns]).T
-    expected = (v @ b)[:9]
+    expected = (bank.effect(RESTARTS * row + RESTART) @ b)[:9]
     found = error_of(faulty, sound)
     assert np.abs(expected).max() > 1e-6
     for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
@@ -147,12 +144,12 @@ def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
         bank = made.hypotheses
         assert bank is not None
         for name in names:
-            at = GROUPS + (RESTARTS * row_of(name) + RESTART) * GROUP
-            group = bank.bank[at : at + GROUP]
-            assert group[N_AT] == 24.0  # four epochs of six rows
-            found[name].append(solve(group, 3, bank.table.numbers[row_of(name)], 1e-9, m))
-            assert group[E_AT : E_AT + 3].any()
-            assert group[L_AT] > 0.0
+            row = row_of(name)
+            assert bank.each(N_AT)[row, RESTART] == 24.0  # four epochs of six rows
+            at = group_at(bank.bank, RESTARTS * row + RESTART)
+            found[name].append(solve(bank.bank, at, 3, bank.table.numbers[row], 1e-9, m))
+            assert bank.each(E_AT)[row, RESTART] != 0.0
+            assert bank.each(L_AT)[row, RESTART] > 0.0
     for name, values in found.items():
         sigma = math.sqrt(2.0 * 3.0 / len(values))
         assert abs(np.mean(values) - 3.0) < 4.5 * sigma, (name, np.mean(values))
@@ -262,7 +259,8 @@ def test_each_kind_says_what_it_is() -> None:
         assert min(kind.sd) > 0.0
         assert kind.per_hour > 0.0
     table = table_of(kinds)
-    assert table.columns == RESTARTS * sum(kind.size for kind in kinds)
+    assert table.groups == RESTARTS * len(kinds)
+    assert table.threes == RESTARTS * sum(kind.size == 3 for kind in kinds)
 
 
 def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
@@ -299,8 +297,7 @@ def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
     bank = sound.hypotheses
     assert bank is not None
     row = next(k for k, kind in enumerate(kinds) if kind.name == "late")
-    block, column = divmod(int(bank.table.ints[row, 3]) + RESTART, model.width)
-    expected = bank.sensitivities[block, :9, column] * tau_s
+    expected = bank.effect(RESTARTS * row + RESTART)[:9, 0] * tau_s
     apart = error_of(late, sound)
     for part in (slice(3, 6), slice(6, 9)):
         scale = np.abs(expected[part]).max()
