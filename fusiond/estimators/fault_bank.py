@@ -8,7 +8,7 @@ measurements by a known signature,
 The mean of the filter's error under f is V b. With the filter's own gain K, innovation nu and the
 variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt(W),
 
-    between updates     V <- Phi V                       the kernels of the transition matrix
+    between updates     V <- Phi V                       fusiond.estimators.fault_carried
     each row            s = (H V + D) / sqrt(W)          L += s^T s   e += s^T y   J += y^2   N += 1
     if it was fused     V <- V - g s
 
@@ -81,19 +81,20 @@ KIND_INTS = 9
 PRIOR, LOG_RATE, LAG, MEAN = 0, 3, 4, 5
 KIND_NUMBERS = 6
 
-# The bank's array: head, ring of the path, groups, sensitivities. The head holds which restart each
-# level is at (4), the instant (s), place (m) and number of entries of the path, where V begins, how
-# many groups there are and how many of them have three numbers, and LANES: loops whose length is
-# read from an array become vector code.
+# The bank's array: head, ring of the path, groups, a transition, sensitivities V (n, columns). The
+# head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
+# the path, where V begins, how many groups there are and how many of them have three numbers, LANES
+# (loops whose length is read from an array become vector code), where the transition since the last
+# aid lies, and 1 if it is not the identity.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
-ALL, THREES, LENGTH, HEAD = 10, 11, 12, 16
+ALL, THREES, LENGTH, PHI, WAITS, HEAD = 10, 11, 12, 13, 14, 16
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
 # Groups (a restart of a kind, in the order of kinds) lie eight side by side, a row of eight of each
 # of their numbers: J, N, onset (s), log odds, weight, what is left unexplained beyond chance, since
 # which epoch (s) it has been likely and explained all, or never, then L and e: of one number nine
-# rows, of three sixteen. Of V and of an aid's rows the eight of each component lie side by side.
+# rows, of three sixteen. Of V and of an aid's rows the columns of a component of eight lie so, too.
 J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY = (LANES * row for row in range(7))
 L_AT, E_AT, OF_ONE = LANES * 7, LANES * 8, LANES * 9
 L10, L11, L20, L21, L22, E1, E2, OF_THREE = (LANES * row for row in range(9, 17))
@@ -106,6 +107,8 @@ UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0
 """Log odds beyond which a hypothesis is likely: a thousand to one."""
+LEAST_WEIGHT = 1e-7
+"""What is as unlikely opens nothing: of a kilometre a third of a metre."""
 LASTS_S = 1.0
 """For so long it must have been: a receiver's errors of a second are one error."""
 
@@ -168,19 +171,20 @@ def bank_size(table: FaultTable, n: int, width: int) -> int:
         return 0
     tiles, ones = -(-threes // LANES), -(-(groups - threes) // LANES)
     size = GROUPS + tiles * OF_THREE + ones * OF_ONE
-    return size + blocks_of(table, width) * n * width
+    return size + width * width + n * columns_of(table)
 
 
-def blocks_of(table: FaultTable, width: int) -> int:
-    """Blocks of columns of V, each of as many rows of eight as fit in `width`."""
+def columns_of(table: FaultTable) -> int:
+    """Columns of V, and of an aid's rows."""
     tiles, ones = -(-table.threes // LANES), -(-(table.groups - table.threes) // LANES)
-    return -(-(3 * tiles + ones) // (width // LANES))
+    return (3 * tiles + ones) * LANES
 
 
 def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
     """Write what of a new bank never changes."""
     if bank.size:
-        bank[SENSITIVITIES] = bank.size - blocks_of(table, width) * n * width
+        bank[SENSITIVITIES] = bank.size - n * columns_of(table)
+        bank[PHI] = bank[SENSITIVITIES] - width * width
         bank[ALL], bank[THREES], bank[LENGTH] = table.groups, table.threes, LANES
 
 
@@ -194,13 +198,11 @@ def group_at(bank: Array, number: int) -> int:
     return ones + (number - threes) // LANES * OF_ONE + (number - threes) % LANES
 
 
-@compiled("i8(f8[::1], i8, i8, i8)", forceinline=True)
-def column_of(bank: Array, width: int, number: int, component: int) -> int:
-    """Column of a group's component, of an aid's rows and, block after block, of V."""
-    threes, fit = int(bank[THREES]), width // LANES
+@compiled("i8(f8[::1], i8, i8)", forceinline=True)
+def column_of(bank: Array, number: int, component: int) -> int:
+    """Column of a group's component, of V and of an aid's rows."""
+    threes = int(bank[THREES])
     if number < threes:
-        eight, lane = 3 * (number // LANES) + component, number % LANES
-    else:
-        eight = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
-        lane = (number - threes) % LANES
-    return eight // fit * width + eight % fit * LANES + lane
+        return (3 * (number // LANES) + component) * LANES + number % LANES
+    ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
+    return ones * LANES + (number - threes) % LANES

@@ -39,6 +39,7 @@ from fusiond.estimators.fault_bank import (
     L_ROWS,
     LANES,
     LASTS_S,
+    LEAST_WEIGHT,
     LENGTH,
     LIKELY,
     LOG_ODDS,
@@ -68,8 +69,6 @@ _TINY = 1e-9
 """A direction that nothing has shown has no evidence: L counts with this much of the prior's."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the amount of a kind that has one of its own may differ."""
-LEAST_WEIGHT = 1e-7
-"""What is as unlikely opens nothing: of a kilometre a third of a metre."""
 _NOTHING = -40.0
 """Log of what counts nothing beside one: a sum of doubles does not show it."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, the
@@ -226,11 +225,12 @@ def judge(
             found[RIVAL_ODDS] = max(found[RIVAL_ODDS], bank[at + LOG_ODDS])
 
 
-@compiled("void(f8[::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)
-def mixture(bank: Array, numbers: Array, n: int, width: int, opened: Array) -> None:
+@compiled("void(f8[::1], f8[:, ::1], i8, f8[:, ::1])", allocates=True)
+def mixture(bank: Array, numbers: Array, n: int, opened: Array) -> None:
     """Write what the weighed hypotheses leave open of the first rows of the error state (q, q)."""
     q = opened.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
+    columns = v.shape[0] // n
     opened[:] = 0.0
     m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
     for number in range(int(bank[ALL])):
@@ -242,10 +242,9 @@ def mixture(bank: Array, numbers: Array, n: int, width: int, opened: Array) -> N
         for c in range(size):
             for d in range(size):
                 x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
-            column = column_of(bank, width, number, c)
-            first = column // width * n * width + column % width
+            first = column_of(bank, number, c)
             for i in range(q):
-                rows[c, i] = v[first + i * width]
+                rows[c, i] = v[first + i * columns]
         for i in range(q):
             for c in range(size):
                 along = 0.0
@@ -255,12 +254,11 @@ def mixture(bank: Array, numbers: Array, n: int, width: int, opened: Array) -> N
                     opened[i, j] += rows[c, j] * along
 
 
-@compiled("void(f8[::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1])", allocates=True)
+@compiled("void(f8[::1], f8[:, ::1], i8, i8, f8[::1], f8[:, ::1])", allocates=True)
 def estimate(
     bank: Array,
     numbers: Array,
     n: int,
-    width: int,
     number: int,
     size_and_variance: Array,
     effect: Array,
@@ -268,6 +266,7 @@ def estimate(
     """Write b (3,) and M (9,) of a group, and what V b and V M V^T are: `effect` (1 + n, n)."""
     at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
     v = bank[int(bank[SENSITIVITIES]) :]
+    columns = v.shape[0] // n
     m = np.empty(12)
     solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
     size_and_variance[:] = 0.0
@@ -275,10 +274,9 @@ def estimate(
     rows = np.empty((3, n))
     for c in range(size):
         size_and_variance[c] = m[9 + c]
-        column = column_of(bank, width, number, c)
-        first = column // width * n * width + column % width
+        first = column_of(bank, number, c)
         for i in range(n):
-            rows[c, i] = v[first + i * width]
+            rows[c, i] = v[first + i * columns]
             effect[0, i] += rows[c, i] * m[9 + c]
         for d in range(size):
             size_and_variance[3 + 3 * c + d] = m[3 * c + d]

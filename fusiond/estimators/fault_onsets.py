@@ -32,6 +32,7 @@ from fusiond.estimators.fault_bank import (
     column_of,
     group_at,
 )
+from fusiond.estimators.fault_carried import begin_transition
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.strapdown import HEIGHT, LAT, STEP_DCM, STEP_SMOOTH_N, VN
@@ -40,12 +41,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8, f8[::1], f8[::1])")
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8, f8[::1], f8[::1])")
 def _begin_group(
     bank: Array,
     ints: Indices,
     n: int,
-    width: int,
     kind: int,
     restart: int,
     t_s: float,
@@ -60,32 +60,32 @@ def _begin_group(
     bank[at + ONSET] = t_s
     bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
     v = bank[int(bank[SENSITIVITIES]) :]
+    columns = v.shape[0] // n
     for c in range(size):
-        column = column_of(bank, width, number, c)
-        first = column // width * n * width + column % width
+        first = column_of(bank, number, c)
         for i in range(n):
-            v[first + i * width] = 0.0
+            v[first + i * columns] = 0.0
         of, slots = ints[kind, SIGNATURE], ints[kind, SLOTS : SLOTS + 3]
         if of == STATES:
             for j in range(3):
                 if (j == c or size == 1) and slots[j] >= 0:
-                    v[first + slots[j] * width] = 1.0
+                    v[first + slots[j] * columns] = 1.0
         elif of == TURNED:
             for i in range(3):
-                v[first + i * width] = step[STEP_DCM + 3 * i + c]
+                v[first + i * columns] = step[STEP_DCM + 3 * i + c]
             if slots[c] >= 0:
-                v[first + slots[c] * width] = 1.0
+                v[first + slots[c] * columns] = 1.0
         elif of == SHIFTED:
             # It began at fixes that were stamped by tau too late: p - v tau, v - a tau.
             for i in range(3):
                 force = step[STEP_SMOOTH_N + i]
                 if i == 2:
                     force += gravity(nav[LAT], nav[HEIGHT])
-                v[first + (3 + i) * width] = -force
-                v[first + (6 + i) * width] = -nav[VN + i]
+                v[first + (3 + i) * columns] = -force
+                v[first + (6 + i) * columns] = -nav[VN + i]
             for j in range(3):
                 if slots[j] >= 0:
-                    v[first + slots[j] * width] = -1.0
+                    v[first + slots[j] * columns] = -1.0
 
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
@@ -93,15 +93,16 @@ def begin_all(
     bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
 ) -> None:
     """Begin all hypotheses anew; what the path was remains."""
+    begin_transition(bank, n, width)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
-            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step)
+            _begin_group(bank, ints, n, kind, restart, t_ns * 1e-9, nav, step)
     for level in range(len(PERIODS_NS)):
         bank[RESTARTED + level] = t_ns // PERIODS_NS[level]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8)")
-def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart: int) -> None:
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
+def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
     """A restart that is about to begin anew takes the place of the less likely one of the level
     above, if that is much less likely."""
     level = LEVEL_OF[restart] + 1
@@ -121,18 +122,15 @@ def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart:
     for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
         bank[there + j] = bank[at + j]
     v = bank[int(bank[SENSITIVITIES]) :]
+    columns = v.shape[0] // n
     for c in range(size):
-        own, other = column_of(bank, width, number, c), column_of(bank, width, to, c)
-        first = own // width * n * width + own % width
-        second = other // width * n * width + other % width
+        own, other = column_of(bank, number, c), column_of(bank, to, c)
         for i in range(n):
-            v[second + i * width] = v[first + i * width]
+            v[other + i * columns] = v[own + i * columns]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])")
-def restart_due(
-    bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
-) -> None:
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, f8[::1], f8[::1])")
+def restart_due(bank: Array, ints: Indices, n: int, t_ns: int, nav: Array, step: Array) -> None:
     """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
     one that has just been handed on is not the next to begin."""
     for back in range(len(PERIODS_NS)):
@@ -144,5 +142,5 @@ def restart_due(
             for kind in range(ints.shape[0]):
                 if ints[kind, SIGNATURE] == SHIFTED:  # it is so from the start on
                     continue
-                _promote(bank, ints, n, width, kind, slot)
-                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step)
+                _promote(bank, ints, n, kind, slot)
+                _begin_group(bank, ints, n, kind, slot, t_ns * 1e-9, nav, step)

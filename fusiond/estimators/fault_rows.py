@@ -129,11 +129,9 @@ def _concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
     return of_this
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8, f8, f8, f8[::1])")
+@compiled("void(f8[::1], i8, i8, f8, f8, f8, f8[::1])")
 def _offset_rows(
     bank: Array,
-    ints: Indices,
-    width: int,
     kind: int,
     component: int,
     offset: float,
@@ -148,17 +146,16 @@ def _offset_rows(
         d = offset
         if slope != 0.0:
             d += slope * (t_s - bank[group_at(bank, number) + ONSET])
-        s[column_of(bank, width, number, component)] += d
+        s[column_of(bank, number, component)] += d
 
 
 @compiled(
-    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8[::1], i8, i8, f8[::1])",
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8, f8[::1])",
 )
 def _sign(
     bank: Array,
     ints: Indices,
     numbers: Array,
-    width: int,
     kind: int,
     measures: int,
     t_s: float,
@@ -182,12 +179,12 @@ def _sign(
             else:
                 d = nav[VN + a] - _at_past(bank, back, then, 3 + a)
             if math.isfinite(d):
-                _offset_rows(bank, ints, width, kind, 0, d, 0.0, t_s, s)
+                _offset_rows(bank, kind, 0, d, 0.0, t_s, s)
     elif of == SPEED and measures == ROLLS:
         d = -math.hypot(nav[VN], nav[VN + 1])
         for a in range(m):
             s = work[a * columns : (a + 1) * columns]
-            _offset_rows(bank, ints, width, kind, 0, d, 0.0, t_s, s)
+            _offset_rows(bank, kind, 0, d, 0.0, t_s, s)
     else:
         offset = slope = 0.0
         if measures == PLACES:
@@ -205,19 +202,44 @@ def _sign(
         if offset != 0.0 or slope != 0.0:
             for a in range(min(m, ints[kind, SIZE])):
                 s = work[a * columns : (a + 1) * columns]
-                _offset_rows(bank, ints, width, kind, a, offset, slope, t_s, s)
+                _offset_rows(bank, kind, a, offset, slope, t_s, s)
+
+
+@compiled("void(f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1])")
+def add_rows(
+    v: Array, columns: int, first: int, of: Indices, count: int, c: Array, out: Array
+) -> None:
+    """Add to `out` c (n,) times V, from column `first` on: of its rows `count`, `of` which c is not
+    zero, four in one pass."""
+    at = 0
+    while at < count:
+        more = at + 4 <= count
+        i_0 = of[at]
+        v_0, c_0 = v[i_0 * columns + first :], c[i_0]
+        if more:
+            i_1, i_2, i_3 = of[at + 1], of[at + 2], of[at + 3]
+            v_1, c_1 = v[i_1 * columns + first :], c[i_1]
+            v_2, c_2 = v[i_2 * columns + first :], c[i_2]
+            v_3, c_3 = v[i_3 * columns + first :], c[i_3]
+            for j in range(out.shape[0]):
+                out[j] += c_0 * v_0[j] + c_1 * v_1[j] + c_2 * v_2[j] + c_3 * v_3[j]
+            at += 4
+        else:
+            for j in range(out.shape[0]):
+                out[j] += c_0 * v_0[j]
+            at += 1
 
 
 @compiled(
-    "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
-    "f8[:, ::1], f8[::1])"
+    "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
+    "f8[:, ::1], f8[::1])",
+    allocates=True,
 )
 def sensitivity_rows(
     bank: Array,
     ints: Indices,
     numbers: Array,
     n: int,
-    width: int,
     t_ns: int,
     measures: int,
     device: int,
@@ -231,22 +253,20 @@ def sensitivity_rows(
     columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav (10,)."""
     m, kinds = h.shape[0], ints.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
-    blocks = v.shape[0] // (n * width)
-    columns: int = blocks * width
-    for j in range(m * columns):
-        work[j] = 0.0
+    columns: int = v.shape[0] // n
+    of = np.empty(n, dtype=np.int64)
     for a in range(m):
+        s, count = work[a * columns : (a + 1) * columns], 0
         for i in range(n):
-            c = h[a, i]
-            if c != 0.0:
-                for b in range(blocks):
-                    first, at = (b * n + i) * width, a * columns + b * width
-                    rows, part = v[first : first + width], work[at : at + width]
-                    for j in range(part.shape[0]):
-                        part[j] += c * rows[j]
+            if h[a, i] != 0.0:
+                of[count] = i
+                count += 1
+        for j in range(s.shape[0]):
+            s[j] = 0.0
+        add_rows(v, columns, 0, of, count, h[a], s)
     for kind in range(kinds):
         if _concerns(ints, kind, measures, device):
-            _sign(bank, ints, numbers, width, kind, measures, t_ns * 1e-9, nav, m, columns, work)
+            _sign(bank, ints, numbers, kind, measures, t_ns * 1e-9, nav, m, columns, work)
     for a in range(m):
         s, along = work[a * columns : (a + 1) * columns], 0.0
         for i in range(n):
@@ -264,45 +284,44 @@ def sensitivity_rows(
     return columns
 
 
-@compiled("void(f8[::1], i8, i8, f8[:, ::1], i8, i8, f8[::1])")
-def _fold_in(v: Array, n: int, width: int, g: Array, m: int, columns: int, work: Array) -> None:
-    """V <- V - g^T s, three rows in one pass."""
-    blocks = columns // width
-    for first in range(0, m, 3):
-        second, third = min(first + 1, m - 1), min(first + 2, m - 1)
-        for b in range(blocks):
-            at = b * width
-            s_0 = work[first * columns + at : first * columns + at + width]
-            s_1 = work[second * columns + at : second * columns + at + width]
-            s_2 = work[third * columns + at : third * columns + at + width]
+@compiled("void(f8[::1], i8, f8[:, ::1], i8, i8, f8[::1])")
+def _fold_in(v: Array, n: int, g: Array, m: int, columns: int, work: Array) -> None:
+    """V <- V - g^T s, three rows in one pass, or one."""
+    at = 0
+    while at < m:
+        s_0 = work[at * columns : (at + 1) * columns]
+        if at + 3 <= m:
+            s_1 = work[(at + 1) * columns : (at + 2) * columns]
+            s_2 = work[(at + 2) * columns : (at + 3) * columns]
             for i in range(n):
-                c_0 = g[first, i]
-                c_1 = g[second, i] if second > first else 0.0
-                c_2 = g[third, i] if third > second else 0.0
-                row = (b * n + i) * width
-                rows = v[row : row + width]
+                c_0, c_1, c_2 = g[at, i], g[at + 1, i], g[at + 2, i]
                 if c_0 == 0.0 and c_1 == 0.0 and c_2 == 0.0:
                     continue
-                if m - first == 1:
-                    for j in range(rows.shape[0]):
-                        rows[j] -= c_0 * s_0[j]
-                else:
-                    for j in range(rows.shape[0]):
-                        rows[j] = rows[j] - c_0 * s_0[j] - c_1 * s_1[j] - c_2 * s_2[j]
+                row = v[i * columns : (i + 1) * columns]
+                for j in range(row.shape[0]):
+                    row[j] -= c_0 * s_0[j] + c_1 * s_1[j] + c_2 * s_2[j]
+            at += 3
+        else:
+            for i in range(n):
+                c_0 = g[at, i]
+                if c_0 != 0.0:
+                    row = v[i * columns : (i + 1) * columns]
+                    for j in range(row.shape[0]):
+                        row[j] -= c_0 * s_0[j]
+            at += 1
 
 
-@compiled("void(f8[::1], i8, i8, f8[::1], f8[:, ::1], b1, f8[::1])")
-def account(bank: Array, n: int, width: int, y: Array, g: Array, fused: bool, work: Array) -> None:
+@compiled("void(f8[::1], i8, f8[::1], f8[:, ::1], b1, f8[::1])")
+def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Array) -> None:
     """Take in what `sensitivity_rows` has left in `work` with the whitened innovation y (m,);
     `fused` where the filter folds the rows in, with g (m, w) as `whiten` leaves it."""
     m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
-    blocks = v.shape[0] // (n * width)
-    columns = blocks * width
+    columns = v.shape[0] // n
     square = 0.0
     for a in range(m):
         square += y[a] * y[a]
-    length, fit = int(bank[LENGTH]), width // LANES
+    length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     eights = threes + (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
     unsigned = np.uint64
@@ -317,15 +336,13 @@ def account(bank: Array, n: int, width: int, y: Array, g: Array, fused: bool, wo
             bank[j + unsigned(N_AT)] += m
         for a in range(m):
             y_a = y[a]
-            at_0 = unsigned(a * columns + first // fit * width + first % fit * LANES)
+            at_0 = unsigned(a * columns + first * LANES)
             for k in range(length):
                 j, s_0 = own + unsigned(k), work[at_0 + unsigned(k)]
                 bank[j + unsigned(L_AT)] += s_0 * s_0
                 bank[j + unsigned(E_AT)] += s_0 * y_a
             if three:
-                second, third = first + 1, first + 2
-                at_1 = unsigned(a * columns + second // fit * width + second % fit * LANES)
-                at_2 = unsigned(a * columns + third // fit * width + third % fit * LANES)
+                at_1, at_2 = at_0 + unsigned(LANES), at_0 + unsigned(2 * LANES)
                 for k in range(length):
                     j, lane = own + unsigned(k), unsigned(k)
                     s_0, s_1, s_2 = work[at_0 + lane], work[at_1 + lane], work[at_2 + lane]
@@ -337,4 +354,4 @@ def account(bank: Array, n: int, width: int, y: Array, g: Array, fused: bool, wo
                     bank[j + unsigned(E1)] += s_1 * y_a
                     bank[j + unsigned(E2)] += s_2 * y_a
     if fused:
-        _fold_in(v, n, width, g, m, columns, work)
+        _fold_in(v, n, g, m, columns, work)

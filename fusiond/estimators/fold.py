@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from fusiond.estimators.fault_bank import (
     ALL,
     CLASS,
+    LEAST_WEIGHT,
     RESTARTS,
     SIZE,
     WEIGHT,
     column_of,
     group_at,
 )
-from fusiond.estimators.fault_odds import LEAST_WEIGHT, solve
+from fusiond.estimators.fault_odds import solve
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
@@ -24,9 +25,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1], i8, f8[::1])", allocates=True)
+@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])", allocates=True)
 def nis_if_sensors_fail(
-    bank: Array, ints: Indices, numbers: Array, width: int, y: Array, columns: int, work: Array
+    bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Array
 ) -> float:
     """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
     leave open, as they are weighed; `work` as `sensitivity_rows` leaves it."""
@@ -42,10 +43,10 @@ def nis_if_sensors_fail(
         for a in range(rows):
             for b in range(rows):
                 for i in range(size):
-                    s_a = work[a * columns + column_of(bank, width, number, i)]
+                    s_a = work[a * columns + column_of(bank, number, i)]
                     for j in range(size):
                         x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
-                        s_b = work[b * columns + column_of(bank, width, number, j)]
+                        s_b = work[b * columns + column_of(bank, number, j)]
                         c[a, b] += s_a * s_b * x
     # y^T C^-1 y by elimination.
     left, nis = y.copy(), 0.0
@@ -89,18 +90,16 @@ def fold_and_account(
     A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
     would never be found else. Where such a fault, as likely as it is, explains it, it is folded in.
     """
-    n, width = dx.shape[0], cov.shape[0]
+    n = dx.shape[0]
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
-    restart_due(bank, ints, n, width, t_ns, nav, step)
-    columns = sensitivity_rows(
-        bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work
-    )
+    restart_due(bank, ints, n, t_ns, nav, step)
+    columns = sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
     judged = nis
     if nis > threshold:
-        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, width, y, columns, work))
-    account(bank, n, width, y, g, judged <= threshold, work)
+        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
+    account(bank, n, y, g, judged <= threshold, work)
     if judged <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
@@ -111,7 +110,7 @@ def fold_and_account(
 
 @compiled(
     "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1],"
-    "f8[:, ::1], i8, i8, i8, i8, f8[::1])"
+    "f8[:, ::1], i8, i8, i8, f8[::1])"
 )
 def account_for(
     nav: Array,
@@ -124,7 +123,6 @@ def account_for(
     bank: Array,
     ints: Indices,
     numbers: Array,
-    width: int,
     t_ns: int,
     measures: int,
     device: int,
@@ -133,6 +131,6 @@ def account_for(
     """What the bank makes of rows that were `fused` or not, as `whiten` has left y (m,) and g (m,
     w): of a filter that keeps its estimate."""
     n = h.shape[1]
-    restart_due(bank, ints, n, width, t_ns, nav, step)
-    sensitivity_rows(bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work)
-    account(bank, n, width, y, g, fused, work)
+    restart_due(bank, ints, n, t_ns, nav, step)
+    sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
+    account(bank, n, y, g, fused, work)

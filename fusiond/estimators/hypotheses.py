@@ -24,12 +24,13 @@ from fusiond.estimators.fault_bank import (
     UNEXPLAINED,
     WEIGHT,
     FaultTable,
-    blocks_of,
     column_of,
+    columns_of,
     group_at,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_all
+from fusiond.estimators.fault_opened import OPENED_WORK, widen_by_faults
 from fusiond.models.model import Model
 
 Array = NDArray[np.float64]
@@ -56,13 +57,12 @@ class Hypotheses:
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
         """What the last `judge` has found."""
-        self.columns = blocks_of(table, model.width) * model.width
-        self.work = np.zeros(LENT_ROWS * self.columns)
+        self.columns = columns_of(table)
+        self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
-        n, w, v = self.n, self.width, bank[int(bank[SENSITIVITIES]) :]
-        self.sensitivities = v.reshape(-1, n, w)
-        """V, a block (n, w) of columns after another."""
+        self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)
+        """V (n, columns)."""
         self._nine = np.zeros((9, 9))
         self._of_source: dict[str, tuple[int, int]] = {}
 
@@ -86,16 +86,21 @@ class Hypotheses:
         judge(self.bank, *table[:3], t_ns * 1e-9, self.found)
         return self.found
 
+    def widen(self, step: Array, wider: Array) -> None:
+        """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""
+        table = self.table
+        widen_by_faults(self.bank, table.lanes, self.n, step, self.work, wider)
+
     def opened(self) -> Array:
         """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
         anew by the next call."""
-        mixture(self.bank, self.table.numbers, self.n, self.width, self._nine)
+        mixture(self.bank, self.table.numbers, self.n, self._nine)
         return self._nine
 
     def opened_of_all(self) -> Array:
         """The same of all states (n, n)."""
         out = np.zeros((self.n, self.n))
-        mixture(self.bank, self.table.numbers, self.n, self.width, out)
+        mixture(self.bank, self.table.numbers, self.n, out)
         return out
 
     def estimated(self, number: int) -> Estimated:
@@ -103,7 +108,7 @@ class Hypotheses:
         kind = number // RESTARTS
         at = self._at[kind, number % RESTARTS]
         found, effect = np.zeros(12), np.zeros((1 + self.n, self.n))
-        estimate(self.bank, self.table.numbers, self.n, self.width, number, found, effect)
+        estimate(self.bank, self.table.numbers, self.n, number, found, effect)
         p = int(self.table.ints[kind, SIZE])
         return Estimated(
             kind,
@@ -122,8 +127,7 @@ class Hypotheses:
     def effect(self, number: int) -> Array:
         """V of a group (n, p)."""
         count = int(self.table.ints[number // RESTARTS, SIZE])
-        columns = [column_of(self.bank, self.width, number, c) for c in range(count)]
-        return np.array([self.sensitivities[c // self.width, :, c % self.width] for c in columns]).T
+        return self.sensitivities[:, [column_of(self.bank, number, c) for c in range(count)]]
 
     @property
     def log_odds(self) -> Array:

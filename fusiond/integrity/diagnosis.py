@@ -42,7 +42,6 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, FAULTY, RIVAL_ODDS
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
-from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
@@ -220,7 +219,7 @@ class Diagnosis:
             elif outcome.name == "gated" and not one.out and (not aid.constraint or aid.no_slip):
                 one.gated(t_ns, explained)
         if correction is None and bank is not None and self._widens(aid, bank):
-            opened_variances(bank.opened(), estimator.step, estimator.wider)
+            bank.widen(estimator.step, estimator.wider)
             _open_by_mounting(estimator)
         return correction
 
