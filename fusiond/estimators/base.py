@@ -29,7 +29,7 @@ from fusiond.estimators.propagation import (
     RECORD,
     propagate_for,
 )
-from fusiond.estimators.reading import Published, sigmas, widen
+from fusiond.estimators.reading import Published, sigmas, speed_sigma, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
 from fusiond.estimators.sensors import sensor_estimates
@@ -175,6 +175,9 @@ class Estimator(Protocol):
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
 
+    def speed_sigma(self) -> float:
+        """One sigma (m/s) of the horizontal velocity."""
+
     def snapshot(self) -> Snapshot:
         """A copy of everything."""
 
@@ -298,6 +301,10 @@ class ErrorStateFilter:
         sigmas(self._covs[0], self.nav, self.step, *self.published, out)
         widen(self.wider, out)
         return out
+
+    def speed_sigma(self) -> float:
+        """One sigma (m/s) of the horizontal velocity."""
+        return speed_sigma(self._cov, self.nav, self.step, *self.published, self.wider)
 
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""

@@ -85,9 +85,9 @@ KIND_NUMBERS = 6
 # head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
-# aid lies, and 1 if it is not the identity.
+# aid lies, 1 if it is not the identity, and the probability of any fault as it was judged last.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
-ALL, THREES, LENGTH, PHI, WAITS, HEAD = 10, 11, 12, 13, 14, 16
+ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, HEAD = 10, 11, 12, 13, 14, 15, 16
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -192,17 +192,20 @@ def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
 def group_at(bank: Array, number: int) -> int:
     """Where a group's numbers begin."""
     threes = int(bank[THREES])
-    if number < threes:
-        return GROUPS + number // LANES * OF_THREE + number % LANES
-    ones = GROUPS + (threes + LANES - 1) // LANES * OF_THREE
-    return ones + (number - threes) // LANES * OF_ONE + (number - threes) % LANES
+    tile, lane = number // LANES, number % LANES
+    at: int = GROUPS + tile * OF_THREE + lane
+    if number >= threes:
+        tile, lane = (number - threes) // LANES, (number - threes) % LANES
+        at = GROUPS + (threes + LANES - 1) // LANES * OF_THREE + tile * OF_ONE + lane
+    return at
 
 
 @compiled("i8(f8[::1], i8, i8)", forceinline=True)
 def column_of(bank: Array, number: int, component: int) -> int:
     """Column of a group's component, of V and of an aid's rows."""
     threes = int(bank[THREES])
-    if number < threes:
-        return (3 * (number // LANES) + component) * LANES + number % LANES
-    ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
-    return ones * LANES + (number - threes) % LANES
+    column: int = (3 * (number // LANES) + component) * LANES + number % LANES
+    if number >= threes:
+        ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
+        column = ones * LANES + (number - threes) % LANES
+    return column

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     ALL,
+    ANY_FAULT,
     CLASS,
     CONSTANTS,
     DECIDED,
@@ -71,9 +72,11 @@ MOST_OFF = 3.0
 """Sigmas of its prior by which the amount of a kind that has one of its own may differ."""
 _NOTHING = -40.0
 """Log of what counts nothing beside one: a sum of doubles does not show it."""
+APART = 4.0
+"""Log odds between two classes: fifty to one."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, the
-# largest of another class or device, the largest of any that explains, and the weight of all.
-BEST, BEST_ODDS, RIVAL_ODDS, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
+# largest of another class or device, and the largest of any that explains.
+BEST, BEST_ODDS, RIVAL_ODDS, EXPLAINS, FOUND = 0, 1, 2, 3, 4
 
 
 @compiled("f8(f8[::1], i8, i8, f8[::1], f8, f8[::1])", allocates=True)
@@ -160,7 +163,7 @@ def _gains(bank: Array, lanes: Array) -> None:
 def judge(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, epoch_s: float, found: Array
 ) -> None:
-    """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
+    """Write log odds, weight and what is left unexplained of each group, and `found` (4,), at an
     epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
     been likely, and has explained all, for `LASTS_S`.
     """
@@ -197,7 +200,7 @@ def judge(
             if less > _NOTHING:
                 bank[at + WEIGHT] = math.exp(less)
                 total += bank[at + WEIGHT]
-    found[BEST], found[FAULTY] = -1.0, 1.0 - nothing / total
+    found[BEST], bank[ANY_FAULT] = -1.0, 1.0 - nothing / total
     found[BEST_ODDS] = found[RIVAL_ODDS] = found[EXPLAINS] = -np.inf
     for number in range(groups):
         at = group_at(bank, number)
@@ -223,6 +226,13 @@ def judge(
             ints[kind, CLASS] != ints[best, CLASS] or ints[kind, DEVICE] != ints[best, DEVICE]
         ):
             found[RIVAL_ODDS] = max(found[RIVAL_ODDS], bank[at + LOG_ODDS])
+
+
+@compiled("b1(f8[::1])", forceinline=True)
+def identified(found: Array) -> bool:
+    """Whether a group is so much likelier than all of other classes, as `judge` has `found`."""
+    apart = found[BEST] >= 0.0 and found[BEST_ODDS] - found[RIVAL_ODDS] > APART
+    return bool(apart)
 
 
 @compiled("void(f8[::1], f8[:, ::1], i8, f8[:, ::1])", allocates=True)

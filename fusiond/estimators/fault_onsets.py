@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ANY_FAULT,
     BEGINS_AT,
     LANES,
     LEVEL_OF,
@@ -94,6 +95,7 @@ def begin_all(
 ) -> None:
     """Begin all hypotheses anew; what the path was remains."""
     begin_transition(bank, n, width)
+    bank[ANY_FAULT] = 0.0
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
             _begin_group(bank, ints, n, kind, restart, t_ns * 1e-9, nav, step)

@@ -1,11 +1,13 @@
-r"""What the hypotheses of a bank leave open of what a filter publishes, as a compiled kernel.
+r"""What the hypotheses of a bank are found to be, and leave open of what a filter publishes.
 
 Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
 the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
 
     v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
 
-for eight groups side by side.
+for eight groups side by side. The attitude is that of the axes that were configured, and the
+vehicle's as far as the unit sits on it so: pitch and yaw are open by what the mounting has beyond
+chance, too.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     ALL,
+    ANY_FAULT,
     CONSTANTS,
     E1,
     E2,
@@ -37,11 +40,18 @@ from fusiond.estimators.fault_bank import (
     THREES,
     WEIGHT,
 )
+from fusiond.estimators.fault_odds import identified, judge
 from fusiond.estimators.reading import opened_variances
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.error_model import CORE_SIZE
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+COUNTS = 1e-3
+"""Probability of any fault below which what is open is not computed between two measurements."""
+RARE = 10.83
+"""Chi-square of one that chance exceeds in one vehicle of a thousand."""
 
 # What the kernel needs to work: sums, lane by lane, of nine variances and three products; of eight
 # groups C below its diagonal (3), D^-1 (3), b (3) and weight; v C^-T (3) and v b of the attitude.
@@ -183,3 +193,42 @@ def widen_by_faults(
         for k in range(LANES):
             opened[(0, 0, 1)[pair], (1, 2, 2)[pair]] += sums[(CORE_SIZE + pair) * LANES + k]
     opened_variances(opened, step, wider)
+
+
+@compiled(
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, b1, b1, f8[::1], f8[::1], f8[:, ::1],"
+    " f8[::1], f8[::1], f8[::1])"
+)
+def judge_and_widen(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    lanes: Array,
+    n: int,
+    t_ns: int,
+    measured: bool,
+    used: bool,
+    xi: Array,
+    step: Array,
+    mounting: Array,
+    work: Array,
+    wider: Array,
+    found: Array,
+) -> None:
+    """`judge`, if what has come was `measured` and is `used`, and `wider` (9,), unless a hypothesis
+    is identified: at each measurement, and between two while a fault is likely enough to count.
+
+    `mounting` (2, 2): slots of the mounting's pitch and yaw in xi (n,), or -1, and what of their
+    squares is chance.
+    """
+    if measured and used:
+        judge(bank, ints, numbers, lanes, t_ns * 1e-9, found)
+        if identified(found):
+            return
+    elif not measured and not bank[ANY_FAULT] > COUNTS:
+        return
+    widen_by_faults(bank, lanes, n, step, work, wider)
+    for k in range(2):
+        slot = int(mounting[k, 0])
+        if slot >= 0:
+            wider[7 + k] += max(0.0, xi[slot] * xi[slot] - mounting[k, 1])

@@ -30,8 +30,9 @@ from fusiond.estimators.fault_bank import (
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_all
-from fusiond.estimators.fault_opened import OPENED_WORK, widen_by_faults
+from fusiond.estimators.fault_opened import OPENED_WORK, RARE, judge_and_widen, widen_by_faults
 from fusiond.models.model import Model
+from fusiond.models.vehicle import MOUNTING
 
 Array = NDArray[np.float64]
 
@@ -56,7 +57,11 @@ class Hypotheses:
         self.bank, self.table = bank, table
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
-        """What the last `judge` has found."""
+        """What the last `judge` has found, as of fusiond.estimators.fault_odds."""
+        self._mounting = np.full((2, 2), -1.0)
+        """Slots of pitch and yaw of the mounting, and what of their squares is chance."""
+        for k, slot in enumerate(model.slots_of(MOUNTING)[:2]):
+            self._mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
         self.columns = columns_of(table)
         self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
         numbers = range(int(bank[ALL]))
@@ -86,10 +91,19 @@ class Hypotheses:
         judge(self.bank, *table[:3], t_ns * 1e-9, self.found)
         return self.found
 
+    def take(
+        self, t_ns: int, measured: bool, used: bool, xi: Array, step: Array, wider: Array
+    ) -> Array:
+        """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
+        unless one is identified, what the weighed hypotheses leave open of what is published,
+        `wider` (9,)."""
+        now = self.n, t_ns, measured, used, xi, step, self._mounting, self.work, wider, self.found
+        judge_and_widen(self.bank, *self.table[:3], *now)
+        return self.found
+
     def widen(self, step: Array, wider: Array) -> None:
         """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""
-        table = self.table
-        widen_by_faults(self.bank, table.lanes, self.n, step, self.work, wider)
+        widen_by_faults(self.bank, self.table.lanes, self.n, step, self.work, wider)
 
     def opened(self) -> Array:
         """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
@@ -122,7 +136,8 @@ class Hypotheses:
 
     def each(self, which: int) -> Array:
         """One of the numbers of all groups (k, restarts), as of fusiond.estimators.fault_bank."""
-        return self.bank[self._at + which]
+        found: Array = self.bank[self._at + which]
+        return found
 
     def effect(self, number: int) -> Array:
         """V of a group (n, p)."""

@@ -40,20 +40,15 @@ from fusiond.estimators.fault_bank import (
     VELOCITY,
     VELOCITY_RAMP,
 )
-from fusiond.estimators.fault_odds import BEST, BEST_ODDS, EXPLAINS, FAULTY, RIVAL_ODDS
+from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
-from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN
 
 Array = NDArray[np.float64]
 
-APART = 4.0
-"""Log odds between two classes: fifty to one."""
-COUNTS = 1e-3
-"""Probability of any fault below which what is open is not computed between two measurements."""
 ALIKE = 7.0
 """Hypotheses of the class that are less likely by more than this count nothing."""
 GROWS: dict[int, tuple[int | None, int | None]] = {
@@ -64,8 +59,6 @@ GROWS: dict[int, tuple[int | None, int | None]] = {
     CARRIED: (1, 0),
 }
 """With which power of its age a fault grows in positions and in velocities."""
-RARE = 10.83
-"""Chi-square of one that chance exceeds in one vehicle of a thousand."""
 MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
 """A vehicle moves whose speed is beyond both."""
 FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
@@ -203,36 +196,28 @@ class Diagnosis:
         self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
         """Take in how an aid ended; what to take out of the filter's state, if anything."""
-        bank, t_ns, correction, explained = estimator.hypotheses, aid.t_ns, None, False
-        if one.out:
-            passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-            one.looked_at(t_ns, passes and one.repeats == 0, outcome.lasting - outcome.nis)
-            self._agrees(aid, one)
-        else:
-            if bank is not None and not aid.constraint:
-                found = bank.judge(t_ns)
+        e, t_ns, correction, explained = estimator, aid.t_ns, None, False
+        bank, measured, used = e.hypotheses, not aid.constraint, not one.out
+        if bank is not None:
+            found = bank.take(t_ns, measured, used, e.xi, e.step, e.wider)
+            if measured and used:
                 correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
-            if outcome.name == "fused":
-                one.fused(t_ns, () if aid.constraint else outcome.whitened)
-            elif outcome.name == "gated" and not one.out and (not aid.constraint or aid.no_slip):
-                one.gated(t_ns, explained)
-        if correction is None and bank is not None and self._widens(aid, bank):
-            bank.widen(estimator.step, estimator.wider)
-            _open_by_mounting(estimator)
+        if not used:
+            passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
+            one.looked_at(t_ns, passes and one.repeats == 0, outcome.lasting - outcome.nis)
+            self._agrees(aid, one)
+        elif outcome.name == "fused":
+            one.fused(t_ns, () if aid.constraint else outcome.whitened)
+        elif outcome.name == "gated" and not one.out and (not aid.constraint or aid.no_slip):
+            one.gated(t_ns, explained)
         return correction
 
-    @staticmethod
-    def _widens(aid: Aid, bank: Hypotheses) -> bool:
-        """Whether what is published may be wider by now: at each measurement, and between two while
-        a fault is likely enough to count."""
-        return not aid.constraint or bank.found.item(FAULTY) > COUNTS
-
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
-        best, odds, rival = found.item(BEST), found.item(BEST_ODDS), found.item(RIVAL_ODDS)
-        if best < 0.0 or odds - rival <= APART:
+        if not identified(found):
             return None
+        best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         weights = np.exp([each.log_odds - odds for each in taken])
         weights /= weights.sum()
@@ -296,16 +281,6 @@ class Diagnosis:
         self._agreement = {**self._agreement, aid.device: known.with_aid(aid)}
 
 
-def _open_by_mounting(estimator: Estimator) -> None:
-    """The attitude is that of the axes that were configured, and the vehicle's as far as the unit
-    sits on it so: pitch and yaw are open by what the mounting has beyond chance."""
-    model, wider = estimator.model, estimator.wider
-    for row, slot in zip((7, 8), model.slots_of(MOUNTING), strict=False):
-        beyond = estimator.xi.item(slot) ** 2 - RARE * model.initial.item(slot) ** 2
-        if beyond > 0.0:
-            wider[row] += beyond
-
-
 def _moves(estimator: Estimator) -> bool:
     """Whether the vehicle surely moves, by the filter's own speed and its sigma."""
     if estimator.step.item(STEP_RESTS_S) > 0.0:
@@ -314,5 +289,4 @@ def _moves(estimator: Estimator) -> bool:
     speed = math.hypot(nav.item(VN), nav.item(VE))
     if speed <= MOVES_M_S:
         return False
-    sd = estimator.sigmas()
-    return speed > MOVES_SIGMAS * math.hypot(sd.item(3), sd.item(4))
+    return speed > MOVES_SIGMAS * estimator.speed_sigma()
