@@ -131,7 +131,7 @@ class FaultTable(NamedTuple):
     @property
     def groups(self) -> int:
         """How many groups there are."""
-        return RESTARTS * self.ints.shape[0]
+        return RESTARTS * len(self.ints)
 
 
 def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:

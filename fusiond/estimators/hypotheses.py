@@ -97,9 +97,12 @@ class Hypotheses:
         """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
         unless one is identified, what the weighed hypotheses leave open of what is published,
         `wider` (9,)."""
-        now = self.n, t_ns, measured, used, xi, step, self._mounting, self.work, wider, self.found
-        judge_and_widen(self.bank, *self.table[:3], *now)
-        return self.found
+        table, n, found = self.table, self.n, self.found
+        judge_and_widen(
+            *(self.bank, table.ints, table.numbers, table.lanes, n, t_ns, measured, used),
+            *(xi, step, self._mounting, self.work, wider, found),
+        )
+        return found
 
     def widen(self, step: Array, wider: Array) -> None:
         """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""

@@ -188,7 +188,9 @@ class Diagnosis:
         one.hear(aid.t_ns)
         if aid.constraint or (value := value_of(aid.offers())) is None:
             return one
-        if one.repeats_itself(value, _moves(estimator)) and not one.out:
+        # A position that differs repeats nothing, whether it moves or not.
+        moving = (value == one.value or not one.locates) and _moves(estimator)
+        if one.repeats_itself(value, moving) and not one.out:
             self._exclude(aid.t_ns, REPEATS, lambda s: s.device == aid.device)
         return self._series[aid.source]
 
