@@ -388,7 +388,8 @@ class ErrorStateFilter:
         """Back to a snapshot, bit for bit."""
         m = self._memory
         self.t_ns, self.sample, m.kept[:], _, self._holding, extra = s
-        m.head[AHEAD] = self.passing = s.held is not None
+        m.head[AHEAD] = s.held is not None
+        self.passing = s.held is not None or (self.hypotheses is not None and self.hypotheses.waits)
         if s.held is not None:
             m.held[:] = s.held
         self._own_restore(extra)

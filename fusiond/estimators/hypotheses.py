@@ -22,6 +22,7 @@ from fusiond.estimators.fault_bank import (
     SENSITIVITIES,
     SIZE,
     UNEXPLAINED,
+    WAITS,
     WEIGHT,
     FaultTable,
     column_of,
@@ -80,6 +81,11 @@ class Hypotheses:
             device = devices.index(aid.device) if aid.device in devices else -1
             known = self._of_source[aid.source] = _measures(aid, device >= 0), device
         return known
+
+    @property
+    def waits(self) -> bool:
+        """Whether V is still that of the last aid, as it is after a look in passing."""
+        return self.bank.item(WAITS) != 0.0
 
     def begin(self, t_ns: int, nav: Array, step: Array) -> None:
         """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
