@@ -48,11 +48,7 @@ class Drive:
 
     def late(self, number: int) -> Callable[[], int]:
         """Drive on to the next late fix; the work is the tick in which it comes."""
-        until = round((AT_S + number * EVERY_S) * RATE_HZ)
-        while self._row < until:
-            self._aids(self._row // SAMPLES)
-            self._feed(SAMPLES)
-        assert self._navigator.started is not None
+        self.go_on(AT_S + number * EVERY_S)
         row = self._row - round(LATE_S * RATE_HZ)
         lat, lon, height = self._truth.at(self._truth.t_s[1 + row : 2 + row]).position[0].tolist()
         at, now = int(self._times[row]), int(self._times[self._row - 1])
@@ -61,12 +57,29 @@ class Drive:
         def work() -> int:
             rewinds = self._navigator.timeline.counters.rewinds
             assert self._navigator.add(fix, at, seen_ns=now) == "accepted"
-            self._feed(TICK_SAMPLES)
-            self._navigator.solution(int(self._times[self._row - 1]))
+            self.tick()
             assert self._navigator.timeline.counters.rewinds > rewinds
             return 1
 
         return work
+
+    def go_on(self, until_s: float) -> None:
+        """Drive on to that instant, at which an epoch comes next."""
+        until = round(until_s * RATE_HZ)
+        while self._row < until:
+            self.fix()
+            self._wheel()
+            self._feed(SAMPLES)
+        assert self._navigator.started is not None
+
+    def tick(self) -> None:
+        """The samples of one tick, and the solution after them."""
+        self._feed(TICK_SAMPLES)
+        self._navigator.solution(int(self._times[self._row - 1]))
+
+    def to_next_fix(self) -> None:
+        """Drive on to the tick at whose end the next epoch is."""
+        self._feed(SAMPLES - TICK_SAMPLES)
 
     def _feed(self, samples: int) -> None:
         rows = slice(self._row, self._row + samples)
@@ -74,9 +87,9 @@ class Drive:
         self._navigator.advance()
         self._row = rows.stop
 
-    def _aids(self, epoch: int) -> None:
-        """What receiver and wheel say at an instant that comes next."""
-        r = self._receiver
+    def fix(self) -> None:
+        """What the receiver says at the epoch that comes next."""
+        r, epoch = self._receiver, self._row // SAMPLES
         t_ns = round(float(r.t_s[epoch]) * 1e9)
         stamp = MonotonicStamp(t_ns)
         lat, lon, height = r.position[epoch].tolist()
@@ -84,7 +97,14 @@ class Drive:
         fix = PositionFix("gnss", t_ns, stamp, lat, lon, height, sd_ned_m=r.sd_ned_m)
         fix = replace(fix, v_ned_m_s=(n, e, d), sd_v_ned_m_s=r.sd_v_ned_m_s)
         self._navigator.add(fix, t_ns)
-        self._navigator.add(WheelSpeed("wheel", t_ns, stamp, math.hypot(n, e)), t_ns)
+
+    def _wheel(self) -> None:
+        """What the wheel says at that epoch."""
+        r, epoch = self._receiver, self._row // SAMPLES
+        t_ns = round(float(r.t_s[epoch]) * 1e9)
+        n, e, _ = r.v_ned[epoch].tolist()
+        speed = WheelSpeed("wheel", t_ns, MonotonicStamp(t_ns), math.hypot(n, e))
+        self._navigator.add(speed, t_ns)
 
 
 def late_fix(repetitions: int) -> Callable[[int], Callable[[], int]]:

@@ -29,7 +29,7 @@ from fusiond.estimators.propagation import (
     RECORD,
     propagate_for,
 )
-from fusiond.estimators.reading import Published, sigmas, widen
+from fusiond.estimators.reading import Published, sigmas, speed_sigma, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
 from fusiond.estimators.sensors import sensor_estimates
@@ -175,6 +175,9 @@ class Estimator(Protocol):
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
 
+    def speed_sigma(self) -> float:
+        """One sigma (m/s) of the horizontal velocity."""
+
     def snapshot(self) -> Snapshot:
         """A copy of everything."""
 
@@ -214,7 +217,7 @@ class ErrorStateFilter:
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
-        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.columns else None
+        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.groups else None
         self._holding = False
         self._carrying = False
         self.turned = 0.0
@@ -299,6 +302,10 @@ class ErrorStateFilter:
         widen(self.wider, out)
         return out
 
+    def speed_sigma(self) -> float:
+        """One sigma (m/s) of the horizontal velocity."""
+        return speed_sigma(self._cov, self.nav, self.step, *self.published, self.wider)
+
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
         feed_back(self.nav, self.xi, dx)
@@ -381,7 +388,8 @@ class ErrorStateFilter:
         """Back to a snapshot, bit for bit."""
         m = self._memory
         self.t_ns, self.sample, m.kept[:], _, self._holding, extra = s
-        m.head[AHEAD] = self.passing = s.held is not None
+        m.head[AHEAD] = s.held is not None
+        self.passing = s.held is not None or (self.hypotheses is not None and self.hypotheses.waits)
         if s.held is not None:
             m.held[:] = s.held
         self._own_restore(extra)

@@ -8,15 +8,14 @@ measurements by a known signature,
 The mean of the filter's error under f is V b. With the filter's own gain K, innovation nu and the
 variance W of each row, which `whiten` leaves as y = nu / sqrt(W) and g = K sqrt(W),
 
-    between updates     V <- Phi V                       the kernels of the transition matrix
+    between updates     V <- Phi V                       fusiond.estimators.fault_carried
     each row            s = (H V + D) / sqrt(W)          L += s^T s   e += s^T y   J += y^2   N += 1
     if it was fused     V <- V - g s
 
     size of the fault   b = M (e + S^-1 m),  M = (L + S^-1)^-1      prior b ~ N(m, S)
     evidence            l = e^T L^-1 e                   chi-square of p if nothing is wrong
     left unexplained    J - l                            chi-square of N - p if it is f
-    log odds            log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
-                        + e^T m - m^T L m / 2
+    log odds            as of fusiond.estimators.fault_odds
 
 An onset is not known: each kind runs from restarts of several periods T, in turns. What has turned
 out to be a likely onset takes the place of a less likely one of the next longer period before it
@@ -35,10 +34,13 @@ systems, IEEE Trans. AC 21 (1976), 108.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from fusiond.navigation.compiled import compiled
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -68,64 +70,144 @@ PLACES, MOVES, ROLLS, OTHER, NOTHING = range(5)
 """What an aid's rows are: a position, a velocity, a speed, something of its own, nothing that can
 be at fault."""
 
-# Columns of the table of kinds: signature, device, size p, first column, slots of a step, class,
+# Columns of the table of kinds: signature, device, size p, slots of a step, class,
 # whether it is in its device's positions and in its velocities.
-SIGNATURE, DEVICE, SIZE, FIRST, SLOTS, CLASS, LOCATES, MOVES_TOO = 0, 1, 2, 3, 4, 7, 8, 9
+SIGNATURE, DEVICE, SIZE, SLOTS, CLASS, LOCATES, MOVES_TOO = 0, 1, 2, 3, 6, 7, 8
 ANY = -3
 """In the place of a device: all that send positions or velocities."""
-KIND_INTS = 10
+KIND_INTS = 9
 # And of their numbers: prior sigmas (3), log of the rate (1/s), delay (s), the amount's prior mean,
 # whether its size is known to be of that prior (1 or 0).
 PRIOR, LOG_RATE, LAG, MEAN, BOUNDED = 0, 3, 4, 5, 6
 KIND_NUMBERS = 7
 
-# The bank's array: head, ring of the path, groups, sensitivities. The head holds which restart each
-# age is at (4), the instant (s), place (m) and number of entries of the path, where V begins.
-RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES, HEAD = 0, 4, 5, 8, 9, 16
+# The bank's array: head, ring of the path, groups, a transition, sensitivities V (n, columns). The
+# head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
+# the path, where V begins, how many groups there are and how many of them have three numbers, LANES
+# (loops whose length is read from an array become vector code), where the transition since the last
+# aid lies, 1 if it is not the identity, and the probability of any fault as it was judged last.
+RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
+ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, HEAD = 10, 11, 12, 13, 14, 15, 16
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
-# A group: L (9), e (3), J, N, onset (s), log odds, weight, what is left unexplained beyond chance,
-# since which epoch (s) it has been likely and explained all, or never; log of what its rate counts
-# by; what it explains, l.
-L_AT, E_AT, J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY = 0, 9, *range(12, 19)
-COUNTS_BY, EXPLAINED, GROUP = 19, 20, 21
+LANES = 8
+# Groups (a restart of a kind, in the order of kinds) lie eight side by side, a row of eight of each
+# of their numbers: J, N, onset (s), log odds, weight, what is left unexplained beyond chance, since
+# which epoch (s) it has been likely and explained all, or never, what it explains, l, and log of
+# what its rate counts by, then L and e: of one number eleven rows, of three nineteen. Of V and of
+# an aid's rows the columns of a component of eight lie so, too.
+J_AT, N_AT, ONSET, LOG_ODDS, WEIGHT, UNEXPLAINED, LIKELY = (LANES * row for row in range(7))
+EXPLAINED, COUNTS_BY, L_AT, E_AT, OF_ONE = (LANES * row for row in range(7, 12))
+L10, L11, L20, L21, L22, E1, E2, OF_THREE = (LANES * row for row in range(11, 19))
+L_ROWS = np.array([[L_AT, L10, L20], [L10, L11, L21], [L20, L21, L22]])
+E_ROWS = np.array([E_AT, E1, E2])
+# What never changes of eight groups: the prior's precisions, its mean, and what of the log odds
+# does not depend on what has come.
+P_AT, MEAN_AT, ODDS_AT, CONSTANTS = 0, LANES * 3, LANES * 4, LANES * 5
 UNEXPLAINED_SIGMAS = 4.0
 """One in 30,000, of chi-square by its mean and variance (2 N): who leaves more does not fit."""
 DECIDED = 7.0
 """Log odds beyond which a hypothesis is likely: a thousand to one."""
+LEAST_WEIGHT = 1e-7
+"""What is as unlikely opens nothing: of a kilometre a third of a metre."""
 LASTS_S = 1.0
 """For so long it must have been: a receiver's errors of a second are one error."""
 
 
 class FaultTable(NamedTuple):
-    """Kinds of faults as the kernels read them, `ints` (k, 10) and `numbers` (k, 7), how many
-    columns they have in all, and the devices whose numbers they name."""
+    """Kinds of faults as the kernels read them, those of three numbers first: `ints` (k, 9) and
+    `numbers` (k, 7), `lanes` with the constants of their groups, and the devices whose numbers they
+    name."""
 
     ints: Indices
     numbers: Array
-    columns: int
+    lanes: Array
     devices: tuple[str, ...] = ()
 
+    @property
+    def threes(self) -> int:
+        """How many groups have three numbers."""
+        return RESTARTS * int(np.count_nonzero(self.ints[:, SIZE] == 3))
 
-NO_FAULTS = FaultTable(
-    np.zeros((0, KIND_INTS), dtype=np.int64), np.zeros((0, KIND_NUMBERS)), columns=0
+    @property
+    def groups(self) -> int:
+        """How many groups there are."""
+        return RESTARTS * len(self.ints)
+
+
+def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:
+    """The table of these kinds; ValueError where one has another number than three or one, a mean
+    of three, or those of three do not come first."""
+    sizes = ints[:, SIZE]
+    if not np.isin(sizes, (1, 3)).all() or (np.diff(sizes) > 0).any():
+        raise ValueError("kinds have three numbers or one, those of three first")
+    if numbers[sizes == 3, BOUNDED].any() or numbers[numbers[:, BOUNDED] == 0.0, MEAN].any():
+        raise ValueError("only a kind of one number is known to be of a size, about a mean")
+    threes = RESTARTS * int(np.count_nonzero(sizes == 3))
+    parts = [threes, RESTARTS * len(sizes) - threes]
+    lanes = np.zeros((sum(-(-part // LANES) for part in parts), CONSTANTS))
+    lanes[:, P_AT:MEAN_AT], lanes[:, ODDS_AT:] = 1.0, -np.inf
+    for number in range(sum(parts)):
+        kind, level = number // RESTARTS, LEVEL_OF[number % RESTARTS]
+        first = number if number < threes else number + -threes % LANES
+        row, lane = divmod(first, LANES)
+        prior = numbers[kind, PRIOR : PRIOR + sizes[kind]]
+        for c, sd in enumerate(prior.tolist()):
+            lanes[row, P_AT + LANES * c + lane] = 1.0 / (sd * sd)
+        lanes[row, MEAN_AT + lane] = numbers[kind, MEAN]
+        odds = numbers[kind, LOG_RATE] + math.log(PERIODS_S[level])
+        known = numbers[kind, BOUNDED] != 0.0
+        lanes[row, ODDS_AT + lane] = odds - np.log(prior).sum() if known else odds
+    return FaultTable(ints, numbers, lanes.ravel(), devices)
+
+
+NO_FAULTS = fault_table(
+    np.zeros((0, KIND_INTS), dtype=np.int64), np.zeros((0, KIND_NUMBERS)), devices=()
 )
 
 
 def bank_size(table: FaultTable, n: int, width: int) -> int:
     """Doubles of a bank beside a filter of n states in rows of `width`."""
-    if not table.columns:
+    threes, groups = table.threes, table.groups
+    if not groups:
         return 0
-    groups: int = RESTARTS * table.ints.shape[0]
-    return GROUPS + groups * GROUP + chunks_of(table.columns, width) * n * width
+    tiles, ones = -(-threes // LANES), -(-(groups - threes) // LANES)
+    size = GROUPS + tiles * OF_THREE + ones * OF_ONE
+    return size + width * width + n * columns_of(table)
 
 
-def chunks_of(columns: int, width: int) -> int:
-    """Blocks of `width` columns that hold all."""
-    return -(-columns // width)
+def columns_of(table: FaultTable) -> int:
+    """Columns of V, and of an aid's rows."""
+    tiles, ones = -(-table.threes // LANES), -(-(table.groups - table.threes) // LANES)
+    return (3 * tiles + ones) * LANES
 
 
-def begin_bank(bank: Array, table: FaultTable) -> None:
+def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
     """Write what of a new bank never changes."""
     if bank.size:
-        bank[SENSITIVITIES] = GROUPS + RESTARTS * table.ints.shape[0] * GROUP
+        bank[SENSITIVITIES] = bank.size - n * columns_of(table)
+        bank[PHI] = bank[SENSITIVITIES] - width * width
+        bank[ALL], bank[THREES], bank[LENGTH] = table.groups, table.threes, LANES
+
+
+@compiled("i8(f8[::1], i8)", forceinline=True)
+def group_at(bank: Array, number: int) -> int:
+    """Where a group's numbers begin."""
+    threes = int(bank[THREES])
+    tile, lane = number // LANES, number % LANES
+    at: int = GROUPS + tile * OF_THREE + lane
+    if number >= threes:
+        tile, lane = (number - threes) // LANES, (number - threes) % LANES
+        at = GROUPS + (threes + LANES - 1) // LANES * OF_THREE + tile * OF_ONE + lane
+    return at
+
+
+@compiled("i8(f8[::1], i8, i8)", forceinline=True)
+def column_of(bank: Array, number: int, component: int) -> int:
+    """Column of a group's component, of V and of an aid's rows."""
+    threes = int(bank[THREES])
+    column: int = (3 * (number // LANES) + component) * LANES + number % LANES
+    if number >= threes:
+        ones = 3 * ((threes + LANES - 1) // LANES) + (number - threes) // LANES
+        column = ones * LANES + (number - threes) % LANES
+    return column

@@ -27,36 +27,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ALL,
+    ANY_FAULT,
     BOUNDED,
     CLASS,
+    CONSTANTS,
     COUNTS_BY,
     DECIDED,
     DEVICE,
+    E1,
+    E2,
     E_AT,
+    E_ROWS,
     EXPLAINED,
-    FIRST,
     FOLLOWED,
-    GROUP,
     GROUPS,
     J_AT,
+    L10,
+    L11,
+    L20,
+    L21,
+    L22,
     L_AT,
+    L_ROWS,
+    LANES,
     LASTS_S,
-    LEVEL_OF,
+    LEAST_WEIGHT,
+    LENGTH,
     LIKELY,
     LOG_ODDS,
-    LOG_RATE,
     MEAN,
+    MEAN_AT,
     N_AT,
+    ODDS_AT,
+    OF_ONE,
+    OF_THREE,
     ONSET,
-    PERIODS_S,
+    P_AT,
     PRIOR,
     RESTARTS,
     SENSITIVITIES,
     SIGNATURE,
-    SIZE,
+    THREES,
     UNEXPLAINED,
     UNEXPLAINED_SIGMAS,
     WEIGHT,
+    column_of,
+    group_at,
 )
 from fusiond.navigation.compiled import compiled
 
@@ -69,34 +86,31 @@ MISSED, ALIKE_S = 0.1, 0.25
 """Of what a hypothesis explains so much may be lost by an onset that lies between two restarts: a
 drift that began a seventh of its age before or after it loses a twentieth. An onset that is not
 missed is as near as half the youngest period."""
-SOLVED = 13
-"""What `solve` writes."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
-LEAST_WEIGHT = 1e-7
-"""What is as unlikely opens nothing: of a kilometre a third of a metre."""
+_NOTHING = -40.0
+"""Log of what counts nothing beside one: a sum of doubles does not show it."""
+APART = 4.0
+"""Log odds between two classes: fifty to one."""
 # What `judge` writes: the group with the largest odds of those that explain, its log odds, by how
-# much it is ahead of any of another class or device, the largest of any that explains, and the
-# weight of all.
-BEST, BEST_ODDS, AHEAD, EXPLAINS, FAULTY, FOUND = 0, 1, 2, 3, 4, 5
+# much it is ahead of any of another class or device, and the largest of any that explains.
+BEST, BEST_ODDS, AHEAD, EXPLAINS, FOUND = 0, 1, 2, 3, 4
 
 
-@compiled("f8(f8[::1], i8, f8[::1], f8, f8, f8[::1])", allocates=True)
-def solve(group: Array, size: int, numbers: Array, mean: float, share: float, m: Array) -> float:
-    """M = (L + share S^-1)^-1 of a group into m (9,), behind it b (3,) for a prior about `mean`,
-    and log det(I + S L / share); `numbers` (7,) of its kind. Returns by how much b explains the
-    evidence better than nothing wrong does, as log likelihood; by Gauss and Jordan with a positive
-    matrix."""
+@compiled("f8(f8[::1], i8, i8, f8[::1], f8, f8[::1])", allocates=True)
+def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Array) -> float:
+    """M = (L + share S^-1)^-1 of the group at `at` into m (9,) and behind it b (3,), with the mean
+    of its kind's `numbers` (7,) where `share` is 1; by Gauss and Jordan with a positive matrix.
+    Returns e^T b: without a mean what it explains, l."""
     a = np.empty((3, 6))
+    mean = numbers[MEAN] if share == 1.0 else 0.0
     for i in range(size):
         for j in range(size):
-            a[i, j] = group[L_AT + 3 * i + j]
+            a[i, j] = bank[at + L_ROWS[i, j]]
             a[i, size + j] = 1.0 if i == j else 0.0
         a[i, i] += share / (numbers[PRIOR + i] * numbers[PRIOR + i])
-    logarithm = 0.0
     for k in range(size):
         pivot = a[k, k]
-        logarithm += math.log(pivot * numbers[PRIOR + k] * numbers[PRIOR + k] / share)
         for j in range(2 * size):
             a[k, j] /= pivot
         for i in range(size):
@@ -109,47 +123,111 @@ def solve(group: Array, size: int, numbers: Array, mean: float, share: float, m:
         m[9 + i] = mean
         for j in range(size):
             m[3 * i + j] = a[i, size + j]
-            beyond = group[E_AT + j]  # e - L m
+            beyond = bank[at + E_ROWS[j]]  # e - L m
             for k in range(size):
-                beyond -= group[L_AT + 3 * j + k] * mean
+                beyond -= bank[at + L_ROWS[j, k]] * mean
             m[9 + i] += a[i, size + j] * beyond
-    for i in range(size):
-        beyond = group[E_AT + i]
-        along = group[E_AT + i] * mean
-        for k in range(size):
-            beyond -= group[L_AT + 3 * i + k] * mean
-            along -= 0.5 * mean * group[L_AT + 3 * i + k] * mean
-        gained += 0.5 * beyond * (m[9 + i] - mean) + along
-    m[12] = logarithm
+        gained += bank[at + E_ROWS[i]] * m[9 + i]
     return gained
+
+
+@compiled("void(f8[::1], f8[::1])")
+def _gains(bank: Array, lanes: Array) -> None:
+    """Write, of all groups, what they explain and what is left unexplained; of those of one number
+    also what the log odds gain by it with the prior, for log odds, and L + S^-1, for the weight."""
+    length = int(bank[LENGTH])
+    threes = (int(bank[THREES]) + LANES - 1) // LANES
+    ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
+    unsigned = np.uint64
+    for row in range(threes + ones):
+        at = unsigned(GROUPS + min(row, threes) * OF_THREE + max(row - threes, 0) * OF_ONE)
+        constants = unsigned(row * CONSTANTS)
+        size = 3.0 if row < threes else 1.0
+        if row < threes:
+            for k in range(length):
+                j, c = at + unsigned(k), constants + unsigned(k)
+                d_0 = bank[j + unsigned(L_AT)] + _TINY * lanes[c + unsigned(P_AT)]
+                a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
+                l_1, l_2 = a_1 / d_0, a_2 / d_0
+                d_1 = bank[j + unsigned(L11)] + _TINY * lanes[c + unsigned(P_AT + LANES)]
+                d_1 -= l_1 * a_1
+                a_3 = bank[j + unsigned(L21)] - l_2 * a_1
+                l_3 = a_3 / d_1
+                d_2 = bank[j + unsigned(L22)] + _TINY * lanes[c + unsigned(P_AT + 2 * LANES)]
+                d_2 -= l_2 * a_2 + l_3 * a_3
+                e_0 = bank[j + unsigned(E_AT)]
+                e_1 = bank[j + unsigned(E1)] - l_1 * e_0
+                e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
+                gained = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
+                bank[j + unsigned(EXPLAINED)] = gained
+        else:
+            for k in range(length):
+                j, c = at + unsigned(k), constants + unsigned(k)
+                information, mean = bank[j + unsigned(L_AT)], lanes[c + unsigned(MEAN_AT)]
+                e, prior = bank[j + unsigned(E_AT)], lanes[c + unsigned(P_AT)]
+                bank[j + unsigned(EXPLAINED)] = e * e / (information + _TINY * prior)
+                a = information + prior
+                beyond = e - information * mean
+                along = mean * (e - 0.5 * mean * information)
+                bank[j + unsigned(LOG_ODDS)] = 0.5 * beyond * beyond / a + along
+                bank[j + unsigned(WEIGHT)] = a
+        for k in range(length):
+            j = at + unsigned(k)
+            degrees = max(bank[j + unsigned(N_AT)] - size, 1.0)
+            most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
+            left = bank[j + unsigned(J_AT)] - bank[j + unsigned(EXPLAINED)] - most
+            bank[j + unsigned(UNEXPLAINED)] = left
+
+
+@compiled("void(f8[::1], f8[:, ::1], f8[::1], i8)")
+def _odds(bank: Array, numbers: Array, lanes: Array, number: int) -> None:
+    """Write the log odds of a group."""
+    threes, at, kind = int(bank[THREES]), group_at(bank, number), number // RESTARTS
+    size = 3.0 if number < threes else 1.0
+    a, bank[at + WEIGHT] = bank[at + WEIGHT], 0.0
+    if bank[at + N_AT] == 0.0:
+        bank[at + LOG_ODDS], bank[at + UNEXPLAINED] = -np.inf, 0.0
+        return
+    place = number if number < threes else number + -threes % LANES
+    rate = lanes[place // LANES * CONSTANTS + place % LANES + ODDS_AT] + bank[at + COUNTS_BY]
+    if numbers[kind, BOUNDED] == 0.0:
+        gained = 0.5 * (bank[at + EXPLAINED] - size * math.log(bank[at + N_AT]))
+    else:
+        gained = bank[at + LOG_ODDS] - 0.5 * math.log(a)
+        off = (bank[at + E_AT] - bank[at + L_AT] * numbers[kind, MEAN]) / a
+        if abs(off) > MOST_OFF * numbers[kind, PRIOR]:
+            bank[at + UNEXPLAINED] = np.inf  # it is of another size than this kind has
+    bank[at + LOG_ODDS] = rate + gained
 
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
 def _ahead(bank: Array, ints: Indices, best: int, kind: int) -> float:
     """By how much a group is ahead of those of a kind; infinite where nobody need choose."""
-    own, group = best // RESTARTS, bank[GROUPS + best * GROUP :]
+    own, group = best // RESTARTS, group_at(bank, best)
     if ints[kind, CLASS] == ints[own, CLASS] and ints[kind, DEVICE] == ints[own, DEVICE]:
         return np.inf
     step = ints[kind, SIGNATURE] <= FOLLOWED
     alike = step == (ints[own, SIGNATURE] <= FOLLOWED)
     fit, ahead, same = 0.0, np.inf, False
     for restart in range(RESTARTS):
-        other = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-        if other[UNEXPLAINED] > 0.0:
+        other = group_at(bank, RESTARTS * kind + restart)
+        if bank[other + UNEXPLAINED] > 0.0:
             continue
-        ahead = min(ahead, group[LOG_ODDS] - other[LOG_ODDS])
-        if other[LOG_ODDS] > 0.0:
-            fit = max(fit, other[EXPLAINED])
-            same = same or abs(other[ONSET] - group[ONSET]) < ALIKE_S
+        ahead = min(ahead, bank[group + LOG_ODDS] - bank[other + LOG_ODDS])
+        if bank[other + LOG_ODDS] > 0.0:
+            fit = max(fit, bank[other + EXPLAINED])
+            same = same or abs(bank[other + ONSET] - bank[group + ONSET]) < ALIKE_S
     if fit > 0.0 and not alike:
-        missed = 0.0 if same else MISSED * group[EXPLAINED]
-        ahead = min(ahead, 0.5 * (group[EXPLAINED] - fit - missed))
+        missed = 0.0 if same else MISSED * bank[group + EXPLAINED]
+        ahead = min(ahead, 0.5 * (bank[group + EXPLAINED] - fit - missed))
     return ahead
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8, f8[::1])", allocates=True)
-def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Array) -> None:
-    """Write log odds, weight and what is left unexplained of each group, and `found` (5,), at an
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1])", allocates=True)
+def judge(
+    bank: Array, ints: Indices, numbers: Array, lanes: Array, epoch_s: float, found: Array
+) -> None:
+    """Write log odds, weight and what is left unexplained of each group, and `found` (4,), at an
     epoch of a measurement. A single one accuses whoever is nearest: a hypothesis is found that has
     been likely, and has explained all, for `LASTS_S`.
 
@@ -158,119 +236,105 @@ def judge(bank: Array, ints: Indices, numbers: Array, epoch_s: float, found: Arr
     less: what fits as well is not told apart by rates alone. Compared are those of one onset; else
     the source's may have lost something.
     """
-    kinds = ints.shape[0]
-    m = np.empty(SOLVED)
+    groups = int(bank[ALL])
+    _gains(bank, lanes)
     largest = 0.0
-    for kind in range(kinds):
-        size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            group[LOG_ODDS], group[WEIGHT], group[UNEXPLAINED] = -np.inf, 0.0, 0.0
-            if group[N_AT] == 0.0:
-                continue
-            explained = 2.0 * solve(group, size, numbers[kind], 0.0, _TINY, m)
-            degrees = max(group[N_AT] - size, 1.0)
-            most = degrees + UNEXPLAINED_SIGMAS * math.sqrt(2.0 * degrees)
-            group[EXPLAINED] = explained
-            group[UNEXPLAINED] = group[J_AT] - explained - most
-            gained = 0.5 * explained - 0.5 * size * math.log(group[N_AT])
-            mean = numbers[kind, MEAN]
-            if numbers[kind, BOUNDED] != 0.0:
-                gained = solve(group, size, numbers[kind], mean, 1.0, m) - 0.5 * m[12]
-                if abs(m[9] - mean) > MOST_OFF * numbers[kind, PRIOR]:
-                    group[UNEXPLAINED] = np.inf  # it is of another size than this kind has
-            rate = numbers[kind, LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
-            group[LOG_ODDS] = rate + group[COUNTS_BY] + gained
-            if group[UNEXPLAINED] <= 0.0:
-                largest = max(largest, group[LOG_ODDS])
-    total = math.exp(-largest)
-    for kind in range(kinds):
-        for restart in range(RESTARTS):
-            at = GROUPS + (RESTARTS * kind + restart) * GROUP
-            if bank[at + UNEXPLAINED] <= 0.0:
-                total += math.exp(bank[at + LOG_ODDS] - largest)
-    found[BEST], found[FAULTY] = -1.0, 1.0 - math.exp(-largest) / total
+    for number in range(groups):
+        _odds(bank, numbers, lanes, number)
+        at = group_at(bank, number)
+        if bank[at + UNEXPLAINED] <= 0.0:
+            largest = max(largest, bank[at + LOG_ODDS])
+    nothing = math.exp(-largest)
+    total = nothing
+    for number in range(groups):
+        at = group_at(bank, number)
+        if bank[at + UNEXPLAINED] <= 0.0:
+            less = bank[at + LOG_ODDS] - largest
+            if less > _NOTHING:
+                bank[at + WEIGHT] = math.exp(less)
+                total += bank[at + WEIGHT]
+    found[BEST], bank[ANY_FAULT] = -1.0, 1.0 - nothing / total
     found[BEST_ODDS] = found[EXPLAINS] = -np.inf
-    for kind in range(kinds):
-        for restart in range(RESTARTS):
-            number = RESTARTS * kind + restart
-            group = bank[GROUPS + number * GROUP :]
-            if group[UNEXPLAINED] > 0.0:
-                group[LIKELY] = np.inf
-                continue
-            group[WEIGHT] = math.exp(group[LOG_ODDS] - largest) / total
-            if not group[LOG_ODDS] > DECIDED:
-                group[LIKELY] = np.inf
-            elif not group[LIKELY] <= epoch_s:
-                group[LIKELY] = epoch_s
-            lasted = epoch_s - group[LIKELY] > LASTS_S - 1e-3
-            if lasted and group[LOG_ODDS] > found[BEST_ODDS]:
-                found[BEST], found[BEST_ODDS] = number, group[LOG_ODDS]
-            found[EXPLAINS] = max(found[EXPLAINS], group[LOG_ODDS])
     found[AHEAD] = np.inf
+    for number in range(groups):
+        at = group_at(bank, number)
+        bank[at + WEIGHT] /= total
+        if bank[at + UNEXPLAINED] > 0.0:
+            bank[at + LIKELY] = np.inf
+            continue
+        odds = bank[at + LOG_ODDS]
+        if not odds > DECIDED:
+            bank[at + LIKELY] = np.inf
+        elif not bank[at + LIKELY] <= epoch_s:
+            bank[at + LIKELY] = epoch_s
+        lasted = epoch_s - bank[at + LIKELY] > LASTS_S - 1e-3
+        if lasted and odds > found[BEST_ODDS]:
+            found[BEST], found[BEST_ODDS] = number, odds
+        found[EXPLAINS] = max(found[EXPLAINS], odds)
     if found[BEST] >= 0.0:
-        for kind in range(kinds):
+        for kind in range(ints.shape[0]):
             found[AHEAD] = min(found[AHEAD], _ahead(bank, ints, int(found[BEST]), kind))
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[:, ::1])", allocates=True)
-def mixture(bank: Array, ints: Indices, numbers: Array, n: int, width: int, opened: Array) -> None:
+@compiled("b1(f8[::1])", forceinline=True)
+def identified(found: Array) -> bool:
+    """Whether a group is so much likelier than all of other classes, as `judge` has `found`."""
+    apart = found[BEST] >= 0.0 and found[AHEAD] > APART
+    return bool(apart)
+
+
+@compiled("void(f8[::1], f8[:, ::1], i8, f8[:, ::1])", allocates=True)
+def mixture(bank: Array, numbers: Array, n: int, opened: Array) -> None:
     """Write what the weighed hypotheses leave open of the first rows of the error state (q, q)."""
-    kinds, q = ints.shape[0], opened.shape[0]
+    q = opened.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
+    columns = v.shape[0] // n
     opened[:] = 0.0
-    m, x, rows = np.empty(SOLVED), np.empty((3, 3)), np.empty((3, q))
-    for kind in range(kinds):
-        size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            weight = group[WEIGHT]
-            if weight < LEAST_WEIGHT:
-                continue
-            solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
-            for c in range(size):
-                for d in range(size):
-                    x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
-                column = ints[kind, FIRST] + restart * size + c
-                first = column // width * n * width + column % width
-                for i in range(q):
-                    rows[c, i] = v[first + i * width]
+    m, x, rows = np.empty(12), np.empty((3, 3)), np.empty((3, q))
+    for number in range(int(bank[ALL])):
+        at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
+        weight = bank[at + WEIGHT]
+        if weight < LEAST_WEIGHT:
+            continue
+        solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
+        for c in range(size):
+            for d in range(size):
+                x[c, d] = weight * (m[3 * c + d] + m[9 + c] * m[9 + d])
+            first = column_of(bank, number, c)
             for i in range(q):
-                for c in range(size):
-                    along = 0.0
-                    for d in range(size):
-                        along += x[c, d] * rows[d, i]
-                    for j in range(q):
-                        opened[i, j] += rows[c, j] * along
+                rows[c, i] = v[first + i * columns]
+        for i in range(q):
+            for c in range(size):
+                along = 0.0
+                for d in range(size):
+                    along += x[c, d] * rows[d, i]
+                for j in range(q):
+                    opened[i, j] += rows[c, j] * along
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[:, ::1])", allocates=True)
+@compiled("void(f8[::1], f8[:, ::1], i8, i8, f8[::1], f8[:, ::1])", allocates=True)
 def estimate(
     bank: Array,
-    ints: Indices,
     numbers: Array,
     n: int,
-    width: int,
     number: int,
     size_and_variance: Array,
     effect: Array,
 ) -> None:
     """Write b (3,) and M (9,) of a group, and what V b and V M V^T are: `effect` (1 + n, n)."""
-    kind, restart = number // RESTARTS, number % RESTARTS
-    size = ints[kind, SIZE]
-    group = bank[GROUPS + number * GROUP :]
+    at, size = group_at(bank, number), 3 if number < int(bank[THREES]) else 1
     v = bank[int(bank[SENSITIVITIES]) :]
-    m = np.empty(SOLVED)
-    solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
+    columns = v.shape[0] // n
+    m = np.empty(12)
+    solve(bank, at, size, numbers[number // RESTARTS], 1.0, m)
     size_and_variance[:] = 0.0
     effect[:] = 0.0
     rows = np.empty((3, n))
     for c in range(size):
         size_and_variance[c] = m[9 + c]
-        column = ints[kind, FIRST] + restart * size + c
-        first = column // width * n * width + column % width
+        first = column_of(bank, number, c)
         for i in range(n):
-            rows[c, i] = v[first + i * width]
+            rows[c, i] = v[first + i * columns]
             effect[0, i] += rows[c, i] * m[9 + c]
         for d in range(size):
             size_and_variance[3 + 3 * c + d] = m[3 * c + d]

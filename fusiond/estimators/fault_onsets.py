@@ -14,24 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
-    ANY,
+    ALL,
+    ANY_FAULT,
     BEGINS_AT,
     COUNTS_BY,
-    DEVICE,
-    FIRST,
     FOLLOWED,
-    GROUP,
-    GROUPS,
+    LANES,
     LEVEL_OF,
     LIKELY,
-    LOCATES,
     LOG_ODDS,
-    MEAN,
-    MOVES,
-    MOVES_TOO,
+    OF_ONE,
+    OF_THREE,
     ONSET,
     PERIODS_NS,
-    PLACES,
     PROMOTED,
     RESTARTED,
     RESTARTS,
@@ -42,10 +37,15 @@ from fusiond.estimators.fault_bank import (
     SLOTS,
     SLOTS_OF,
     STATES,
+    THREES,
     TURNED,
     WEIGHT,
+    column_of,
+    group_at,
 )
-from fusiond.estimators.fault_odds import SOLVED, solve
+from fusiond.estimators.fault_carried import begin_transition
+from fusiond.estimators.fault_odds import solve
+from fusiond.estimators.fault_rows import concerns
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.strapdown import HEIGHT, LAT, STEP_DCM, STEP_SMOOTH_N, VN
@@ -60,40 +60,36 @@ COUNTS = 1e-3
 """Weight of a fault below which what it has done is not looked at."""
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[::1])", allocates=True)
-def _followed(
-    bank: Array, ints: Indices, numbers: Array, n: int, width: int, followed: Array
-) -> None:
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1])", allocates=True)
+def _followed(bank: Array, ints: Indices, numbers: Array, n: int, followed: Array) -> None:
     """Write what faults of sources have done to the filter (n,), and behind it their weight."""
     followed[:] = 0.0
-    v, m = bank[int(bank[SENSITIVITIES]) :], np.empty(SOLVED)
-    for kind in range(ints.shape[0]):
-        if ints[kind, SIGNATURE] <= FOLLOWED:
+    if not bank[ANY_FAULT] > COUNTS:
+        return
+    v, m = bank[int(bank[SENSITIVITIES]) :], np.empty(12)
+    columns = v.shape[0] // n
+    for number in range(int(bank[ALL])):
+        kind, at = number // RESTARTS, group_at(bank, number)
+        weight = bank[at + WEIGHT]
+        if ints[kind, SIGNATURE] <= FOLLOWED or weight < COUNTS:
             continue
-        size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            weight = group[WEIGHT]
-            if weight < COUNTS:
-                continue
-            solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
-            followed[n] += weight
-            for c in range(size):
-                column = ints[kind, FIRST] + restart * size + c
-                first = column // width * n * width + column % width
-                for i in range(n):
-                    followed[i] += weight * m[9 + c] * v[first + i * width]
+        size = 3 if number < int(bank[THREES]) else 1
+        solve(bank, at, size, numbers[kind], 1.0, m)
+        followed[n] += weight
+        for c in range(size):
+            first = column_of(bank, number, c)
+            for i in range(n):
+                followed[i] += weight * m[9 + c] * v[first + i * columns]
     if followed[n] > 0.0:
         for i in range(n):
             followed[i] /= followed[n]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8, f8[::1], f8[::1], f8[::1])")
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8, f8[::1], f8[::1], f8[::1])")
 def _begin_group(
     bank: Array,
     ints: Indices,
     n: int,
-    width: int,
     kind: int,
     restart: int,
     t_s: float,
@@ -103,44 +99,44 @@ def _begin_group(
 ) -> None:
     """Begin one kind's restart anew, with its onset now, at a state nav (10,) after `step`;
     `followed` (n + 1,) as `_followed` leaves it."""
-    at = GROUPS + (RESTARTS * kind + restart) * GROUP
-    for j in range(GROUP):
+    number, size = RESTARTS * kind + restart, ints[kind, SIZE]
+    at = group_at(bank, number)
+    for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
         bank[at + j] = 0.0
     bank[at + ONSET] = t_s
     bank[at + LOG_ODDS], bank[at + LIKELY] = -np.inf, np.inf
     if ints[kind, SIGNATURE] == FOLLOWED:
         bank[at + COUNTS_BY] = math.log(max(followed[n], UNLIKELY))
     v = bank[int(bank[SENSITIVITIES]) :]
-    size = ints[kind, SIZE]
+    columns = v.shape[0] // n
     for c in range(size):
-        column = ints[kind, FIRST] + restart * size + c
-        first = column // width * n * width + column % width
+        first = column_of(bank, number, c)
         for i in range(n):
-            v[first + i * width] = 0.0
+            v[first + i * columns] = 0.0
         of, slots = ints[kind, SIGNATURE], ints[kind, SLOTS : SLOTS + 3]
         if of == STATES:
             for j in range(3):
                 if (j == c or size == 1) and slots[j] >= 0:
-                    v[first + slots[j] * width] = 1.0
+                    v[first + slots[j] * columns] = 1.0
         elif of == TURNED:
             for i in range(3):
-                v[first + i * width] = step[STEP_DCM + 3 * i + c]
+                v[first + i * columns] = step[STEP_DCM + 3 * i + c]
             if slots[c] >= 0:
-                v[first + slots[c] * width] = 1.0
+                v[first + slots[c] * columns] = 1.0
         elif of == SHIFTED:
             # It began at fixes that were stamped by tau too late: p - v tau, v - a tau.
             for i in range(3):
                 force = step[STEP_SMOOTH_N + i]
                 if i == 2:
                     force += gravity(nav[LAT], nav[HEIGHT])
-                v[first + (3 + i) * width] = -force
-                v[first + (6 + i) * width] = -nav[VN + i]
+                v[first + (3 + i) * columns] = -force
+                v[first + (6 + i) * columns] = -nav[VN + i]
             for j in range(3):
                 if slots[j] >= 0:
-                    v[first + slots[j] * width] = -1.0
+                    v[first + slots[j] * columns] = -1.0
         elif of == FOLLOWED:
             for i in range(n):
-                v[first + i * width] = followed[i]
+                v[first + i * columns] = followed[i]
 
 
 @compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, f8[::1], f8[::1])", allocates=True)
@@ -148,51 +144,66 @@ def begin_all(
     bank: Array, ints: Indices, n: int, width: int, t_ns: int, nav: Array, step: Array
 ) -> None:
     """Begin all hypotheses anew; what the path was remains."""
+    begin_transition(bank, n, width)
+    bank[ANY_FAULT] = 0.0
     followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):
-            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step, followed)
+            _begin_group(bank, ints, n, kind, restart, t_ns * 1e-9, nav, step, followed)
     for level in range(len(PERIODS_NS)):
         bank[RESTARTED + level] = t_ns // PERIODS_NS[level]
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8)")
-def _promote(bank: Array, ints: Indices, n: int, width: int, kind: int, restart: int) -> None:
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8)")
+def _promote(bank: Array, ints: Indices, n: int, kind: int, restart: int) -> None:
     """A restart that is about to begin anew takes the place of the less likely one of the level
     above, if that is much less likely."""
     level = LEVEL_OF[restart] + 1
     if level >= len(SLOTS_OF):
         return
-    at = GROUPS + RESTARTS * kind * GROUP
-    odds, least, found = bank[at + restart * GROUP + LOG_ODDS], np.inf, -1
+    number, size = RESTARTS * kind + restart, ints[kind, SIZE]
+    at = group_at(bank, number)
+    odds, least, found = bank[at + LOG_ODDS], np.inf, -1
     for slot in range(BEGINS_AT[level], BEGINS_AT[level] + SLOTS_OF[level]):
-        if bank[at + slot * GROUP + LOG_ODDS] < least:
-            least, found = bank[at + slot * GROUP + LOG_ODDS], slot
+        above = bank[group_at(bank, RESTARTS * kind + slot) + LOG_ODDS]
+        if above < least:
+            least, found = above, slot
     if found < 0 or not odds > least + PROMOTED:
         return
-    for j in range(GROUP):
-        bank[at + found * GROUP + j] = bank[at + restart * GROUP + j]
+    to = RESTARTS * kind + found
+    there = group_at(bank, to)
+    for j in range(0, OF_ONE if size == 1 else OF_THREE, LANES):
+        bank[there + j] = bank[at + j]
     v = bank[int(bank[SENSITIVITIES]) :]
-    size = ints[kind, SIZE]
+    columns = v.shape[0] // n
     for c in range(size):
-        own = ints[kind, FIRST] + restart * size + c
-        other = ints[kind, FIRST] + found * size + c
-        first = own // width * n * width + own % width
-        second = other // width * n * width + other % width
+        own, other = column_of(bank, number, c), column_of(bank, to, c)
         for i in range(n):
-            v[second + i * width] = v[first + i * width]
+            v[other + i * columns] = v[own + i * columns]
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[::1])", allocates=True)
-def restart_due(
+@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, f8[::1], f8[::1])", allocates=True)
+def begin_again(
     bank: Array,
     ints: Indices,
-    numbers: Array,
     n: int,
-    width: int,
+    measures: int,
+    device: int,
     t_ns: int,
     nav: Array,
     step: Array,
+) -> None:
+    """Begin those hypotheses anew that are of rows which return to service."""
+    followed = np.zeros(n + 1)
+    for kind in range(ints.shape[0]):
+        if concerns(ints, kind, measures, device):
+            for restart in range(RESTARTS):
+                _begin_group(bank, ints, n, kind, restart, t_ns * 1e-9, nav, step, followed)
+
+
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8[::1], f8[::1])", allocates=True)
+def restart_due(
+    bank: Array, ints: Indices, numbers: Array, n: int, t_ns: int, nav: Array, step: Array
 ) -> None:
     """Begin anew those restarts whose turn has come at `t_ns`; of the longest period first, so that
     one that has just been handed on is not the next to begin."""
@@ -204,44 +215,10 @@ def restart_due(
             bank[RESTARTED + level] = turn
             if followed.shape[0] == 0:
                 followed = np.zeros(n + 1)
-                _followed(bank, ints, numbers, n, width, followed)
+                _followed(bank, ints, numbers, n, followed)
             slot = BEGINS_AT[level] + turn % SLOTS_OF[level]
             for kind in range(ints.shape[0]):
                 if ints[kind, SIGNATURE] == SHIFTED:  # it is so from the start on
                     continue
-                _promote(bank, ints, n, width, kind, slot)
-                _begin_group(bank, ints, n, width, kind, slot, t_ns * 1e-9, nav, step, followed)
-
-
-@compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
-def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """Whether a kind is in such rows of a device, or of any that locate or move."""
-    if measures == PLACES and not ints[kind, LOCATES]:
-        return False
-    if measures == MOVES and not ints[kind, MOVES_TOO]:
-        return False
-    if ints[kind, DEVICE] == ANY:
-        return bool(measures <= MOVES)
-    of_this: bool = ints[kind, DEVICE] == device
-    return of_this
-
-
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, i8, i8, i8, f8[::1], f8[::1])", allocates=True)
-def begin_again(
-    bank: Array,
-    ints: Indices,
-    n: int,
-    width: int,
-    measures: int,
-    device: int,
-    t_ns: int,
-    nav: Array,
-    step: Array,
-) -> None:
-    """Begin those hypotheses anew that are of rows which return to service."""
-    followed = np.zeros(n + 1)
-    for kind in range(ints.shape[0]):
-        if ints[kind, SIGNATURE] <= FOLLOWED or not concerns(ints, kind, measures, device):
-            continue
-        for restart in range(RESTARTS):
-            _begin_group(bank, ints, n, width, kind, restart, t_ns * 1e-9, nav, step, followed)
+                _promote(bank, ints, n, kind, slot)
+                _begin_group(bank, ints, n, kind, slot, t_ns * 1e-9, nav, step, followed)

@@ -11,20 +11,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ALL,
+    ANY,
     CARRIED,
     DELAY,
+    DEVICE,
+    E1,
+    E2,
     E_AT,
     ENTRIES,
-    FIRST,
     FOLLOWED,
-    GROUP,
     GROUPS,
     HEAD,
     J_AT,
+    L10,
+    L11,
+    L20,
+    L21,
+    L22,
     L_AT,
     LAG,
+    LANES,
+    LENGTH,
+    LOCATES,
     MOVES,
+    MOVES_TOO,
     N_AT,
+    OF_ONE,
+    OF_THREE,
     ONSET,
     OTHER,
     PATH,
@@ -42,10 +56,12 @@ from fusiond.estimators.fault_bank import (
     SIGNATURE,
     SIZE,
     SPEED,
+    THREES,
     VELOCITY,
     VELOCITY_RAMP,
+    column_of,
+    group_at,
 )
-from fusiond.estimators.fault_onsets import concerns
 from fusiond.navigation.compiled import compiled
 from fusiond.navigation.strapdown import VN
 
@@ -71,24 +87,138 @@ def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
     bank[ENTRIES] = entries + 1.0
 
 
-@compiled("f8(f8[::1], f8, i8)")
-def _past(bank: Array, t_s: float, component: int) -> float:
-    """Component (place 0 to 2, velocity 3 to 5) of the path at `t_s`, linear between two points;
-    not a number where it is not kept."""
+@compiled("i8(f8[::1], f8)")
+def _past(bank: Array, t_s: float) -> int:
+    """How many points ago the path was last before `t_s`, or at it; -1 where it is not kept."""
     entries = int(bank[ENTRIES])
-    for back in range(min(entries, RING) - 1):
-        at = HEAD + (entries - 1 - back) % RING * POINT
-        before = HEAD + (entries - 2 - back) % RING * POINT
-        if bank[before] <= t_s:
-            share = (t_s - bank[before]) / (bank[at] - bank[before])
-            a, b = bank[before + 1 + component], bank[at + 1 + component]
-            found: float = a + share * (b - a)
-            return found
-    return math.nan
+    first, end = 1, min(entries, RING)  # of two points the first is looked for
+    while first < end:
+        middle = (first + end) // 2
+        if bank[HEAD + (entries - 1 - middle) % RING * POINT] <= t_s:
+            end = middle
+        else:
+            first = middle + 1
+    return first if first < min(entries, RING) else -1
 
 
-@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], i8, i8)")
-def signature(
+@compiled("f8(f8[::1], i8, f8, i8)")
+def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
+    """Component (place 0 to 2, velocity 3 to 5) of the path at `t_s`, linear from the point so many
+    ago to the next."""
+    entries = int(bank[ENTRIES])
+    at = HEAD + (entries - back) % RING * POINT
+    before = HEAD + (entries - 1 - back) % RING * POINT
+    share = (t_s - bank[before]) / (bank[at] - bank[before])
+    a, b = bank[before + 1 + component], bank[at + 1 + component]
+    found: float = a + share * (b - a)
+    return found
+
+
+@compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
+def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
+    """Whether a kind is one of rows, of a device, or of any and this one locates or moves."""
+    if ints[kind, SIGNATURE] <= FOLLOWED:
+        return False
+    if measures == PLACES and not ints[kind, LOCATES]:
+        return False
+    if measures == MOVES and not ints[kind, MOVES_TOO]:
+        return False
+    if ints[kind, DEVICE] == ANY:
+        return bool(measures <= MOVES)
+    of_this: bool = ints[kind, DEVICE] == device
+    return of_this
+
+
+@compiled("void(f8[::1], i8, i8, f8, f8, f8, f8[::1])")
+def _offset_rows(
+    bank: Array,
+    kind: int,
+    component: int,
+    offset: float,
+    slope: float,
+    t_s: float,
+    s: Array,
+) -> None:
+    """Add to s (columns,) what a kind's component makes of a row: an offset, and what has grown
+    with a slope since the onset of each restart until `t_s`."""
+    for restart in range(RESTARTS):
+        number = RESTARTS * kind + restart
+        d = offset
+        if slope != 0.0:
+            d += slope * (t_s - bank[group_at(bank, number) + ONSET])
+        s[column_of(bank, number, component)] += d
+
+
+@compiled("UniTuple(f8, 2)(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8)")
+def _of_row(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    kind: int,
+    measures: int,
+    t_s: float,
+    nav: Array,
+    back: int,
+    row: int,
+) -> tuple[float, float]:
+    """D of a row for the component of a kind that is in it: an offset, and a slope over the time
+    since its onset. `back`: where the path was when the delay began, as `_past` says."""
+    of, offset, slope = ints[kind, SIGNATURE], 0.0, 0.0
+    if of == DELAY:
+        if measures <= MOVES and back >= 0:
+            then = t_s - numbers[kind, LAG]
+            if measures == PLACES:
+                offset = bank[PATH + row] + (t_s - bank[PATH_S]) * nav[VN + row]
+                offset -= _at_past(bank, back, then, row)
+            else:
+                offset = nav[VN + row] - _at_past(bank, back, then, 3 + row)
+    elif of == SPEED:
+        if measures == ROLLS:
+            offset = -math.hypot(nav[VN], nav[VN + 1])
+    elif measures == PLACES:
+        if of == POSITION:
+            offset = -1.0
+        elif of in (POSITION_RAMP, CARRIED):
+            slope = -1.0
+    elif measures == MOVES:
+        if of in (VELOCITY, CARRIED):
+            offset = -1.0
+        elif of == VELOCITY_RAMP:
+            slope = -1.0
+    elif measures == OTHER and of == ROWS:
+        offset = -1.0
+    return offset if math.isfinite(offset) else 0.0, slope
+
+
+@compiled(
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, f8, f8[::1], i8, i8, f8[::1])",
+)
+def _sign(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    kind: int,
+    measures: int,
+    t_s: float,
+    nav: Array,
+    m: int,
+    columns: int,
+    work: Array,
+) -> None:
+    """Add D of the m rows of an aid that a kind concerns."""
+    of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
+    back = _past(bank, t_s - numbers[kind, LAG]) if of == DELAY else -1
+    for a in range(m if size == 1 else min(m, size)):
+        offset, slope = _of_row(bank, ints, numbers, kind, measures, t_s, nav, back, a)
+        if offset != 0.0 or slope != 0.0:
+            s = work[a * columns : (a + 1) * columns]
+            _offset_rows(bank, kind, 0 if size == 1 else a, offset, slope, t_s, s)
+
+
+@compiled(
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8, f8, f8[::1], f8[::1], f8[::1])",
+)
+def rows_of_fault(
     bank: Array,
     ints: Indices,
     numbers: Array,
@@ -98,50 +228,55 @@ def signature(
     t_s: float,
     age_s: float,
     nav: Array,
-    row: int,
-    component: int,
-) -> float:
-    """D of a row for a component of a kind that has run for `age_s`."""
-    of, d = ints[kind, SIGNATURE], 0.0
-    if of <= FOLLOWED or not concerns(ints, kind, measures, device):
-        return 0.0
-    if of == DELAY:
-        lag = numbers[kind, LAG]
-        if measures == PLACES:
-            d = bank[PATH + row] + (t_s - bank[PATH_S]) * nav[VN + row]
-            d -= _past(bank, t_s - lag, row)
-        elif measures == MOVES:
-            d = nav[VN + row] - _past(bank, t_s - lag, 3 + row)
-        return d if math.isfinite(d) else 0.0
-    if of == SPEED:
-        return -math.hypot(nav[VN], nav[VN + 1]) if measures == ROLLS else 0.0
-    if row != component:
-        return 0.0
-    if measures == PLACES:
-        if of == POSITION:
-            d = -1.0
-        elif of in (POSITION_RAMP, CARRIED):
-            d = -age_s
-    elif measures == MOVES:
-        if of in (VELOCITY, CARRIED):
-            d = -1.0
-        elif of == VELOCITY_RAMP:
-            d = -age_s
-    elif measures == OTHER and of == ROWS:
-        d = -1.0
-    return d
+    b: Array,
+    out: Array,
+) -> None:
+    """Write D b (3,) of a fault of a kind that is so old, of size b (p,)."""
+    out[:] = 0.0
+    if not concerns(ints, kind, measures, device):
+        return
+    of, size = ints[kind, SIGNATURE], ints[kind, SIZE]
+    back = _past(bank, t_s - numbers[kind, LAG]) if of == DELAY else -1
+    for a in range(3):
+        offset, slope = _of_row(bank, ints, numbers, kind, measures, t_s, nav, back, a)
+        out[a] = (offset + slope * age_s) * b[0 if size == 1 else a]
+
+
+@compiled("void(f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1])")
+def add_rows(
+    v: Array, columns: int, first: int, of: Indices, count: int, c: Array, out: Array
+) -> None:
+    """Add to `out` c (n,) times V, from column `first` on: of its rows `count`, `of` which c is not
+    zero, four in one pass."""
+    at = 0
+    while at < count:
+        more = at + 4 <= count
+        i_0 = of[at]
+        v_0, c_0 = v[i_0 * columns + first :], c[i_0]
+        if more:
+            i_1, i_2, i_3 = of[at + 1], of[at + 2], of[at + 3]
+            v_1, c_1 = v[i_1 * columns + first :], c[i_1]
+            v_2, c_2 = v[i_2 * columns + first :], c[i_2]
+            v_3, c_3 = v[i_3 * columns + first :], c[i_3]
+            for j in range(out.shape[0]):
+                out[j] += c_0 * v_0[j] + c_1 * v_1[j] + c_2 * v_2[j] + c_3 * v_3[j]
+            at += 4
+        else:
+            for j in range(out.shape[0]):
+                out[j] += c_0 * v_0[j]
+            at += 1
 
 
 @compiled(
-    "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
-    "f8[:, ::1], f8[::1])"
+    "i8(f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, i8, f8[::1], f8[:, ::1], f8[::1],"
+    "f8[:, ::1], f8[::1])",
+    allocates=True,
 )
 def sensitivity_rows(
     bank: Array,
     ints: Indices,
     numbers: Array,
     n: int,
-    width: int,
     t_ns: int,
     measures: int,
     device: int,
@@ -155,89 +290,105 @@ def sensitivity_rows(
     columns. H (m, n), variances r (m,), g (m, w) = L^-1 H P as `whiten` leaves it; nav (10,)."""
     m, kinds = h.shape[0], ints.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
-    blocks = v.shape[0] // (n * width)
-    columns: int = blocks * width
-    t_s = t_ns * 1e-9
+    columns: int = v.shape[0] // n
+    of = np.empty(n, dtype=np.int64)
     for a in range(m):
-        s = work[a * columns : (a + 1) * columns]
-        along = 0.0
+        s, count = work[a * columns : (a + 1) * columns], 0
+        for i in range(n):
+            if h[a, i] != 0.0:
+                of[count] = i
+                count += 1
+        for j in range(s.shape[0]):
+            s[j] = 0.0
+        add_rows(v, columns, 0, of, count, h[a], s)
+    for kind in range(kinds):
+        if concerns(ints, kind, measures, device):
+            _sign(bank, ints, numbers, kind, measures, t_ns * 1e-9, nav, m, columns, work)
+    for a in range(m):
+        s, along = work[a * columns : (a + 1) * columns], 0.0
         for i in range(n):
             along += h[a, i] * g[a, i]
         # Of S = (h g) root + r, which is root^2.
-        root = 0.5 * (along + math.sqrt(along * along + 4.0 * r[a]))
-        for b in range(blocks):
-            part = s[b * width : (b + 1) * width]
-            for j in range(width):
-                part[j] = 0.0
-            for i in range(n):
-                c = h[a, i]
-                if c != 0.0:
-                    first = (b * n + i) * width
-                    rows = v[first : first + width]
-                    for j in range(width):
-                        part[j] += c * rows[j]
-        for kind in range(kinds):
-            if ints[kind, SIGNATURE] <= FOLLOWED or not concerns(ints, kind, measures, device):
-                continue
-            size = ints[kind, SIZE]
-            for restart in range(RESTARTS):
-                age_s = t_s - bank[GROUPS + (RESTARTS * kind + restart) * GROUP + ONSET]
-                for c in range(size):
-                    s[ints[kind, FIRST] + restart * size + c] += signature(
-                        bank, ints, numbers, kind, measures, device, t_s, age_s, nav, a, c
-                    )
+        over = 1.0 / (0.5 * (along + math.sqrt(along * along + 4.0 * r[a])))
         for b in range(a):
             common, before = 0.0, work[b * columns : (b + 1) * columns]
             for i in range(n):
                 common += h[a, i] * g[b, i]
-            for j in range(columns):
+            for j in range(s.shape[0]):
                 s[j] -= common * before[j]
-        for j in range(columns):
-            s[j] /= root
+        for j in range(s.shape[0]):
+            s[j] *= over
     return columns
 
 
-@compiled("void(f8[::1], i8[:, ::1], i8, i8, f8[::1], f8[:, ::1], b1, f8[::1])")
-def account(
-    bank: Array,
-    ints: Indices,
-    n: int,
-    width: int,
-    y: Array,
-    g: Array,
-    fused: bool,
-    work: Array,
-) -> None:
+@compiled("void(f8[::1], i8, f8[:, ::1], i8, i8, f8[::1])")
+def _fold_in(v: Array, n: int, g: Array, m: int, columns: int, work: Array) -> None:
+    """V <- V - g^T s, three rows in one pass, or one."""
+    at = 0
+    while at < m:
+        s_0 = work[at * columns : (at + 1) * columns]
+        if at + 3 <= m:
+            s_1 = work[(at + 1) * columns : (at + 2) * columns]
+            s_2 = work[(at + 2) * columns : (at + 3) * columns]
+            for i in range(n):
+                c_0, c_1, c_2 = g[at, i], g[at + 1, i], g[at + 2, i]
+                if c_0 == 0.0 and c_1 == 0.0 and c_2 == 0.0:
+                    continue
+                row = v[i * columns : (i + 1) * columns]
+                for j in range(row.shape[0]):
+                    row[j] -= c_0 * s_0[j] + c_1 * s_1[j] + c_2 * s_2[j]
+            at += 3
+        else:
+            for i in range(n):
+                c_0 = g[at, i]
+                if c_0 != 0.0:
+                    row = v[i * columns : (i + 1) * columns]
+                    for j in range(row.shape[0]):
+                        row[j] -= c_0 * s_0[j]
+            at += 1
+
+
+@compiled("void(f8[::1], i8, f8[::1], f8[:, ::1], b1, f8[::1])")
+def account(bank: Array, n: int, y: Array, g: Array, fused: bool, work: Array) -> None:
     """Take in what `sensitivity_rows` has left in `work` with the whitened innovation y (m,);
     `fused` where the filter folds the rows in, with g (m, w) as `whiten` leaves it."""
-    m, kinds = y.shape[0], ints.shape[0]
+    m = y.shape[0]
     v = bank[int(bank[SENSITIVITIES]) :]
-    blocks = v.shape[0] // (n * width)
-    columns = blocks * width
+    columns = v.shape[0] // n
     square = 0.0
     for a in range(m):
         square += y[a] * y[a]
-    for kind in range(kinds):
-        size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            first = ints[kind, FIRST] + restart * size
-            for a in range(m):
-                s = work[a * columns + first :]
-                for c in range(size):
-                    group[E_AT + c] += s[c] * y[a]
-                    for d in range(size):
-                        group[L_AT + 3 * c + d] += s[c] * s[d]
-            group[J_AT] += square
-            group[N_AT] += m
+    length = int(bank[LENGTH])
+    threes = (int(bank[THREES]) + LANES - 1) // LANES
+    eights = threes + (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
+    unsigned = np.uint64
+    for row in range(eights):
+        three = row < threes
+        at = GROUPS + min(row, threes) * OF_THREE + max(row - threes, 0) * OF_ONE
+        first = 3 * row if three else 2 * threes + row
+        own = unsigned(at)
+        for k in range(length):
+            j = own + unsigned(k)
+            bank[j + unsigned(J_AT)] += square
+            bank[j + unsigned(N_AT)] += m
+        for a in range(m):
+            y_a = y[a]
+            at_0 = unsigned(a * columns + first * LANES)
+            for k in range(length):
+                j, s_0 = own + unsigned(k), work[at_0 + unsigned(k)]
+                bank[j + unsigned(L_AT)] += s_0 * s_0
+                bank[j + unsigned(E_AT)] += s_0 * y_a
+            if three:
+                at_1, at_2 = at_0 + unsigned(LANES), at_0 + unsigned(2 * LANES)
+                for k in range(length):
+                    j, lane = own + unsigned(k), unsigned(k)
+                    s_0, s_1, s_2 = work[at_0 + lane], work[at_1 + lane], work[at_2 + lane]
+                    bank[j + unsigned(L10)] += s_1 * s_0
+                    bank[j + unsigned(L11)] += s_1 * s_1
+                    bank[j + unsigned(L20)] += s_2 * s_0
+                    bank[j + unsigned(L21)] += s_2 * s_1
+                    bank[j + unsigned(L22)] += s_2 * s_2
+                    bank[j + unsigned(E1)] += s_1 * y_a
+                    bank[j + unsigned(E2)] += s_2 * y_a
     if fused:
-        for b in range(blocks):
-            for i in range(n):
-                first = (b * n + i) * width
-                rows = v[first : first + width]
-                for a in range(m):
-                    c = g[a, i]
-                    if c != 0.0:
-                        s = work[a * columns + b * width :]
-                        for j in range(width):
-                            rows[j] -= c * s[j]
+        _fold_in(v, n, g, m, columns, work)

@@ -6,18 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    ALL,
     CLASS,
-    FIRST,
     FOLLOWED,
-    GROUP,
-    GROUPS,
-    MEAN,
+    LEAST_WEIGHT,
     RESTARTS,
     SIGNATURE,
     SIZE,
     WEIGHT,
+    column_of,
+    group_at,
 )
-from fusiond.estimators.fault_odds import LEAST_WEIGHT, SOLVED, solve
+from fusiond.estimators.fault_odds import solve
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
@@ -35,25 +35,23 @@ def nis_if_sensors_fail(
     and those of sources that are over leave open, as they are weighed; `work` as
     `sensitivity_rows` leaves it."""
     rows = y.shape[0]
-    c, m = np.eye(rows), np.empty(SOLVED)
-    for kind in range(ints.shape[0]):
-        if ints[kind, CLASS] != 0 and ints[kind, SIGNATURE] != FOLLOWED:
+    c, m = np.eye(rows), np.empty(12)
+    for number in range(int(bank[ALL])):
+        kind, at = number // RESTARTS, group_at(bank, number)
+        weight = bank[at + WEIGHT]
+        ours = ints[kind, CLASS] == 0 or ints[kind, SIGNATURE] == FOLLOWED
+        if not ours or weight < LEAST_WEIGHT:
             continue
         size = ints[kind, SIZE]
-        for restart in range(RESTARTS):
-            group = bank[GROUPS + (RESTARTS * kind + restart) * GROUP :]
-            weight = group[WEIGHT]
-            if weight < LEAST_WEIGHT:
-                continue
-            solve(group, size, numbers[kind], numbers[kind, MEAN], 1.0, m)
-            first = ints[kind, FIRST] + restart * size
-            for a in range(rows):
-                for b in range(rows):
-                    for i in range(size):
-                        for j in range(size):
-                            x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
-                            s = work[a * columns + first + i] * work[b * columns + first + j]
-                            c[a, b] += s * x
+        solve(bank, at, size, numbers[kind], 1.0, m)
+        for a in range(rows):
+            for b in range(rows):
+                for i in range(size):
+                    s_a = work[a * columns + column_of(bank, number, i)]
+                    for j in range(size):
+                        x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
+                        s_b = work[b * columns + column_of(bank, number, j)]
+                        c[a, b] += s_a * s_b * x
     # y^T C^-1 y by elimination.
     left, nis = y.copy(), 0.0
     for k in range(rows):
@@ -96,18 +94,16 @@ def fold_and_account(
     A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
     would never be found else. Where such a fault, as likely as it is, explains it, it is folded in.
     """
-    n, width = dx.shape[0], cov.shape[0]
+    n = dx.shape[0]
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
-    restart_due(bank, ints, numbers, n, width, t_ns, nav, step)
-    columns = sensitivity_rows(
-        bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work
-    )
+    restart_due(bank, ints, numbers, n, t_ns, nav, step)
+    columns = sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
     judged = nis
     if nis > threshold:
         judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
-    account(bank, ints, n, width, y, g, judged <= threshold, work)
+    account(bank, n, y, g, judged <= threshold, work)
     if judged <= threshold:
         dx[:] = 0.0
         fold_in(cov, dx, y, g)
@@ -118,7 +114,7 @@ def fold_and_account(
 
 @compiled(
     "void(f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], b1, f8[::1], i8[:, ::1],"
-    "f8[:, ::1], i8, i8, i8, i8, f8[::1])"
+    "f8[:, ::1], i8, i8, i8, f8[::1])"
 )
 def account_for(
     nav: Array,
@@ -131,7 +127,6 @@ def account_for(
     bank: Array,
     ints: Indices,
     numbers: Array,
-    width: int,
     t_ns: int,
     measures: int,
     device: int,
@@ -140,6 +135,6 @@ def account_for(
     """What the bank makes of rows that were `fused` or not, as `whiten` has left y (m,) and g (m,
     w): of a filter that keeps its estimate."""
     n = h.shape[1]
-    restart_due(bank, ints, numbers, n, width, t_ns, nav, step)
-    sensitivity_rows(bank, ints, numbers, n, width, t_ns, measures, device, nav, h, r, g, work)
-    account(bank, ints, n, width, y, g, fused, work)
+    restart_due(bank, ints, numbers, n, t_ns, nav, step)
+    sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
+    account(bank, n, y, g, fused, work)

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from fusiond.aiding.base import LENT_ROWS, Linearised
 from fusiond.estimators.fault_bank import (
+    ALL,
     EXPLAINED,
-    GROUP,
-    GROUPS,
     LOG_ODDS,
     MOVES,
     NOTHING,
@@ -22,15 +21,21 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     ROLLS,
     SENSITIVITIES,
+    SIZE,
     UNEXPLAINED,
+    WAITS,
     WEIGHT,
     FaultTable,
-    chunks_of,
+    column_of,
+    columns_of,
+    group_at,
 )
 from fusiond.estimators.fault_odds import FOUND, estimate, judge, mixture
 from fusiond.estimators.fault_onsets import begin_again, begin_all
-from fusiond.estimators.fault_rows import signature
+from fusiond.estimators.fault_opened import OPENED_WORK, RARE, judge_and_widen, widen_by_faults
+from fusiond.estimators.fault_rows import rows_of_fault
 from fusiond.models.model import Model
+from fusiond.models.vehicle import MOUNTING
 
 Array = NDArray[np.float64]
 
@@ -56,17 +61,18 @@ class Hypotheses:
     def __init__(self, bank: Array, table: FaultTable, model: Model) -> None:
         self.bank, self.table = bank, table
         self.n, self.width = model.size, model.width
-        kinds = table.ints.shape[0]
         self.found = np.full(FOUND, -np.inf)
-        """What the last `judge` has found."""
-        self.columns = chunks_of(table.columns, model.width) * model.width
-        self.work = np.zeros(LENT_ROWS * self.columns)
-        self._groups = bank[GROUPS : GROUPS + RESTARTS * kinds * GROUP].reshape(
-            kinds, RESTARTS, GROUP
-        )
-        n, w, v = self.n, self.width, bank[int(bank[SENSITIVITIES]) :]
-        self.sensitivities = v.reshape(-1, n, w)
-        """V, a block (n, w) of columns after another."""
+        """What the last `judge` has found, as of fusiond.estimators.fault_odds."""
+        self._mounting = np.full((2, 2), -1.0)
+        """Slots of pitch and yaw of the mounting, and what of their squares is chance."""
+        for k, slot in enumerate(model.slots_of(MOUNTING)[:2]):
+            self._mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
+        self.columns = columns_of(table)
+        self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
+        numbers = range(int(bank[ALL]))
+        self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
+        self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)
+        """V (n, columns)."""
         self._nine = np.zeros((9, 9))
         self._of_source: dict[str, tuple[int, int]] = {}
 
@@ -80,82 +86,111 @@ class Hypotheses:
             known = self._of_source[aid.source] = _measures(aid, device >= 0), device
         return known
 
+    @property
+    def waits(self) -> bool:
+        """Whether V is still that of the last aid, as it is after a look in passing."""
+        return self.bank.item(WAITS) != 0.0
+
     def begin(self, t_ns: int, nav: Array, step: Array) -> None:
         """Begin all hypotheses anew at `t_ns`, of a filter with that state (10,) and last step."""
         begin_all(self.bank, self.table.ints, self.n, self.width, t_ns, nav, step)
 
-    def adds(self, aid: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
-        """D b (3,): what a fault of size `b`, of such an age, does to an aid's rows."""
-        ints, numbers, (measures, device) = *self.table[:2], self.of(aid)
-        found = np.zeros(3)
-        for row in range(3):
-            for c, size in enumerate(b):
-                at = (kind, measures, device, aid.t_ns * 1e-9, age_s, nav, row, c)
-                found[row] += size * signature(self.bank, ints, numbers, *at)
-        return found
-
     def begin_again(self, aid: Linearised, nav: Array, step: Array) -> None:
         """An aid's series returns to service: what was shown of it before is why it was out, and
         its hypotheses begin anew."""
-        n, width = self.n, self.width
-        begin_again(self.bank, self.table.ints, n, width, *self.of(aid), aid.t_ns, nav, step)
+        begin_again(self.bank, self.table.ints, self.n, *self.of(aid), aid.t_ns, nav, step)
+
+    def adds(self, aid: Linearised, kind: int, b: Array, age_s: float, nav: Array) -> Array:
+        """D b (3,): what a fault of size `b`, of such an age, does to an aid's rows."""
+        out, table = np.empty(3), self.table
+        of = kind, *self.of(aid)
+        rows_of_fault(self.bank, *table[:2], *of, aid.t_ns * 1e-9, age_s, nav, b, out)
+        return out
 
     def judge(self, t_ns: int) -> Array:
         """Odds of all at the epoch of a measurement; what they come to, `found` (5,)."""
         table = self.table
-        judge(self.bank, table.ints, table.numbers, t_ns * 1e-9, self.found)
+        judge(self.bank, *table[:3], t_ns * 1e-9, self.found)
         return self.found
+
+    def take(
+        self, t_ns: int, measured: bool, used: bool, xi: Array, step: Array, wider: Array
+    ) -> Array:
+        """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
+        unless one is identified, what the weighed hypotheses leave open of what is published,
+        `wider` (9,)."""
+        table, n, found = self.table, self.n, self.found
+        judge_and_widen(
+            *(self.bank, table.ints, table.numbers, table.lanes, n, t_ns, measured, used),
+            *(xi, step, self._mounting, self.work, wider, found),
+        )
+        return found
+
+    def widen(self, step: Array, wider: Array) -> None:
+        """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""
+        widen_by_faults(self.bank, self.table.lanes, self.n, step, self.work, wider)
 
     def opened(self) -> Array:
         """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
         anew by the next call."""
-        mixture(self.bank, *self.table[:2], self.n, self.width, self._nine)
+        mixture(self.bank, self.table.numbers, self.n, self._nine)
         return self._nine
 
     def opened_of_all(self) -> Array:
         """The same of all states (n, n)."""
         out = np.zeros((self.n, self.n))
-        mixture(self.bank, *self.table[:2], self.n, self.width, out)
+        mixture(self.bank, self.table.numbers, self.n, out)
         return out
 
     def estimated(self, number: int) -> Estimated:
         """The hypothesis of a group."""
         kind = number // RESTARTS
-        group = self._groups[kind, number % RESTARTS]
+        at = self._at[kind, number % RESTARTS]
         found, effect = np.zeros(12), np.zeros((1 + self.n, self.n))
-        estimate(self.bank, *self.table[:2], self.n, self.width, number, found, effect)
-        p = int(self.table.ints[kind, 2])
+        estimate(self.bank, self.table.numbers, self.n, number, found, effect)
+        p = int(self.table.ints[kind, SIZE])
         return Estimated(
             kind,
-            float(group[ONSET]),
-            float(group[LOG_ODDS]),
-            0.5 * float(group[EXPLAINED]),
+            float(self.bank[at + ONSET]),
+            float(self.bank[at + LOG_ODDS]),
+            0.5 * float(self.bank[at + EXPLAINED]),
             found[:p],
             found[3:].reshape(3, 3)[:p, :p],
             effect[0],
             effect[1:],
         )
 
+    def each(self, which: int) -> Array:
+        """One of the numbers of all groups (k, restarts), as of fusiond.estimators.fault_bank."""
+        found: Array = self.bank[self._at + which]
+        return found
+
+    def effect(self, number: int) -> Array:
+        """V of a group (n, p)."""
+        count = int(self.table.ints[number // RESTARTS, SIZE])
+        return self.sensitivities[:, [column_of(self.bank, number, c) for c in range(count)]]
+
     @property
     def log_odds(self) -> Array:
         """Log odds (k, restarts) of the last `judge`."""
-        return self._groups[:, :, LOG_ODDS]
+        return self.each(LOG_ODDS)
 
     @property
     def log_likelihood(self) -> Array:
         """Log of the largest likelihood ratios (k, restarts), of the last `judge`."""
-        return 0.5 * self._groups[:, :, EXPLAINED]
+        found: Array = 0.5 * self.each(EXPLAINED)
+        return found
 
     @property
     def explains(self) -> NDArray[np.bool_]:
         """(k, restarts): no more is left than chance leaves."""
-        found: NDArray[np.bool_] = self._groups[:, :, UNEXPLAINED] <= 0.0
+        found: NDArray[np.bool_] = self.each(UNEXPLAINED) <= 0.0
         return found
 
     @property
     def weights(self) -> Array:
         """Posterior probabilities (k, restarts) of the last `judge`."""
-        return self._groups[:, :, WEIGHT]
+        return self.each(WEIGHT)
 
 
 def _measures(aid: Linearised, known: bool) -> int:

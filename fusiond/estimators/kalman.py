@@ -65,7 +65,7 @@ class KalmanEstimator(ErrorStateFilter):
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)
                 if nis < math.inf:
-                    told = bank.bank, *table[:2], bank.width, aid.t_ns, *of, bank.work
+                    told = bank.bank, *table[:2], aid.t_ns, *of, bank.work
                     account_for(nav, self.step, h, r, y, g, bool(nis <= threshold), *told)
         if nis <= threshold:
             return Outcome("fused", nis, degrees, tuple(y.tolist()))
@@ -99,7 +99,7 @@ class KalmanEstimator(ErrorStateFilter):
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)
         y, g = work(count, self.model.width)
         if whiten(self._cov, z - h @ self._dx, h, r, y, g) < math.inf:
-            told = bank.bank, *bank.table[:2], bank.width, aid.t_ns, *bank.of(aid)
+            told = bank.bank, *bank.table[:2], aid.t_ns, *bank.of(aid)
             space = np.empty(count * bank.columns)
             account_for(self.nav, self.step, h, r, y, g, fused, *told, space)
 

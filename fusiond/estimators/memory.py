@@ -98,7 +98,7 @@ def memory(
     factors[:], of_model[:] = shares, model.packed
     head = array[:LINE].view(np.int64)
     head[[SIZE, ROOM, USED, TRANSITION, GAP, BANK]] = n, k, k, transition, gap_ns, hypotheses
-    begin_bank(bank, faults)
+    begin_bank(bank, faults, n, width)
     return Memory(
         array,
         head,

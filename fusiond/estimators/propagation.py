@@ -24,8 +24,7 @@ from fusiond.estimators.covariance import (
     work_size,
 )
 from fusiond.estimators.crossing import DENSITIES, GRID_NS, SPAN, STEPS, add_up, cross_for
-from fusiond.estimators.fault_bank import SENSITIVITIES
-from fusiond.estimators.fault_rows import walk_path
+from fusiond.estimators.fault_carried import carry_for, settle
 from fusiond.estimators.memory import (
     AHEAD,
     BANK,
@@ -106,39 +105,8 @@ def published_ahead(
 def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
     """`propagate` for covariances of `width` rows."""
     cross, propagate_transition = cross_for(width), transition_for(width)
+    carry_hypotheses = carry_for(width)
     worked, scratched, square = work_size(width), scratch_size(width), width * width
-
-    @compiled(
-        "void(f8[::1], i8, f8[::1], f8[::1], f8, f8[::1], b1, f8[::1], b1[::1], i8[::1], i8[::1],"
-        " f8[::1], f8[::1])",
-        variant=width,
-    )
-    def carry_hypotheses(
-        bank: Array,
-        now: int,
-        nav: Array,
-        sums: Array,
-        span: float,
-        c: Array,
-        rests: bool,
-        turn: Array,
-        active: NDArray[np.bool_],
-        sensor_terms: Indices,
-        rate_terms: Indices,
-        noise: Array,
-        work: Array,
-    ) -> None:
-        """Carry the sensitivities of a bank over what `sums` hold, `span` seconds until `now`."""
-        walk_path(bank, nav, now * 1e-9, span)
-        rows = bank[int(bank[SENSITIVITIES]) :]
-        size = noise.shape[0] // 3 * width
-        for block in range(rows.shape[0] // size):
-            part = rows[block * size : (block + 1) * size]
-            propagate_transition(
-                part, sums[STEPS:DENSITIES], c, span, active, sensor_terms, rate_terms, noise, work
-            )
-            if rests:
-                rest_rows(part, width, width, turn, sensor_terms[:12], sensor_terms[12:])
 
     @compiled(
         "void(b1, b1, f8, b1, i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], i8, f8, f8, f8, i8,"
@@ -379,6 +347,8 @@ def propagate_for(width: int) -> Callable[..., tuple[int, int]]:
                         *(active, sensor_terms, rate_terms, noise, work),
                     )
                 sums[SPAN] = 0.0
+        if bank.size and not passing:
+            settle(bank, n, width)
         head[AHEAD] = sums[SPAN] > 0.0
         for k in range(used):
             mirror(covs[k * square : (k + 1) * square], width, n)

@@ -193,6 +193,23 @@ def widen(wider: Array, out: Array) -> None:
             out[i] = math.sqrt(out[i] * out[i] + wider[i])
 
 
+@compiled("f8(f8[:, ::1], f8[::1], f8[::1], i8, f8, f8, f8[::1])", allocates=True)
+def speed_sigma(
+    cov: Array,
+    nav: Array,
+    step: Array,
+    time_slot: int,
+    clock_sd_s: float,
+    axes_sd_rad: float,
+    wider: Array,
+) -> float:
+    """One sigma of the horizontal velocity, of `sigmas` that are `wider`."""
+    out = np.empty(9)
+    sigmas(cov, nav, step, time_slot, clock_sd_s, axes_sd_rad, out)
+    widen(wider, out)
+    return math.hypot(out[3], out[4])
+
+
 @compiled("void(f8[:, ::1], f8[::1], f8[::1])")
 def opened_variances(opened: Array, step: Array, out: Array) -> None:
     """Write `out` (9,), as `sigmas` squared, of what is open of attitude, velocity and position (9,

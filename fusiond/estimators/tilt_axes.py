@@ -244,11 +244,9 @@ def carry_over_all(
     return turned
 
 
-@compiled(
-    "void(f8[:, :, ::1], f8[::1], f8[::1], f8[::1], f8, i8[:, ::1], i8[::1], i8[::1], i8[::1])"
-)
-def carry_over_blocks(
-    blocks: Array,
+@compiled("void(f8[:, :], f8[::1], f8[::1], f8[::1], f8, i8[:, ::1], i8[::1], i8[::1], i8[::1])")
+def carry_over_rows(
+    m: Array,
     before: Array,
     nav: Array,
     xi: Array,
@@ -258,10 +256,9 @@ def carry_over_blocks(
     lever: Indices,
     late: Indices,
 ) -> None:
-    """V <- T V for the sensitivities (blocks, n, w) of a bank, as `carry_over_all` does P."""
-    for k in range(blocks.shape[0]):
-        turn_rows(blocks[k], before[Q0:NAV_SIZE], nav[Q0:], biases[0], biases[1])
-        keep_rows(blocks[k], before, nav, xi, turned, gyros, lever, late)
+    """V <- T V for sensitivities (n, k), as `carry_over_all` does P."""
+    turn_rows(m, before[Q0:NAV_SIZE], nav[Q0:], biases[0], biases[1])
+    keep_rows(m, before, nav, xi, turned, gyros, lever, late)
 
 
 class TiltAxesFilter(KalmanEstimator):
@@ -326,8 +323,8 @@ class TiltAxesFilter(KalmanEstimator):
         slots = self._biases, *self._kept
         self.turned = carry_over_all(self._covariance, before, self.nav, self.xi, *slots)
         if self.hypotheses is not None:
-            blocks = self.hypotheses.sensitivities
-            carry_over_blocks(blocks, before, self.nav, self.xi, self.turned, *slots)
+            v = self.hypotheses.sensitivities
+            carry_over_rows(v, before, self.nav, self.xi, self.turned, *slots)
 
     @property
     def _keeps_turn(self) -> bool:

@@ -27,7 +27,6 @@ from fusiond.estimators.fault_bank import (
     CLASS,
     DELAY,
     DEVICE,
-    FIRST,
     FOLLOWED,
     KIND_INTS,
     KIND_NUMBERS,
@@ -39,7 +38,6 @@ from fusiond.estimators.fault_bank import (
     POSITION,
     POSITION_RAMP,
     PRIOR,
-    RESTARTS,
     ROWS,
     SHIFTED,
     SIGNATURE,
@@ -51,6 +49,7 @@ from fusiond.estimators.fault_bank import (
     VELOCITY,
     VELOCITY_RAMP,
     FaultTable,
+    fault_table,
 )
 from fusiond.integrity.service import LASTS_S
 from fusiond.models.model import Model
@@ -304,7 +303,7 @@ def kinds_of(model: Model, aiding: Mapping[str, str], slips: bool) -> list[Kind]
     found.append(over_kind())
     # At rest nobody can tell a gyro from the ground that turns: a ferry, a turntable.
     found += row_kinds("zero_rate", "the ground turns", "deg/s", (1.0 / DEG,) * 3, DEG, BODY)
-    return found
+    return sorted(found, key=lambda kind: -kind.size)  # as a table of them has to be
 
 
 def table_of(kinds: Sequence[Kind]) -> FaultTable:
@@ -312,18 +311,16 @@ def table_of(kinds: Sequence[Kind]) -> FaultTable:
     ints = np.zeros((len(kinds), KIND_INTS), dtype=np.int64)
     numbers = np.ones((len(kinds), KIND_NUMBERS))
     devices = tuple(dict.fromkeys(kind.device for kind in kinds if kind.device))
-    columns = 0
     for row, kind in enumerate(kinds):
         ints[row, SIGNATURE], ints[row, CLASS] = kind.signature, kind.of
         ints[row, LOCATES], ints[row, MOVES_TOO] = kind.locates, kind.moves
         ints[row, DEVICE] = devices.index(kind.device) if kind.device else -2
         if kind.device == TOGETHER:
             ints[row, DEVICE] = ANY
-        ints[row, SIZE], ints[row, FIRST] = kind.size, columns
+        ints[row, SIZE] = kind.size
         ints[row, SLOTS : SLOTS + 3] = (*kind.slots, -1, -1, -1)[:3]
         numbers[row, PRIOR : PRIOR + kind.size] = kind.sd
         numbers[row, LOG_RATE] = math.log(kind.per_hour / 3600.0)
         numbers[row, LAG], numbers[row, MEAN] = kind.lag_s, kind.mean
         numbers[row, BOUNDED] = kind.bounded
-        columns += RESTARTS * kind.size
-    return FaultTable(ints, numbers, columns, devices)
+    return fault_table(ints, numbers, devices)

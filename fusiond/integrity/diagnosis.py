@@ -38,29 +38,21 @@ from fusiond.estimators.fault_bank import (
     DECIDED,
     RESTARTS,
 )
-from fusiond.estimators.fault_odds import AHEAD, BEST, BEST_ODDS, EXPLAINS, FAULTY
+from fusiond.estimators.fault_odds import APART, BEST, BEST_ODDS, EXPLAINS, identified
 from fusiond.estimators.hypotheses import Estimated, Hypotheses
-from fusiond.estimators.reading import opened_variances
 from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.finding import Finding, Lasting
 from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
-from fusiond.models.vehicle import MOUNTING
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, STEP_RESTS_S, VE, VN
 
 Array = NDArray[np.float64]
 
-APART = 4.0
-"""Log odds between two classes: fifty to one."""
 PLACE_ROW = 6
 """First row of the position in the error state."""
-COUNTS = 1e-3
-"""Probability of any fault below which what is open is not computed between two measurements."""
 ALIKE = 7.0
 """Hypotheses of the class that are less likely by more than this count nothing."""
-RARE = 10.83
-"""Chi-square of one that chance exceeds in one vehicle of a thousand."""
 MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
 """A vehicle moves whose speed is beyond both."""
 FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
@@ -166,7 +158,9 @@ class Diagnosis:
         one.hear(aid.t_ns)
         if aid.constraint or (value := value_of(aid.offers())) is None:
             return one
-        if one.repeats_itself(value, _moves(estimator)) and not one.out:
+        # A position that differs repeats nothing, whether it moves or not.
+        moving = (value == one.value or not one.locates) and _moves(estimator)
+        if one.repeats_itself(value, moving) and not one.out:
             self._exclude(aid.t_ns, REPEATS, lambda s: s.device == aid.device)
         return self._series[aid.source]
 
@@ -174,34 +168,40 @@ class Diagnosis:
         self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
     ) -> Correction | None:
         """Take in how an aid ended; what to take out of the filter's state, if anything."""
-        bank, t_ns, correction, explained = estimator.hypotheses, aid.t_ns, None, False
+        e, t_ns, correction, explained = estimator, aid.t_ns, None, False
+        bank, measured, used = e.hypotheses, not aid.constraint, not one.out
         if one.out or one.device in self._agreement:
             self._agrees(aid, one)
-        if one.out:
-            passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
-            if outcome.lasting:
-                known = self._lasting[one.source].judged(outcome.lasting)
-                self._lasting = {**self._lasting, one.source: known}
-            lasts = min(outcome.lasting, default=math.nan)
-            one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis)
-            if self._goes_its_own_way(one):
-                correction = _somewhere_else(aid, estimator)
-                one.readmit(t_ns)
-            if not one.out:
-                self._is_over(one)
-                if bank is not None:
-                    bank.begin_again(aid, estimator.nav, estimator.step)
-        else:
-            if bank is not None and not aid.constraint:
-                found = bank.judge(t_ns)
+        if bank is not None:
+            found = bank.take(t_ns, measured, used, e.xi, e.step, e.wider)
+            if measured and used:
                 correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
-            if not one.out:  # by that decision
-                self._counts(aid, one, outcome, explained)
-        if correction is None and bank is not None and self._widens(aid, bank):
-            opened_variances(bank.opened(), estimator.step, estimator.wider)
-            _open_by_mounting(estimator)
+        if not used:
+            correction = self._looked_at(aid, one, outcome, estimator)
+        elif not one.out:  # by that decision
+            self._counts(aid, one, outcome, explained)
+        return correction
+
+    def _looked_at(
+        self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
+    ) -> Correction | None:
+        """One that is out was compared with what is published."""
+        correction, t_ns, bank = None, aid.t_ns, estimator.hypotheses
+        passes = outcome.nis <= gate_threshold(aid.gate, max(outcome.degrees, 1))
+        if outcome.lasting:
+            known = self._lasting[one.source].judged(outcome.lasting)
+            self._lasting = {**self._lasting, one.source: known}
+        lasts = min(outcome.lasting, default=math.nan)
+        one.looked_at(t_ns, passes and one.repeats == 0, lasts - outcome.nis)
+        if self._goes_its_own_way(one):
+            correction = _somewhere_else(aid, estimator)
+            one.readmit(t_ns)
+        if not one.out:
+            self._is_over(one)
+            if bank is not None:
+                bank.begin_again(aid, estimator.nav, estimator.step)
         return correction
 
     @staticmethod
@@ -212,16 +212,10 @@ class Diagnosis:
         elif outcome.name == "gated" and (not aid.constraint or aid.no_slip):
             one.gated(aid.t_ns, explained)
 
-    @staticmethod
-    def _widens(aid: Aid, bank: Hypotheses) -> bool:
-        """Whether what is published may be wider by now: at each measurement, and between two while
-        a fault is likely enough to count."""
-        return not aid.constraint or bank.found.item(FAULTY) > COUNTS
-
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
-        best, odds = found.item(BEST), found.item(BEST_ODDS)
-        if best < 0.0 or found.item(AHEAD) <= APART:
+        if not identified(found):
             return None
+        best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         fits = np.array([each.log_likelihood for each in taken])
         weights = np.exp(fits - fits.max())
@@ -337,16 +331,6 @@ def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
     return Correction(np.zeros(len(spread)), spread)
 
 
-def _open_by_mounting(estimator: Estimator) -> None:
-    """The attitude is that of the axes that were configured, and the vehicle's as far as the unit
-    sits on it so: pitch and yaw are open by what the mounting has beyond chance."""
-    model, wider = estimator.model, estimator.wider
-    for row, slot in zip((7, 8), model.slots_of(MOUNTING), strict=False):
-        beyond = estimator.xi.item(slot) ** 2 - RARE * model.initial.item(slot) ** 2
-        if beyond > 0.0:
-            wider[row] += beyond
-
-
 def _moves(estimator: Estimator) -> bool:
     """Whether the vehicle surely moves, by the filter's own speed and its sigma."""
     if estimator.step.item(STEP_RESTS_S) > 0.0:
@@ -355,5 +339,4 @@ def _moves(estimator: Estimator) -> bool:
     speed = math.hypot(nav.item(VN), nav.item(VE))
     if speed <= MOVES_M_S:
         return False
-    sd = estimator.sigmas()
-    return speed > MOVES_SIGMAS * math.hypot(sd.item(3), sd.item(4))
+    return speed > MOVES_SIGMAS * estimator.speed_sigma()

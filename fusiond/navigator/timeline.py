@@ -215,33 +215,30 @@ class Timeline:
 
     def _apply(self, entry: Entry) -> Outcome:
         """An exception, wherever it comes from, costs the aid."""
+        estimator, diagnosis = self.estimator, self.diagnosis
         try:
-            return self._applied(entry)
+            if entry.feedback == "release":
+                estimator.release()
+            elif entry.feedback == "hold":
+                estimator.hold()
+            aid = entry.aid.at(estimator.nav)
+            entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
+            if self._isolates:
+                return estimator.update(aid)
+            one = diagnosis.comes(aid, estimator)
+            if one.out:
+                outcome = estimator.look(aid, diagnosis.lasting(aid, one, estimator))
+            else:
+                outcome = estimator.update(aid, one.noise)
+            if aid.rests_s:
+                estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
+            if outcome.name in JUDGED:
+                correction = diagnosis.judge(aid, one, outcome, estimator)
+                if correction is not None:
+                    estimator.adopt(correction.mean, correction.spread)
         except RAISED_BY_NUMBERS as error:
             entry.error = repr(error)
             return Outcome("failed")
-
-    def _applied(self, entry: Entry) -> Outcome:
-        estimator, diagnosis = self.estimator, self.diagnosis
-        if entry.feedback == "release":
-            estimator.release()
-        elif entry.feedback == "hold":
-            estimator.hold()
-        aid = entry.aid.at(estimator.nav)
-        entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
-        if self._isolates:
-            return estimator.update(aid)
-        one = diagnosis.comes(aid, estimator)
-        if one.out:
-            outcome = estimator.look(aid, diagnosis.lasting(aid, one, estimator))
-        else:
-            outcome = estimator.update(aid, one.noise)
-        if aid.rests_s:
-            estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
-        if outcome.name in JUDGED:
-            correction = diagnosis.judge(aid, one, outcome, estimator)
-            if correction is not None:
-                estimator.adopt(correction.mean, correction.spread)
         return outcome
 
     def _count(self, entry: Entry, outcome: Outcome) -> None:

@@ -14,8 +14,17 @@ from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
-from fusiond.estimators.fault_bank import E_AT, GROUP, GROUPS, L_AT, LEVEL_OF, N_AT, RESTARTS
-from fusiond.estimators.fault_odds import SOLVED, solve
+from fusiond.estimators.fault_bank import (
+    E_AT,
+    E_ROWS,
+    L_AT,
+    L_ROWS,
+    LEVEL_OF,
+    N_AT,
+    RESTARTS,
+    group_at,
+)
+from fusiond.estimators.fault_odds import solve
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.models.catalogue import make_model
@@ -126,10 +135,7 @@ def test_the_filter_is_off_by_v_b(fault: str, size: tuple[float, ...]) -> None:
     bank = sound.hypotheses
     assert bank is not None
     row = row_of(fault)
-    first = int(bank.table.ints[row, 3]) + RESTART * 3
-    columns = [divmod(first + c, MODEL.width) for c in range(3)]
-    v = np.array([bank.sensitivities[block, :, j] for block, j in columns]).T
-    expected = (v @ b)[:9]
+    expected = (bank.effect(RESTARTS * row + RESTART) @ b)[:9]
     found = error_of(faulty, sound)
     assert np.abs(expected).max() > 1e-6
     for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
@@ -141,19 +147,18 @@ def test_evidence_is_chi_square_if_nothing_is_wrong() -> None:
     """Of each kind of three numbers, over 60 runs: mean within 4.5 of its own sigmas."""
     names = ("gyro", "accelerometer", "position", "velocity", "velocity_drift")
     found: dict[str, list[float]] = {name: [] for name in names}
-    m = np.empty(SOLVED)
+    m = np.empty(12)
     for seed in range(60):
         made = run(seed=100 + seed)
         bank = made.hypotheses
         assert bank is not None
         for name in names:
-            at = GROUPS + (RESTARTS * row_of(name) + RESTART) * GROUP
-            group = bank.bank[at : at + GROUP]
-            assert group[N_AT] == 24.0  # four epochs of six rows
-            numbers = bank.table.numbers[row_of(name)]
-            found[name].append(2.0 * solve(group, 3, numbers, 0.0, 1e-9, m))
-            assert group[E_AT : E_AT + 3].any()
-            assert group[L_AT] > 0.0
+            row = row_of(name)
+            assert bank.each(N_AT)[row, RESTART] == 24.0  # four epochs of six rows
+            at = group_at(bank.bank, RESTARTS * row + RESTART)
+            found[name].append(solve(bank.bank, at, 3, bank.table.numbers[row], 1e-9, m))
+            assert bank.each(E_AT)[row, RESTART] != 0.0
+            assert bank.each(L_AT)[row, RESTART] > 0.0
     for name, values in found.items():
         sigma = math.sqrt(2.0 * 3.0 / len(values))
         assert abs(np.mean(values) - 3.0) < 4.5 * sigma, (name, np.mean(values))
@@ -191,25 +196,20 @@ def test_odds_are_those_of_schwarz_or_of_a_size_that_is_known() -> None:
     assert bank is not None
     bank.judge(LAST_NS)
 
-    def group_of(row: int) -> tuple[Array, Array, Array, float]:
-        at = GROUPS + (RESTARTS * row + RESTART) * GROUP
-        group, p = bank.bank[at : at + GROUP], KINDS[row].size
-        information = group[L_AT : L_AT + 9].reshape(3, 3)[:p, :p]
-        return (
-            information,
-            group[E_AT : E_AT + p],
-            group,
-            math.log(2.0 * KINDS[row].per_hour / 3600),
-        )
+    def group_of(row: int) -> tuple[Array, Array, float, float]:
+        at, p = group_at(bank.bank, RESTARTS * row + RESTART), KINDS[row].size
+        information = bank.bank[at + L_ROWS[:p, :p]]
+        rate = math.log(2.0 * KINDS[row].per_hour / 3600.0)
+        return information, bank.bank[at + E_ROWS[:p]], float(bank.bank[at + N_AT]), rate
 
     row = row_of("position")
-    information, e, group, rate = group_of(row)
+    information, e, rows, rate = group_of(row)
     gained = 0.5 * e @ np.linalg.solve(information, e)
-    expected = rate + gained - 1.5 * math.log(group[N_AT])
+    expected = rate + gained - 1.5 * math.log(rows)
     assert math.isclose(bank.log_odds[row, RESTART], expected, rel_tol=1e-6)
     assert math.isclose(bank.log_likelihood[row, RESTART], gained, rel_tol=1e-6)
     row = next(k for k, kind in enumerate(KINDS) if kind.name == "delay" and kind.lag_s == 1.0)
-    information, e, group, rate = group_of(row)
+    information, e, rows, rate = group_of(row)
     of, beyond, about = information.item(), e.item() - information.item(), KINDS[row].sd[0] ** 2
     gained = e.item() - 0.5 * of + 0.5 * beyond**2 / (of + 1.0 / about)
     expected = rate + gained - 0.5 * math.log1p(about * of)
@@ -344,7 +344,8 @@ def test_each_kind_says_what_it_is() -> None:
         assert min(kind.sd) > 0.0
         assert kind.per_hour > 0.0
     table = table_of(kinds)
-    assert table.columns == RESTARTS * sum(kind.size for kind in kinds)
+    assert table.groups == RESTARTS * len(kinds)
+    assert table.threes == RESTARTS * sum(kind.size == 3 for kind in kinds)
 
 
 def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
@@ -381,8 +382,7 @@ def test_a_solution_that_lags_with_its_fixes_is_off_by_v_tau() -> None:
     bank = sound.hypotheses
     assert bank is not None
     row = next(k for k, kind in enumerate(kinds) if kind.name == "late")
-    block, column = divmod(int(bank.table.ints[row, 3]) + RESTART, model.width)
-    expected = bank.sensitivities[block, :9, column] * tau_s
+    expected = bank.effect(RESTARTS * row + RESTART)[:9, 0] * tau_s
     apart = error_of(late, sound)
     for part in (slice(3, 6), slice(6, 9)):
         scale = np.abs(expected[part]).max()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.base import Linearised
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import VelocityAid
-from fusiond.estimators.fault_bank import GROUP, GROUPS, NO_FAULTS, ONSET, RESTARTS
+from fusiond.estimators.fault_bank import NO_FAULTS, ONSET, RESTARTS
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.tilt_axes import TiltAxesFilter
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
@@ -49,13 +49,8 @@ def effect(estimator: KalmanEstimator, name: str, onset_ns: int) -> Array:
     bank = estimator.hypotheses
     assert bank is not None
     [row] = [k for k, kind in enumerate(kinds(estimator.model)) if kind.name == name]
-    groups = bank.bank[GROUPS:]
-    size, first = int(bank.table.ints[row, 2]), int(bank.table.ints[row, 3])
-    onsets = [groups[(RESTARTS * row + r) * GROUP + ONSET] for r in range(RESTARTS)]
-    restart = next(r for r, s in enumerate(onsets) if s == onset_ns * 1e-9)
-    columns = [first + restart * size + c for c in range(size)]
-    v = bank.sensitivities
-    return np.array([v[c // bank.width, :, c % bank.width] for c in columns]).T
+    onsets = bank.each(ONSET)[row].tolist()
+    return bank.effect(RESTARTS * row + onsets.index(onset_ns * 1e-9))
 
 
 def apart(wrong: KalmanEstimator, right: KalmanEstimator) -> Array:
@@ -70,7 +65,7 @@ def test_a_bank_changes_nothing_while_nothing_is_wrong() -> None:
     """To the bit, though beside it two hundred and more hypotheses run."""
     (plain, aids, buffer), (watched, _, _) = driven(faults=False), driven()
     assert watched.hypotheses is not None
-    assert watched.hypotheses.table.columns > 200
+    assert watched.hypotheses.table.groups > 100
     for estimator in (plain, watched):
         town_drive.run(estimator, buffer, aids)
     assert np.array_equal(plain.nav, watched.nav)
@@ -149,5 +144,4 @@ def test_what_is_adopted_is_taken_out_of_the_state_and_widens_it() -> None:
     assert estimator.covariance == pytest.approx(p + spread)
     assert estimator.sigmas()[3] == pytest.approx(math.sqrt(p[DV, DV] + 0.04))
     assert estimator.hypotheses is not None
-    onsets = estimator.hypotheses.bank[GROUPS + ONSET :: GROUP][:RESTARTS]
-    assert (onsets == estimator.t_ns * 1e-9).all()
+    assert (estimator.hypotheses.each(ONSET) == estimator.t_ns * 1e-9).all()

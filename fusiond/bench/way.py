@@ -1,0 +1,72 @@
+"""The way of an ordinary fix through the code: from its arrival to the sigma that is published.
+
+A vehicle that navigates: a fix with its velocity is handed over, the samples of a tick come, the
+filter runs, the solution is read. The Python functions and modules of the package that it passes
+through are what somebody has to read who asks why a sigma is what it is. Compiled kernels are none
+of them; what is done seldom (a checkpoint, a verdict) the one in the middle of five fixes has not.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from types import CodeType, FrameType
+from typing import NamedTuple
+
+from fusiond.bench.late_fix import AT_S, Drive
+
+FIXES = 5
+OURS, NOT_OURS = "fusiond.", ("fusiond.bench.", "fusiond.simulation.")
+"""The receiver is simulated."""
+
+
+class Way(NamedTuple):
+    """Calls of each function, by module and qualified name."""
+
+    calls: dict[tuple[str, str], int]
+
+    @property
+    def functions(self) -> int:
+        """How many different ones."""
+        return len(self.calls)
+
+    @property
+    def modules(self) -> int:
+        """In how many modules they are."""
+        return len({module for module, _ in self.calls})
+
+
+def ordinary_fix() -> Way:
+    """Of `FIXES` fixes of a drive that navigates the one with the median of functions."""
+    drive = Drive(1)
+    drive.go_on(AT_S)
+    found = [_way(drive) for _ in range(FIXES)]
+    return sorted(found, key=lambda way: way.functions)[FIXES // 2]
+
+
+def _way(drive: Drive) -> Way:
+    calls: Counter[tuple[str, str]] = Counter()
+    ours: dict[CodeType, tuple[str, str] | None] = {}
+
+    def called(frame: FrameType, event: str, _: object) -> None:
+        if event != "call":
+            return
+        code = frame.f_code
+        if code not in ours:
+            module = str(frame.f_globals.get("__name__", ""))
+            part = code.co_name.startswith("<") and code.co_name != "<lambda>"
+            ours[code] = None
+            if module.startswith(OURS) and not module.startswith(NOT_OURS) and not part:
+                ours[code] = module, code.co_qualname
+        if (name := ours[code]) is not None:
+            calls[name] += 1
+
+    drive.to_next_fix()
+    before = sys.getprofile()
+    sys.setprofile(called)
+    try:
+        drive.fix()
+        drive.tick()
+    finally:
+        sys.setprofile(before)
+    return Way(dict(calls))

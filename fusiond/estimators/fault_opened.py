@@ -1,0 +1,234 @@
+r"""What the hypotheses of a bank are found to be, and leave open of what a filter publishes.
+
+Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
+the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,
+
+    v M v^T = (v C^-T) D^-1 (v C^-T)^T      v a row of V
+
+for eight groups side by side. The attitude is that of the axes that were configured, and the
+vehicle's as far as the unit sits on it so: pitch and yaw are open by what the mounting has beyond
+chance, too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.estimators.fault_bank import (
+    ALL,
+    ANY_FAULT,
+    CONSTANTS,
+    E1,
+    E2,
+    E_AT,
+    GROUPS,
+    L10,
+    L11,
+    L20,
+    L21,
+    L22,
+    L_AT,
+    LANES,
+    LEAST_WEIGHT,
+    LENGTH,
+    MEAN_AT,
+    OF_ONE,
+    OF_THREE,
+    P_AT,
+    SENSITIVITIES,
+    THREES,
+    WEIGHT,
+)
+from fusiond.estimators.fault_odds import identified, judge
+from fusiond.estimators.reading import opened_variances
+from fusiond.navigation.compiled import compiled
+from fusiond.navigation.error_model import CORE_SIZE
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+COUNTS = 1e-3
+"""Probability of any fault below which what is open is not computed between two measurements."""
+RARE = 10.83
+"""Chi-square of one that chance exceeds in one vehicle of a thousand."""
+
+# What the kernel needs to work: sums, lane by lane, of nine variances and three products; of eight
+# groups C below its diagonal (3), D^-1 (3), b (3) and weight; v C^-T (3) and v b of the attitude.
+_FACTORS = (CORE_SIZE + 3) * LANES
+_ROWS = _FACTORS + 10 * LANES
+OPENED_WORK = _ROWS + 3 * 4 * LANES
+
+
+@compiled("void(f8[::1], f8[::1], i8, i8, i8, f8[::1])")
+def _factors(bank: Array, lanes: Array, row: int, threes: int, at: int, factors: Array) -> None:
+    """Write C, D^-1, b and weight of eight groups, whose numbers begin at `at`, to `factors`."""
+    length, own, of = int(bank[LENGTH]), np.uint64(at), np.uint64(row * CONSTANTS)
+    unsigned = np.uint64
+    for k in range(length):
+        lane = unsigned(k)
+        weight = bank[own + unsigned(WEIGHT) + lane]
+        factors[unsigned(9 * LANES) + lane] = weight if weight >= LEAST_WEIGHT else 0.0
+    if row < threes:
+        for k in range(length):
+            lane = unsigned(k)
+            j, c = own + lane, of + lane
+            d_0 = bank[j + unsigned(L_AT)] + lanes[c + unsigned(P_AT)]
+            a_1, a_2 = bank[j + unsigned(L10)], bank[j + unsigned(L20)]
+            l_1, l_2 = a_1 / d_0, a_2 / d_0
+            d_1 = bank[j + unsigned(L11)] + lanes[c + unsigned(P_AT + LANES)] - l_1 * a_1
+            a_3 = bank[j + unsigned(L21)] - l_2 * a_1
+            l_3 = a_3 / d_1
+            d_2 = bank[j + unsigned(L22)] + lanes[c + unsigned(P_AT + 2 * LANES)]
+            d_2 -= l_2 * a_2 + l_3 * a_3
+            e_0 = bank[j + unsigned(E_AT)]
+            e_1 = bank[j + unsigned(E1)] - l_1 * e_0
+            e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
+            b_2 = e_2 / d_2
+            b_1 = e_1 / d_1 - l_3 * b_2
+            factors[lane] = l_1
+            factors[unsigned(LANES) + lane] = l_2
+            factors[unsigned(2 * LANES) + lane] = l_3
+            factors[unsigned(3 * LANES) + lane] = 1.0 / d_0
+            factors[unsigned(4 * LANES) + lane] = 1.0 / d_1
+            factors[unsigned(5 * LANES) + lane] = 1.0 / d_2
+            factors[unsigned(6 * LANES) + lane] = e_0 / d_0 - l_1 * b_1 - l_2 * b_2
+            factors[unsigned(7 * LANES) + lane] = b_1
+            factors[unsigned(8 * LANES) + lane] = b_2
+    else:
+        for k in range(length):
+            lane = unsigned(k)
+            j, c = own + lane, of + lane
+            information, mean = bank[j + unsigned(L_AT)], lanes[c + unsigned(MEAN_AT)]
+            over = 1.0 / (information + lanes[c + unsigned(P_AT)])
+            beyond = bank[j + unsigned(E_AT)] - information * mean
+            factors[unsigned(3 * LANES) + lane] = over
+            factors[unsigned(6 * LANES) + lane] = mean + over * beyond
+
+
+@compiled("void(f8[::1], f8[::1], i8, f8[::1], f8[::1], f8[::1])", allocates=True)
+def widen_by_faults(
+    bank: Array, lanes: Array, n: int, step: Array, work: Array, wider: Array
+) -> None:
+    """Write `wider` (9,): what the weighed hypotheses leave open of position, velocity, roll, pitch
+    and yaw, with the attitude that `step` (28,) holds; `work` (OPENED_WORK,)."""
+    v = bank[int(bank[SENSITIVITIES]) :]
+    columns, length = v.shape[0] // n, int(bank[LENGTH])
+    threes = (int(bank[THREES]) + LANES - 1) // LANES
+    ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
+    sums, factors, rows = work[:_FACTORS], work[_FACTORS:_ROWS], work[_ROWS:OPENED_WORK]
+    unsigned = np.uint64
+    for j in range(sums.shape[0]):
+        sums[j] = 0.0
+    for row in range(threes + ones):
+        at = GROUPS + min(row, threes) * OF_THREE + max(row - threes, 0) * OF_ONE
+        most = 0.0
+        for k in range(LANES):
+            most = max(most, bank[at + WEIGHT + k])
+        if most < LEAST_WEIGHT:
+            continue
+        _factors(bank, lanes, row, threes, at, factors)
+        first = LANES * (3 * row if row < threes else 2 * threes + row)
+        if row < threes:
+            for i in range(CORE_SIZE):
+                in_0 = unsigned(first + i * columns)
+                in_1, in_2 = in_0 + unsigned(LANES), in_0 + unsigned(2 * LANES)
+                out, to = unsigned(i * LANES), unsigned(min(i, 2) * 4 * LANES)
+                for k in range(length):
+                    lane = unsigned(k)
+                    v_0, v_1, v_2 = v[in_0 + lane], v[in_1 + lane], v[in_2 + lane]
+                    along = v_0 * factors[unsigned(6 * LANES) + lane]
+                    along += v_1 * factors[unsigned(7 * LANES) + lane]
+                    along += v_2 * factors[unsigned(8 * LANES) + lane]
+                    u_1 = v_1 - factors[lane] * v_0
+                    u_2 = v_2 - factors[unsigned(LANES) + lane] * v_0
+                    u_2 -= factors[unsigned(2 * LANES) + lane] * u_1
+                    open_ = along * along
+                    open_ += v_0 * v_0 * factors[unsigned(3 * LANES) + lane]
+                    open_ += u_1 * u_1 * factors[unsigned(4 * LANES) + lane]
+                    open_ += u_2 * u_2 * factors[unsigned(5 * LANES) + lane]
+                    sums[out + lane] += open_ * factors[unsigned(9 * LANES) + lane]
+                    if i < 3:
+                        rows[to + lane] = v_0
+                        rows[to + unsigned(LANES) + lane] = u_1
+                        rows[to + unsigned(2 * LANES) + lane] = u_2
+                        rows[to + unsigned(3 * LANES) + lane] = along
+        else:
+            for i in range(CORE_SIZE):
+                in_0, out = unsigned(first + i * columns), unsigned(i * LANES)
+                for k in range(length):
+                    lane = unsigned(k)
+                    v_0, b = v[in_0 + lane], factors[unsigned(6 * LANES) + lane]
+                    open_ = v_0 * v_0 * (factors[unsigned(3 * LANES) + lane] + b * b)
+                    sums[out + lane] += open_ * factors[unsigned(9 * LANES) + lane]
+        for pair in range(3):
+            one, other = (0, 0, 1)[pair], (1, 2, 2)[pair]
+            out = unsigned((CORE_SIZE + pair) * LANES)
+            if row < threes:
+                left, right = unsigned(4 * LANES * one), unsigned(4 * LANES * other)
+                for k in range(length):
+                    lane = unsigned(k)
+                    a, b = left + lane, right + lane
+                    open_ = rows[a + unsigned(3 * LANES)] * rows[b + unsigned(3 * LANES)]
+                    open_ += rows[a] * rows[b] * factors[unsigned(3 * LANES) + lane]
+                    u_1, w_1 = rows[a + unsigned(LANES)], rows[b + unsigned(LANES)]
+                    open_ += u_1 * w_1 * factors[unsigned(4 * LANES) + lane]
+                    u_2, w_2 = rows[a + unsigned(2 * LANES)], rows[b + unsigned(2 * LANES)]
+                    open_ += u_2 * w_2 * factors[unsigned(5 * LANES) + lane]
+                    sums[out + lane] += open_ * factors[unsigned(9 * LANES) + lane]
+            else:
+                left = unsigned(first + one * columns)
+                right = unsigned(first + other * columns)
+                for k in range(length):
+                    lane = unsigned(k)
+                    b = factors[unsigned(6 * LANES) + lane]
+                    open_ = v[left + lane] * v[right + lane]
+                    open_ *= factors[unsigned(3 * LANES) + lane] + b * b
+                    sums[out + lane] += open_ * factors[unsigned(9 * LANES) + lane]
+    opened = np.zeros((CORE_SIZE, CORE_SIZE))
+    for i in range(CORE_SIZE):
+        for k in range(LANES):
+            opened[i, i] += sums[i * LANES + k]
+    for pair in range(3):
+        for k in range(LANES):
+            opened[(0, 0, 1)[pair], (1, 2, 2)[pair]] += sums[(CORE_SIZE + pair) * LANES + k]
+    opened_variances(opened, step, wider)
+
+
+@compiled(
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, b1, b1, f8[::1], f8[::1], f8[:, ::1],"
+    " f8[::1], f8[::1], f8[::1])"
+)
+def judge_and_widen(
+    bank: Array,
+    ints: Indices,
+    numbers: Array,
+    lanes: Array,
+    n: int,
+    t_ns: int,
+    measured: bool,
+    used: bool,
+    xi: Array,
+    step: Array,
+    mounting: Array,
+    work: Array,
+    wider: Array,
+    found: Array,
+) -> None:
+    """`judge`, if what has come was `measured` and is `used`, and `wider` (9,), unless a hypothesis
+    is identified: at each measurement, and between two while a fault is likely enough to count.
+
+    `mounting` (2, 2): slots of the mounting's pitch and yaw in xi (n,), or -1, and what of their
+    squares is chance.
+    """
+    if measured and used:
+        judge(bank, ints, numbers, lanes, t_ns * 1e-9, found)
+        if identified(found):
+            return
+    elif not measured and not bank[ANY_FAULT] > COUNTS:
+        return
+    widen_by_faults(bank, lanes, n, step, work, wider)
+    for k in range(2):
+        slot = int(mounting[k, 0])
+        if slot >= 0:
+            wider[7 + k] += max(0.0, xi[slot] * xi[slot] - mounting[k, 1])
