@@ -203,7 +203,8 @@ class Diagnosis:
         if bank is not None:
             found = bank.take(t_ns, measured, used, e.xi, e.step, e.wider)
             if measured and used:
-                correction = self._decide(t_ns, bank, found)
+                if identified(found):
+                    correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
         if not used:
@@ -216,9 +217,8 @@ class Diagnosis:
             one.gated(t_ns, explained)
         return correction
 
-    def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
-        if not identified(found):
-            return None
+    def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
+        """What is identified."""
         best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         weights = np.exp([each.log_odds - odds for each in taken])
