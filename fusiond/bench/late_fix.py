@@ -78,8 +78,18 @@ class Drive:
         self._navigator.solution(int(self._times[self._row - 1]))
 
     def to_next_fix(self) -> None:
-        """Drive on to the tick at whose end the next epoch is."""
+        """The samples until the next epoch, and of it, come; the filter has run until the tick
+        before."""
         self._feed(SAMPLES - TICK_SAMPLES)
+        rows = slice(self._row, self._row + TICK_SAMPLES)
+        self._navigator.add_imu(self._times[rows], self._samples[rows])
+
+    def take_fix(self) -> None:
+        """The fix of that epoch comes, the filter runs, the solution is read."""
+        self.fix()
+        self._row += TICK_SAMPLES
+        self._navigator.advance()
+        self._navigator.solution(int(self._times[self._row - 1]))
 
     def _feed(self, samples: int) -> None:
         rows = slice(self._row, self._row + samples)

@@ -1,9 +1,9 @@
 """The way of an ordinary fix through the code: from its arrival to the sigma that is published.
 
-A vehicle that navigates: a fix with its velocity is handed over, the samples of a tick come, the
-filter runs, the solution is read. The Python functions and modules of the package that it passes
-through are what somebody has to read who asks why a sigma is what it is. Compiled kernels are none
-of them; what is done seldom (a checkpoint, a verdict) the one in the middle of five fixes has not.
+A vehicle that navigates, its samples there: a fix with its velocity is handed over, the filter
+runs, the solution is read. The Python functions and modules of the package that it passes through
+are what somebody has to read who asks why a sigma is what it is. Compiled kernels are none of them;
+what is done seldom (a checkpoint, a verdict) the one in the middle of five fixes has not.
 """
 
 from __future__ import annotations
@@ -65,8 +65,7 @@ def _way(drive: Drive) -> Way:
     before = sys.getprofile()
     sys.setprofile(called)
     try:
-        drive.fix()
-        drive.tick()
+        drive.take_fix()
     finally:
         sys.setprofile(before)
     return Way(dict(calls))

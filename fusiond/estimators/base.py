@@ -366,7 +366,7 @@ class ErrorStateFilter:
 
     def _linearise(self, aid: Linearised) -> Innovation | NotApplicable:
         """The aid's innovation, linear in the error state."""
-        rows = aid.innovation(self.state)
+        rows = aid.innovation(self._view)
         return self._weighed(aid, rows) if aid.robust else rows
 
     def _weighed(

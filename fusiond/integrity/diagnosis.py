@@ -175,7 +175,8 @@ class Diagnosis:
         if bank is not None:
             found = bank.take(t_ns, measured, used, e.xi, e.step, e.wider)
             if measured and used:
-                correction = self._decide(t_ns, bank, found)
+                if identified(found):
+                    correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
                 one = self._series[aid.source]
         if not used:
@@ -212,9 +213,8 @@ class Diagnosis:
         elif outcome.name == "gated" and (not aid.constraint or aid.no_slip):
             one.gated(aid.t_ns, explained)
 
-    def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction | None:
-        if not identified(found):
-            return None
+    def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
+        """What is identified."""
         best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         fits = np.array([each.log_likelihood for each in taken])

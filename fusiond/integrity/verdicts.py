@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, groupby
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +28,10 @@ Array = NDArray[np.float64]
 
 @dataclass(slots=True)
 class _Series:
-    """A monitor, and what it is to judge: number in the order of all, innovation (m,), its NIS."""
+    """A monitor, and what it is to judge: m, number in the order of all, innovation (m,), NIS."""
 
     monitor: ConsistencyMonitor
-    waiting: list[tuple[int, Sequence[float] | Array, float]] = field(default_factory=list)
+    waiting: list[tuple[int, int, Sequence[float] | Array, float]] = field(default_factory=list)
 
 
 class Verdicts:
@@ -72,7 +73,7 @@ class Verdicts:
             options = ConsistencyOptions(window, self._alpha, gate=aid.gate, shared=shared)
             series = self._series[source] = _Series(ConsistencyMonitor(options))
         self._heard += 1
-        series.waiting.append((self._heard, row, nis))
+        series.waiting.append((len(row), self._heard, row, nis))
 
     def tell(self) -> None:
         """Judge what has come since the last time, and say which verdicts have turned, in the order
@@ -80,8 +81,8 @@ class Verdicts:
         turned: list[tuple[int, str, Verdict]] = []
         for source, series in self._series.items():
             waiting, series.waiting = series.waiting, []
-            for _, alike in groupby(waiting, key=lambda each: len(each[1])):
-                numbers, rows, nis = zip(*alike, strict=True)
+            for _, alike in groupby(waiting, key=itemgetter(0)):
+                _, numbers, rows, nis = zip(*alike, strict=True)
                 whitened = np.fromiter(chain.from_iterable(rows), np.float64)
                 judged = series.monitor.add_whitened(whitened.reshape(len(rows), -1), nis)
                 for row, verdict in judged:

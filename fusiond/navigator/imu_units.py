@@ -25,6 +25,7 @@ from drivers.measurements import PositionFix
 from fusiond.aiding.base import Aid
 from fusiond.aiding.offers import PositionOffer
 from fusiond.estimators.base import Estimator
+from fusiond.models.model import Model
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer, squares
@@ -142,6 +143,9 @@ class RateUnits:
 
     def __init__(self, bias_sd: float, on_event: Callable[[str, str], None]) -> None:
         self._bias_sd, self._event = bias_sd, on_event
+        self._first: tuple[Model, list[tuple[int, int]]] | None = None
+        """Columns and slots of the first bias of each gyro and accelerometer, of the filter's
+        model."""
         self.change()
 
     def change(self) -> None:
@@ -153,8 +157,25 @@ class RateUnits:
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
     def unproven(self, estimator: Estimator) -> str | None:
-        """Why a solution with these biases is not vouched for before the course has turned."""
-        return None if self._fit else unlike_sheet(estimator)
+        """Why a solution with these biases is not vouched for before the course has turned: one
+        that the data sheet does not allow; None where they are like it."""
+        if self._fit:
+            return None
+        model = estimator.model
+        if self._first is None or self._first[0] is not model:
+            columns = [*range(RATE_ERROR, RATE_ERROR + 3), *range(FORCE_ERROR, FORCE_ERROR + 3)]
+            slots = [(c, s) for c in columns for s in model.parameters(c)[:1]]
+            self._first = model, slots
+        worst, told, xi = SHEET_SIGMAS, None, estimator.xi
+        for column, slot in self._first[1]:
+            bias = abs(xi.item(slot))
+            sigmas = bias / model.initial.item(slot)
+            if sigmas > worst:
+                gyro, worst = column < FORCE_ERROR, sigmas
+                size, unit = (math.degrees(bias), "deg/s") if gyro else (bias, "m/s^2")
+                what = "gyro" if gyro else "accelerometer"
+                told = f"{what}'s bias of {size:.2g} {unit} is {sigmas:.0f} sigma of [imu]"
+        return told and f"the {told}: another unit or sensor; the next bends tell"
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
         """The samples from row `new` on have come."""
@@ -207,24 +228,6 @@ class RateUnits:
         elif wrong is None and self.wrong is not None:
             self._event("imu_units_well", "the rates fit the turns of the fixes' course again")
         self.wrong = wrong
-
-
-def unlike_sheet(estimator: Estimator) -> str | None:
-    """What to say of a bias that the data sheet does not allow; None where they are like it."""
-    model, worst, told = estimator.model, SHEET_SIGMAS, None
-    for column, what, unit in (
-        (RATE_ERROR, "gyro", "deg/s"),
-        (FORCE_ERROR, "accelerometer", "m/s^2"),
-    ):
-        for axis in range(3):
-            for slot in model.parameters(column + axis)[:1]:
-                bias = abs(float(estimator.xi[slot]))
-                sigmas = bias / float(model.initial[slot])
-                if sigmas > worst:
-                    size = math.degrees(bias) if column == RATE_ERROR else bias
-                    worst = sigmas
-                    told = f"{what}'s bias of {size:.2g} {unit} is {sigmas:.0f} sigma of [imu]"
-    return told and f"the {told}: another unit or sensor; the next bends tell"
 
 
 def _turned(imu: ImuBuffer, begin_ns: int, end_ns: int) -> float:

@@ -317,8 +317,9 @@ class Navigator:
     @property
     def unconfirmed(self) -> str:
         """What the heading hangs on and nothing has shown, in words; empty where it does not."""
-        hangs = self._afterwards.unconfirmed if self._afterwards else ""
-        return "no fix has confirmed it yet" if self.on_trial else hangs
+        if self.warm is not None and self.warm.on_trial:
+            return "no fix has confirmed it yet"
+        return self._afterwards.unconfirmed if self._afterwards else ""
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, of all that has been run by `advance`.

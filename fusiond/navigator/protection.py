@@ -63,7 +63,7 @@ class ProtectionWatch:
     def bound(self) -> Bound:
         """Of the estimator's state."""
         if self._levels is None:
-            return self.unknown()
+            return Bound(BoundState.OFF)
         last = self._last
         found = last[1] if last is not None and last[0] == self._levels.t_ns else self._levels.now()
         vertical = math.nan if found.vpl_m is None else found.vpl_m

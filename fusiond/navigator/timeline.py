@@ -158,7 +158,7 @@ class Timeline:
             if at < self._next:
                 self._next += 1
             self._rewind(key)
-        elif self.waiting > MOST_WAITING:
+        elif len(self._entries) - self._next > MOST_WAITING:
             self._give_up(1, "no_imu" if self._checkpoints else "no_alignment")
         return entry
 

@@ -26,6 +26,8 @@ FIGURES = (
     "process_epoch_ratio",
     "process_start_s",
     "reduced_order_step_ratio",
+    "fix_functions",
+    "fix_modules",
 )
 
 

@@ -115,7 +115,8 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
     height = m.height_m
     if receiver.holds:
-        share = _with_geoid(share, m.geoid_sd_m, o)
+        if m.geoid_sd_m:
+            share = _with_geoid(share, m.geoid_sd_m, o)
     elif m.geoid_sd_m > sd[2]:
         height = None  # nothing holds what fixes share: sigma would shrink with their number
     motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
