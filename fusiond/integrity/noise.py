@@ -7,14 +7,25 @@ long-run variance is more than one, component by component,
     s = gamma_0 + 2 sum_k (1 - k / (K + 1)) gamma_k,    gamma_k = E[u_i u_(i-k)],   u = y sqrt(s)
 
 and white errors of s times the stated variance have the same sums, which is what a filter that
-looks back further than the errors last makes of them. It counts with max(1, s): a receiver that
-states too little is weighed, not accused, and one that states too much is believed.
+looks back further than the errors last makes of them. Only more than one counts: a receiver that
+states too little is weighed, not accused, and one that states too much is believed. The estimate
+itself scatters, with white innovations by
+
+    var(s) = (2 + 4 sum_k (1 - k / (K + 1))^2) / N = 12.1 / N
+
+so that max(1, s) would be too large by 0.4 of its sigma on the average, of a series that states
+what it has: 0.08 after 300 innovations. What counts is the non-negative garrote,
+
+    1 + (s - 1) (1 - (2 sigma_s / (s - 1))^2)    where s - 1 is more than 2 sigma_s, else 1
+
+whose mean is too large by 0.016 sigma_s then, and which leaves what is surely more as it is.
 
 What is shown lately may be the beginning of a fault: it counts when it is `WAITS_NS` old, and not
 if the series has left service meanwhile.
 
 Source: Bartlett's estimate of a spectrum at zero, as Newey and West, Econometrica 55 (1987), 703;
-Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15 (1970).
+Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans. AC 15 (1970);
+Breiman, Better subset regression using the nonnegative garrote, Technometrics 37 (1995), 373.
 """
 
 from __future__ import annotations
@@ -35,6 +46,10 @@ WAITS_NS = 15_000_000_000
 """A drift of 0.1 m/s is found within twice this; longer ones hide nothing."""
 MOST = 100.0
 """Of a variance: ten times the sigma. What is beyond is no noise."""
+SURE = 2.0
+"""Sigmas of its own scatter by which a scale must be more than one to count at all."""
+SCATTER = 2.0 + 4.0 * sum((1.0 - k / (LAGS + 1.0)) ** 2 for k in range(1, LAGS + 1))
+"""Variance of s of one series of white innovations, times their number."""
 _ROWS = 3
 # The array of a series: scales (3); how many innovations are learned from, wait, and have come
 # since (s), how many the ring holds; sums of the lags of those three, (3, K + 1) each; the ring.
@@ -66,12 +81,16 @@ def _settle(packed: Array) -> None:
     packed[_LEARNED] = keep * learned + n
     packed[_WAITING], packed[_NEW_COUNT] = packed[_NEW_COUNT], 0.0
     total = packed[_LEARNED] + PRIOR_COUNT
+    chance = SURE * SURE * SCATTER * packed[_LEARNED] / (total * total)
     for i in range(_ROWS):
         at = _SUMS + i * (LAGS + 1)
         s = (packed[at] + PRIOR_COUNT) / total
         for k in range(1, LAGS + 1):
             s += 2.0 * (1.0 - k / (LAGS + 1.0)) * packed[at + k] / total
-        packed[i] = min(max(s, 1.0), MOST)
+        beyond = s - 1.0
+        packed[i] = 1.0
+        if beyond > 0.0 and beyond * beyond > chance:
+            packed[i] = min(1.0 + beyond - chance / beyond, MOST)
 
 
 @compiled("void(f8[::1], f8, f8, f8, f8, i8)")

@@ -76,7 +76,7 @@ class Block:
     -1 a parameter that acts on measurements only. `white` is the noise density of each state
     (unit^2 / s), `tau_s` and `steady` (one sigma) those of a Markov process, `initial` one sigma at
     the start where nothing else sets it. `rate` names the block of one state that is the rate of
-    each of these.
+    each of these; zero where the model has no such block.
     """
 
     name: str

@@ -77,7 +77,7 @@ class Model:
         rate_terms = [
             (slot_of_offset, self.slots_of(block.rate)[0])
             for block, slots in self._slots()
-            if block.rate
+            if self.slots_of(block.rate)
             for slot_of_offset in slots
         ]
         for name, value in {

@@ -18,14 +18,19 @@ WHEEL_ROUNDING = "wheel_rounding"
 FIX_TIME = "gnss_time"
 FIX_WANDER = "gnss_wander"
 VELOCITY_TIME = "gnss_velocity_time"
+CLOCK_SKEW = "gnss_clock_skew"
 ANTENNA_LEVER = "antenna_lever"
 BAROMETER_OFFSET = "barometer_offset"
 BAROMETER_SCALE = "barometer_scale"
 BAROMETER_AIRFLOW = "barometer_airflow"
 
-# Random walk (s per root second) of a time offset: a serial line's load and two clocks that differ
-# by some 10 ppm move it by milliseconds in minutes.
+# Random walk (s per root second) of a time offset: a serial line's load moves it by milliseconds in
+# minutes.
 TIME_WALK_S_SQRT_S = 1e-3
+# One sigma of how much faster one of two clocks runs: crystals are within 50 ppm of each other,
+# ceramic resonators within 0.5 %, and NTP slews a host's clock by 500 ppm. The unit of drive_0708
+# and its receiver part by 250 ppm.
+CLOCK_SKEW_SD = 2e-4
 
 
 def mounting(sd_rad: float) -> Block:
@@ -56,9 +61,17 @@ def wheel_rounding(name: str, sd: float) -> Block:
     return _constant(name, "1", ("share",), sd)
 
 
-def time_offset(name: str, sd_s: float) -> Block:
-    """How much later (s) than its stamp a measurement is valid."""
-    return Block(name, "s", ("t",), (-1,), initial=sd_s, white=TIME_WALK_S_SQRT_S**2)
+def time_offset(name: str, sd_s: float, skew: str = "") -> Block:
+    """How much later (s) than its stamp a measurement is valid; `skew` names the block of what that
+    grows by."""
+    walk = TIME_WALK_S_SQRT_S**2
+    return Block(name, "s", ("t",), (-1,), initial=sd_s, white=walk, rate=skew)
+
+
+def clock_skew(name: str) -> Block:
+    """By how much (s/s) the offsets in time of a device grow: its clock and that of the inertial
+    unit run at two rates."""
+    return _constant(name, "1", ("rate",), CLOCK_SKEW_SD)
 
 
 def fix_wander(name: str, lasts_s: float) -> Block:

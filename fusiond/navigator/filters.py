@@ -21,7 +21,7 @@ from fusiond.integrity.verdicts import Verdicts
 from fusiond.models.blocks import Block
 from fusiond.models.catalogue import make_model
 from fusiond.models.model import Model, TooManyStatesError
-from fusiond.models.vehicle import ANTENNA_LEVER, FIX_WANDER
+from fusiond.models.vehicle import ANTENNA_LEVER, CLOCK_SKEW, FIX_WANDER
 from fusiond.navigation.crosstalk import Crosstalk
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.vibration import Vibration
@@ -41,7 +41,7 @@ def model_of(config: Config, *extra: Block) -> Model:
     try:
         return make_model(name, noise, *extra)
     except TooManyStatesError as error:
-        for unasked in (_wanders, _unasked):
+        for unasked in (_skews, _wanders, _unasked):
             asked = [block for block in extra if not unasked(config, block)]
             if len(asked) < len(extra):
                 return model_of(config, *asked)
@@ -50,6 +50,11 @@ def model_of(config: Config, *extra: Block) -> Model:
             f"estimator.model: {error}; the aids add {names}: choose a smaller model, such as"
             " 'ins15', or fewer aids"
         ) from error
+
+
+def _skews(_: Config, block: Block) -> bool:
+    """Whether a block is what two clocks part by."""
+    return block.name.startswith(CLOCK_SKEW)
 
 
 def _wanders(_: Config, block: Block) -> bool:

@@ -16,10 +16,11 @@ from fusiond.aiding.base import Innovation, NotApplicable
 from fusiond.aiding.body_velocity import NonHolonomicAid, WheelSpeedAid
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.standstill import ZeroRateAid, ZeroVelocityAid
-from fusiond.aiding.velocity import VelocityAid
+from fusiond.aiding.velocity import AVERAGED, VelocityAid
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
     FIX_TIME,
+    VELOCITY_TIME,
     WHEEL_DRIFT,
     WHEEL_LATENCY,
     WHEEL_ROUNDING,
@@ -162,6 +163,21 @@ def test_timing_error_of_a_velocity_adds_along_the_acceleration() -> None:
     assert np.abs(state.acceleration).min() > 0.01
     expected = np.square(sd) + np.square(0.5 * state.acceleration)
     assert innovation_of(aid, state).r == pytest.approx(expected)
+
+
+def test_a_velocity_that_lags_is_an_average_where_the_vehicle_jolts() -> None:
+    """By 0.13 s behind the position: half of what the lag makes of the acceleration."""
+    model = vehicle_model()
+    xi = np.zeros(model.size)
+    xi[model.slots_of(FIX_TIME)], xi[model.slots_of(VELOCITY_TIME)] = 0.1, -0.03
+    state = state_of(model, runs.level_nav(RPY, VELOCITY), xi)
+    sd = (0.1, 0.1, 0.2)
+    alone = VelocityAid(*SOURCE, (12.3, -7.2, 0.7), sd, LEVER, VELOCITY_TIME)
+    beside = replace(alone, fix_time=FIX_TIME)
+    assert innovation_of(alone, state).r == pytest.approx(np.square(sd))
+    expected = np.square(sd) + np.square(AVERAGED * 0.13 * state.acceleration)
+    assert innovation_of(beside, state).r == pytest.approx(expected)
+    assert innovation_of(beside, state).z == pytest.approx(innovation_of(alone, state).z)
 
 
 @settings(max_examples=50, deadline=None)

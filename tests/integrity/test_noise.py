@@ -25,6 +25,20 @@ def test_white_innovations_leave_it_at_one(seed: int) -> None:
     assert scale_of(np.random.default_rng(seed).standard_normal(MANY)) < 1.5
 
 
+@pytest.mark.parametrize("count", [300, 1_000])
+def test_what_chance_shows_does_not_add_up(count: int) -> None:
+    """A floor of one under an estimate that scatters is more than one on the average: 1.08 and
+    1.04 of these."""
+    found = []
+    for seed in range(60):
+        packed = unlearned()
+        y = np.random.default_rng(seed).standard_normal((count, 3))
+        for k in range(count):
+            learn(packed, k * STEP_S, *(y[k] / np.sqrt(packed[:3])).tolist(), 3)
+        found.extend(packed[:3].tolist())
+    assert 1.0 <= np.mean(found) < 1.02
+
+
 def test_one_that_states_half_its_sigma_counts_four_times_its_variance() -> None:
     found = [scale_of(2.0 * np.random.default_rng(k).standard_normal(MANY)) for k in range(8)]
     assert 3.2 < np.mean(found) < 4.8

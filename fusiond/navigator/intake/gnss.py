@@ -15,10 +15,12 @@ from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.vehicle import (
     ANTENNA_LEVER,
+    CLOCK_SKEW,
     FIX_TIME,
     FIX_WANDER,
     VELOCITY_TIME,
     antenna_lever,
+    clock_skew,
     fix_wander,
     time_offset,
 )
@@ -151,6 +153,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         receiver.velocity_time,
         receiver.lever,
         sd_time_s,
+        receiver.time,
     )
     return [position, velocity]
 
@@ -249,14 +252,16 @@ def _wandering(
 
 
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
-    """What a receiver's fixes share: their offset in time, that of its velocities, what is left of
-    the lever arm, an error north and east, and one down."""
+    """What a receiver's fixes share: their offset in time, that of its velocities, what both grow
+    by, what is left of the lever arm, an error north and east, and one down."""
     found = []
     if section.time_offset_sd_s:
-        found.append(time_offset(sections.own(FIX_TIME, source, section), section.time_offset_sd_s))
+        skew, sd_s = sections.own(CLOCK_SKEW, source, section), section.time_offset_sd_s
+        found.append(time_offset(sections.own(FIX_TIME, source, section), sd_s, skew))
         if section.use_velocity:
             name = sections.own(VELOCITY_TIME, source, section)
-            found.append(time_offset(name, section.time_offset_sd_s))
+            found.append(time_offset(name, sd_s, skew))
+        found.append(clock_skew(skew))
     lever_sd = lever_sd_m(section, sections.aiding)
     if lever_sd:
         name = sections.own(ANTENNA_LEVER, source, section)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -49,16 +49,18 @@ PHASE = "steady"
 class Drive:
     """A folder of recorded tables, what is known of the vehicle, and sets of outages as begin, from
     the first sample on, and length (s). `truth` is a table that is no aid; without it the fixes
-    that are withheld are. `quality` stands in the place of that of each fix."""
+    that are withheld are. `qualities` stand in the place of those that fixes state."""
 
     folder: str
     settings: dict[str, Any]
     outages: tuple[tuple[tuple[float, float], ...], ...]
     wheels: bool = False
     truth: str | None = None
-    quality: int | None = None
+    qualities: Mapping[int, int] = field(default_factory=dict)
 
 
+BY_NMEA = {1: 4, 2: 5}
+"""Fixed and float ambiguities of RTKLIB as NMEA calls them."""
 _RTK: dict[str, Any] = {
     "imu": {"axes": ("-x", "+y", "-z"), "sensor_class": "mems", "rate_hz": 100.0},
     "aiding": {"gnss": {"lever_arm_m": (0.0, -0.05, 0.0)}},
@@ -71,7 +73,7 @@ _EVERY_45_S = tuple(
 """Of README of the data: eight of 15 s, and four sets between them."""
 DRIVES: dict[str, Drive] = {
     "drive_0708": Drive("drive_0708", _RTK, _EVERY_45_S),
-    "drive_0708, quality 4": Drive("drive_0708", _RTK, _EVERY_45_S, quality=4),
+    "drive_0708, quality 4": Drive("drive_0708", _RTK, _EVERY_45_S, qualities=BY_NMEA),
     "css_164": Drive(
         "css_164",
         {
@@ -135,7 +137,7 @@ def real_run(job: RealJob) -> dict[str, Any]:
     drive = DRIVES[job.drive]
     config = Config.model_validate(drive.settings)
     whole, reference, begin_s = _read(job.data / drive.folder, drive.wheels, drive.truth)
-    recording = whole if drive.quality is None else _of_quality(whole, drive.quality)
+    recording = _of_quality(whole, drive.qualities) if drive.qualities else whole
     windows = () if job.outages is None else drive.outages[job.outages]
     for at_s, length_s in windows:
         recording = recording.withheld(at_s, at_s + length_s)
@@ -223,10 +225,10 @@ def _read(
     return recording, read_truth(folder / (truth or "gnss.csv")), begin * 1e-9
 
 
-def _of_quality(recording: Recording, quality: int) -> Recording:
+def _of_quality(recording: Recording, qualities: Mapping[int, int]) -> Recording:
     received = [
-        replace(item, measurement=replace(item.measurement, quality=quality))
-        if isinstance(item.measurement, PositionFix)
+        replace(item, measurement=replace(m, quality=qualities[m.quality]))
+        if isinstance(m := item.measurement, PositionFix)
         else item
         for item in recording.received
     ]

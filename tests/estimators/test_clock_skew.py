@@ -1,0 +1,69 @@
+"""A receiver whose clock runs faster than that of the inertial unit: offsets in time that grow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fusiond.configuration.schema import Config
+from fusiond.models.vehicle import CLOCK_SKEW, CLOCK_SKEW_SD, FIX_TIME, VELOCITY_TIME
+from fusiond.navigator.filters import model_of
+from fusiond.navigator.intake import Intake
+from fusiond.navigator.navigator import Navigator
+from fusiond.studies.faults.published import against
+from fusiond.studies.faults.recording import Recording
+from fusiond.studies.faults.scenes import CODE, RTK, Vehicle, scene
+
+SKEW = 250e-6
+"""As of the unit of drive_0708: 0.1 s in 400 s."""
+LENGTH_S = 300.0
+
+
+def test_it_is_the_rate_of_both_offsets() -> None:
+    config = Vehicle("mems", CODE, told="noise").config()
+    model = model_of(config, *Intake(config.aiding, config.plausibility).extra_blocks())
+    [skew] = model.slots_of(CLOCK_SKEW)
+    offsets = [*model.slots_of(FIX_TIME), *model.slots_of(VELOCITY_TIME)]
+    assert model.rate_terms.tolist() == [offsets, [skew, skew]]
+    assert model.initial[skew] == CLOCK_SKEW_SD
+
+
+def test_it_goes_first_where_there_is_no_room() -> None:
+    """Of a car with wheels and a lever arm that nobody gave, 41 states; 40 fit."""
+    config = Config.model_validate(
+        {
+            "imu": {"axes": ("+x", "+y", "+z"), "sensor_class": "consumer", "rate_hz": 100.0},
+            "aiding": {"gnss": {}, "wheel": {}},
+            "constraints": {"non_holonomic": {"enabled": True}},
+            "estimator": {"model": "ins21"},
+        }
+    )
+    model = Navigator(config).model
+    assert not model.slots_of(CLOCK_SKEW)
+    assert model.slots_of("gnss_wander")
+    assert model.rate_terms.shape == (2, 0)
+
+
+@pytest.mark.parametrize("skew", [SKEW, 0.0])
+def test_fixes_of_a_fast_clock_are_followed_and_nobody_is_accused(skew: float) -> None:
+    """Stamps that grow late by 0.25 ms a second: 75 ms in the end."""
+    on = scene(Vehicle("mems", RTK, told="noise"), "looked", 5, LENGTH_S)
+    ns = (on.recording.stamps * (1.0 + skew)).astype(np.int64)
+    seen = (on.recording.imu_seen * (1.0 + skew)).astype(np.int64)
+    by_its_clock = Recording(ns, seen, on.recording.samples, on.recording.received)
+    seen_states = []
+
+    def watch(navigator: Navigator) -> None:
+        if navigator.started is not None:
+            e = navigator.estimator
+            [slot], [offset] = e.model.slots_of(CLOCK_SKEW), e.model.slots_of(FIX_TIME)
+            variance = float(e.covariance[slot, slot])
+            seen_states.append((e.xi.item(slot), np.sqrt(variance), e.xi.item(offset)))
+
+    ticks = np.arange(1.0, 10.0 * LENGTH_S - 5.0) * 0.1
+    run = against(on.config, by_its_clock, on.truth.at(ticks), None, watch)
+    found, sd, offset_s = seen_states[-1]
+    assert found == pytest.approx(skew, abs=4.0 * sd)
+    assert sd < 0.7 * CLOCK_SKEW_SD
+    assert offset_s == pytest.approx(LENGTH_S * skew, abs=0.03)
+    assert not {e.code for e in run.events} & {"isolated", "sensor_fault"}
