@@ -275,9 +275,9 @@ def _newest(folder: Path) -> Path:
 async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
     """A vehicle under way and a broker; the configuration of a daemon for them."""
     bus = bus_here(0)
-    ports = Ports(*(free_port() for _ in Ports._fields))
     # Else Mosquitto waits for the client's delayed acknowledgement, 40 ms.
     broker = Broker(folder, "allow_anonymous true", "set_tcp_nodelay true")
+    ports = Ports(*(free_port() for _ in Ports._fields[:-1]), mqtt=broker.port)
     config = folder / "load.toml"
     config.write_text(
         CONFIG.format(
@@ -285,6 +285,7 @@ async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
             imu_hz=200.0, tick_hz=100.0, nav_hz=100.0, folder=folder, port=broker.port,
             filter="kalman", kind="raw",
         )
+        + 'commands = ["request_fix"]\n'
         + RECORDING.format(folder=folder)
         + OUTPUTS.format(**ports._asdict())
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """What guests do to the daemon's servers, each in a process of its own:
 
-    python benchmarks/attackers.py NAME SECONDS GPSD_PORT NMEA_PORT PROMETHEUS_PORT FOXGLOVE_PORT
+    python benchmarks/attackers.py NAME SECONDS GPSD NMEA PROMETHEUS FOXGLOVE MQTT    (ports)
 
 Says `attacking` once it has begun, and at the end as JSON how many connections it made and how many
 bytes it sent. It yields the processor to everyone else (nice 19): an attacker has its own, and what
@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from itertools import cycle, repeat
+from itertools import count, cycle, repeat
 from typing import NamedTuple
 
 
@@ -29,6 +29,8 @@ class Ports(NamedTuple):
     nmea: int
     prometheus: int
     foxglove: int
+    mqtt: int
+    """Of the broker that the daemon listens at."""
 
 
 WATCH = b'?WATCH={"enable":true,"json":true};'
@@ -90,9 +92,9 @@ class Sender:
         if not self.rest:
             self.rest = next(self.saying, b"")
         if self.rest:
-            count = self.sock.send(self.rest)
-            self.sent += count
-            self.rest = self.rest[count:]
+            taken = self.sock.send(self.rest)
+            self.sent += taken
+            self.rest = self.rest[taken:]
         else:
             self.sock.send(b"")
             if self.deaf:
@@ -154,12 +156,61 @@ def _unended() -> Iterator[bytes]:
     yield from repeat(b'"')
 
 
+def _text(data: bytes) -> bytes:
+    return len(data).to_bytes(2) + data
+
+
+def _packet(kind: int, body: bytes) -> bytes:
+    """Of MQTT 3.1.1 (section 2.2)."""
+    size, rest = b"", len(body)
+    while not size or rest:
+        rest, low = rest >> 7, rest & 0x7F
+        size += bytes([low | (0x80 if rest else 0)])
+    return bytes([kind]) + size + body
+
+
+def publication(topic: str, payload: bytes, retained: bool = False) -> bytes:
+    """With QoS 0, which a broker hands on as fast as it comes."""
+    return _packet(0x30 | retained, _text(topic.encode()) + payload)
+
+
+def joined() -> bytes:
+    """Connects to a broker under a name of its own."""
+    return _packet(0x10, b"\x00\x04MQTT\x04\x02\x00\x00" + _text(os.urandom(8).hex().encode()))
+
+
+def _commands() -> Iterator[bytes]:
+    """As they should be, each with an id of its own."""
+    yield joined()
+    for first in count(0, 100):
+        yield b"".join(
+            publication("fusiond/load/cmd/request_fix", b'{"id":"%d"}' % (first + k))
+            for k in range(100)
+        )
+
+
+def _births() -> Iterator[bytes]:
+    yield joined()
+    yield from repeat(publication("homeassistant/status", b"online") * 100)
+
+
+LISTENED = ("homeassistant/status", *(f"fusiond/load/cmd/{name}" for name in ("inject", "x")))
+
+
+def _garbage() -> Iterator[bytes]:
+    """Large, and kept by the broker, on every topic that the daemon listens to."""
+    yield joined()
+    for number in count():
+        for topic in LISTENED:
+            yield publication(topic, bytes([number % 256]) * 60_000, retained=True)
+
+
 SCRAPE = b"GET /metrics HTTP/1.1\r\n\r\n"
 
 
 def _hasty(ports: Ports) -> list[Sender]:
     """Who comes and is gone again."""
-    return [Sender(port, _once(), deaf=False) for port in ports]
+    return [Sender(port, _once()) for port in ports[:-1]]
 
 
 ATTACKS: dict[str, Callable[[Ports], list[Sender]]] = {
@@ -187,6 +238,9 @@ ATTACKS: dict[str, Callable[[Ports], list[Sender]]] = {
     "headers_300_slow": lambda p: [
         Sender(p.prometheus, lambda: repeat(b"G"), deaf=True) for _ in range(300)
     ],
+    "commands_4": lambda p: [Sender(p.mqtt, _commands) for _ in range(4)],
+    "births_4": lambda p: [Sender(p.mqtt, _births) for _ in range(4)],
+    "garbage_4": lambda p: [Sender(p.mqtt, _garbage) for _ in range(4)],
 }
 """By name: what the connections of an attack do, all at once."""
 SLOW_S = {"headers_300_slow": 0.5, "unended_64": 0.002}

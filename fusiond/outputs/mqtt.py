@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access, packet_limit
+from fusiond.outputs import broker_access, incoming, packet_limit
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
@@ -98,6 +98,7 @@ class MqttPublisher:
                 options.commands, on_command, self.counters, on_event, utc_now
             )
         self._reconnecting = Reconnecting()
+        self._quiet = incoming.quiet()
         self.status = DriverStatus()
 
     # ------------------------------------------------------------------ for the tick
@@ -201,8 +202,7 @@ class MqttPublisher:
             max_queued_incoming_messages=_INCOMING,
             logger=_LOG,
             tls_context=self._tls,
-            # Else a message waits for the broker's word on the one before (Nagle): 20 ms of gap.
-            socket_options=((socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),),
+            socket_options=incoming.SOCKET_OPTIONS,
         )
         packet_limit.limit(client, MAX_PAYLOAD_BYTES)
         return client
@@ -212,6 +212,7 @@ class MqttPublisher:
         self._flowing.set()
         # Not a TaskGroup: in Python 3.11 it leaves its parent counted as cancelled.
         tasks = [
+            asyncio.create_task(self._listen(client)),
             asyncio.create_task(self._receive(client)),
             asyncio.create_task(self._send_confirmed(client)),
             asyncio.create_task(self._send_latest(client)),
@@ -308,15 +309,28 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ commands
 
+    async def _listen(self, client: aiomqtt.Client) -> None:
+        """Keep subscribed to what others publish to us, but for a while after a flood."""
+        addresses = [*self._heard]
+        if self._commands is not None:
+            addresses.append(f"{self._base}/cmd/+")
+        coming = incoming.Incoming(client, self.counters, self._quiet)
+        while True:
+            for address in addresses:
+                await client.subscribe(address, 1)
+                _honour_cancellation()
+            quiet_s = await coming.flood()
+            await client.unsubscribe(addresses)
+            _honour_cancellation()
+            most = f"{incoming.MESSAGES.per_s:.0f} a second"
+            text = f"commands and the like, more than {most}: not listening for {quiet_s:.0f} s"
+            self._on_event("mqtt_flooded", text)
+            await asyncio.sleep(quiet_s)
+            coming.over()
+
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Answer commands; ends with `MqttError` when the connection does."""
         prefix = f"{self._base}/cmd/"
-        if self._commands is not None:
-            await client.subscribe(f"{prefix}+", 1)
-            _honour_cancellation()
-        for address in self._heard:
-            await client.subscribe(address, 1)
-            _honour_cancellation()
         async for message in client.messages:
             payload = message.payload
             if not isinstance(payload, bytes):
