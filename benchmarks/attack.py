@@ -178,6 +178,7 @@ async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
     finally:
         if process.returncode is None:
             process.kill()
+            await process.wait()
     found: dict[str, Any] = json.loads(told.splitlines()[-1])
     return found
 

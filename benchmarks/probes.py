@@ -173,6 +173,7 @@ async def probing(port: int, topic: str) -> AsyncIterator[Probed]:
         for process in started.values():
             if process.returncode is None:
                 process.kill()
+                await process.wait()
 
 
 def main() -> None:
