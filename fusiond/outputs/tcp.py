@@ -14,7 +14,6 @@ import errno
 import logging
 import select
 import socket
-import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from fusiond.outputs.allowance import Allowance
 from fusiond.outputs.guests import Guests
 from fusiond.outputs.places import gives_way, host_of
 from fusiond.outputs.port import Port
-from fusiond.outputs.sockets import bound, tune
+from fusiond.outputs.sockets import LINGER_NOT, bound, tune
 
 MOST_CLIENTS = 256
 """A quarter of the descriptors that a process has by default (1024, RLIMIT_NOFILE)."""
@@ -39,8 +38,8 @@ REQUEST_S = 10.0
 """Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
 by default."""
 HASTY_S = 1.0
-"""When all places are taken, who has asked nothing, or takes nothing of an answer, for so long makes
-room for one who comes."""
+"""When all places are taken, who has asked nothing for so long gives way to one who comes; so does
+who takes nothing of an answer."""
 PAUSE_S = 1.0
 """Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
 SHORT_TOLD_S = 60.0
@@ -50,7 +49,6 @@ _READ_BYTES = 1024
 _BACKLOG = 128
 _SHORT = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _GONE = select.EPOLLHUP | select.EPOLLERR
-_LINGER_NOT = struct.pack("ii", 1, 0)
 _SECOND_NS = 1_000_000_000
 
 log = logging.getLogger("fusiond")
@@ -146,7 +144,7 @@ class Client:
         if not self.closed:
             self._counters[reason] += 1
             # Reset: the kernel would keep for a minute what nobody reads.
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER_NOT)
             self.close()
 
     def close(self) -> None:
