@@ -287,6 +287,7 @@ ATTACKS: dict[str, Callable[[Ports], list[Sender]]] = {
     "garbage_4": lambda p: [Sender(p.mqtt, _garbage) for _ in range(4)],
 }
 """By name: what the connections of an attack do, all at once."""
+OVER_THE_BROKER = ("commands_4", "births_4", "garbage_4")
 SLOW_S = {
     "headers_300_slow": 0.5,
     "unended_64": 0.002,
