@@ -46,13 +46,14 @@ class MqttPublisher:
     """Publishes a vehicle's topics and takes its commands.
 
     `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
-    `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out
-    a configured command; without it, or with none configured, nothing is subscribed. `utc_now` (ns,
-    None if unknown) dates the replies.
+    `mqtt_flooded`, `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`.
+    `on_command` carries out a configured command; without it, or with none configured, nothing is
+    subscribed. `utc_now` (ns, None if unknown) dates the replies.
 
     `counters`: `mqtt_published`; `mqtt_dropped` (replaced by a newer one, pushed out of the full
     event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_taken_over`, connections lost
-    to another client of our name; those of `CommandIntake`. `status` is for `health`.
+    to another client of our name; `mqtt_flooded`, messages for us that were dropped unread; those
+    of `CommandIntake`. `status` is for `health`.
 
     Raises `ConfigError` for a password file or TLS files that cannot be used.
     """
