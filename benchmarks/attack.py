@@ -9,9 +9,10 @@ listens to. One daemon takes all attacks (`benchmarks/attackers.py`) one after a
 `--seconds`; `peace` is as long without one. Columns:
 
 * `ticks`, `overruns`: of the scheduler meanwhile;
-* `nav_ms`: largest gap between two `nav` at the broker's client; `tick_ms`: between the instants
-  they are of, which no client, broker or network adds to;
-* `guest_ms`: largest gap between two epochs (10 Hz) at a client of gpsd's that reads all the while;
+* largest gap between two `nav`: `nav_ms` at a client of the broker that does nothing else,
+  `sent_ms` as they reach the broker, `tick_ms` between the instants they are of; `bare_ms` that of
+  a loop that wakes every 10 ms and does nothing: the computer's own (`benchmarks/probes.py`);
+* `guest_ms`: largest gap between two epochs (10 Hz) at a gpsd client that reads all the while;
   `scrape_ms`: longest answer to a scrape, of one a second;
 * `before`, `most`, `after`: resident memory, MB; `after` is `--rest` seconds later;
 * `fds`: descriptors before, at most and after;
@@ -45,16 +46,14 @@ from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
-
-import aiomqtt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.attackers import ATTACKS, Ports
 from benchmarks.daemon_load import CONFIG, RECORDING, resident_mb, simulate
+from benchmarks.probes import gap_ms, probing
 from fusiond.recording.reader import Log
 from tests.broker import Broker, free_port, listening
 from tests.hil.heard import Heard
@@ -62,6 +61,7 @@ from tests.hil.processes import SIM_IMU, DaemonProcess
 from tests.live.rig import bus_here, network_of_its_own
 
 SETTLE_S = 5.0
+NAV = "fusiond/load/nav"
 OUTPUTS = """
 [outputs.gpsd]
 port = {gpsd}
@@ -78,7 +78,8 @@ port = {foxglove}
 """
 COLUMNS = (
     ("attack", "attack", 18), ("ticks", "ticks", 6), ("overruns", "overruns", 9),
-    ("nav_ms", "nav_ms", 8), ("tick_ms", "tick_ms", 8), ("guest_ms", "guest_ms", 9),
+    ("nav_ms", "nav_ms", 8), ("sent_ms", "sent_ms", 8), ("tick_ms", "tick_ms", 8),
+    ("bare_ms", "bare_ms", 8), ("guest_ms", "guest_ms", 9),
     ("scrape_ms", "scrape_ms", 10), ("before", "before_mb", 7), ("most", "most_mb", 7),
     ("after", "after_mb", 7), ("fds", "fds", 14), ("log", "log_lines_a_minute", 6),
 )  # fmt: skip
@@ -88,25 +89,10 @@ COLUMNS = (
 class Watch:
     """What is seen from outside while it lasts."""
 
-    nav_s: list[float] = field(default_factory=list)
-    nav_ms: list[int] = field(default_factory=list)
     guest_s: list[float] = field(default_factory=list)
     scrape_s: list[float] = field(default_factory=list)
     memory_mb: list[float] = field(default_factory=list)
     descriptors: list[int] = field(default_factory=list)
-
-
-def _gap_ms(times_s: list[float]) -> float:
-    gaps = [b - a for a, b in pairwise(times_s)]
-    return round(1000.0 * max(gaps, default=float("inf")), 1)
-
-
-async def _hear_nav(port: int, watch: Watch) -> None:
-    async with aiomqtt.Client("127.0.0.1", port) as client:
-        await client.subscribe("fusiond/load/nav")
-        async for message in client.messages:
-            watch.nav_s.append(time.monotonic())
-            watch.nav_ms.append(json.loads(bytes(message.payload))["t_ms"])
 
 
 async def _read_gpsd(port: int, watch: Watch) -> None:
@@ -153,10 +139,9 @@ async def _sample(pid: int, watch: Watch) -> None:
 
 
 @asynccontextmanager
-async def _watching(pid: int, broker: int, ports: Ports) -> AsyncIterator[Watch]:
+async def _watching(pid: int, ports: Ports) -> AsyncIterator[Watch]:
     watch = Watch()
     tasks = [
-        asyncio.create_task(_hear_nav(broker, watch)),
         asyncio.create_task(_read_gpsd(ports.gpsd, watch)),
         asyncio.create_task(_scrape(ports.prometheus, watch)),
         asyncio.create_task(_sample(pid, watch)),
@@ -193,6 +178,7 @@ async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
     finally:
         if process.returncode is None:
             process.kill()
+            await process.wait()
     found: dict[str, Any] = json.loads(told.splitlines()[-1])
     return found
 
@@ -200,7 +186,7 @@ async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
 async def _row(
     name: str, daemon: DaemonProcess, heard: Heard, broker: int, ports: Ports, args: Any
 ) -> dict[str, Any]:
-    async with _watching(daemon.pid, broker, ports) as watch:
+    async with probing(broker, NAV) as probed, _watching(daemon.pid, ports) as watch:
         before = await heard.until("health")
         log_at = len(daemon.log)
         memory_mb, descriptors = watch.memory_mb[-1], watch.descriptors[-1]
@@ -215,9 +201,8 @@ async def _row(
         "attack": name,
         "ticks": after["ticks"] - before["ticks"],
         "overruns": after["overruns"] - before["overruns"],
-        "nav_ms": _gap_ms(watch.nav_s),
-        "tick_ms": _gap_ms([t * 1e-3 for t in watch.nav_ms]),
-        "guest_ms": _gap_ms(watch.guest_s),
+        **probed.row(),
+        "guest_ms": gap_ms(watch.guest_s),
         "scrape_ms": round(1000.0 * max(watch.scrape_s, default=float("inf")), 1),
         "before_mb": round(memory_mb, 1),
         "most_mb": round(max(watch.memory_mb), 1),
@@ -265,17 +250,16 @@ async def kill(folder: Path, args: Any) -> list[dict[str, Any]]:
             for name in ("poll_8_unread", "deaf_1100", "subscribe_138000")
         ]
         for number in range(args.kill):
-            watch = Watch()
-            listening_ = asyncio.create_task(_hear_nav(broker.port, watch))
-            async with DaemonProcess(config) as daemon:
-                await daemon.start()
-                await daemon.ready()
-                await asyncio.sleep(dice.uniform(1.0, 3.0))
-            await asyncio.sleep(0.2)
-            listening_.cancel()
+            async with probing(broker.port, NAV) as probed:
+                async with DaemonProcess(config) as daemon:
+                    await daemon.start()
+                    await daemon.ready()
+                    await asyncio.sleep(dice.uniform(1.0, 3.0))
+                await asyncio.sleep(0.2)
             log = Log([_newest(folder)])
             kept_ms = [m.json()["t_ms"] for m in log.messages("/nav")]
-            lost_s = (watch.nav_ms[-1] - max(kept_ms, default=watch.nav_ms[0])) * 1e-3
+            heard_ms = [t_ms for _, t_ms in probed.heard]
+            lost_s = (heard_ms[-1] - max(kept_ms, default=heard_ms[0])) * 1e-3
             rows.append({"lost_s": round(lost_s, 3), "kept": len(kept_ms), "log": log.problems})
             print(number, rows[-1], flush=True)
         for attack in attacks:
@@ -292,9 +276,9 @@ def _newest(folder: Path) -> Path:
 async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
     """A vehicle under way and a broker; the configuration of a daemon for them."""
     bus = bus_here(0)
-    ports = Ports(*(free_port() for _ in Ports._fields))
     # Else Mosquitto waits for the client's delayed acknowledgement, 40 ms.
     broker = Broker(folder, "allow_anonymous true", "set_tcp_nodelay true")
+    ports = Ports(*(free_port() for _ in Ports._fields[:-1]), mqtt=broker.port)
     config = folder / "load.toml"
     config.write_text(
         CONFIG.format(
@@ -302,6 +286,7 @@ async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
             imu_hz=200.0, tick_hz=100.0, nav_hz=100.0, folder=folder, port=broker.port,
             filter="kalman", kind="raw",
         )
+        + 'commands = ["request_fix"]\n'
         + RECORDING.format(folder=folder)
         + OUTPUTS.format(**ports._asdict())
     )  # fmt: skip

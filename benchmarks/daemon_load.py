@@ -15,7 +15,8 @@ cost more: UDP, msgpack and a Python object for each.
 `--record` records all of it, and not, in turns of 10 s within the one run, by MQTT commands:
 `recording_percent` is the mean of the differences between neighbours and its standard error, each
 turn without its first second, in which a log is opened or ended. `--clients` has N
-clients of MQTT, gpsd and NMEA each listen, at 10 Hz. `age_ms` is the time from the instant of a
+clients of MQTT, gpsd and NMEA each listen, at 10 Hz, and of Foxglove and Prometheus 32 at most.
+`age_ms` is the time from the instant of a
 solution, that of its newest CAN frame, to the arrival of its `nav` at a client of the broker:
 median, 99 % and most. With many clients that is a matter of the machine as well, of which they
 (`clients_cpu_percent`) and the broker take a part.
@@ -95,6 +96,11 @@ rate_hz = 10.0
 [outputs.nmea]
 port = {nmea}
 rate_hz = 10.0
+[outputs.foxglove]
+port = {foxglove}
+rate_hz = 10.0
+[outputs.prometheus]
+port = {prometheus}
 """
 RECORDING = """
 [recording]
@@ -105,7 +111,9 @@ COMMANDS = """commands = ["start_recording", "stop_recording"]
 TURN_S, SKIPPED_S = 10.0, 1.0
 
 
-def simulate(folder: str, interface: str, channel: str, raw: bool) -> None:
+def simulate(
+    folder: str, interface: str, channel: str, raw: bool, duration_s: float = 600.0
+) -> None:
     scenario = SCENARIOS["drive"]
     vehicle = SimulatedVehicle(
         replace(
@@ -115,7 +123,7 @@ def simulate(folder: str, interface: str, channel: str, raw: bool) -> None:
             gnss=replace(scenario.gnss, rate_hz=GNSS_HZ),
             gnss_raw=replace(scenario.gnss_raw, rate_hz=GNSS_HZ),
         ),
-        duration_s=600.0,
+        duration_s=duration_s,
         can_imu=SIM_IMU_OPTIONS.model_copy(update={"interface": interface, "channel": channel}),
         gnss_link=Path(folder, "gnss"),
         rdss_link=Path(folder, "rdss"),
@@ -212,7 +220,8 @@ async def measure(
     """Run both processes for `seconds` after alignment; the figures."""
     bus = bus_here(0)
     interface, channel = bus["interface"], bus["channel"]
-    broker, gpsd, nmea = Broker(folder), free_port(), free_port()
+    broker = Broker(folder)
+    served_at = {n: free_port() for n in ("gpsd", "nmea", "foxglove", "prometheus")}
     config = folder / "load.toml"
     config.write_text(
         CONFIG.format(
@@ -226,10 +235,10 @@ async def measure(
             kind="raw" if raw else "gnss",
         )
         + (COMMANDS + RECORDING.format(folder=folder) if record else "")
-        + (OUTPUTS.format(gpsd=gpsd, nmea=nmea) if clients else "")
+        + (OUTPUTS.format(**served_at) if clients else "")
     )
     vehicle = multiprocessing.get_context("spawn").Process(
-        target=simulate, args=(str(folder), interface, channel, raw), daemon=True
+        target=simulate, args=(str(folder), interface, channel, raw, seconds + 300.0), daemon=True
     )
     try:
         with broker:
@@ -245,11 +254,12 @@ async def measure(
                     await heard.until("nav", lambda m: m["mode"] == "navigating")
                     await asyncio.sleep(SETTLE_S)
                     async with (
-                        _clients(clients, broker.port, gpsd, nmea) as served,
+                        _clients(clients, broker.port, *served_at.values()) as served,
                         _ages_ms(broker) as ages_ms,
                     ):
                         since, before = heard.count, await heard.until("health")
                         start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
+                        first_mb = resident_mb(daemon.pid)
                         shares: list[float] = []
                         if record:
                             shares = await _in_turns(daemon.pid, broker.port, seconds)
@@ -270,6 +280,7 @@ async def measure(
         "recording_and_not_percent": [round(share, 1) for share in shares],
         "cpu_percent": round(100.0 * used_s / elapsed_s, 1),
         "resident_mb": round(memory_mb, 1),
+        "resident_before_mb": round(first_mb, 1),
         "first_tick_s": round(first_tick_s, 2),
         "seconds": round(elapsed_s, 1),
         "interface": interface,

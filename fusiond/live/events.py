@@ -43,6 +43,7 @@ WARNINGS = (
     "imu_units",
     "damaged",
     "taken",
+    "flooded",
     "protection_level",
     "injected",
     "restart_needed",

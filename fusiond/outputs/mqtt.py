@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from drivers.base import DriverStatus
 from fusiond.configuration.schema import Mqtt
-from fusiond.outputs import broker_access, packet_limit
+from fusiond.outputs import broker_access, incoming, packet_limit
 from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
@@ -46,13 +46,14 @@ class MqttPublisher:
     """Publishes a vehicle's topics and takes its commands.
 
     `on_event(code, text)` hears `mqtt_connected`, `mqtt_lost`, `mqtt_absent` (once an outage),
-    `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`. `on_command` carries out
-    a configured command; without it, or with none configured, nothing is subscribed. `utc_now` (ns,
-    None if unknown) dates the replies.
+    `mqtt_flooded`, `client_name_taken`, `mqtt_command_failed` and `mqtt_password_exposed`.
+    `on_command` carries out a configured command; without it, or with none configured, nothing is
+    subscribed. `utc_now` (ns, None if unknown) dates the replies.
 
     `counters`: `mqtt_published`; `mqtt_dropped` (replaced by a newer one, pushed out of the full
     event queue, or lost with a connection); `mqtt_reconnects`; `mqtt_taken_over`, connections lost
-    to another client of our name; those of `CommandIntake`. `status` is for `health`.
+    to another client of our name; `mqtt_flooded`, messages for us that were dropped unread; those
+    of `CommandIntake`. `status` is for `health`.
 
     Raises `ConfigError` for a password file or TLS files that cannot be used.
     """
@@ -98,6 +99,7 @@ class MqttPublisher:
                 options.commands, on_command, self.counters, on_event, utc_now
             )
         self._reconnecting = Reconnecting()
+        self._quiet = incoming.quiet()
         self.status = DriverStatus()
 
     # ------------------------------------------------------------------ for the tick
@@ -201,8 +203,7 @@ class MqttPublisher:
             max_queued_incoming_messages=_INCOMING,
             logger=_LOG,
             tls_context=self._tls,
-            # Else a message waits for the broker's word on the one before (Nagle): 20 ms of gap.
-            socket_options=((socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),),
+            socket_options=incoming.SOCKET_OPTIONS,
         )
         packet_limit.limit(client, MAX_PAYLOAD_BYTES)
         return client
@@ -212,6 +213,7 @@ class MqttPublisher:
         self._flowing.set()
         # Not a TaskGroup: in Python 3.11 it leaves its parent counted as cancelled.
         tasks = [
+            asyncio.create_task(self._listen(client)),
             asyncio.create_task(self._receive(client)),
             asyncio.create_task(self._send_confirmed(client)),
             asyncio.create_task(self._send_latest(client)),
@@ -308,15 +310,28 @@ class MqttPublisher:
 
     # ------------------------------------------------------------------ commands
 
+    async def _listen(self, client: aiomqtt.Client) -> None:
+        """Keep subscribed to what others publish to us, but for a while after a flood."""
+        addresses = [*self._heard]
+        if self._commands is not None:
+            addresses.append(f"{self._base}/cmd/+")
+        coming = incoming.Incoming(client, self.counters, self._quiet)
+        while True:
+            for address in addresses:
+                await client.subscribe(address, 1)
+                _honour_cancellation()
+            quiet_s = await coming.flood()
+            await client.unsubscribe(addresses)
+            _honour_cancellation()
+            most = f"{incoming.MESSAGES.per_s:.0f} a second"
+            text = f"commands and the like, more than {most}: not listening for {quiet_s:.0f} s"
+            self._on_event("mqtt_flooded", text)
+            await asyncio.sleep(quiet_s)
+            coming.over()
+
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Answer commands; ends with `MqttError` when the connection does."""
         prefix = f"{self._base}/cmd/"
-        if self._commands is not None:
-            await client.subscribe(f"{prefix}+", 1)
-            _honour_cancellation()
-        for address in self._heard:
-            await client.subscribe(address, 1)
-            _honour_cancellation()
         async for message in client.messages:
             payload = message.payload
             if not isinstance(payload, bytes):

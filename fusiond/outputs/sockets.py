@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
+
+LINGER_NOT = struct.pack("ii", 1, 0)
+"""SO_LINGER, by which closing is a reset: the kernel would keep for a minute what nobody reads."""
 
 
 async def bound(host: str, port: int) -> list[socket.socket]:

@@ -14,7 +14,6 @@ import errno
 import logging
 import select
 import socket
-import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -23,8 +22,9 @@ from typing import Protocol
 from fusiond.outputs.activation import activated
 from fusiond.outputs.allowance import Allowance
 from fusiond.outputs.guests import Guests
+from fusiond.outputs.places import gives_way, host_of
 from fusiond.outputs.port import Port
-from fusiond.outputs.sockets import bound, tune
+from fusiond.outputs.sockets import LINGER_NOT, bound, tune
 
 MOST_CLIENTS = 256
 """A quarter of the descriptors that a process has by default (1024, RLIMIT_NOFILE)."""
@@ -38,7 +38,8 @@ REQUEST_S = 10.0
 """Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
 by default."""
 HASTY_S = 1.0
-"""When all places are taken, who has asked nothing for so long makes room for one who comes."""
+"""When all places are taken, who has asked nothing for so long gives way to one who comes; so does
+who takes nothing of an answer."""
 PAUSE_S = 1.0
 """Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
 SHORT_TOLD_S = 60.0
@@ -48,7 +49,6 @@ _READ_BYTES = 1024
 _BACKLOG = 128
 _SHORT = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _GONE = select.EPOLLHUP | select.EPOLLERR
-_LINGER_NOT = struct.pack("ii", 1, 0)
 _SECOND_NS = 1_000_000_000
 
 log = logging.getLogger("fusiond")
@@ -77,7 +77,8 @@ class Unheard:
 class Client:
     """One connection; closed, it is nothing more than its number of descriptor was."""
 
-    def __init__(self, sock: socket.socket, server: TcpServer) -> None:
+    def __init__(self, sock: socket.socket, server: TcpServer, host: str) -> None:
+        self.host = host
         self._socket = sock
         self._server = server
         self._guests = server.guests
@@ -143,7 +144,7 @@ class Client:
         if not self.closed:
             self._counters[reason] += 1
             # Reset: the kernel would keep for a minute what nobody reads.
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER_NOT)
             self.close()
 
     def close(self) -> None:
@@ -155,6 +156,12 @@ class Client:
         self._socket.close()
         self._out.clear()
         self._server.ended(self)
+
+    def owes(self, now_ns: int) -> bool:
+        """Whether a request, or the room for an answer that ends the connection, is overdue."""
+        since_ns = self.since_ns if self.request_due else self._moved_ns
+        due = self.request_due or self._finishing
+        return due and now_ns - since_ns > HASTY_S * _SECOND_NS
 
     # ------------------------------------------------------------------ pieces of work
 
@@ -261,9 +268,9 @@ class TcpServer:
 
     `greet(client)` gives the session of a connection. `counters`: `clients` (since the start),
     `clients_refused` (too many at once), `clients_dropped` (did not read), `clients_flooding`
-    (asked too often), `clients_faulty` (a fault of ours), `slowed` (read later, for what it sent),
-    `malformed`, `sent`, `skipped` (epochs that a client was too slow for). `port` says how it
-    stands.
+    (asked too often), `clients_gave_way` (to one of another host, or with an answer that it did not
+    take), `clients_faulty` (a fault of ours), `slowed` (read later, for what it sent), `malformed`,
+    `sent`, `skipped` (epochs that a client was too slow for). `port` says how it stands.
     """
 
     def __init__(
@@ -331,12 +338,13 @@ class TcpServer:
 
     def _accept(self, listening: socket.socket) -> None:
         try:
-            sock, _ = listening.accept()
+            sock, address = listening.accept()
         except OSError as error:
             if error.errno in _SHORT:
                 self._pause(listening, error)
             return  # else who came has gone again
-        self._make_room()
+        host = host_of(address)
+        self._make_room(host)
         if len(self.clients) >= self._places or self.guests.full:
             self.counters["clients_refused"] += 1
             sock.close()
@@ -347,7 +355,7 @@ class TcpServer:
             sock.close()
             return
         self.counters["clients"] += 1
-        client = Client(sock, self)
+        client = Client(sock, self, host)
         self.clients[client] = None
         self.port.serves(len(self.clients))
         client.session = self._greet(client)
@@ -356,15 +364,13 @@ class TcpServer:
     def _places(self) -> int:
         return self.guests.places(self._most)
 
-    def _make_room(self) -> None:
-        """Where all places are taken: who has been longest without a request goes."""
+    def _make_room(self, host: str) -> None:
+        """Where all places are taken, for one who comes from `host`."""
         if len(self.clients) < self._places:
             return
-        now_ns = time.perf_counter_ns()
-        for client in self.clients:
-            if client.request_due and now_ns - client.since_ns > HASTY_S * _SECOND_NS:
-                client.drop("malformed")
-                return
+        client = gives_way(self.clients, host, time.perf_counter_ns())
+        if client is not None:
+            client.drop("malformed" if client.request_due else "clients_gave_way")
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
         """No descriptor is left: said once a minute at most, and tried again later."""

@@ -6,7 +6,7 @@ import pytest
 
 from tests.dashboard.serving import at_work, browsing
 from tests.dashboard.test_page import make_hub
-from tests.outputs.test_guests import HOSTILE
+from tests.outputs.test_hostile_requests import HOSTILE
 
 
 @pytest.mark.parametrize(

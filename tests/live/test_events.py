@@ -40,6 +40,7 @@ from tests.clock.host_time import Host, S
         ("saved_state_damaged", "warning"),
         ("warm_start_refused", "warning"),
         ("client_name_taken", "warning"),
+        ("mqtt_flooded", "warning"),
     ],
 )
 def test_the_code_gives_the_level(code: str, level: str) -> None:

@@ -12,6 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from fusiond.outputs import incoming
 from fusiond.outputs.command_intake import BURST, REMEMBERED, CommandIntake
 from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
 from fusiond.outputs.topics import EVENT, NAV
@@ -98,7 +101,10 @@ async def test_commands_that_are_not_configured_do_nothing(tmp_path: Path) -> No
     assert [c.id for c in taken] == ["2"]
 
 
-async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(tmp_path: Path) -> None:
+async def test_a_flood_of_commands_is_answered_once_and_starves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(incoming, "QUIET_S", 0.5)
     taken: list[Command] = []
     flood = 3000
 

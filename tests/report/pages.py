@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from fusiond.commands.app import app
 from fusiond.configuration.schema import Config
 from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.recording.about import about_run
@@ -78,3 +80,9 @@ def solution(path: Path, from_s: float, east_m: float = 0.0, rows: int = 400) ->
         nothing = np.zeros((rows, 3))
         file.rows(t, lat, lon, np.full(rows, 30.0), v, nothing, np.full((rows, 9), 0.5), status)
     return path
+
+
+def fusiond(*args: str | Path) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["report", *map(str, args)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.output

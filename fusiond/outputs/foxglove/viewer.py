@@ -70,6 +70,7 @@ class Viewer:
             logger=_LOG,
         )
         self._message = bytearray()
+        self._head_bytes = 0
         self._subscriptions: dict[int, Channel] = {}
         self._waiting: dict[int, Data] = {}
         self.channels: Counter[int] = Counter()
@@ -116,6 +117,12 @@ class Viewer:
     # ------------------------------------------------------------------ from the viewer
 
     def receive(self, data: bytes) -> None:
+        if self._client.request_due:
+            # websockets has bounds for a line and for lines, together a megabyte.
+            self._head_bytes += len(data)
+            if self._head_bytes > MOST_REQUEST_BYTES:
+                self._client.drop("malformed")
+                return
         for begin in range(0, len(data), _SLICE_BYTES):
             self._socket.receive_data(data[begin : begin + _SLICE_BYTES])
             for event in self._socket.events_received():

@@ -1,0 +1,81 @@
+"""Connections of the dashboard's web server: how many there may be, and what each may wait for.
+
+uvicorn waits for a request for ever, and for a browser to take its answer: a thousand who send a
+byte now and then would have all descriptors of the process, and nobody a page. So a connection has
+so long for a request, and so long for the next bytes of an answer. When there are as many as may
+be, the one that has waited longest without a request makes room; where none has, who comes is sent
+away. A WebSocket has its own (`fusiond.dashboard.viewer`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from fusiond.outputs.sockets import LINGER_NOT
+
+MOST_CONNECTIONS = 128
+"""Sixteen viewers, each a browser, which opens six to a host and two more for its WebSockets."""
+REQUEST_S = 10.0
+"""As the daemon's own servers wait (`fusiond.outputs.tcp`)."""
+STUCK_S = 20.0
+"""For bytes of an answer to be taken, as a viewer has."""
+LOOK_S = 0.5
+
+
+class Door(H11Protocol):
+    """A connection that is looked after. Idle ones between two requests are uvicorn's to close."""
+
+    _since_s = _moved_s = 0.0
+    _held_bytes = 0
+    _looking: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._since_s = time.monotonic()
+        if len(self.connections) > MOST_CONNECTIONS:
+            self._make_room()
+        self._look()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        if self._looking is not None:
+            self._looking.cancel()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._since_s = time.monotonic()
+
+    @property
+    def _asked(self) -> bool:
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _make_room(self) -> None:
+        waiting = [one for one in self.connections if isinstance(one, Door) and not one._asked]
+        min(waiting, key=lambda one: one._since_s, default=self)._give_up()
+
+    def _give_up(self) -> None:
+        self.connections.discard(self)
+        self.transport.get_extra_info("socket").setsockopt(
+            socket.SOL_SOCKET, socket.SO_LINGER, LINGER_NOT
+        )
+        self.transport.abort()
+
+    def _look(self) -> None:
+        self._looking = None
+        if self not in self.connections:  # closed, or a WebSocket has it
+            return
+        now_s = time.monotonic()
+        if not self._asked and now_s - self._since_s > REQUEST_S:
+            self._give_up()
+            return
+        held_bytes = self.transport.get_write_buffer_size()
+        if held_bytes != self._held_bytes or not held_bytes:
+            self._held_bytes, self._moved_s = held_bytes, now_s
+        elif now_s - self._moved_s > STUCK_S:
+            self._give_up()
+            return
+        self._looking = self.loop.call_later(LOOK_S, self._look)

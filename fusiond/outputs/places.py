@@ -1,0 +1,54 @@
+"""Who gives way when all places of a server are taken and one more comes.
+
+First who owes something: a request that has not come, an answer that it does not take. Then, where
+one host has more connections than the newcomer's would have, the last of that host's: so one host
+can have all places, and keeps them only while nobody else wants one. Of IPv6 a host is its network
+of 64 bits, of which it may have every address (RFC 4291, 2.5.4).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from ipaddress import IPv6Address, ip_address
+from typing import Any, Protocol, TypeVar
+
+_HOST_BITS = 64
+
+
+class Placed(Protocol):
+    """A connection that has a place."""
+
+    host: str
+
+    def owes(self, now_ns: int) -> bool:
+        """Whether something of it has been waited for long enough."""
+
+
+T = TypeVar("T", bound=Placed)
+
+
+def host_of(address: Any) -> str:
+    """Of a peer's address as `accept` gives it."""
+    name = str(address[0]) if address else ""
+    try:
+        found = ip_address(name.partition("%")[0])
+    except ValueError:
+        return name
+    if not isinstance(found, IPv6Address):
+        return name
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return str(IPv6Address(int(found) >> _HOST_BITS << _HOST_BITS))
+
+
+def gives_way(taken: Collection[T], host: str, now_ns: int) -> T | None:
+    """Who makes room for one of `host`, if anybody does; `taken` in the order they came in."""
+    for placed in taken:
+        if placed.owes(now_ns):
+            return placed
+    counts = Counter(placed.host for placed in taken)
+    crowd = max(counts, key=lambda name: counts[name], default=host)
+    if counts[crowd] <= counts[host] + 1:
+        return None
+    return [placed for placed in taken if placed.host == crowd][-1]
