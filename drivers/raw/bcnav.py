@@ -14,12 +14,11 @@ sections 6 and 7.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from drivers.nmea.running_checks import crc24q
 from drivers.raw.bits import Bits, Table, angle, read, s, u
 from drivers.raw.messages import Ephemeris
-from drivers.raw.subframes import Decoded, RefusedError, Subframe, ephemeris, week_of_toe
+from drivers.raw.subframes import Decoded, RefusedError, Subframe, ephemeris
 from drivers.raw.weeks import WeekReference
 
 SUBFRAMES = {3: 1, 19: 2, 9: 3}
@@ -136,7 +135,16 @@ class Bcnav1Decoder:
             raise RefusedError("ephemeris_mixed")
         tow_s = two.unsigned(13, 8) * 3600
         week = weeks.bdt_week(two.unsigned(0, 13), tow_s)
-        return _made(subframe, "bcnav1", numbers, week, tow_s, issue, healthy, two, _DELAYS_1)
+        return ephemeris(
+            subframe,
+            "bcnav1",
+            numbers,
+            sent=(week, tow_s),
+            delays=(two, _DELAYS_1),
+            issue=issue,
+            accuracy_m=None,
+            healthy=healthy,
+        )
 
 
 class Bcnav2Decoder:
@@ -173,16 +181,15 @@ class Bcnav2Decoder:
         # HS 2 bits, DIF and SIF of this signal, in 11 and 30.
         healthy = eleven.unsigned(30, 4) == 0 and thirty.unsigned(30, 4) == 0
         return [
-            _made(
+            ephemeris(
                 subframe,
                 "bcnav2",
                 numbers,
-                week,
-                _second_of(ten),
-                _issue(ten),
-                healthy,
-                thirty,
-                _DELAYS_2,
+                sent=(week, _second_of(ten)),
+                delays=(thirty, _DELAYS_2),
+                issue=_issue(ten),
+                accuracy_m=None,
+                healthy=healthy,
             )
         ]
 
@@ -194,26 +201,3 @@ def _second_of(bits: Bits) -> int:
 
 def _issue(ten: Bits) -> int:
     return ten.unsigned(53, 8)
-
-
-def _made(
-    subframe: Subframe,
-    message: str,
-    numbers: dict[str, Any],
-    week: int,
-    tow_s: float,
-    issue: int,
-    healthy: bool,
-    delays: Bits,
-    table: tuple[Any, ...],
-) -> Ephemeris:
-    return ephemeris(
-        subframe,
-        message,
-        numbers,
-        week=week_of_toe(week, tow_s, numbers["toe_s"]),
-        group_delay_s=tuple(delay.read(delays) for delay in table),
-        issue=issue,
-        accuracy_m=None,
-        healthy=healthy,
-    )

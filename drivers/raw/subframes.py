@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.raw.bits import Bits, KlobucharTable
+from drivers.raw.bits import Bits, KlobucharTable, Number
 from drivers.raw.messages import Ephemeris, Klobuchar, System
 from drivers.raw.weeks import HALF_WEEK_S
 
@@ -60,16 +60,36 @@ class Parts:
 Decoded = list[Ephemeris | Klobuchar]
 
 
-def ephemeris(subframe: Subframe, message: str, numbers: dict[str, Any], **rest: Any) -> Ephemeris:
-    """The `Ephemeris` of `subframe`'s satellite. RefusedError when no orbit can be so."""
+def ephemeris(
+    subframe: Subframe,
+    message: str,
+    numbers: dict[str, Any],
+    *,
+    sent: tuple[int, float],
+    delays: tuple[Bits, tuple[Number, ...]],
+    issue: int,
+    accuracy_m: float | None,
+    healthy: bool,
+) -> Ephemeris:
+    """The `Ephemeris` of `subframe`'s satellite. RefusedError when no orbit can be so.
+
+    `sent`: week and time of week at which the message began; `delays`: the bits with the group
+    delays, and their table.
+    """
+    week, tow_s = sent
+    bits, table = delays
     found = Ephemeris(
         source=subframe.source,
         t_seen_ns=subframe.t_seen_ns,
         system=subframe.system,
         prn=subframe.prn,
         message=message,
+        week=week_of_toe(week, tow_s, numbers["toe_s"]),
+        group_delay_s=tuple(delay.read(bits) for delay in table),
+        issue=issue,
+        accuracy_m=accuracy_m,
+        healthy=healthy,
         **numbers,
-        **rest,
     )
     check_orbit(found)
     return found
