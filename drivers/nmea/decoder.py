@@ -12,7 +12,7 @@ from collections import Counter
 from datetime import date
 from typing import Literal
 
-from drivers.base import DriverOptions
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,
@@ -40,8 +40,6 @@ from drivers.nmea.reasons import POSITIONS, Heard, cautions, no_fix, note, nothi
 from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
 from drivers.plausible import SIGMA_M
 
-BUILD_DATE = date(2026, 11, 20)
-"""No receiver can truly report a date before this software was written."""
 RMC_ALONE_AFTER = 2
 """Epochs in a row without GGA or GNS after which RMC's position is a fix: one may be damaged."""
 
@@ -50,17 +48,11 @@ _QUALITIES = frozenset({1, 2, 3, 4, 5})
 Formatter = Literal["GGA", "GNS", "RMC", "VTG", "GSA", "GST", "ZDA", "HDT", "THS"]
 
 
-class NmeaDecoding(DriverOptions):
+class NmeaDecoding(SolutionDecoding):
     """What the decoder may be told."""
 
     last_sentence: Formatter | None = None
     """The sentence that ends an epoch (one that is sent once an epoch); learned by default."""
-    heading_offset_deg: float = 0.0
-    """Added to HDT and THS: from the antenna baseline to the vehicle's forward axis, clockwise."""
-    earliest_date: date = BUILD_DATE
-    """Dates before it are refused; set it back to read old logs."""
-    allow_simulator: bool = False
-    """Accept quality 7 (manual) and 8 (simulator)."""
 
 
 class NmeaDecoder:

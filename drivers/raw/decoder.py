@@ -19,8 +19,8 @@ from collections.abc import Callable
 from datetime import date
 from typing import Protocol
 
+from drivers.decoding import BUILD_DATE
 from drivers.measurements import UtcStamp
-from drivers.nmea.decoder import BUILD_DATE
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.raw.bcnav import Bcnav1Decoder, Bcnav2Decoder
 from drivers.raw.beidou_words import GEO

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from drivers.bestpos.decoder import BestposDecoder
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
 from drivers.raw.messages import RawGnssEpoch
 from drivers.raw.rinex import (
@@ -25,7 +26,7 @@ from drivers.raw.rinex import (
 from drivers.raw.rinex_nav import Broadcast, navigation
 from drivers.raw.weeks import GPS_EPOCH_S, WEEK_S, leap_seconds
 from drivers.sbf.decoder import SbfDecoder
-from drivers.solution import REFUSALS, SolutionDecoding
+from drivers.solution import REFUSALS
 from drivers.ubx.decoder import UbxDecoder
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
