@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.raw.bits import Bits, KlobucharTable, Number
-from drivers.raw.messages import Ephemeris, Klobuchar, System
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, System
 from drivers.raw.weeks import HALF_WEEK_S
 
 MAX_ECCENTRICITY = 0.5
@@ -57,7 +57,7 @@ class Parts:
         self.found.clear()
 
 
-Decoded = list[Ephemeris | Klobuchar]
+Decoded = list[NavigationMessage]
 
 
 def ephemeris(
@@ -101,6 +101,13 @@ def klobuchar(subframe: Subframe, bits: Bits, table: KlobucharTable) -> Klobucha
     return Klobuchar(
         subframe.source, subframe.t_seen_ns, subframe.system, (a0, a1, a2, a3), (b0, b1, b2, b3)
     )
+
+
+def bdgim(subframe: Subframe, bits: Bits, table: tuple[Number, ...]) -> list[NavigationMessage]:
+    """BeiDou-3's ionosphere in `bits`; none where all is zero, as of a satellite that has none."""
+    a1, a2, a3, a4, a5, a6, a7, a8, a9 = (n.read(bits) for n in table)
+    alpha = (a1, a2, a3, a4, a5, a6, a7, a8, a9)
+    return [Bdgim(subframe.source, subframe.t_seen_ns, alpha)] if any(alpha) else []
 
 
 def check_orbit(found: Ephemeris) -> None:
