@@ -26,26 +26,36 @@ from drivers.measurements import (
 from drivers.nmea.cycle import Cycle
 from drivers.nmea.epochs import (
     FORMATTERS,
+    INTEGRATED,
     MAX_CYCLE,
     TALKERS,
     BadFieldError,
     Epoch,
-    one_time,
     time_of_day_ns,
     time_step_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.geoid import Geoid
-from drivers.nmea.reasons import POSITIONS, Heard, cautions, no_fix, note, nothing_verified
-from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
+from drivers.nmea.reasons import (
+    FULLER,
+    OWN_SENTENCES,
+    POSITIONS,
+    Heard,
+    cautions,
+    no_fix,
+    note,
+    nothing_verified,
+)
+from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, one_time, posix_ns
 from drivers.plausible import SIGMA_M
 
-RMC_ALONE_AFTER = 2
-"""Epochs in a row without GGA or GNS after which RMC's position is a fix: one may be damaged."""
+PLAIN_AFTER = 2
+"""Epochs in a row without GGA or GNS after which RMC's or GLL's position is a fix: one may be
+damaged."""
 
 _TIMELESS = frozenset({"GSA", "VTG"})
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
-Formatter = Literal["GGA", "GNS", "RMC", "VTG", "GSA", "GST", "ZDA", "HDT", "THS"]
+Formatter = Literal["GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "ZDA", "HDT", "THS"]
 
 
 class NmeaDecoding(SolutionDecoding):
@@ -63,8 +73,8 @@ class NmeaDecoder:
     `repeated_sentence`; noted `late_sentence`; refused epochs `no_fix`,
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
-    `height_not_measured`, `height_above_sea`, `rmc_alone`, `unknown_status`, `sigma_too_small`,
-    `untimed_epoch`.
+    `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`, `integrated`,
+    `unknown_status`, `sigma_too_small`, `untimed_epoch`.
     """
 
     def __init__(
@@ -94,7 +104,7 @@ class NmeaDecoder:
         self._closed_by = ""
         """What closed it: `last` sentence, `silence`, or what came then."""
         self._without_gga = 0
-        """Epochs with RMC in a row that had neither GGA nor GNS."""
+        """Epochs with RMC or GLL in a row that had neither GGA nor GNS."""
 
     @property
     def cautions(self) -> dict[str, str]:
@@ -153,12 +163,16 @@ class NmeaDecoder:
             return
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
-            note(self.heard.unused, sentence.formatter)
+            own = sentence.talker == "P" or sentence.address in OWN_SENTENCES
+            note(self.heard.unused, sentence.address if own else sentence.formatter)
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
             if sentence.formatter in POSITIONS:
                 note(self.heard.talkers, sentence.talker)
+            return
+        if sentence.formatter == "GLL" and FULLER & self.heard.used.keys():
+            self.counters["unused_sentence"] += 1  # the same once more, and the epoch would wait
             return
         try:
             self._group(sentence, t_seen_ns, found)
@@ -249,10 +263,10 @@ class NmeaDecoder:
             note(self.heard.statuses, epoch.unknown_status)
         if epoch.quality is not None:
             self._without_gga = 0
-        elif epoch.rmc_valid is not None:
+        elif epoch.plain_valid is not None:
             self._without_gga += 1
-            if self._without_gga >= RMC_ALONE_AFTER:
-                epoch.take_rmc_position()
+            if self._without_gga >= PLAIN_AFTER:
+                epoch.take_plain()
         refusal = self._refusal(epoch)
         day = self._date(epoch, found, valid=refusal is None)
         self.refusal = refusal or ""
@@ -289,7 +303,7 @@ class NmeaDecoder:
                 return "manual_refused"
             if epoch.quality == 8 or "S" in epoch.modes:
                 return "simulator_refused"
-        if epoch.quality == 0 or epoch.rmc_valid is False:
+        if epoch.quality == 0 or epoch.plain_valid is False:
             return "no_fix"
         if epoch.quality is None:
             return None
@@ -310,7 +324,8 @@ class NmeaDecoder:
         if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
         # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
-        believed = valid and bool(epoch.quality) if epoch.rmc_valid is None else epoch.rmc_valid
+        told = epoch.plain_valid
+        believed = valid and bool(epoch.quality) if told is None else told
         if believed:
             self._calendar.dated(epoch.day, epoch.time_of_day_ns, epoch.t_seen_ns)
         utc_ns = posix_ns(epoch.day, epoch.time_of_day_ns)
@@ -332,11 +347,13 @@ class NmeaDecoder:
         self, epoch: Epoch, stamp: Stamp, lat_deg: float, lon_deg: float, quality: int
     ) -> PositionFix:
         self.counters["fixes"] += 1
-        if epoch.by_rmc:
-            self.counters["rmc_alone"] += 1
+        if epoch.by_plain:
+            self.counters["rmc_alone" if epoch.by_plain == "RMC" else "gll_alone"] += 1
+        if not INTEGRATED.isdisjoint(address[:2] for address in epoch.addresses):
+            self.counters["integrated"] += 1
         altitude, separation, height, geoid_sd_m = epoch.altitude_m, epoch.separation_m, None, 0.0
         if altitude is None:
-            if not epoch.by_rmc:
+            if not epoch.by_plain:
                 self.counters["height_missing"] += 1
         elif epoch.two_dimensional:
             self.counters["height_not_measured"] += 1
