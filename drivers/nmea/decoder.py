@@ -50,8 +50,8 @@ from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, one_ti
 from drivers.plausible import SIGMA_M
 
 PLAIN_AFTER = 2
-"""Epochs in a row without GGA or GNS after which RMC's or GLL's position is a fix: one may be
-damaged."""
+"""Epochs with RMC or GLL in a row that have neither GGA nor GNS, after which their position is a
+fix: one may be damaged. A GGA at an instant of its own is none of these (plotters take turns)."""
 
 _TIMELESS = frozenset({"GSA", "VTG"})
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
@@ -171,9 +171,6 @@ class NmeaDecoder:
             if sentence.formatter in POSITIONS:
                 note(self.heard.talkers, sentence.talker)
             return
-        if sentence.formatter == "GLL" and FULLER & self.heard.used.keys():
-            self.counters["unused_sentence"] += 1  # the same once more, and the epoch would wait
-            return
         try:
             self._group(sentence, t_seen_ns, found)
         except BadFieldError:
@@ -186,6 +183,9 @@ class NmeaDecoder:
     def _group(self, sentence: Sentence, t_seen_ns: int, found: list[Measurement]) -> None:
         formatter, time_ns = sentence.formatter, time_of_day_ns(sentence)
         epoch = self._epoch
+        if formatter == "GLL" and time_ns is not None and self._told_already(time_ns, sentence):
+            self.counters["unused_sentence"] += 1
+            return
         if epoch is not None and time_ns is not None and self._belongs_before(epoch, t_seen_ns):
             epoch = self._epoch = None
             self._late()
@@ -230,6 +230,14 @@ class NmeaDecoder:
         step_ns = time_step_ns(sentence)
         return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
+    def _told_already(self, time_ns: int, sentence: Sentence) -> bool:
+        """Whether the place at this instant came by a sentence that says more: many a burst ends
+        with GLL, behind all GSV, and the epoch would wait for it."""
+        epoch = self._epoch if self._epoch is not None else self._closed
+        if epoch is None or epoch.time_of_day_ns is None or FULLER.isdisjoint(epoch.cycle):
+            return False
+        return self._of_epoch(epoch, time_ns, sentence)
+
     def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
         """Whether what has no time of its own came sooner after the epoch that a silence closed
         than before the one that begins now."""
@@ -261,12 +269,12 @@ class NmeaDecoder:
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
             note(self.heard.statuses, epoch.unknown_status)
-        if epoch.quality is not None:
-            self._without_gga = 0
-        elif epoch.plain_valid is not None:
+        if epoch.quality is None and epoch.plain_valid is not None:
             self._without_gga += 1
             if self._without_gga >= PLAIN_AFTER:
                 epoch.take_plain()
+        elif epoch.plain_valid is not None:
+            self._without_gga = 0
         refusal = self._refusal(epoch)
         day = self._date(epoch, found, valid=refusal is None)
         self.refusal = refusal or ""
@@ -328,6 +336,8 @@ class NmeaDecoder:
         believed = valid and bool(epoch.quality) if told is None else told
         if believed:
             self._calendar.dated(epoch.day, epoch.time_of_day_ns, epoch.t_seen_ns)
+        elif told is None and epoch.quality is None and self.heard.used["RMC"]:
+            return epoch.day  # a ZDA of another instant than RMC: some are seconds ahead of it
         utc_ns = posix_ns(epoch.day, epoch.time_of_day_ns)
         trusted = self._trust.report(utc_ns, epoch.t_day_seen_ns, valid=believed)
         if trusted is not None:

@@ -291,7 +291,8 @@ def _take_gga(epoch: Epoch, fields: Fields) -> None:
     hdop = _dop(fields, "HDOP")
     _take_height(epoch, fields)
     epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality or 0
-    epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
+    epoch.satellites = satellites or epoch.satellites or satellites  # GNS may have counted some
+    epoch.hdop = hdop if hdop is not None else epoch.hdop
     epoch.counted = max(epoch.counted, satellites or 0)
 
 

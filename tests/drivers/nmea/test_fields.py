@@ -38,6 +38,7 @@ from tests.drivers.nmea.sentences import (
     VTG,
     ZDA,
     ZDA_RDSS,
+    at,
     changed,
     decode,
     decoder,
@@ -266,6 +267,39 @@ def test_gll_holds_up_no_epoch_of_a_fuller_sentence(fuller: str) -> None:
     counts = one.counters["fixes"]
     one.feed(wire(changed(fuller, "0214", "0220")), 0)
     assert one.counters["fixes"] == counts + 1  # at once, with the learned last sentence
+
+
+def test_a_gga_that_counts_no_satellites_beside_gns() -> None:
+    """A timing receiver says 00 in GGA and 11 in GNS."""
+    assert fix_of(GNS, changed(GGA, ",18,", ",00,")).satellites == 18
+    assert fix_of(changed(GGA, ",18,", ",00,")).satellites == 0
+
+
+def test_a_zda_ahead_of_rmc_holds_up_no_trust() -> None:
+    """An AC12 sends ZDA two seconds ahead of the GGA and RMC before it: UTC is RMC's."""
+    said = []
+    for k in range(8):
+        now, ahead = f"0214{10 + k}.00", f"0214{12 + k}.00"
+        said.append([at(GGA, now), GSA, at(RMC, now), at(ZDA, ahead)])
+    one = decoder()
+    found = [m for k, epoch in enumerate(said) for m in one.feed(wire(*epoch), k * 1_000_000_000)]
+    reports = [m for m in found + one.flush() if isinstance(m, TimeReport)]
+    assert [m.trusted for m in reports] == [False, False, *[True] * 6]
+    assert [m.utc_ns for m in reports] == [f.stamp.utc_ns for f in fixes(found)]  # type: ignore[union-attr]
+
+
+def test_sentences_that_take_turns_are_a_fix_each() -> None:
+    """RMC, GLL with VTG, RMC, GGA with ZDA, a second apart, as a plotter of 2006 sent them."""
+    bare = made("INGLL,3958.1234,N,11619.5432,E,021429,A")
+    turns = [[changed(RMC, "GN", "IN")], [bare, changed(VTG, "GN", "IN")]]
+    turns += [[changed(RMC, "GN", "IN")], [changed(GGA_SW, "GP", "IN")]]
+    said = [changed(s, "0214", f"02{14 + k}") if "0214" in s else s
+            for k in range(16) for s in turns[k % 4]]  # fmt: skip
+    found, one = decode(*said)
+    assert len(fixes(found)) == 15
+    assert [f.v_ned_m_s is not None for f in fixes(found)[:4]] == [True, True, False, True]
+    assert one.counters["gll_alone"] == 4
+    assert one.counters["rmc_alone"] == 7
 
 
 def test_gll_of_another_time_or_place_is_refused() -> None:
