@@ -249,6 +249,7 @@ class NmeaDecoder:
     def _late(self) -> None:
         """More of an epoch that was closed: where it was closed is learned anew."""
         self.counters["late_sentence"] += 1
+        self._without_gga = 0  # an epoch in two parts has what one of them lacked
         if self._closed_by == "silence":
             self._cycle.paused()
         else:

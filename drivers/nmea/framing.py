@@ -204,7 +204,8 @@ class StreamSplitter(Splitter[Item]):
         raw = bytes(self._buffer[at : star + 3])
         if not _verifies(raw):
             # The two bytes behind the star may be the start of something else.
-            return self._refuse("checksum_bad", star + 1 - at)
+            why = "checksum_missing" if raw[-2] in b"\r\n" else "checksum_bad"
+            return self._refuse(why, star + 1 - at)
         address, *fields = raw[1:-3].decode("ascii").split(",")
         if not _ADDRESS.match(address):
             return self._refuse("address_bad", len(raw))
