@@ -73,8 +73,8 @@ class NmeaDecoder:
     `repeated_sentence`; noted `late_sentence`; refused epochs `no_fix`,
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
-    `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`, `integrated`,
-    `unknown_status`, `sigma_too_small`, `untimed_epoch`.
+    `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`, `gga_awaited`,
+    `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`.
     """
 
     def __init__(
@@ -274,6 +274,8 @@ class NmeaDecoder:
             self._without_gga += 1
             if self._without_gga >= PLAIN_AFTER:
                 epoch.take_plain()
+            elif epoch.plain_valid:
+                self.counters["gga_awaited"] += 1
         elif epoch.plain_valid is not None:
             self._without_gga = 0
         refusal = self._refusal(epoch)

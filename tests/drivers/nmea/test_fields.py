@@ -253,6 +253,7 @@ def test_gll_before_mode_of_the_standard() -> None:
     found, one = decode(*(changed(old, "0214", f"02{minute}") for minute in range(14, 17)))
     assert [f.quality for f in fixes(found)] == [1, 1]
     assert one.counters["gll_alone"] == 2
+    assert one.counters["gga_awaited"] == 1
     assert fixes(found)[0].rounding_sd_ned_m[0] == pytest.approx(1.852 / math.sqrt(12.0))
 
 
