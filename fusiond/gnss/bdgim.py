@@ -81,24 +81,23 @@ def _norm(n: int, m: int) -> float:
     return math.sqrt(math.factorial(n - m) * (2 * n + 1) * twice / math.factorial(n + m))
 
 
-def _put(out: Array, degree_order: tuple[int, int], value: float) -> None:
-    n, m = degree_order
-    sines = (_HIGHEST + 1) * _ORDERS if m < 0 else 0
-    out[sines + n * _ORDERS + abs(m)] = value * _norm(n, abs(m))
+def _place(n: int, m: int) -> int:
+    return ((_HIGHEST + 1) * _ORDERS if m < 0 else 0) + n * _ORDERS + abs(m)
+
+
+_NORMS = np.array([_norm(n, abs(m)) for n, m in (*_BROADCAST, *_REST)])
+_PLACES = np.array([_place(n, m) for n, m in (*_BROADCAST, *_REST)])
 
 
 def bdgim_terms(model: Bdgim, week: int, tow_s: float) -> Array:
-    """Write (49,) what `bdgim` takes for a GPS time; it holds for the two hours of BDT."""
+    """What `bdgim` takes, (49,), for a GPS time; it holds for the two hours of BDT."""
     mjd = GPS_EPOCH_MJD + 7 * week + (tow_s - BDT_BEHIND_GPS_S) / 86_400.0
     middle = (math.floor(mjd / SLOT_D) + 0.5) * SLOT_D
     angles = 2.0 * math.pi / _PERIODS_D * middle
     series = np.empty(1 + 2 * len(angles))
     series[0], series[1::2], series[2::2] = 1.0, np.cos(angles), np.sin(angles)
     out = np.zeros(TERMS)
-    for where, value in zip(_BROADCAST, model.alpha, strict=True):
-        _put(out, where, value)
-    for where, row in zip(_REST, _REST_TECU, strict=True):
-        _put(out, where, float(row @ series))
+    out[_PLACES] = _NORMS * np.concatenate((model.alpha, _REST_TECU @ series))
     first = model.alpha[0]
     out[-1] = next(first / part for above, part in FLOORS if first > above)
     return out
