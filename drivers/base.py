@@ -20,8 +20,8 @@ from drivers.measurements import DeviceEvent, Measurement
 from drivers.raw.messages import RawEvent
 
 Emitted = Measurement | RawEvent | DeviceEvent
-"""All that a driver may hand over. `Ephemeris` and `Klobuchar` have no stamp: they say themselves
-what they are valid for."""
+"""All that a driver may hand over. A `NavigationMessage` has no stamp: it says itself what it is
+valid for."""
 Emit = Callable[[Emitted], None]
 Now = Callable[[], int]
 

@@ -19,7 +19,7 @@ from drivers.inputs import Inputs
 from drivers.measurements import DeviceEvent, Measurement, TimeReport
 from drivers.network_port import PortName, on_network, open_port
 from drivers.ntrip.client import NtripClient, NtripOptions
-from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent
+from drivers.raw.messages import NavigationMessage, RawEvent
 from drivers.serial_line import SerialLine
 
 SILENCE_S = 0.05
@@ -183,7 +183,7 @@ class ReceiverDriver:
 
     def _hand_over(self, found: Sequence[Measurement | RawEvent]) -> None:
         for measurement in found:
-            if not isinstance(measurement, TimeReport | Ephemeris | Klobuchar):
+            if not isinstance(measurement, TimeReport | NavigationMessage):
                 self._useful_ns = measurement.t_seen_ns
             self._emit(measurement)
 

@@ -14,7 +14,7 @@ from datetime import UTC, date, datetime
 from functools import reduce
 from operator import xor
 
-from drivers.base import DriverOptions
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,
@@ -26,7 +26,6 @@ from drivers.measurements import (
     UtcStamp,
     Vector3,
 )
-from drivers.nmea.decoder import BUILD_DATE
 from drivers.nmea.time import DAY_NS, Calendar, EpochOrder, TimeTrust
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 
@@ -46,17 +45,6 @@ REFUSALS = {
     "sigma_too_large": "the receiver states that it does not know where it is",
 }
 """In words for `status`, by counter."""
-
-
-class SolutionDecoding(DriverOptions):
-    """What a decoder of solutions may be told."""
-
-    heading_offset_deg: float = 0.0
-    """Added to headings: from the antenna baseline to the vehicle's forward axis, clockwise."""
-    earliest_date: date = BUILD_DATE
-    """Dates before it are refused; set it back to read old logs."""
-    allow_simulator: bool = False
-    """Accept positions that the receiver calls simulated or put in by hand."""
 
 
 @dataclass(slots=True)

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from drivers.base import Emit, Now, monotonic_ns
+from drivers.decoding import SolutionDecoding
 from drivers.nmea.framing import StreamSplitter
 from drivers.nmea.protocols import named
 from drivers.receiver import ReceiverDriver, ReceiverOptions
-from drivers.solution import REFUSALS, SolutionDecoding
+from drivers.solution import REFUSALS
 
 KEPT_BYTES = 4096
 """What is looked at for its protocol: an epoch or two of anything."""

@@ -14,15 +14,14 @@ Logs Reference Manual; Unicore Reference Commands Manual for N4 High Precision P
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import dataclass, field
 
 from drivers.bestpos.framing import Log, LogSplitter
-from drivers.cycle import Cycle
 from drivers.measurements import Measurement
 from drivers.plausible import LEAP_SECONDS, within
-from drivers.raw.weeks import leap_seconds, utc_ns
-from drivers.solution import Solution, SolutionDecoding, SolutionJudge
+from drivers.raw.weeks import utc_as_told
+from drivers.solution import Solution
+from drivers.solution_decoder import SolutionDecoder
 
 POSITIONS = ("BESTGNSSPOS", "BESTNAV", "BESTPOS", "RTKPOS", "PPPPOS", "PSRPOS")
 """Best first: BESTPOS of a receiver with an IMU is its inertial solution, BESTGNSSPOS is not."""
@@ -82,74 +81,31 @@ _Velocity = tuple[float, float, float]
 _VelocitySd = tuple[float, float, float]
 
 
-class BestposDecoder:
-    """`feed` bytes, get measurements; `flush` at the end of the file.
+class BestposDecoder(SolutionDecoder[Log, _Epoch]):
+    """See `SolutionDecoder`.
 
     Beside those of `LogSplitter`, `Cycle` and `SolutionJudge` it counts `logs_used`,
     `logs_not_used`, `bad_field`, `heading_not_valid`, `heading_not_fixed`,
     `position_type_unknown`, `velocity_latent`.
     """
 
-    def __init__(
-        self,
-        source: str,
-        decoding: SolutionDecoding | None = None,
-        counters: Counter[str] | None = None,
-    ) -> None:
-        self.counters: Counter[str] = Counter() if counters is None else counters
-        self._decoding = decoding or SolutionDecoding()
-        self._splitter = LogSplitter(self.counters)
-        self._judge = SolutionJudge(source, self._decoding, self.counters)
-        self._cycle = Cycle(self.counters)
-        self._epoch: _Epoch | None = None
-        self._leap_seconds: int | None = None
+    _leap_seconds: int | None = None
+    """As TIME told them."""
 
-    @property
-    def refusal(self) -> str:
-        """Why the last epoch gave no fix, by counter name."""
-        return self._judge.refusal
-
-    @property
-    def gga(self) -> bytes:
-        """The last fix as a GGA; empty before one."""
-        return self._judge.gga
-
-    @property
-    def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
-        return self._epoch is not None
-
-    def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
-        """The measurements that `data`, seen at `t_seen_ns`, completes."""
-        found: list[Measurement] = []
-        for log in self._splitter.feed(data):
-            self._take(log, t_seen_ns, found)
-        return found
-
-    def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
-        found: list[Measurement] = []
-        self._close(found, learn=True)
-        return found
-
-    def flush(self) -> list[Measurement]:
-        """The stream ended, or broke: everything that can still be had from what came."""
-        self._splitter.finish()
-        found: list[Measurement] = []
-        self._close(found, learn=False)
-        return found
+    def _make_splitter(self) -> LogSplitter:
+        return LogSplitter(self.counters)
 
     # ----------------------------------------------------------------- logs to epochs
 
-    def _take(self, log: Log, t_seen_ns: int, found: list[Measurement]) -> None:
+    def _take(self, log: Log, found: list[Measurement]) -> None:
         name = log.name
         try:
             if name in HEADINGS:
-                self._heading(log, t_seen_ns, found)
+                self._heading(log, found)
             elif name == "TIME":
                 self._time(log)
             elif name in POSITIONS or name in VELOCITIES:
-                self._group(log, t_seen_ns, found)
+                self._group(log, found)
             else:
                 self.counters["logs_not_used"] += 1
                 return
@@ -158,19 +114,17 @@ class BestposDecoder:
             return
         self.counters["logs_used"] += 1
 
-    def _group(self, log: Log, t_seen_ns: int, found: list[Measurement]) -> None:
+    def _group(self, log: Log, found: list[Measurement]) -> None:
         key = log.week, log.tow_s
-        if self._cycle.begins_anew(key, log.name):
-            self._close(found, learn=True)
-        elif self._cycle.late(key, log.name):
+        if not self._belongs(key, log.name, found):
             return
         epoch = self._epoch
-        place = self._place(log, t_seen_ns) if log.name in POSITIONS else None
+        place = self._place(log) if log.name in POSITIONS else None
         velocity = self._velocity(log) if log.name in VELOCITIES else None
         if epoch is None:
             leap = log.leap_seconds if log.leap_seconds is not None else self._leap_seconds
             epoch = self._epoch = _Epoch(log.week or 0, log.tow_s, log.believed, leap)
-        epoch.t_seen_ns = t_seen_ns
+        epoch.t_seen_ns = self._t_seen_ns
         if place is not None:
             epoch.places[log.name] = place
         if velocity is not None:
@@ -178,33 +132,23 @@ class BestposDecoder:
         if self._cycle.add(key, log.name):
             self._close(found, learn=False, at_once=True)
 
-    def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
-        epoch, self._epoch = self._epoch, None
-        if epoch is None:
-            return
-        self._cycle.close(learn=learn, at_once=at_once)
+    def _solution(self, epoch: _Epoch) -> Solution | None:
         there = [epoch.places[name] for name in POSITIONS if name in epoch.places]
         if not there:
-            return
+            return None
         best = next((s for s in there if s.refusal is None), there[0])
         best.t_seen_ns = epoch.t_seen_ns
-        best.utc_ns, best.utc_known = self._utc(epoch), epoch.believed
+        if epoch.week:
+            best.utc_ns = utc_as_told(epoch.week, epoch.tow_s, epoch.leap_seconds)
+        best.utc_known = epoch.believed
         moving = [epoch.velocities[name] for name in VELOCITIES if name in epoch.velocities]
         if moving:
             best.v_ned_m_s, best.sd_v_ned_m_s = moving[0]
-        found += self._judge.epoch(best)
-
-    def _utc(self, epoch: _Epoch) -> int | None:
-        if not epoch.week:
-            return None
-        leap = epoch.leap_seconds
-        if leap is None:
-            leap = leap_seconds(epoch.week, epoch.tow_s)
-        return utc_ns(epoch.week, epoch.tow_s, leap)
+        return best
 
     # ----------------------------------------------------------------- fields
 
-    def _place(self, log: Log, t_seen_ns: int) -> Solution:
+    def _place(self, log: Log) -> Solution:
         f = log.fields
         if len(f) < _POSITION:
             raise BadFieldError("too few fields")
@@ -224,7 +168,7 @@ class BestposDecoder:
             _number(f[at]) for at in (2, 3, 4, 5, 7, 8, 9)
         )
         return Solution(
-            t_seen_ns,
+            self._t_seen_ns,
             refusal=refusal,
             quality=found if isinstance(found, int) else 1,
             lat_rad=math.radians(lat),
@@ -257,7 +201,7 @@ class BestposDecoder:
         level, vertical = _number(f[7]), _number(f[8])
         return v, (level, level, vertical)
 
-    def _heading(self, log: Log, t_seen_ns: int, found: list[Measurement]) -> None:
+    def _heading(self, log: Log, found: list[Measurement]) -> None:
         f = log.fields
         if len(f) < 8:
             raise BadFieldError("too few fields")
@@ -271,10 +215,9 @@ class BestposDecoder:
         at_ns = None
         if log.week is not None:
             leap = log.leap_seconds if log.leap_seconds is not None else self._leap_seconds
-            if leap is None:
-                leap = leap_seconds(log.week, log.tow_s)
-            at_ns = utc_ns(log.week, log.tow_s, leap)
-        found += self._judge.heading(t_seen_ns, at_ns, math.radians(heading), math.radians(sd))
+            at_ns = utc_as_told(log.week, log.tow_s, leap)
+        yaw_rad, sd_rad = math.radians(heading), math.radians(sd)
+        found += self._judge.heading(self._t_seen_ns, at_ns, yaw_rad, sd_rad)
 
     def _time(self, log: Log) -> None:
         f = log.fields

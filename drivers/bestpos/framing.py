@@ -12,7 +12,6 @@ CRC"; Unicore Reference Commands Manual for N4 High Precision Products.
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -23,12 +22,11 @@ from drivers.raw.weeks import (
     LAST_WEEK,
     WEEK_S,
 )
+from drivers.splitter import Splitter
 
 MAX_LOG = 2048
 """Bytes from `#` to its CRC. A position has 300; RANGE and the like, which are longer, are not
 read."""
-SLICE = 4096
-"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
 _NOT_BODY = re.compile(rb"[^\x20-\x22\x24-\x29\x2b-\x7e]")  # anything but text, and # and *
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{2,31}\Z")
 _BODY = 9
@@ -60,42 +58,19 @@ class Log:
     fields: tuple[str, ...]
 
 
-class LogSplitter:
+class LogSplitter(Splitter[Log]):
     """Bytes in, verified logs out, whatever the splits.
 
     Counts `logs`; refused `crc_bad`, `log_too_long`, `log_cut` (text without a CRC, or the end of
     the stream), `header_bad`; and `other_bytes`, all that belonged to no good log.
     """
 
-    def __init__(self, counters: Counter[str]) -> None:
-        self.counters = counters
-        self._buffer = bytearray()
-
-    @property
-    def waiting(self) -> int:
-        """Bytes kept until more come."""
-        return len(self._buffer)
-
-    def feed(self, data: bytes) -> list[Log]:
-        """The logs that `data` completes, in order."""
-        found: list[Log] = []
-        for start in range(0, len(data), SLICE):
-            self._buffer += data[start : start + SLICE]
-            self._scan(found)
-        return found
-
-    def finish(self) -> None:
-        """End of the stream: what waits for more bytes is incomplete."""
-        if self._buffer:
-            self._refuse("log_cut", len(self._buffer))
-            self._buffer.clear()
-
     def _refuse(self, why: str, length: int) -> int:
         self.counters[why] += 1
         self.counters["other_bytes"] += length
         return length
 
-    def _scan(self, found: list[Log]) -> None:
+    def _scan(self, found: list[Log], *, final: bool) -> None:
         buffer, at = self._buffer, 0
         while True:
             start = buffer.find(b"#", at)
@@ -105,6 +80,8 @@ class LogSplitter:
             if start < 0:
                 break
             used = self._log(at, found)
+            if used is None and final:
+                used = self._refuse("log_cut", len(buffer) - at)
             if used is None:
                 break
             at += used

@@ -22,7 +22,7 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from drivers.base import PermanentDriverError
-from drivers.can.dbc_flaws import SoundPart, UnreadableError, read_whole, sound_part
+from drivers.can.dbc_flaws import SoundPart, UnreadableError, read_whole, sound_part, unselected
 from drivers.can.layout import AbsentSignalError, Layout
 from drivers.shipped import shipped
 
@@ -211,7 +211,7 @@ def _loaded(path: Path, changed_ns: int) -> Database:
     text = content.decode(encoding, "replace")
     flaw: Exception | str = "there is no message in it"
     try:
-        if (database := read_whole(text)).messages:
+        if (database := read_whole(text)).messages and not unselected(text):
             return database
     except Exception as error:  # its parser raises what its parts raise: KeyError, bitstruct.Error
         flaw = error
@@ -219,6 +219,9 @@ def _loaded(path: Path, changed_ns: int) -> Database:
         sound = sound_part(text)
     except UnreadableError as error:
         raise PermanentDriverError(f"dbc: {path}: {flaw}") from error
+    if sound.extended:
+        names = ", ".join(sound.extended)
+        log.warning("%s: identifiers of more than 11 bits are read as extended: %s", path, names)
     for left_out, reason in sound.left_out.items():
         log.warning("%s: %s is left out: %s", path, left_out, reason)
     return sound

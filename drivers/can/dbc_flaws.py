@@ -1,15 +1,16 @@
 """What can be read of a DBC file that as a whole cannot: messages one by one, the others by name.
 
-Of public files one in six has a flaw somewhere: a standard identifier of more than 11 bits, a name
-that begins with a digit, a comma for a decimal point, a comment without its signal, values of a
-message that is not there. Mostly it stands beside what one wants of the file. Of each message its
-own statements are kept that decoding depends on, and nothing else of the file:
+Of public files one in six has a flaw somewhere: an identifier of 29 bits without the mark of one
+(bit 31), a name that begins with a digit, a comma for a decimal point, a comment without its
+signal, values of a message that is not there. Mostly it stands beside what one wants of the file.
+Of each message its own statements are kept that decoding depends on, and nothing else of the file:
 
     BO_, SG_              the message and its signals
     SIG_VALTYPE_          which of them are floating-point numbers
     SG_MUL_VAL_           which multiplexer's values select one
     BA_ of `_ATTRIBUTES`  SAE J1939 or not; names longer than 32 characters
 
+An identifier that a standard frame cannot have is that of an extended one.
 They are read together, those that fail by halves. A message whose multiplexer or types cannot be
 read would be decoded wrongly, and is left out; of another one the flawed signals are.
 
@@ -40,6 +41,8 @@ _SIGNAL = re.compile(r"\s*SG_\s+(?P<name>[^\s:]+)(?:\s+(?P<mux>[mM]\w*))?\s*:")
 _OWNER = re.compile(r"\s*(?:SIG_VALTYPE_|SG_MUL_VAL_)\s+(\d+)\s+(\w+)")
 _ATTRIBUTE = re.compile(rf"\s*BA_\w*\s+(?:(?:BO_|SG_)\s+)?\"({'|'.join(_ATTRIBUTES)})\"")
 _ATTRIBUTE_OWNER = re.compile(r'\s*BA_\s+"\w+"\s+(BO_|SG_)\s+(\d+)(?:\s+(\w+))?')
+UNSELECTED = "it shares its bits with other signals, and none (M) says which of them a frame holds"
+LAST_STANDARD, LAST_EXTENDED, EXTENDED = 0x7FF, 0x1FFFFFFF, 1 << 31
 _AT_LINE = re.compile(r"at line \d+, column \d+: ")
 
 
@@ -54,11 +57,14 @@ class UnreadableError(Exception):
 
 class SoundPart(Database):
     """The messages that can be read; `left_out` says why of the others, by `Message` or
-    `Message.Signal`."""
+    `Message.Signal`; `extended` names those whose identifier was taken for one of 29 bits."""
 
-    def __init__(self, messages: list[Message], left_out: dict[str, str]) -> None:
+    def __init__(
+        self, messages: list[Message], left_out: dict[str, str], extended: list[str]
+    ) -> None:
         super().__init__(messages, strict=False)
         self.left_out = left_out
+        self.extended = extended
 
 
 @dataclass(slots=True)
@@ -71,6 +77,17 @@ class _Unit:
     """Lines by name of the signal."""
     own: list[tuple[str | None, str]] = field(default_factory=list)
     """Statements, with the signal that each is of."""
+    marked: bool = False
+    """Whether the mark of an extended frame was put to its identifier."""
+
+    def mark(self, can_id: str) -> None:
+        """Put the mark of an extended frame to it, where no standard frame can have it."""
+        if not can_id.isascii() or not LAST_STANDARD < int(can_id) <= LAST_EXTENDED:
+            return
+        found, put = re.compile(rf"\b{can_id}\b"), str(int(can_id) | EXTENDED)
+        self.head = found.sub(put, self.head, count=1)
+        self.own = [(signal, found.sub(put, line, count=1)) for signal, line in self.own]
+        self.marked = True
 
     def text(self, without: Iterable[str] = ()) -> tuple[str, str]:
         """The message, less some signals; and the statements of those that it has."""
@@ -82,8 +99,19 @@ class _Unit:
     @property
     def selectors(self) -> set[str]:
         """Signals that select others."""
+        return {name for name, mark in self._marks() if mark.endswith("M")}
+
+    def unselected(self) -> list[str]:
+        """Signals that are to be selected, where none selects."""
+        marks = self._marks()
+        if any(mark.endswith("M") for _, mark in marks):
+            return []
+        return [name for name, mark in marks if len(mark) > 1]
+
+    def _marks(self) -> list[tuple[str, str]]:
+        """What stands behind each name: M, m and a number, or nothing."""
         found = ((name, _SIGNAL.match(line)) for name, line in self.signals.items())
-        return {name for name, m in found if m is not None and (m["mux"] or "").endswith("M")}
+        return [(name, (m["mux"] or "") if m is not None else "") for name, m in found]
 
 
 def read_whole(text: str) -> Database:
@@ -97,11 +125,25 @@ def sound_part(text: str) -> SoundPart:
     """The messages of a DBC file that can be read. Raises `UnreadableError`."""
     left_out: dict[str, str] = {}
     units, shared = _units(text, left_out)
+    for unit in units:
+        for name in unit.unselected():
+            del unit.signals[name]
+            left_out[f"{unit.name}.{name}"] = UNSELECTED
     reader = _Reader(_readable(shared, left_out), left_out)
     messages = reader.read(units)
     if not messages:
         raise UnreadableError(next(iter(left_out.values()), "there is no message in it"))
-    return SoundPart(messages, left_out)
+    read = {message.name for message in messages}
+    return SoundPart(messages, left_out, [u.name for u in units if u.marked and u.name in read])
+
+
+def unselected(text: str) -> bool:
+    """Whether a signal of the file shares its bits with others, and none selects one of them.
+
+    cantools reads such a one as if it were there in every frame.
+    """
+    units, _ = _units(text, {})
+    return any(unit.unselected() for unit in units)
 
 
 def _readable(shared: Sequence[str], left_out: dict[str, str]) -> list[str]:
@@ -196,6 +238,7 @@ def _units(text: str, left_out: dict[str, str]) -> tuple[list[_Unit], list[str]]
                 left_out[name] = f"no message: {line.strip()!r}"
                 continue
             unit = _Unit(message["name"], line.strip(), own=own[message["id"]])
+            unit.mark(message["id"])
             units.append(unit)
         elif words[:1] == ["SG_"] and unit is not None:
             signal = _SIGNAL.match(line)

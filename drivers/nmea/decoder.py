@@ -12,7 +12,7 @@ from collections import Counter
 from datetime import date
 from typing import Literal
 
-from drivers.base import DriverOptions
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,
@@ -26,41 +26,43 @@ from drivers.measurements import (
 from drivers.nmea.cycle import Cycle
 from drivers.nmea.epochs import (
     FORMATTERS,
+    INTEGRATED,
     MAX_CYCLE,
     TALKERS,
     BadFieldError,
     Epoch,
-    one_time,
     time_of_day_ns,
     time_step_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.geoid import Geoid
-from drivers.nmea.reasons import POSITIONS, Heard, cautions, no_fix, note, nothing_verified
-from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, posix_ns
+from drivers.nmea.reasons import (
+    FULLER,
+    OWN_SENTENCES,
+    POSITIONS,
+    Heard,
+    cautions,
+    no_fix,
+    note,
+    nothing_verified,
+)
+from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, one_time, posix_ns
 from drivers.plausible import SIGMA_M
 
-BUILD_DATE = date(2026, 11, 20)
-"""No receiver can truly report a date before this software was written."""
-RMC_ALONE_AFTER = 2
-"""Epochs in a row without GGA or GNS after which RMC's position is a fix: one may be damaged."""
+PLAIN_AFTER = 2
+"""Epochs with RMC or GLL in a row that have neither GGA nor GNS, after which their position is a
+fix: one may be damaged. A GGA at an instant of its own is none of these (plotters take turns)."""
 
 _TIMELESS = frozenset({"GSA", "VTG"})
 _QUALITIES = frozenset({1, 2, 3, 4, 5})
-Formatter = Literal["GGA", "GNS", "RMC", "VTG", "GSA", "GST", "ZDA", "HDT", "THS"]
+Formatter = Literal["GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "ZDA", "HDT", "THS"]
 
 
-class NmeaDecoding(DriverOptions):
+class NmeaDecoding(SolutionDecoding):
     """What the decoder may be told."""
 
     last_sentence: Formatter | None = None
     """The sentence that ends an epoch (one that is sent once an epoch); learned by default."""
-    heading_offset_deg: float = 0.0
-    """Added to HDT and THS: from the antenna baseline to the vehicle's forward axis, clockwise."""
-    earliest_date: date = BUILD_DATE
-    """Dates before it are refused; set it back to read old logs."""
-    allow_simulator: bool = False
-    """Accept quality 7 (manual) and 8 (simulator)."""
 
 
 class NmeaDecoder:
@@ -71,8 +73,8 @@ class NmeaDecoder:
     `repeated_sentence`; noted `late_sentence`; refused epochs `no_fix`,
     `dead_reckoning_refused`, `manual_refused`, `simulator_refused`, `unknown_quality`,
     `height_implausible`, `speed_implausible`, `sigma_too_large`; within one `heading_mode_refused`,
-    `height_not_measured`, `height_above_sea`, `rmc_alone`, `unknown_status`, `sigma_too_small`,
-    `untimed_epoch`.
+    `height_not_measured`, `height_above_sea`, `rmc_alone`, `gll_alone`, `gga_awaited`,
+    `integrated`, `unknown_status`, `sigma_too_small`, `untimed_epoch`.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class NmeaDecoder:
         self._closed_by = ""
         """What closed it: `last` sentence, `silence`, or what came then."""
         self._without_gga = 0
-        """Epochs with RMC in a row that had neither GGA nor GNS."""
+        """Epochs with RMC or GLL in a row that had neither GGA nor GNS."""
 
     @property
     def cautions(self) -> dict[str, str]:
@@ -161,7 +163,8 @@ class NmeaDecoder:
             return
         if sentence.formatter not in FORMATTERS:
             self.counters["unused_sentence"] += 1
-            note(self.heard.unused, sentence.formatter)
+            own = sentence.talker == "P" or sentence.address in OWN_SENTENCES
+            note(self.heard.unused, sentence.address if own else sentence.formatter)
             return
         if sentence.talker not in TALKERS:
             self.counters["other_talker"] += 1
@@ -180,6 +183,9 @@ class NmeaDecoder:
     def _group(self, sentence: Sentence, t_seen_ns: int, found: list[Measurement]) -> None:
         formatter, time_ns = sentence.formatter, time_of_day_ns(sentence)
         epoch = self._epoch
+        if formatter == "GLL" and time_ns is not None and self._told_already(time_ns, sentence):
+            self.counters["unused_sentence"] += 1
+            return
         if epoch is not None and time_ns is not None and self._belongs_before(epoch, t_seen_ns):
             epoch = self._epoch = None
             self._late()
@@ -224,6 +230,14 @@ class NmeaDecoder:
         step_ns = time_step_ns(sentence)
         return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
+    def _told_already(self, time_ns: int, sentence: Sentence) -> bool:
+        """Whether the place at this instant came by a sentence that says more: many a burst ends
+        with GLL, behind all GSV, and the epoch would wait for it."""
+        epoch = self._epoch if self._epoch is not None else self._closed
+        if epoch is None or epoch.time_of_day_ns is None or FULLER.isdisjoint(epoch.cycle):
+            return False
+        return self._of_epoch(epoch, time_ns, sentence)
+
     def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
         """Whether what has no time of its own came sooner after the epoch that a silence closed
         than before the one that begins now."""
@@ -235,6 +249,7 @@ class NmeaDecoder:
     def _late(self) -> None:
         """More of an epoch that was closed: where it was closed is learned anew."""
         self.counters["late_sentence"] += 1
+        self._without_gga = 0  # an epoch in two parts has what one of them lacked
         if self._closed_by == "silence":
             self._cycle.paused()
         else:
@@ -255,12 +270,14 @@ class NmeaDecoder:
         if epoch.unknown_status:
             self.counters["unknown_status"] += 1
             note(self.heard.statuses, epoch.unknown_status)
-        if epoch.quality is not None:
-            self._without_gga = 0
-        elif epoch.rmc_valid is not None:
+        if epoch.quality is None and epoch.plain_valid is not None:
             self._without_gga += 1
-            if self._without_gga >= RMC_ALONE_AFTER:
-                epoch.take_rmc_position()
+            if self._without_gga >= PLAIN_AFTER:
+                epoch.take_plain()
+            elif epoch.plain_valid:
+                self.counters["gga_awaited"] += 1
+        elif epoch.plain_valid is not None:
+            self._without_gga = 0
         refusal = self._refusal(epoch)
         day = self._date(epoch, found, valid=refusal is None)
         self.refusal = refusal or ""
@@ -297,7 +314,7 @@ class NmeaDecoder:
                 return "manual_refused"
             if epoch.quality == 8 or "S" in epoch.modes:
                 return "simulator_refused"
-        if epoch.quality == 0 or epoch.rmc_valid is False:
+        if epoch.quality == 0 or epoch.plain_valid is False:
             return "no_fix"
         if epoch.quality is None:
             return None
@@ -318,9 +335,12 @@ class NmeaDecoder:
         if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
         # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
-        believed = valid and bool(epoch.quality) if epoch.rmc_valid is None else epoch.rmc_valid
+        told = epoch.plain_valid
+        believed = valid and bool(epoch.quality) if told is None else told
         if believed:
             self._calendar.dated(epoch.day, epoch.time_of_day_ns, epoch.t_seen_ns)
+        elif told is None and epoch.quality is None and self.heard.used["RMC"]:
+            return epoch.day  # a ZDA of another instant than RMC: some are seconds ahead of it
         utc_ns = posix_ns(epoch.day, epoch.time_of_day_ns)
         trusted = self._trust.report(utc_ns, epoch.t_day_seen_ns, valid=believed)
         if trusted is not None:
@@ -340,11 +360,13 @@ class NmeaDecoder:
         self, epoch: Epoch, stamp: Stamp, lat_deg: float, lon_deg: float, quality: int
     ) -> PositionFix:
         self.counters["fixes"] += 1
-        if epoch.by_rmc:
-            self.counters["rmc_alone"] += 1
+        if epoch.by_plain:
+            self.counters["rmc_alone" if epoch.by_plain == "RMC" else "gll_alone"] += 1
+        if not INTEGRATED.isdisjoint(address[:2] for address in epoch.addresses):
+            self.counters["integrated"] += 1
         altitude, separation, height, geoid_sd_m = epoch.altitude_m, epoch.separation_m, None, 0.0
         if altitude is None:
-            if not epoch.by_rmc:
+            if not epoch.by_plain:
                 self.counters["height_missing"] += 1
         elif epoch.two_dimensional:
             self.counters["height_not_measured"] += 1

@@ -7,8 +7,8 @@ it was. Empty fields are normal and become None.
 Quality comes from GGA; NovAtel's 9 is a fix with corrections of a satellite (2). Where only GNS is
 sent it comes from its mode string, one letter a system: the worst letter of the systems in use
 counts, in the order A (1), D (2), P (3), F (5), R (4), and E, M or S in any of them marks the whole
-epoch as estimated, manual or simulated. Where only RMC is sent it comes from its mode, or from its
-status in receivers that put the mode there (Unicore: D beside mode R):
+epoch as estimated, manual or simulated. Where only RMC or GLL is sent it comes from its mode, or
+from RMC's status in receivers that put the mode there (Unicore: D beside mode R):
 
     A  D  F  P  R    valid: autonomous, differential, float RTK, precise, fixed RTK
     E  M  S          valid for the receiver: estimated, manual, simulated
@@ -34,7 +34,10 @@ from drivers.nmea.time import parse_time_of_day
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.rounding import NEAREST_SD
 
-TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GI", "GQ", "QZ"})
+INTEGRATED = frozenset({"II", "IN"})
+"""Integrated instrumentation and navigation: a plotter or an adapter tells what it got, computed or
+smoothed, in the receiver's own sentences."""
+TALKERS = frozenset({"GP", "GN", "BD", "GB", "GL", "GA", "GI", "GQ", "QZ"}) | INTEGRATED
 """Satellites: GPS, several, BeiDou (two names), GLONASS, Galileo, NavIC, QZSS (two names)."""
 MAX_CYCLE = 24
 """Sentences that one epoch may hold; a receiver sends at most nine formatters and some GSA."""
@@ -56,12 +59,11 @@ OVERDETERMINED = 5
 """Satellites with which a fix is three-dimensional whatever GSA says, if it has an altitude and
 VDOP: four give place and clock, one more than that checks them (modules of Quectel and Telit say 2
 beside 8 to 14)."""
-ROUNDED_NS = 10_000_000
-"""A time with fewer decimals than two is cut: rounded, it would be that of another epoch."""
 MINUTE_M = 1852.0
 """Of latitude."""
 _PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
-_NO_TIME = frozenset({"GSA", "VTG", "HDT", "THS"})
+_TIME_AT = {**dict.fromkeys(("GSA", "VTG", "HDT", "THS"), -1), "GLL": 4}
+"""Which field is the time, where it is not the first; -1: none."""
 
 
 class Printed(NamedTuple):
@@ -96,9 +98,11 @@ class Epoch:
     rmc_valid: bool | None = None
     unknown_status: str = ""
     """A status of RMC that is none: it says nothing of the others, and RMC counts for nothing."""
-    rmc_position: Printed | None = None
-    by_rmc: bool = False
-    """Place and quality are RMC's: there is neither GGA nor GNS."""
+    gll_valid: bool | None = None
+    plain: Printed | None = None
+    """The place in RMC or GLL, which say nothing of its quality but a mode."""
+    by_plain: str = ""
+    """Whose place and quality are the epoch's where there is neither GGA nor GNS: RMC or GLL."""
     place: Printed | None = None
     altitude_m: float | None = None
     height_step_m: float = 0.0
@@ -142,14 +146,20 @@ class Epoch:
             return None
         return self.place.lat_deg, self.place.lon_deg, self.quality
 
-    def take_rmc_position(self) -> None:
-        """RMC is all that the receiver says of its place."""
-        if self.rmc_position is None or not self.rmc_valid:
+    @property
+    def plain_valid(self) -> bool | None:
+        """What RMC, or else GLL, says of place and time; None where neither does."""
+        return self.gll_valid if self.rmc_valid is None else self.rmc_valid
+
+    def take_plain(self) -> None:
+        """RMC or GLL is all that the receiver says of its place."""
+        if self.plain is None or not self.plain_valid:
             return
         known = [quality for mode, quality in _MODE_QUALITY.items() if mode in self.modes]
         if "N" in self.modes:
             known = [0]
-        self.place, self.quality, self.by_rmc = self.rmc_position, (known or [1])[0], True
+        self.place, self.quality = self.plain, (known or [1])[0]
+        self.by_plain = "RMC" if self.rmc_valid else "GLL"
 
     @property
     def two_dimensional(self) -> bool:
@@ -190,26 +200,21 @@ class Epoch:
         return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
 
 
-def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
-    """Whether two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
-    it to two."""
-    if a_step_ns == b_step_ns:
-        return a_ns == b_ns
-    step_ns, beyond = max((a_step_ns, b_ns - a_ns), (b_step_ns, a_ns - b_ns))
-    return 0 <= beyond < step_ns or (step_ns <= ROUNDED_NS and 2 * abs(beyond) <= step_ns)
+def printed_time(sentence: Sentence) -> str:
+    """As it is printed; empty where this kind has none, or the field is."""
+    at = _TIME_AT.get(sentence.formatter, 0)
+    return sentence.fields[at] if 0 <= at < len(sentence.fields) else ""
 
 
 def time_step_ns(sentence: Sentence) -> int:
     """One step of the last digit of its time."""
-    return int(10 ** (9 - min(9, len(sentence.fields[0].partition(".")[2]))))
+    return int(10 ** (9 - min(9, len(printed_time(sentence).partition(".")[2]))))
 
 
 def time_of_day_ns(sentence: Sentence) -> int | None:
     """Its time of day; None where this kind has none or the field is empty. BadFieldError."""
-    if sentence.formatter in _NO_TIME or not sentence.fields:
-        return None
     try:
-        return parse_time_of_day(sentence.fields[0])
+        return parse_time_of_day(printed_time(sentence))
     except ValueError as error:
         raise BadFieldError(str(error)) from None
 
@@ -286,7 +291,8 @@ def _take_gga(epoch: Epoch, fields: Fields) -> None:
     hdop = _dop(fields, "HDOP")
     _take_height(epoch, fields)
     epoch.place, epoch.quality = place, 2 if quality == NOVATEL_SBAS else quality or 0
-    epoch.satellites, epoch.hdop = satellites, hdop if hdop is not None else epoch.hdop
+    epoch.satellites = satellites or epoch.satellites or satellites  # GNS may have counted some
+    epoch.hdop = hdop if hdop is not None else epoch.hdop
     epoch.counted = max(epoch.counted, satellites or 0)
 
 
@@ -310,7 +316,7 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
     status, mode = _letter(fields, "status"), _letter(fields, "posMode")
     place = _position(fields, 2)
     if status in _MODE_QUALITY or status in _ESTIMATED:
-        epoch.rmc_valid, epoch.rmc_position = True, place
+        epoch.rmc_valid, epoch.plain = True, place
         # Who sends D beside R means R; who sends E beside it means that, too.
         mode = mode + status if status in _ESTIMATED else mode or status
     elif status in _NOT_VALID:
@@ -323,6 +329,14 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
         epoch.day = day  # two digits: 69 to 99 are 1969 to 1999, a cold receiver's 1980
     if speed is not None and epoch.rmc_valid:
         epoch.speed_m_s, epoch.course_deg = speed * KNOT_M_S, course
+
+
+def _take_gll(epoch: Epoch, fields: Fields) -> None:
+    place, status = _position(fields, 0), _letter(fields, "status")
+    epoch.modes |= set(_letter(fields, "posMode"))
+    epoch.gll_valid = status == "A"
+    if epoch.gll_valid and epoch.plain is None:
+        epoch.plain = place
 
 
 def _take_vtg(epoch: Epoch, fields: Fields) -> None:
@@ -383,6 +397,7 @@ FORMATTERS: dict[str, Callable[[Epoch, Fields], None]] = {
     "GGA": _take_gga,
     "GNS": _take_gns,
     "RMC": _take_rmc,
+    "GLL": _take_gll,
     "VTG": _take_vtg,
     "GSA": _take_gsa,
     "GST": _take_gst,

@@ -21,6 +21,7 @@ from operator import xor
 from typing import Literal
 
 from drivers.nmea.running_checks import RunningCrc24q, RunningFletcher
+from drivers.splitter import Splitter
 
 MAX_SENTENCE = 256
 """Bytes from `$` to the checksum. The standard says 82, receivers exceed it; a longer run of text
@@ -29,8 +30,6 @@ MAX_UBX_PAYLOAD = 8192
 """A RXM-RAWX of 255 measurements takes 8176; a longer length is a false header."""
 MOST_UNREAD = 4096
 """Bytes that nobody understood, kept to tell what they are: two seconds at 19,200 baud."""
-SLICE = 4096
-"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
 
 # Little-endian, up to the greatest, whose low byte is zero.
 _UBX_LENGTH = rb"(?:.[\x00-\x%02x]|\x00\x%02x)" % (
@@ -104,7 +103,7 @@ class Frame:
 Item = Sentence | Frame
 
 
-class StreamSplitter:
+class StreamSplitter(Splitter[Item]):
     """Bytes in, verified sentences and binary frames out, whatever the splits.
 
     Counts in `counters`: `sentences`, `ubx_frames`, `rtcm_frames`; refused `checksum_bad`,
@@ -114,17 +113,11 @@ class StreamSplitter:
     """
 
     def __init__(self, counters: Counter[str] | None = None) -> None:
-        self.counters: Counter[str] = Counter() if counters is None else counters
+        super().__init__(counters)
         self._unread = bytearray()
-        self._buffer = bytearray()
         self._whole = _WholeSentences()
         self._fletcher = RunningFletcher()
         self._crc = RunningCrc24q()
-
-    @property
-    def waiting(self) -> int:
-        """Bytes kept until more come."""
-        return len(self._buffer)
 
     @property
     def unread(self) -> bytes:
@@ -135,20 +128,6 @@ class StreamSplitter:
     def summed(self) -> int:
         """Bytes that the checks of binary frames worked on, of both kinds together."""
         return self._fletcher.taken + self._crc.taken
-
-    def feed(self, data: bytes) -> list[Item]:
-        """The sentences and frames that `data` completes, in order."""
-        items: list[Item] = []
-        for start in range(0, len(data), SLICE):
-            self._buffer += data[start : start + SLICE]
-            self._scan(items, final=False)
-        return items
-
-    def finish(self) -> list[Item]:
-        """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
-        items: list[Item] = []
-        self._scan(items, final=True)
-        return items
 
     def _scan(self, items: list[Item], *, final: bool) -> None:
         buffer, at = self._buffer, 0
@@ -225,7 +204,8 @@ class StreamSplitter:
         raw = bytes(self._buffer[at : star + 3])
         if not _verifies(raw):
             # The two bytes behind the star may be the start of something else.
-            return self._refuse("checksum_bad", star + 1 - at)
+            why = "checksum_missing" if raw[-2] in b"\r\n" else "checksum_bad"
+            return self._refuse(why, star + 1 - at)
         address, *fields = raw[1:-3].decode("ascii").split(",")
         if not _ADDRESS.match(address):
             return self._refuse("address_bad", len(raw))

@@ -21,8 +21,6 @@ REFUSALS = {
 }
 """By the counter of a refused epoch."""
 TALKERS_NOT_READ = {
-    "II": "integrated instrumentation",
-    "IN": "integrated navigation",
     "EC": "a chart display",
     "EI": "a chart display",
     "AI": "AIS",
@@ -30,7 +28,25 @@ TALKERS_NOT_READ = {
     "SN": "an electronic positioning system",
 }
 """NMEA 0183 4.11, table of talker identifiers."""
-POSITIONS = frozenset({"GGA", "GNS", "RMC"})
+FULLER = frozenset({"GGA", "GNS", "RMC"})
+"""Sentences that say all that GLL does."""
+POSITIONS = FULLER | {"GLL"}
+OWN_SENTENCES = {
+    "PUBX": "u-blox",
+    "PTNL": "Trimble",
+    "PSTI": "SkyTraq",
+    "PASHR": "Ashtech, Applanix and others: attitude of an inertial system",
+    "PQTM": "Quectel",
+    "PSAT": "Hemisphere",
+    "PNVG": "NVS",
+    "PGRM": "Garmin",
+    "KSXT": "Unicore, ComNav and others",
+    "GPHPD": "ComNav and others",
+    "GNHPD": "ComNav and others",
+    "GPFPD": "inertial systems: their own solution",
+    "GTIMU": "inertial systems",
+}
+"""Whose own sentences, by their beginning, in which receivers tell place or attitude."""
 MOST_NAMES = 8
 """Talkers and formatters that are remembered; the first ones are enough to name."""
 ROLLOVER = timedelta(weeks=1024)
@@ -105,6 +121,13 @@ def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
             f"positions of talker {talker}{kind} arrive, which are not read: set the receiver to "
             "talker GP or GN"
         )
+    own = next((a for a in heard.unused for o in OWN_SENTENCES if a.startswith(o)), "")
+    if own and not POSITIONS & set(heard.used):
+        whose = next(who for o, who in OWN_SENTENCES.items() if own.startswith(o))
+        return (
+            f"sentences of a maker's own arrive (${own}: {whose}), which are not read: switch on "
+            "GGA, RMC and GST"
+        )
     if counters["checksum_missing"] >= MANY:
         return CHECKSUMS
     if counters["bad_field"] and not POSITIONS & set(heard.used):
@@ -140,6 +163,17 @@ def cautions(counters: Counter[str], heard: Heard, earliest: date) -> dict[str, 
         found["rmc_alone"] = (
             "only RMC has a position: it is used without height and with the sigma of a poor sky; "
             "switch on GGA and GST"
+        )
+    if counters["gll_alone"]:
+        found["gll_alone"] = (
+            "only GLL has a position: it is used without height and with the sigma of a poor sky; "
+            "switch on GGA, RMC and GST"
+        )
+    if counters["integrated"]:
+        found["integrated"] = (
+            "the positions' talker is II or IN: a plotter or an adapter may have smoothed them, or "
+            "gone on by dead reckoning, and its sigma does not say so; better the receiver's own "
+            "sentences (GP, GN)"
         )
     if counters["unknown_status"]:
         status = heard.statuses.most_common(1)[0][0]

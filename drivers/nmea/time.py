@@ -11,6 +11,8 @@ import re
 from collections import Counter
 from datetime import date
 
+ROUNDED_NS = 10_000_000
+"""A time with fewer decimals than two is cut: rounded, it would be that of another epoch."""
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
 MAX_STEP_NS = 10 * SECOND_NS
@@ -42,6 +44,15 @@ def parse_time_of_day(text: str) -> int | None:
         raise ValueError(f"no such time of day: {text!r}")
     fraction_ns = int((match.group(4) or "0").ljust(9, "0"))
     return (hour * 3600 + minute * 60 + second) * SECOND_NS + fraction_ns
+
+
+def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
+    """Whether two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
+    it to two."""
+    if a_step_ns == b_step_ns:
+        return a_ns == b_ns
+    step_ns, beyond = max((a_step_ns, b_ns - a_ns), (b_step_ns, a_ns - b_ns))
+    return 0 <= beyond < step_ns or (step_ns <= ROUNDED_NS and 2 * abs(beyond) <= step_ns)
 
 
 def posix_ns(day: date, time_of_day_ns: int) -> int:

@@ -1,9 +1,11 @@
-"""BeiDou B-CNAV1 (B1C) and B-CNAV2 (B2a) as UBX-RXM-SFRBX hands them over: ephemeris and delays.
+"""BeiDou B-CNAV1 (B1C) and B-CNAV2 (B2a) as UBX-RXM-SFRBX hands them over: ephemeris, delays, and
+the ionosphere (BDGIM).
 
     B-CNAV1  subframe 1 in 3 words, undecoded; 2 in 19: 576 bits, CRC 24; 3 in 9: 240 bits, CRC 24
     B-CNAV2  one message in 9 words: PRN 6, type 6, second of week 18, data 234, CRC 24
     A        A_ref + dA,  A_ref 27,906,100 m of a MEO, 42,162,200 m of an IGSO
 
+The ionosphere is in page 1 of subframe 3 and in message 30.
 The receiver has undone LDPC code and interleaving, and fills the last word with zeros. Subframe 2
 is an ephemeris with its clock and delays; health is in subframe 3. Messages 10, 11 and 30 are one
 when the low byte of IODC is IODE; 11 has no issue number and follows its 10 by 3 s. The clock
@@ -14,12 +16,11 @@ sections 6 and 7.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from drivers.nmea.running_checks import crc24q
-from drivers.raw.bits import Bits, Table, angle, read, s, u
+from drivers.raw.bits import Bits, Table, angle, bdgim_table, read, s, u
 from drivers.raw.messages import Ephemeris
-from drivers.raw.subframes import Decoded, RefusedError, Subframe, ephemeris, week_of_toe
+from drivers.raw.subframes import Decoded, RefusedError, Subframe, bdgim, ephemeris
 from drivers.raw.weeks import WeekReference
 
 SUBFRAMES = {3: 1, 19: 2, 9: 3}
@@ -83,6 +84,11 @@ _DELAYS_2 = (s(219, 12, -34), s(121, 12, -34), s(133, 12, -34))
 signal."""
 
 
+_IONOSPHERE_1, _IONOSPHERE_2 = bdgim_table(42), bdgim_table(145)
+IONOSPHERE_PAGE = 1
+"""Of subframe 3."""
+
+
 def _checked(words: tuple[int, ...], length: int) -> Bits:
     """The first `length` bits. RefusedError `crc_bad`."""
     value = 0
@@ -111,21 +117,25 @@ class Bcnav1Decoder:
         self._healthy: bool | None = None
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this subframe completes: an ephemeris as soon as both 2 and 3 have been heard.
-        RefusedError by name."""
+        """What this subframe completes: an ephemeris as soon as both 2 and 3 have been heard, and
+        the ionosphere of 3. RefusedError by name."""
         number = SUBFRAMES.get(len(subframe.words))
         if number is None:
             raise RefusedError("subframe_short")
         if number == 1:
             return []
+        found: Decoded = []
         if number == 2:
             self._two = _checked(subframe.words, _SUBFRAME_2)
         else:
+            three = _checked(subframe.words, _SUBFRAME_3)
             # Page 6 bits, HS 2, then DIF and SIF of this signal.
-            self._healthy = _checked(subframe.words, _SUBFRAME_3).unsigned(6, 4) == 0
-        if self._two is None or self._healthy is None:
-            return []
-        return [self._ephemeris(subframe, self._two, self._healthy, weeks)]
+            self._healthy = three.unsigned(6, 4) == 0
+            if three.unsigned(0, 6) == IONOSPHERE_PAGE and self._healthy:
+                found += bdgim(subframe, three, _IONOSPHERE_1)
+        if self._two is not None and self._healthy is not None:
+            found.append(self._ephemeris(subframe, self._two, self._healthy, weeks))
+        return found
 
     def _ephemeris(
         self, subframe: Subframe, two: Bits, healthy: bool, weeks: WeekReference
@@ -136,7 +146,16 @@ class Bcnav1Decoder:
             raise RefusedError("ephemeris_mixed")
         tow_s = two.unsigned(13, 8) * 3600
         week = weeks.bdt_week(two.unsigned(0, 13), tow_s)
-        return _made(subframe, "bcnav1", numbers, week, tow_s, issue, healthy, two, _DELAYS_1)
+        return ephemeris(
+            subframe,
+            "bcnav1",
+            numbers,
+            sent=(week, tow_s),
+            delays=(two, _DELAYS_1),
+            issue=issue,
+            accuracy_m=None,
+            healthy=healthy,
+        )
 
 
 class Bcnav2Decoder:
@@ -155,6 +174,9 @@ class Bcnav2Decoder:
         kind, tow_s, parts = bits.unsigned(6, 6), bits.unsigned(12, 18) * FOLLOWS_S, self._parts
         if kind not in MESSAGES:
             return []
+        # HS 2 bits, DIF and SIF of this signal.
+        good = kind == 30 and bits.unsigned(30, 4) == 0
+        found = bdgim(subframe, bits, _IONOSPHERE_2) if good else []
         if kind == 11 and not (10 in parts and _second_of(parts[10]) == tow_s - FOLLOWS_S):
             return []
         if kind == 10:
@@ -164,7 +186,7 @@ class Bcnav2Decoder:
             self._parts = {kind: bits}
             raise RefusedError("ephemeris_mixed")
         if len(parts) < len(MESSAGES):
-            return []
+            return found
         ten, eleven, thirty = (parts[n] for n in MESSAGES)
         self._parts = {30: thirty}
         numbers = read(ten, _orbit(_ORBIT_2)) | read(eleven, _plane(_PLANE_2))
@@ -172,19 +194,19 @@ class Bcnav2Decoder:
         week = weeks.bdt_week(ten.unsigned(30, 13), _second_of(ten))
         # HS 2 bits, DIF and SIF of this signal, in 11 and 30.
         healthy = eleven.unsigned(30, 4) == 0 and thirty.unsigned(30, 4) == 0
-        return [
-            _made(
+        found.append(
+            ephemeris(
                 subframe,
                 "bcnav2",
                 numbers,
-                week,
-                _second_of(ten),
-                _issue(ten),
-                healthy,
-                thirty,
-                _DELAYS_2,
+                sent=(week, _second_of(ten)),
+                delays=(thirty, _DELAYS_2),
+                issue=_issue(ten),
+                accuracy_m=None,
+                healthy=healthy,
             )
-        ]
+        )
+        return found
 
 
 def _second_of(bits: Bits) -> int:
@@ -194,26 +216,3 @@ def _second_of(bits: Bits) -> int:
 
 def _issue(ten: Bits) -> int:
     return ten.unsigned(53, 8)
-
-
-def _made(
-    subframe: Subframe,
-    message: str,
-    numbers: dict[str, Any],
-    week: int,
-    tow_s: float,
-    issue: int,
-    healthy: bool,
-    delays: Bits,
-    table: tuple[Any, ...],
-) -> Ephemeris:
-    return ephemeris(
-        subframe,
-        message,
-        numbers,
-        week=week_of_toe(week, tow_s, numbers["toe_s"]),
-        group_delay_s=tuple(delay.read(delays) for delay in table),
-        issue=issue,
-        accuracy_m=None,
-        healthy=healthy,
-    )

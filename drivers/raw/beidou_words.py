@@ -14,7 +14,7 @@ from typing import Any
 
 from drivers.raw.bits import Bits, s
 from drivers.raw.messages import Ephemeris
-from drivers.raw.subframes import RefusedError, Subframe, ephemeris, ura_m, week_of_toe
+from drivers.raw.subframes import RefusedError, Subframe, ephemeris, ura_m
 from drivers.raw.weeks import WeekReference
 
 WORDS = 10
@@ -87,13 +87,12 @@ def beidou_ephemeris(
     """
     if numbers["toe_s"] != numbers["toc_s"]:
         raise RefusedError("ephemeris_mixed")
-    week = weeks.bdt_week(first.unsigned(10, 13), tow_s)
     return ephemeris(
         subframe,
         message,
         numbers,
-        week=week_of_toe(week, tow_s, numbers["toe_s"]),
-        group_delay_s=tuple(delay.read(first) for delay in _DELAYS),
+        sent=(weeks.bdt_week(first.unsigned(10, 13), tow_s), tow_s),
+        delays=(first, _DELAYS),
         issue=first.unsigned(1, 5),
         accuracy_m=ura_m(first.unsigned(6, 4)),
         healthy=first.unsigned(0, 1) == 0,

@@ -93,6 +93,14 @@ def read(bits: Bits, table: Table) -> dict[str, Any]:
     return {name: number.read(bits) for name, number in table.items()}
 
 
+def bdgim_table(at: int) -> tuple[Number, ...]:
+    """The nine coefficients of BDGIM in eighths of a TECU, 74 bits from bit `at` (table 7-10 of
+    BDS-SIS-ICD-B1C-1.0): the third and fourth have no sign, the fifth is negative always."""
+    first = u(at, 10, -3), s(at + 10, 8, -3)
+    mean = u(at + 18, 8, -3), u(at + 26, 8, -3), u(at + 34, 8, -3, -1.0)
+    return (*first, *mean, *(s(at + k, 8, -3) for k in (42, 50, 58, 66)))
+
+
 KlobucharTable = tuple[tuple[Number, ...], tuple[Number, ...]]
 
 

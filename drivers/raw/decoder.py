@@ -16,11 +16,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import date
 from typing import Protocol
 
+from drivers.decoding import BUILD_DATE
 from drivers.measurements import UtcStamp
-from drivers.nmea.decoder import BUILD_DATE
 from drivers.nmea.framing import Frame, StreamSplitter
 from drivers.raw.bcnav import Bcnav1Decoder, Bcnav2Decoder
 from drivers.raw.beidou_words import GEO
@@ -28,7 +29,14 @@ from drivers.raw.d1 import D1Decoder
 from drivers.raw.d2 import D2Decoder
 from drivers.raw.inav import InavDecoder
 from drivers.raw.lnav import PREAMBLE, LnavDecoder
-from drivers.raw.messages import Ephemeris, Klobuchar, RawEvent, RawGnssEpoch
+from drivers.raw.messages import (
+    Bdgim,
+    Ephemeris,
+    Klobuchar,
+    NavigationMessage,
+    RawEvent,
+    RawGnssEpoch,
+)
 from drivers.raw.rtcm import RtcmDecoder
 from drivers.raw.subframes import Decoded, RefusedError, Subframe
 from drivers.raw.ubx import (
@@ -88,7 +96,8 @@ class RawDecoder:
         self._weeks = WeekReference(earliest)
         self._rtcm = RtcmDecoder(source, self._weeks, self.counters) if rtcm else None
         self._messages: dict[tuple[str, int, int], MessageDecoder] = {}
-        self._ionosphere: dict[str, Klobuchar] = {}
+        self._ionosphere: dict[str, Klobuchar | Bdgim] = {}
+        """By model."""
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[RawEvent]:
         """The events that `data`, seen at `t_seen_ns`, completes. Sentences are left out."""
@@ -197,15 +206,16 @@ class RawDecoder:
         self.counters[f"subframes_{message}"] += 1
         return [event for event in decoded if self._is_news(event)]
 
-    def _is_news(self, event: Ephemeris | Klobuchar) -> bool:
+    def _is_news(self, event: NavigationMessage) -> bool:
         """Every whole ephemeris counts, for its health and age; an ionosphere once."""
         if isinstance(event, Ephemeris):
             self.counters["ephemerides"] += 1
             return True
-        last = self._ionosphere.get(event.system)
-        if last is not None and (last.alpha, last.beta) == (event.alpha, event.beta):
+        model = "bdgim" if isinstance(event, Bdgim) else event.system
+        last = self._ionosphere.get(model)
+        if last is not None and replace(last, t_seen_ns=event.t_seen_ns) == event:
             return False
-        self._ionosphere[event.system] = event
+        self._ionosphere[model] = event
         self.counters["ionospheres"] += 1
         return True
 

@@ -17,8 +17,8 @@ from drivers.raw.decoder import RawDecoder
 from drivers.raw.messages import Ephemeris, RawEvent, RawGnssEpoch
 from drivers.raw.rtcm import load_pyrtcm
 from drivers.receiver import ReceiverDriver
-from drivers.solution import REFUSALS, SolutionDecoding
-from drivers.ubx.decoder import UbxNavDecoder
+from drivers.solution import REFUSALS
+from drivers.ubx.decoder import UbxDecoder
 from drivers.ubx.messages import CLASS_NAV
 
 Found = Measurement | RawEvent
@@ -67,8 +67,7 @@ class GnssDecoder:
         self._use_nmea_fix = use_nmea_fix
         self._splitter = StreamSplitter(self.counters)
         self._nmea = NmeaDecoder(source, decoding, self.counters)
-        same = {name: getattr(decoding, name) for name in SolutionDecoding.model_fields}
-        self._ubx = UbxNavDecoder(source, SolutionDecoding(**same), self.counters)
+        self._ubx = UbxDecoder(source, decoding, self.counters)
         self._ubx_fix_ns: int | None = None
         self._nmea_fix: UtcStamp | None = None
         self._raw = (

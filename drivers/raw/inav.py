@@ -22,7 +22,6 @@ from drivers.raw.subframes import (
     Subframe,
     ephemeris,
     sisa_m,
-    week_of_toe,
 )
 from drivers.raw.weeks import WeekReference
 
@@ -106,13 +105,12 @@ class InavDecoder:
         numbers = read(Bits.join(*(found[kind] for kind in range(1, 6))), TABLE)
         five = found[5]
         tow = five.unsigned(85, 20)
-        week = weeks.galileo_week(five.unsigned(73, 12), tow)
         return ephemeris(
             subframe,
             "inav",
             numbers,
-            week=week_of_toe(week, tow, numbers["toe_s"]),
-            group_delay_s=tuple(delay.read(five) for delay in _DELAYS),
+            sent=(weeks.galileo_week(five.unsigned(73, 12), tow), tow),
+            delays=(five, _DELAYS),
             issue=found[1].unsigned(6, 10),
             accuracy_m=sisa_m(found[3].unsigned(120, 8)),
             # Health and data validity of E1-B, which carries this message.

@@ -19,7 +19,6 @@ from drivers.raw.subframes import (
     ephemeris,
     klobuchar,
     ura_m,
-    week_of_toe,
 )
 from drivers.raw.weeks import WEEK_S, WeekReference
 
@@ -121,14 +120,13 @@ class LnavDecoder:
         self._parts = {}
         numbers = read(whole, TABLE)
         tow = (one.unsigned(24, 17) * 6 - 6) % WEEK_S  # the HOW counts to the next subframe
-        week = week_of_toe(weeks.gps_week(one.unsigned(48, 10), tow), tow, numbers["toe_s"])
         return [
             ephemeris(
                 subframe,
                 "lnav",
                 numbers,
-                week=week,
-                group_delay_s=(_TGD.read(one),),
+                sent=(weeks.gps_week(one.unsigned(48, 10), tow), tow),
+                delays=(one, (_TGD,)),
                 issue=issues.pop(),
                 accuracy_m=ura_m(one.unsigned(60, 4)),
                 healthy=one.unsigned(64, 6) == 0 and not bits.unsigned(41, 1),  # nor alert flag

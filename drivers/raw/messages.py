@@ -142,4 +142,16 @@ class Klobuchar:
     beta: tuple[float, float, float, float]
 
 
-RawEvent = RawGnssEpoch | Ephemeris | Klobuchar
+@immutable()
+class Bdgim:
+    """BeiDou-3's ionosphere as B-CNAV broadcasts it: nine coefficients of spherical harmonics, in
+    TECU (1e16 electrons a square metre)."""
+
+    source: str
+    t_seen_ns: int
+    alpha: tuple[float, float, float, float, float, float, float, float, float]
+
+
+NavigationMessage = Ephemeris | Klobuchar | Bdgim
+"""What satellites say of orbits, clocks and the ionosphere: valid at no one instant."""
+RawEvent = RawGnssEpoch | NavigationMessage

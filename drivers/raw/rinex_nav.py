@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from drivers.raw.beidou_words import GEO
-from drivers.raw.messages import Ephemeris, Klobuchar, System
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, System
 from drivers.raw.rinex import (
     LABEL,
     OTHERS,
@@ -63,7 +63,7 @@ class Broadcast(NamedTuple):
     """What a satellite sent, and when (GPS time, s since 1980-01-06)."""
 
     gps_s: float
-    message: Ephemeris | Klobuchar
+    message: NavigationMessage
 
 
 def navigation(source: str, text: str, counters: Counter[str]) -> list[Broadcast]:
@@ -239,6 +239,11 @@ def _ionosphere(
     source: str, system: str, message: str, record: list[str], counters: Counter[str]
 ) -> Broadcast | None:
     wanted = _ION.get((system, message)) or ("C" if system == "C" and message == "D1D2" else None)
+    if (system, message) == ("C", "CNVX"):
+        sent_s = gps_seconds(record[0][4:23].split())
+        a1, a2, a3, a4, a5, a6, a7, a8, a9 = _numbers(record, 23, 9)[:9]
+        counters["ionospheres"] += 1
+        return Broadcast(sent_s, Bdgim(source, 0, (a1, a2, a3, a4, a5, a6, a7, a8, a9)))
     if wanted is None:
         counters["ionosphere_not_used"] += 1
         return None

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.raw.bits import Bits, KlobucharTable
-from drivers.raw.messages import Ephemeris, Klobuchar, System
+from drivers.raw.bits import Bits, KlobucharTable, Number
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, System
 from drivers.raw.weeks import HALF_WEEK_S
 
 MAX_ECCENTRICITY = 0.5
@@ -57,19 +57,39 @@ class Parts:
         self.found.clear()
 
 
-Decoded = list[Ephemeris | Klobuchar]
+Decoded = list[NavigationMessage]
 
 
-def ephemeris(subframe: Subframe, message: str, numbers: dict[str, Any], **rest: Any) -> Ephemeris:
-    """The `Ephemeris` of `subframe`'s satellite. RefusedError when no orbit can be so."""
+def ephemeris(
+    subframe: Subframe,
+    message: str,
+    numbers: dict[str, Any],
+    *,
+    sent: tuple[int, float],
+    delays: tuple[Bits, tuple[Number, ...]],
+    issue: int,
+    accuracy_m: float | None,
+    healthy: bool,
+) -> Ephemeris:
+    """The `Ephemeris` of `subframe`'s satellite. RefusedError when no orbit can be so.
+
+    `sent`: week and time of week at which the message began; `delays`: the bits with the group
+    delays, and their table.
+    """
+    week, tow_s = sent
+    bits, table = delays
     found = Ephemeris(
         source=subframe.source,
         t_seen_ns=subframe.t_seen_ns,
         system=subframe.system,
         prn=subframe.prn,
         message=message,
+        week=week_of_toe(week, tow_s, numbers["toe_s"]),
+        group_delay_s=tuple(delay.read(bits) for delay in table),
+        issue=issue,
+        accuracy_m=accuracy_m,
+        healthy=healthy,
         **numbers,
-        **rest,
     )
     check_orbit(found)
     return found
@@ -81,6 +101,13 @@ def klobuchar(subframe: Subframe, bits: Bits, table: KlobucharTable) -> Klobucha
     return Klobuchar(
         subframe.source, subframe.t_seen_ns, subframe.system, (a0, a1, a2, a3), (b0, b1, b2, b3)
     )
+
+
+def bdgim(subframe: Subframe, bits: Bits, table: tuple[Number, ...]) -> list[NavigationMessage]:
+    """BeiDou-3's ionosphere in `bits`; none where all is zero, as of a satellite that has none."""
+    a1, a2, a3, a4, a5, a6, a7, a8, a9 = (n.read(bits) for n in table)
+    alpha = (a1, a2, a3, a4, a5, a6, a7, a8, a9)
+    return [Bdgim(subframe.source, subframe.t_seen_ns, alpha)] if any(alpha) else []
 
 
 def check_orbit(found: Ephemeris) -> None:

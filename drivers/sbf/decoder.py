@@ -15,15 +15,14 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter
 from dataclasses import dataclass
 
-from drivers.cycle import Cycle
 from drivers.measurements import Measurement, Vector3
 from drivers.plausible import LEAP_SECONDS, within
-from drivers.raw.weeks import LAST_WEEK, WEEK_S, leap_seconds, utc_ns
+from drivers.raw.weeks import LAST_WEEK, WEEK_S, utc_as_told
 from drivers.sbf.framing import Block, BlockSplitter
-from drivers.solution import Solution, SolutionDecoding, SolutionJudge
+from drivers.solution import Solution
+from drivers.solution_decoder import SolutionDecoder
 
 PVT, POSITION_COVARIANCE, VELOCITY_COVARIANCE, DOP = 4007, 5906, 5908, 4001
 ATTITUDE, ATTITUDE_COVARIANCE, TIME, END_OF_PVT = 5938, 5939, 5914, 5921
@@ -69,69 +68,31 @@ class _Epoch:
     vdop: float | None = None
 
 
-class SbfDecoder:
-    """`feed` bytes, get measurements; `flush` at the end of the file.
+class SbfDecoder(SolutionDecoder[Block, _Epoch]):
+    """See `SolutionDecoder`.
 
     Every block ends in one counter: `blocks_used`, `blocks_not_used`, `blocks_unreadable`, or
     `late_message`. Of headings `heading_not_valid`, `heading_not_fixed`; of positions
     `position_type_unknown`; the rest is `BlockSplitter`'s and `SolutionJudge`'s.
     """
 
-    def __init__(
-        self,
-        source: str,
-        decoding: SolutionDecoding | None = None,
-        counters: Counter[str] | None = None,
-    ) -> None:
-        self.counters: Counter[str] = Counter() if counters is None else counters
-        self._decoding = decoding or SolutionDecoding()
-        self._splitter = BlockSplitter(self.counters)
-        self._judge = SolutionJudge(source, self._decoding, self.counters)
-        self._cycle = Cycle(self.counters)
-        self._epoch: _Epoch | None = None
-        self._when: tuple[int, int] = (NO_32, NO_16)
-        self._leap_seconds: int | None = None
-        self._heading: tuple[tuple[int, int], float, int] | None = None
-        self._t_seen_ns = 0
+    _when: tuple[int, int] = (NO_32, NO_16)
+    """Of the epoch that is open: time of week (ms) and week."""
+    _leap_seconds: int | None = None
+    _heading: tuple[tuple[int, int], float, int] | None = None
+    """An attitude whose covariance may come: its instant, heading (rad), and when it was seen."""
 
-    @property
-    def refusal(self) -> str:
-        """Why the last epoch gave no fix, by counter name."""
-        return self._judge.refusal
-
-    @property
-    def gga(self) -> bytes:
-        """The last fix as a GGA; empty before one."""
-        return self._judge.gga
+    def _make_splitter(self) -> BlockSplitter:
+        return BlockSplitter(self.counters)
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
-        return self._epoch is not None or self._heading is not None
+        """Whether `silence` would close an epoch, or a heading."""
+        return super().epoch_open or self._heading is not None
 
-    def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
-        """The measurements that `data`, seen at `t_seen_ns`, completes."""
-        self._t_seen_ns = t_seen_ns
-        found: list[Measurement] = []
-        for block in self._splitter.feed(data):
-            self._take(block, found)
-        return found
-
-    def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
-        found: list[Measurement] = []
-        self._close(found, learn=True)
+    def _end(self, found: list[Measurement], *, learn: bool) -> None:
+        super()._end(found, learn=learn)
         self._tell_heading(None, found)
-        return found
-
-    def flush(self) -> list[Measurement]:
-        """The stream ended, or broke: everything that can still be had from what came."""
-        found: list[Measurement] = []
-        for block in self._splitter.finish():
-            self._take(block, found)
-        self._close(found, learn=False)
-        self._tell_heading(None, found)
-        return found
 
     # ----------------------------------------------------------------- blocks to epochs
 
@@ -162,9 +123,7 @@ class SbfDecoder:
 
     def _group(self, block: Block, when: tuple[int, int], found: list[Measurement]) -> bool:
         """Whether a block is taken into an epoch."""
-        if self._cycle.begins_anew(when, block.number):
-            self._close(found, learn=True)
-        elif self._cycle.late(when, block.number):
+        if not self._belongs(when, block.number, found):
             return False
         epoch = self._epoch or _Epoch()
         self._epoch, self._when, epoch.t_seen_ns = epoch, when, self._t_seen_ns
@@ -190,29 +149,23 @@ class SbfDecoder:
             return False
         return True
 
-    def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
-        epoch, self._epoch = self._epoch, None
-        if epoch is None:
-            return
-        self._cycle.close(learn=learn, at_once=at_once)
+    def _solution(self, epoch: _Epoch) -> Solution | None:
         s = epoch.pvt
         if s is None:
-            return
+            return None
         s.t_seen_ns = epoch.t_seen_ns
         s.utc_ns = self._utc(self._when)
         s.utc_known = s.utc_ns is not None
         s.hdop, s.vdop = epoch.hdop, epoch.vdop
         s.sd_ned_m = epoch.sd_ned_m or s.sd_ned_m
         s.sd_v_ned_m_s = epoch.sd_v_ned_m_s
-        found += self._judge.epoch(s)
+        return s
 
     def _utc(self, when: tuple[int, int]) -> int | None:
         tow_ms, week = when
         if tow_ms >= WEEK_S * 1000 or not 0 < week <= LAST_WEEK:
             return None
-        tow_s = tow_ms * 1e-3
-        leap = self._leap_seconds
-        return utc_ns(week, tow_s, leap_seconds(week, tow_s) if leap is None else leap)
+        return utc_as_told(week, tow_ms * 1e-3, self._leap_seconds)
 
     # ----------------------------------------------------------------- fields
 

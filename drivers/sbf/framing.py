@@ -11,13 +11,12 @@ verify, costs its two sync bytes. Source: Septentrio AsteRx SB3 Reference Guide,
 from __future__ import annotations
 
 import binascii
-from collections import Counter
 from typing import NamedTuple
+
+from drivers.splitter import Splitter
 
 MAX_BLOCK = 8192
 """MeasEpoch of 80 channels takes 5 kB; a longer length is a false header."""
-SLICE = 4096
-"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
 SYNC = b"$@"
 _HEADER = 8
 
@@ -30,35 +29,12 @@ class Block(NamedTuple):
     body: bytes
 
 
-class BlockSplitter:
+class BlockSplitter(Splitter[Block]):
     """Bytes in, verified blocks out, whatever the splits.
 
     Counts `sbf_blocks`; refused `sbf_damaged`, `sbf_cut` (the stream ended inside it); and
     `other_bytes`, all that belonged to no good block.
     """
-
-    def __init__(self, counters: Counter[str]) -> None:
-        self.counters = counters
-        self._buffer = bytearray()
-
-    @property
-    def waiting(self) -> int:
-        """Bytes kept until more come."""
-        return len(self._buffer)
-
-    def feed(self, data: bytes) -> list[Block]:
-        """The blocks that `data` completes, in order."""
-        found: list[Block] = []
-        for start in range(0, len(data), SLICE):
-            self._buffer += data[start : start + SLICE]
-            self._scan(found, final=False)
-        return found
-
-    def finish(self) -> list[Block]:
-        """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
-        found: list[Block] = []
-        self._scan(found, final=True)
-        return found
 
     def _scan(self, found: list[Block], *, final: bool) -> None:
         buffer, at = self._buffer, 0

@@ -6,12 +6,11 @@ An epoch closes with NAV-EOE, or as `drivers.cycle` finds.
 from __future__ import annotations
 
 import struct
-from collections import Counter
 
-from drivers.cycle import Cycle
 from drivers.measurements import Measurement, Vector3
 from drivers.nmea.framing import Frame, Item, StreamSplitter
-from drivers.solution import Solution, SolutionDecoding, SolutionJudge
+from drivers.solution import Solution
+from drivers.solution_decoder import SolutionDecoder
 from drivers.ubx.messages import (
     CLASS_NAV,
     COMBINED,
@@ -31,8 +30,8 @@ RTK = {1: 5, 2: 4}
 """Quality of NMEA by carrSoln."""
 
 
-class UbxNavDecoder:
-    """`take` verified frames; `silence` and `flush` end an epoch.
+class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
+    """See `SolutionDecoder`. Who splits the stream himself hands over frames (`take`).
 
     Every NAV frame ends in one counter: `nav_messages`, `nav_unreadable`, `late_message` (its epoch
     was closed), `relposned`, or `ubx_not_used`, which takes all other classes too. Of baselines
@@ -40,33 +39,27 @@ class UbxNavDecoder:
     `SolutionJudge`'s.
     """
 
-    def __init__(self, source: str, decoding: SolutionDecoding, counters: Counter[str]) -> None:
-        self.counters = counters
-        self._judge = SolutionJudge(source, decoding, counters)
-        self._epoch: NavEpoch | None = None
-        self._cycle = Cycle(counters)
-        self._known: tuple[int, int] | None = None
-        """An iTOW, and the UTC that it is."""
+    _known: tuple[int, int] | None = None
+    """An iTOW, and the UTC that it is."""
 
-    @property
-    def refusal(self) -> str:
-        """Why the last epoch gave no fix, by counter name."""
-        return self._judge.refusal
-
-    @property
-    def gga(self) -> bytes:
-        """The last fix as a GGA; empty before one."""
-        return self._judge.gga
-
-    @property
-    def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
-        return self._epoch is not None
+    def _make_splitter(self) -> StreamSplitter:
+        return StreamSplitter(self.counters)
 
     def take(self, raw: bytes, t_seen_ns: int) -> list[Measurement]:
-        """What a frame that `StreamSplitter` verified completes."""
-        kind, payload = raw[3], raw[6:-2]
+        """What a UBX frame that `StreamSplitter` verified completes."""
+        self._t_seen_ns = t_seen_ns
         found: list[Measurement] = []
+        self._frame(raw, found)
+        return found
+
+    def _take(self, item: Item, found: list[Measurement]) -> None:
+        if isinstance(item, Frame) and item.kind == "ubx":
+            self._frame(item.raw, found)
+
+    # ----------------------------------------------------------------- messages to epochs
+
+    def _frame(self, raw: bytes, found: list[Measurement]) -> None:
+        kind, payload = raw[3], raw[6:-2]
         if raw[2] != CLASS_NAV:
             self.counters["ubx_not_used"] += 1
         elif kind == END_OF_EPOCH and len(payload) == 4:
@@ -75,36 +68,19 @@ class UbxNavDecoder:
             if epoch is not None and epoch.itow_ms == int.from_bytes(payload, "little"):
                 self._close(found, learn=False, at_once=True)
         elif kind == RELPOSNED:
-            self._baseline(payload, t_seen_ns, found)
+            self._baseline(payload, found)
         elif kind in MESSAGES:
-            self._group(kind, payload, t_seen_ns, found)
+            self._group(kind, payload, found)
         else:
             self.counters["ubx_not_used"] += 1
-        return found
 
-    def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
-        found: list[Measurement] = []
-        self._close(found, learn=True)
-        return found
-
-    def flush(self) -> list[Measurement]:
-        """The stream ended, or broke."""
-        found: list[Measurement] = []
-        self._close(found, learn=False)
-        return found
-
-    # ----------------------------------------------------------------- messages to epochs
-
-    def _group(self, kind: int, payload: bytes, t_seen_ns: int, found: list[Measurement]) -> None:
+    def _group(self, kind: int, payload: bytes, found: list[Measurement]) -> None:
         _, least, itow_at, take = MESSAGES[kind]
         if len(payload) < least:
             self.counters["nav_unreadable"] += 1
             return
         (itow_ms,) = struct.unpack_from("<I", payload, itow_at)
-        if self._cycle.begins_anew(itow_ms, kind):
-            self._close(found, learn=True)
-        elif self._cycle.late(itow_ms, kind):
+        if not self._belongs(itow_ms, kind, found):
             return
         epoch = self._epoch or NavEpoch(itow_ms)
         try:
@@ -114,22 +90,17 @@ class UbxNavDecoder:
             return
         self._epoch = epoch
         self.counters["nav_messages"] += 1
-        epoch.t_seen_ns = t_seen_ns
+        epoch.t_seen_ns = self._t_seen_ns
         if self._cycle.add(itow_ms, kind):
             self._close(found, learn=False, at_once=True)
 
-    def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
-        epoch, self._epoch = self._epoch, None
-        if epoch is None:
-            return
-        self._cycle.close(learn=learn, at_once=at_once)
+    def _solution(self, epoch: NavEpoch) -> Solution | None:
         epoch.whole()
         if epoch.utc_ns is not None:
             self._known = epoch.itow_ms, epoch.utc_ns
         elif self._known is not None:
             epoch.utc_ns = self._utc_of(epoch.itow_ms)
-        if epoch.rank or epoch.fix is not None:
-            found += self._judge.epoch(_solution(epoch))
+        return _solution(epoch) if epoch.rank or epoch.fix is not None else None
 
     def _utc_of(self, itow_ms: int) -> int | None:
         """UTC of an iTOW by the last one of which it was told; None before one."""
@@ -138,7 +109,7 @@ class UbxNavDecoder:
         since_ms = (itow_ms - self._known[0] + WEEK_MS // 2) % WEEK_MS - WEEK_MS // 2
         return self._known[1] + since_ms * 1_000_000
 
-    def _baseline(self, payload: bytes, t_seen_ns: int, found: list[Measurement]) -> None:
+    def _baseline(self, payload: bytes, found: list[Measurement]) -> None:
         baseline = parse_relposned(payload)
         if baseline is None:
             self.counters["nav_unreadable"] += 1
@@ -152,7 +123,8 @@ class UbxNavDecoder:
         epoch = self._epoch
         if epoch is not None and epoch.itow_ms == baseline.itow_ms and epoch.utc_ns is not None:
             utc_ns = epoch.utc_ns
-        found += self._judge.heading(t_seen_ns, utc_ns, baseline.heading_rad, baseline.sd_rad)
+        yaw_rad, sd_rad = baseline.heading_rad, baseline.sd_rad
+        found += self._judge.heading(self._t_seen_ns, utc_ns, yaw_rad, sd_rad)
 
 
 def _refusal(epoch: NavEpoch) -> str | None:
@@ -186,53 +158,3 @@ def _solution(e: NavEpoch) -> Solution:
         e.hdop,
         e.vdop,
     )
-
-
-class UbxDecoder:
-    """Bytes in, measurements out: `UbxNavDecoder` behind the splitter of a line."""
-
-    def __init__(
-        self,
-        source: str,
-        decoding: SolutionDecoding | None = None,
-        counters: Counter[str] | None = None,
-    ) -> None:
-        self.counters: Counter[str] = Counter() if counters is None else counters
-        self._nav = UbxNavDecoder(source, decoding or SolutionDecoding(), self.counters)
-        self._splitter = StreamSplitter(self.counters)
-        self._t_seen_ns = 0
-
-    @property
-    def refusal(self) -> str:
-        """Why the last epoch gave no fix, by counter name."""
-        return self._nav.refusal
-
-    @property
-    def gga(self) -> bytes:
-        """The last fix as a GGA; empty before one."""
-        return self._nav.gga
-
-    @property
-    def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
-        return self._nav.epoch_open
-
-    def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
-        """The measurements that `data`, seen at `t_seen_ns`, completes."""
-        self._t_seen_ns = t_seen_ns
-        return self._all(self._splitter.feed(data))
-
-    def silence(self) -> list[Measurement]:
-        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
-        return self._nav.silence()
-
-    def flush(self) -> list[Measurement]:
-        """The stream ended, or broke: everything that can still be had from what came."""
-        return [*self._all(self._splitter.finish()), *self._nav.flush()]
-
-    def _all(self, items: list[Item]) -> list[Measurement]:
-        found: list[Measurement] = []
-        for item in items:
-            if isinstance(item, Frame) and item.kind == "ubx":
-                found += self._nav.take(item.raw, self._t_seen_ns)
-        return found

@@ -18,7 +18,7 @@ import numpy as np
 
 from drivers.base import Driver, Emitted
 from drivers.measurements import DeviceEvent, ImuSample, TimeReport
-from drivers.raw.messages import Ephemeris, Klobuchar
+from drivers.raw.messages import NavigationMessage
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
@@ -90,7 +90,7 @@ class Heard:
         if isinstance(item, TimeReport):
             self._clock.report(item)
             return
-        if isinstance(item, Ephemeris | Klobuchar):
+        if isinstance(item, NavigationMessage):
             return  # they have no instant
         instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
         kind.age_s.append((item.t_seen_ns - instant.t_valid_ns) * 1e-9)

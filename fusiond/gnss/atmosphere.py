@@ -154,6 +154,22 @@ def klobuchar_gps(
     return SPEED_OF_LIGHT_M_S * slant * (5e-9 + day)
 
 
+@compiled("UniTuple(f8, 4)(f8, f8, f8, f8)")
+def pierced(
+    ratio: float, lat_rad: float, sin_elevation: float, cos_azimuth: float
+) -> tuple[float, float, float, float]:
+    """Where a ray pierces a layer: sine and cosine of the arc to there, sine of its latitude, and
+    the cosine of the ray's angle from the vertical. `ratio`: earth's radius over the layer's."""
+    se = max(sin_elevation, 0.0)
+    ce = math.sqrt(1.0 - se * se)
+    # The angle at the layer; the arc to its point is pi/2 less this and the elevation.
+    sine = ratio * ce
+    cosine = math.sqrt(1.0 - sine * sine)
+    sin_arc, cos_arc = ce * cosine - se * sine, se * cosine + ce * sine
+    north = math.sin(lat_rad) * cos_arc + math.cos(lat_rad) * sin_arc * cos_azimuth
+    return sin_arc, cos_arc, north, cosine
+
+
 @compiled("f8(f8[::1], f8, f8, f8, f8, f8, f8)")
 def klobuchar_beidou(
     q: Array,
@@ -165,13 +181,8 @@ def klobuchar_beidou(
     sin_azimuth: float,
 ) -> float:
     """Delay in m at B1I; `q` (8,) alpha, beta; BeiDou second of week; receiver's position."""
-    se = max(sin_elevation, 0.0)
-    ce = math.sqrt(1.0 - se * se)
-    # The angle at the layer; the arc to its point is pi/2 less this and the elevation.
-    sine = BEIDOU_RADIUS_M / (BEIDOU_RADIUS_M + LAYER_M) * ce
-    cosine = math.sqrt(1.0 - sine * sine)
-    sin_arc, cos_arc = ce * cosine - se * sine, se * cosine + ce * sine
-    north = math.sin(lat_rad) * cos_arc + math.cos(lat_rad) * sin_arc * cos_azimuth
+    ratio = BEIDOU_RADIUS_M / (BEIDOU_RADIUS_M + LAYER_M)
+    sin_arc, _, north, cosine = pierced(ratio, lat_rad, sin_elevation, cos_azimuth)
     lat = math.asin(north)
     lon = lon_rad + math.asin(sin_arc * sin_azimuth / math.sqrt(1.0 - north * north))
     local = (tow_s + 43200.0 * lon / math.pi) % DAY_S

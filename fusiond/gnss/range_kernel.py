@@ -31,6 +31,7 @@ from fusiond.gnss.atmosphere import (
     slant,
     zenith_delays,
 )
+from fusiond.gnss.bdgim import bdgim
 from fusiond.gnss.ecef import to_geodetic
 from fusiond.gnss.orbit import BDT_BEHIND_GPS_S, satellite_states
 from fusiond.navigation.compiled import compiled
@@ -47,7 +48,7 @@ _NEPERS = 0.1 * math.log(10.0)
 # What the plan says of each row.
 SIGNAL_COLUMNS = 4
 GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE = range(SIGNAL_COLUMNS)
-NO_MODEL, GPS_MODEL, BEIDOU_MODEL = 0.0, 1.0, 2.0
+NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # What the receiver says of each row; NaN where it does not.
 MEASURED_COLUMNS = 5
 PSEUDORANGE, RATE, CNO, SD_PSEUDORANGE, SD_RATE = range(MEASURED_COLUMNS)
@@ -87,8 +88,8 @@ def range_rows(
     """Write (21, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 33), `signals` (n, 4), `measured` (n, 5), `ionosphere` (2, 8): GPS's and
-    BeiDou's coefficients; `noise` (8,).
+    `elements` (n, 33), `signals` (n, 4), `measured` (n, 5), `ionosphere` (3, 49): GPS's and
+    BeiDou's eight coefficients, and the terms of BDGIM; `noise` (8,).
     """
     n = elements.shape[0]
     refused = 0
@@ -145,6 +146,9 @@ def range_rows(
             elif model == BEIDOU_MODEL:
                 bdt = tow - BDT_BEHIND_GPS_S
                 iono = klobuchar_beidou(ionosphere[1], bdt, lat, lon, up, cos_azimuth, sin_azimuth)
+            elif model == BDGIM_MODEL:
+                bdt = tow - BDT_BEHIND_GPS_S
+                iono = bdgim(ionosphere[2], bdt, lat, lon, up, cos_azimuth, sin_azimuth)
             iono *= signals[k, IONO_SCALE]
             iono_sigma = noise[IONO_SHARE] * iono
             if model == NO_MODEL:

@@ -43,6 +43,7 @@ from drivers.raw.messages import (
     System,
 )
 from fusiond.gnss import range_kernel as rk
+from fusiond.gnss.bdgim import TERMS, bdgim_terms
 from fusiond.gnss.group_delay import group_delay
 from fusiond.gnss.orbit import WEEK_S, Orbits
 from fusiond.gnss.store import EphemerisStore
@@ -321,7 +322,7 @@ class RangeModel:
             np.array([self.options.systems.index(s.system) for _, s, _ in chosen], np.int64),
             Orbits.of([e for _, _, e in chosen]),
             np.array(fixed, float).reshape(len(fixed), rk.SIGNAL_COLUMNS),
-            self._ionosphere(),
+            self._ionosphere(epoch),
             tuple(refused),
         )
 
@@ -347,19 +348,24 @@ class RangeModel:
         return outcome
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
-        """Model and scale to the signal's frequency: the system's own, else whichever came."""
+        """Model and scale to the signal's frequency: the system's own, else whichever came. Of
+        BeiDou's two it is BDGIM, which is of the whole earth."""
         have = self.store.ionosphere
         carrier = CARRIER_HZ[signal.system, signal.signal[0]]
+        if self.store.bdgim is not None and (signal.system == "C" or "G" not in have):
+            return rk.BDGIM_MODEL, (GPS_IONO_HZ / carrier) ** 2
         if "C" in have and (signal.system == "C" or "G" not in have):
             return rk.BEIDOU_MODEL, (BEIDOU_IONO_HZ / carrier) ** 2
         if "G" in have:
             return rk.GPS_MODEL, (GPS_IONO_HZ / carrier) ** 2
         return rk.NO_MODEL, (GPS_IONO_HZ / carrier) ** 2
 
-    def _ionosphere(self) -> Array:
-        out = np.zeros((2, 8))
+    def _ionosphere(self, epoch: RawGnssEpoch) -> Array:
+        out = np.zeros((3, TERMS))
         if gps := self.store.ionosphere.get("G"):
-            out[0] = (*gps.alpha, *gps.beta)
+            out[0, :8] = (*gps.alpha, *gps.beta)
         if beidou := self.store.ionosphere.get("C"):
-            out[1] = (*beidou.alpha, *beidou.beta)
+            out[1, :8] = (*beidou.alpha, *beidou.beta)
+        if self.store.bdgim is not None:
+            out[2] = bdgim_terms(self.store.bdgim, epoch.week, epoch.tow_s)
         return out

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from drivers.raw.messages import Ephemeris, Klobuchar, System
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, System
 from fusiond.gnss.orbit import WEEK_S, gps_time
 
 MAX_AGE_S: dict[System, float] = {"G": 7200.0, "E": 14400.0, "C": 7200.0}
@@ -43,14 +43,20 @@ class EphemerisStore:
     def __init__(self) -> None:
         self._kept: dict[tuple[System, int, str], list[Ephemeris]] = {}
         self.ionosphere: dict[System, Klobuchar] = {}
+        self.bdgim: Bdgim | None = None
         self.version = 0
 
     def __len__(self) -> int:
         """Satellites of which an ephemeris is held."""
         return len({key[:2] for key in self._kept})
 
-    def add(self, message: Ephemeris | Klobuchar) -> None:
+    def add(self, message: NavigationMessage) -> None:
         """Take in what a decoder completed; the same again changes only when it was seen."""
+        if isinstance(message, Bdgim):
+            if self.bdgim is None or self.bdgim.alpha != message.alpha:
+                self.version += 1
+            self.bdgim = message
+            return
         if isinstance(message, Klobuchar):
             old = self.ionosphere.get(message.system)
             if old is None or (old.alpha, old.beta) != (message.alpha, message.beta):

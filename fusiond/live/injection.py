@@ -28,7 +28,7 @@ from drivers.measurements import (
     TimeReport,
     WheelSpeed,
 )
-from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, RawGnssEpoch
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.outputs.commands import Inject
 
@@ -105,7 +105,7 @@ class Fault:
             case "drop":
                 return
             case "delay":
-                assert not isinstance(item, Ephemeris | Klobuchar | DeviceEvent)
+                assert not isinstance(item, NavigationMessage | DeviceEvent)
                 delay_ns = round(self.command.size * SECOND_NS)
                 self.held.append((item.t_seen_ns + delay_ns, item))
                 if len(self.held) > MOST_HELD:
@@ -169,7 +169,9 @@ class Fault:
             case Bearing():
                 error = math.radians(self._error(item.t_seen_ns))
                 return replace(item, azimuth_rad=item.azimuth_rad + error)
-            case RawGnssEpoch() | TimeReport() | Ephemeris() | Klobuchar() | DeviceEvent():
+            case RawGnssEpoch() | TimeReport() | DeviceEvent():
+                return item
+            case Ephemeris() | Klobuchar() | Bdgim():
                 return item
 
 

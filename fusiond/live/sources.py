@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.base import Driver, Emitted
 from drivers.inputs import Inputs
 from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
-from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
@@ -110,7 +110,7 @@ class Sources:
             if isinstance(item, TimeReport):
                 self._clock.report(item)
                 return
-            if isinstance(item, Ephemeris | Klobuchar):
+            if isinstance(item, NavigationMessage):
                 self._navigator.learn(item)
                 return
         source = self.all[item.source]

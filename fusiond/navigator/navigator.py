@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.measurements import Measurement
-from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
@@ -171,7 +171,7 @@ class Navigator:
         for aid in felt.aids:
             self.timeline.insert(aid)
 
-    def learn(self, message: Ephemeris | Klobuchar) -> None:
+    def learn(self, message: NavigationMessage) -> None:
         """What a satellite broadcasts, for the raw epochs of the same source."""
         if message.source in self.raw:
             self.raw[message.source].learn(message)

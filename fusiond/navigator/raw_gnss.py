@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
-from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
 from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
@@ -138,7 +138,7 @@ class RawGnss:
         self._counted_ns = -1
         self.refused: Counter[str] = Counter()
 
-    def learn(self, message: Ephemeris | Klobuchar) -> None:
+    def learn(self, message: NavigationMessage) -> None:
         """Keep what a satellite has said."""
         self._store.add(message)
 

@@ -31,7 +31,7 @@ from drivers.measurements import (
     TimeReport,
     UtcStamp,
 )
-from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, RawGnssEpoch
 from fusiond.clock import dates
 from fusiond.clock.clock import Clock
 from fusiond.clock.recorder import (
@@ -288,7 +288,7 @@ class _Replay:
                     reports = self._reports.setdefault(item.source, deque(maxlen=REPORTS))
                     reports.append(self._host.stamp_ns - item.utc_ns)
                 self._clock.report(item)
-            case Ephemeris() | Klobuchar() | RawGnssEpoch():
+            case Ephemeris() | Klobuchar() | Bdgim() | RawGnssEpoch():
                 raise AssertionError("no driver on a CAN bus has raw observations")
             case _:
                 instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)

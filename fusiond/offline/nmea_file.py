@@ -42,8 +42,8 @@ from fusiond.offline.week_rollover import rollover_of
 # A recording may be old; before selective availability ended there was no receiver worth replaying.
 EARLIEST_DATE = date(2000, 5, 1)
 _COMPASS = re.compile(rb"\$[A-Z]{2}HD[GM],")
-_POSITION = re.compile(rb"\$[A-Z]{2}(?:GGA|GNS|RMC),")
-_TIMED = re.compile(rb"\$[A-Z]{2}(?:GGA|GNS|RMC|ZDA),(\d{6}[\d.]*),")
+_POSITION = re.compile(rb"\$[A-Z]{2}(?:GGA|GNS|RMC|GLL),")
+_TIMED = re.compile(rb"\$[A-Z]{2}(?:(?:GGA|GNS|RMC|ZDA),|GLL,(?:[^,]*,){4})(?P<time>\d{6}[\d.]*),")
 _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
 """Counters of what was refused, beside `REFUSALS`, by their ends."""
 
@@ -177,8 +177,8 @@ def _begins(lines: list[bytes]) -> list[int]:
     last = b""
     for number, line in enumerate(lines):
         timed = _TIMED.search(line)
-        if timed is not None and timed[1] != last:
-            last = timed[1]
+        if timed is not None and timed["time"] != last:
+            last = timed["time"]
             found.append(number)
     return found
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from drivers.bestpos.decoder import BestposDecoder
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import Heading, Measurement, MonotonicStamp, PositionFix, UtcStamp
-from drivers.raw.messages import RawGnssEpoch
+from drivers.raw.messages import Bdgim, Ephemeris, NavigationMessage, RawGnssEpoch
 from drivers.raw.rinex import (
     COMPRESSED_LABEL,
     FIRST_LABEL,
@@ -25,7 +26,7 @@ from drivers.raw.rinex import (
 from drivers.raw.rinex_nav import Broadcast, navigation
 from drivers.raw.weeks import GPS_EPOCH_S, WEEK_S, leap_seconds
 from drivers.sbf.decoder import SbfDecoder
-from drivers.solution import REFUSALS, SolutionDecoding
+from drivers.solution import REFUSALS
 from drivers.ubx.decoder import UbxDecoder
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
@@ -180,6 +181,13 @@ def _arrival(epoch: RawGnssEpoch, imu: ImuTable) -> Arrival:
     return Arrival(now, replace(epoch, t_seen_ns=now, stamp=MonotonicStamp(now)))
 
 
+def _kind(message: NavigationMessage) -> tuple[str, str]:
+    """Of which one stands for the next: satellite and message, or the ionosphere's model."""
+    if isinstance(message, Ephemeris):
+        return message.satellite, message.message
+    return ("C", "bdgim") if isinstance(message, Bdgim) else (message.system, "")
+
+
 def _broadcast(records: list[Broadcast], imu: ImuTable) -> list[Arrival]:
     start_ns = round(float(imu.t_s[0]) * 1e9) if len(imu.t_s) else 0
     of_week = is_of_week(imu)
@@ -188,7 +196,7 @@ def _broadcast(records: list[Broadcast], imu: ImuTable) -> list[Arrival]:
     for gps_s, message in sorted(records, key=lambda r: r.gps_s):
         week, tow_s = divmod(gps_s, WEEK_S)
         t_s = tow_s if of_week else gps_s + GPS_EPOCH_S - leap_seconds(int(week), tow_s)
-        kind = getattr(message, "satellite", message.system), getattr(message, "message", "")
+        kind = _kind(message)
         t_ns = start_ns if kind not in known else max(start_ns, round(t_s * 1e9))
         known.add(kind)
         rows.append(Arrival(t_ns, message))

@@ -188,8 +188,8 @@ def summed(sentence: bytes) -> bytes:
     [
         (SENTENCE % (b"GP", b"33.3") + b"\r\n", "without a checksum"),
         (UBX, "UBX frames arrive, but no NMEA: switch on NMEA output"),
-        (summed(SENTENCE % (b"II", b"33.3")), "positions of talker II"),
-        (summed(b"$GPGLL,4712.34,N,00812.34,E,104000.00,A"), "(GLL), but none that counts"),
+        (summed(SENTENCE % (b"LC", b"33.3")), "positions of talker LC"),
+        (summed(b"$GPGSV,1,1,00"), "(GSV), but none that counts"),
         (b'{"class":"VERSION","release":"3.22"}\r\n', "set port to gpsd://HOST"),
         (summed(SENTENCE % (b"GP", b"")), "one sigma of 62 m"),
         (

@@ -16,7 +16,7 @@ class Parser(NamedTuple):
 _NMEA = ("decoder", "epochs", "fields", "time")
 _RAW = ("decoder", "rtcm", "ubx", "weeks")
 _WORDS = ("bcnav", "beidou_words", "bits", "d1", "d2", "decoder", "inav", "lnav", "subframes")
-_SHARED = ("drivers.cycle", "drivers.solution")
+_SHARED = ("drivers.cycle", "drivers.solution", "drivers.solution_decoder", "drivers.splitter")
 _HUB = ("advice", "history", "hub", "schemas", "vehicle")
 
 PARSERS = {

@@ -13,13 +13,13 @@ from typing import Any
 
 from drivers.bestpos.decoder import BestposDecoder
 from drivers.bestpos.framing import log_crc
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import Heading, PositionFix
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.raw.messages import Ephemeris
 from drivers.raw.rinex import ObservationReader, RinexError, version_and_type
 from drivers.raw.rinex_nav import navigation
 from drivers.sbf.decoder import SbfDecoder
-from drivers.solution import SolutionDecoding
 from drivers.ubx.decoder import UbxDecoder
 from tests.drivers.raw.frames import ubx as ubx_frame
 from tests.drivers.sbf.blocks import block

@@ -8,27 +8,14 @@ from collections.abc import Callable, Iterator
 import can
 import numpy as np
 
-from drivers.can.dbc import load_dbc
+from tests.drivers.can.css_module import GOOD, MODULE
 from tests.places import REPOSITORY
 
 CONFIG = REPOSITORY / "config" / "css_164.toml"
 BEGIN_S = 1_760_000_000.0
 RATE_HZ = 100
-MODULE = load_dbc("css_canmod_gps")
-FIX = {
-    "gnss_status": {"FixType": 3, "Satellites": 13},
-    "gnss_time": {"TimeValid": 1, "TimeConfirmed": 1, "Epoch": 0.0},
-    "gnss_pos": {
-        "PositionValid": 1,
-        "Latitude": 56.030215,
-        "Longitude": 10.061796,
-        "PositionAccuracy": 3,
-    },
-    "gnss_altitude": {"AltitudeValid": 1, "Altitude": 127.9, "AltitudeAccuracy": 2},
-    "gnss_attitude": {
-        **dict.fromkeys(("Roll", "RollAccuracy", "Pitch", "PitchAccuracy"), 0),
-        **{"AttitudeValid": 1, "Heading": 227.9, "HeadingAccuracy": 0.2},
-    },
+FIX = GOOD | {
+    "gnss_time": {**GOOD["gnss_time"], "Epoch": 0.0},
     "gnss_speed": {"SpeedValid": 1, "Speed": 12.0, "SpeedAccuracy": 0.2},
 }
 NORTH_DEG_S = 12.0 * math.cos(math.radians(227.9)) / 111_350.0

@@ -64,11 +64,11 @@ def test_fixes_stand_at_gps_second_of_week_or_posix(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("".join(line.partition("*")[0] + "\r\n" for line in log().splitlines()), "without a che"),
-        (log(talker="II"), "positions of talker II"),
+        (log(talker="LC"), "positions of talker LC"),
         (log(rmc=False), "no measurement with a date (RMC or ZDA missing)"),
         (log(DAY.replace(year=1999)), "the receiver's date is 1999-03-24, before 2000-05-01"),
         (log().replace("4712", "4713"), "wrong checksums against 0 sound"),
-        (log(rmc=False, gga=False) + sentence("GPGLL,4712.0,N,00812.0,E,1,A"), "switch on GGA"),
+        (log(rmc=False, gga=False) + sentence("GPGSV,1,1,00"), "switch on GGA"),
         ("\xb5b\x05\x01" * 4, "no NMEA sentence whose checksum is right"),
         ("", "no NMEA sentence whose checksum is right"),
     ],
@@ -76,6 +76,19 @@ def test_fixes_stand_at_gps_second_of_week_or_posix(tmp_path: Path) -> None:
 def test_a_file_without_fixes_says_why(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(TableError, match=re.escape(words)):
         read(tmp_path, text)
+
+
+def test_gll_alone_gives_fixes_by_the_date_of_zda(tmp_path: Path) -> None:
+    """Its time is the fifth field; the epochs of what has none go by it."""
+    lines = []
+    for k in range(SECONDS):
+        when = DAY + timedelta(seconds=k)
+        lines.append(sentence(f"GPZDA,{when:%H%M%S}.00,{when:%d,%m,%Y},00,00"))
+        lines.append(sentence(f"GPGLL,4712.{k:04d},N,00812.0,E,{when:%H%M%S}.00,A,A"))
+        lines.append(sentence("GPVTG,90.0,T,,M,19.4,N,36.0,K"))
+    times, said = read(tmp_path, "".join(lines))
+    assert len(times) == SECONDS - 1
+    assert any(line.startswith("gll_alone: only GLL has a position") for line in said)
 
 
 def test_rmc_alone_gives_fixes_and_says_so(tmp_path: Path) -> None:

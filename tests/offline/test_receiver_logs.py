@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import PositionFix, UtcStamp
-from drivers.solution import SolutionDecoding
 from drivers.ubx.decoder import UbxDecoder
 from fusiond.commands.app import app
 from fusiond.configuration.schema import Config

@@ -6,7 +6,6 @@ import math
 import random
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from drivers.bestpos.decoder import TYPES, BestposDecoder
 from drivers.bestpos.framing import LogSplitter, log_crc
 from drivers.measurements import Heading, Measurement, PositionFix, TimeReport, UtcStamp
+from tests.drivers import solutions
 from tests.drivers.bestpos.logs import (
     PLACE,
     bestnav,
@@ -25,8 +25,8 @@ from tests.drivers.bestpos.logs import (
     novatel,
     unicore,
 )
+from tests.drivers.solutions import UTC_NS, check_refused, check_split_anywhere, fixes
 
-UTC_NS = 1_796_091_269_000_000_000
 GOLDEN = Path(__file__).with_name("golden.log")
 # One of each form, made for this test; each CRC was worked out bit by bit from the polynomial.
 MADE = (
@@ -49,13 +49,7 @@ MADE = (
 
 
 def decoded(*logs: bytes) -> tuple[list[Measurement], BestposDecoder]:
-    decoder = BestposDecoder("gnss")
-    found = [m for each in logs for m in decoder.feed(each, 7)]
-    return found + decoder.flush(), decoder
-
-
-def fixes(found: list[Any]) -> list[PositionFix]:
-    return [m for m in found if isinstance(m, PositionFix)]
+    return solutions.decoded(BestposDecoder, *logs)
 
 
 def bit_by_bit(data: bytes) -> int:
@@ -157,10 +151,7 @@ def test_best_of_an_epoch(first: bytes, second: bytes, quality: int) -> None:
     ],
 )
 def test_refused_by_name(each: bytes, name: str) -> None:
-    found, decoder = decoded(each)
-    assert len(fixes(found)) == (name == "duplicate_epoch")
-    assert decoder.counters[name] == 1
-    assert decoder.refusal == name
+    check_refused(BestposDecoder, each, name)
 
 
 @pytest.mark.parametrize(
@@ -229,12 +220,7 @@ def test_golden_log() -> None:
 
 
 def test_split_anywhere_gives_the_same() -> None:
-    stream = GOLDEN.read_bytes()
-    whole = decoded(stream)
-    for size in (1, 2, 7, 61, 300):
-        pieces = decoded(*(stream[k : k + size] for k in range(0, len(stream), size)))
-        assert pieces[0] == whole[0]
-        assert pieces[1].counters == whole[1].counters
+    check_split_anywhere(BestposDecoder, GOLDEN.read_bytes())
 
 
 SEEDS = (bestpos(), bestvel(), bestnav(), heading(), *MADE)

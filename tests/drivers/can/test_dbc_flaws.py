@@ -12,7 +12,7 @@ import pytest
 
 from drivers.base import PermanentDriverError
 from drivers.can.dbc import SHIPPED, find_signal, load_dbc
-from drivers.can.dbc_flaws import UnreadableError, read_whole, sound_part
+from drivers.can.dbc_flaws import UnreadableError, read_whole, sound_part, unselected
 
 MULTIPLEXED = """VERSION ""
 BU_: A
@@ -29,9 +29,13 @@ SG_MUL_VAL_ 200 V S 2-2;
 
 FLAWS = {
     # As public files have them: opendbc (issues 330, 1422), cantools (issues 150, 301, 504, 734).
-    "standard identifier of 29 bits": (
+    "identifier of 29 bits without its mark": (
         'BO_ 419358976 EEC1: 8 X\n SG_ A : 0|8@1+ (1,0) [0|1] "" X\n',
-        {"EEC1"},
+        set(),
+    ),
+    "identifier of 30 bits": (
+        'BO_ 1075054137 BDB: 8 X\n SG_ A : 0|8@1+ (1,0) [0|1] "" X\n',
+        {"BDB"},
     ),
     "extended identifier of 32 bits": ("BO_ 4294967295 WIDE: 8 X\n", {"WIDE"}),
     "name that begins with a digit": (
@@ -51,6 +55,11 @@ FLAWS = {
     "signal without a bit": (
         'BO_ 1303 FOO: 8 X\n SG_ A : 0|0@1+ (1,0) [0|1] "" X\n',
         {"FOO"},
+    ),
+    "selector in a small letter": (
+        'BO_ 1310 FOO: 8 X\n SG_ S m : 6|2@1+ (1,0) [0|3] "" X\n'
+        ' SG_ A m3 : 0|6@1+ (1,0) [0|1] "" X\n',
+        {"FOO.A"},
     ),
     "multiplexer that cannot be read": (
         'BO_ 1304 FOO: 8 X\n SG_ S M : 0|8@1+ (1;0) [0|1] "" X\n'
@@ -120,8 +129,9 @@ def test_what_is_sound_is_read_as_without_the_flaw(name: str, flaw: str, tmp_pat
     text, left_out = FLAWS[flaw]
     path = tmp_path / "flawed.dbc"
     path.write_text(f"{content(name)}\n{text}", "cp1252")
-    with pytest.raises(Exception):  # noqa: B017, PT011
-        read_whole(path.read_text("cp1252"))
+    if not unselected(path.read_text("cp1252")):
+        with pytest.raises(Exception):  # noqa: B017, PT011
+            read_whole(path.read_text("cp1252"))
     found = load_dbc(str(path))
     expected = told(whole)
     assert {each: told(found)[each] for each in expected} == expected
@@ -140,22 +150,63 @@ def test_who_asks_for_what_is_left_out_hears_why(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "flawed.dbc"
-    texts = [FLAWS[f][0] for f in ("decimal comma", "standard identifier of 29 bits")]
+    texts = [FLAWS[f][0] for f in ("decimal comma", "identifier of 30 bits")]
     texts.append("BO_ 4294967295 IMU_600: 8 X\n")  # of the name of a sound one
     path.write_text("\n".join((content("racelogic_imu04"), *texts)))
     with caplog.at_level(logging.WARNING, "drivers.can.dbc"):
         dbc = load_dbc(str(path))
     assert [record.getMessage().split(": ")[1] for record in caplog.records] == [
         "FOO.A is left out",
-        "EEC1 is left out",
+        "BDB is left out",
         "IMU_600 is left out",
     ]
     find_signal(dbc, "FOO.B", "gyro")
     find_signal(dbc, "IMU_600.YAW_RATE", "gyro")
     with pytest.raises(PermanentDriverError, match=r"gyro: FOO.A cannot be read .* \(0,1>>!<<,0\)"):
         find_signal(dbc, "FOO.A", "gyro")
-    with pytest.raises(PermanentDriverError, match=r"EEC1 cannot be read .* more than 11 bits"):
-        find_signal(dbc, "EEC1.A", "gyro")
+    with pytest.raises(PermanentDriverError, match=r"BDB cannot be read .* more than 11 bits"):
+        find_signal(dbc, "BDB.A", "gyro")
+
+
+def test_an_identifier_of_29_bits_needs_no_mark(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As opendbc, Vector's users and others write it: no standard frame can have it. Its types and
+    attributes are found by the same number, and whoever has all messages so has a file."""
+    marked = content("aceinna_openimu300ri")
+    ids = {m.frame_id for m in load_dbc("aceinna_openimu300ri").messages if m.is_extended_frame}
+    assert len(ids) >= 3
+    bare = marked
+    for can_id in ids:
+        assert str(can_id | 1 << 31) in marked
+        bare = bare.replace(str(can_id | 1 << 31), str(can_id))
+    path = tmp_path / "bare.dbc"
+    path.write_text(bare, "cp1252")
+    with caplog.at_level(logging.WARNING, "drivers.can.dbc"):
+        found = load_dbc(str(path))
+    assert told(found) == told(load_dbc("aceinna_openimu300ri"))
+    (record,) = caplog.records
+    assert "identifiers of more than 11 bits are read as extended: " in record.getMessage()
+    floats = (
+        'BO_ 419358976 EEC1: 8 X\n SG_ A : 0|32@1- (1,0) [0|0] "" X\n'
+        "SIG_VALTYPE_ 419358976 A : 1;\n"
+    )
+    (message,) = sound_part(f'VERSION ""\n{floats}').messages
+    assert (message.frame_id, message.is_extended_frame) == (0x18FEE900, True)
+    assert message.signals[0].is_float
+
+
+def test_a_multiplexed_signal_without_a_selector_is_no_plain_one(tmp_path: Path) -> None:
+    """As in a public file of the PQ platform: it would be read in frames that hold another one."""
+    path = tmp_path / "pq.dbc"
+    path.write_text(
+        'VERSION ""\nBO_ 648 Motor_2: 8 X\n SG_ Torque m3 : 0|6@1+ (10,0) [0|630] "Nm" X\n'
+        ' SG_ Speed : 24|8@1+ (1.28,0) [0|325.12] "km/h" X\n'
+    )
+    dbc = load_dbc(str(path))
+    find_signal(dbc, "Motor_2.Speed", "wheels")
+    with pytest.raises(PermanentDriverError, match="shares its bits with other signals"):
+        find_signal(dbc, "Motor_2.Torque", "wheels")
 
 
 def test_a_file_with_a_byte_order_mark(tmp_path: Path) -> None:

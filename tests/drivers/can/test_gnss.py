@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers.base import PermanentDriverError
-from drivers.can.dbc import load_dbc
 from drivers.can.gnss import CanGnssDecoder, CanGnssDriver, CanGnssOptions
 from drivers.measurements import (
     ArrivalStamp,
@@ -26,6 +25,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from fusiond.configuration.load import load_config
+from tests.drivers.can.css_module import EPOCH_S, GOOD, MODULE
 from tests.drivers.can.served import SECOND, Served, fed, sent
 from tests.patience import until
 from tests.places import REPOSITORY
@@ -33,24 +33,6 @@ from tests.places import REPOSITORY
 DEG = math.pi / 180.0
 NEAREST = 1.0 / math.sqrt(12.0)
 SHIPPED = load_config(REPOSITORY / "config" / "css_164.toml").sources["gnss"].options
-MODULE = load_dbc("css_canmod_gps")
-EPOCH_S = 1_627_275_510.0
-GOOD: dict[str, dict[str, float]] = {
-    "gnss_status": {"FixType": 3, "Satellites": 13},
-    "gnss_time": {"TimeValid": 1, "TimeConfirmed": 1, "Epoch": EPOCH_S},
-    "gnss_pos": {
-        "PositionValid": 1,
-        "Latitude": 56.030215,
-        "Longitude": 10.061796,
-        "PositionAccuracy": 3,
-    },
-    "gnss_altitude": {"AltitudeValid": 1, "Altitude": 127.9, "AltitudeAccuracy": 2},
-    "gnss_attitude": {
-        **dict.fromkeys(("Roll", "RollAccuracy", "Pitch", "PitchAccuracy"), 0),
-        **{"AttitudeValid": 1, "Heading": 227.9, "HeadingAccuracy": 0.2},
-    },
-    "gnss_speed": {"SpeedValid": 1, "Speed": 22.868, "SpeedAccuracy": 0.208},
-}
 
 
 def module(**changes: Any) -> CanGnssDecoder:

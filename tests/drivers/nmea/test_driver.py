@@ -151,7 +151,7 @@ async def test_wrong_baud_rate_is_named(device: Device) -> None:
         (b"\xb5\x62\x01\x07\x00\x00\x08\x19", "silent", "switch on NMEA output"),
         (wire(made("GPGSV,1,1,00,1")), "running", "switch on GGA"),
         (gga(29).partition(b"*")[0] + b"\r\n", "silent", "without a checksum"),
-        (wire(made("IIRMC,021429.00,A,3958.12,N,11619.5,E,1,90,011226,,")), "running", "talker II"),
+        (wire(made("LCRMC,021429.00,A,3958.12,N,11619.5,E,1,90,011226,,")), "running", "talker LC"),
         (wire(made("GNGGA,,,,,,0,00,99.99,,,,,,")), "running", "no fix"),
         (gga(29, quality=6), "running", "dead reckoning"),
         (gga(29, quality=8), "running", "simulates"),

@@ -249,6 +249,18 @@ def test_an_epoch_that_begins_with_rmc_and_pauses() -> None:
     assert line.decoder.counters["rmc_alone"] == 0
 
 
+def test_rmc_takes_no_place_of_a_gga_that_comes_behind_two_pauses() -> None:
+    """RMC, GSA and GGA of one instant, 120 ms apart: while that is learned nothing is RMC's."""
+    line = Line()
+    for rmc, gga in seconds(10, 8, RMC, GGA):
+        line.burst(rmc, after_ms=760)
+        line.burst(GSA, after_ms=120)
+        line.burst(gga, after_ms=120)
+    assert all(f.height_m is not None for f in fixes(line.found))
+    assert line.decoder.counters["rmc_alone"] == 0
+    assert line.velocities[2:] == [True] * (len(line.velocities) - 2)
+
+
 def test_a_velocity_without_a_time_after_a_pause_stays_with_its_own_epoch() -> None:
     """VTG has no time: it belongs to the epoch that is nearer, before it or after."""
     line = Line()

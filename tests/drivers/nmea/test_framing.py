@@ -20,6 +20,8 @@ from drivers.nmea.framing import (
     is_rdss_sentence,
 )
 from drivers.nmea.running_checks import LONGEST_RTCM, RunningCrc24q, RunningFletcher, crc24q
+from tests.drivers.raw import frames
+from tests.drivers.raw.frames import rtcm
 
 
 def nmea(body: str) -> bytes:
@@ -27,17 +29,7 @@ def nmea(body: str) -> bytes:
 
 
 def ubx(payload: bytes, class_id: bytes = b"\x01\x07") -> bytes:
-    covered = class_id + len(payload).to_bytes(2, "little") + payload
-    a = b = 0
-    for byte in covered:
-        a = (a + byte) % 256
-        b = (b + a) % 256
-    return b"\xb5\x62" + covered + bytes([a, b])
-
-
-def rtcm(payload: bytes) -> bytes:
-    frame = b"\xd3" + len(payload).to_bytes(2, "big") + payload
-    return frame + crc24q(frame).to_bytes(3, "big")
+    return frames.ubx(class_id, payload)
 
 
 GGA = b"$GNGGA,021429.00,3958.12345,N,11619.54321,E,4,18,0.62,45.300,M,-9.100,M,1.0,0000*47\r\n"

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from drivers.raw.decoder import RawDecoder
-from drivers.raw.messages import Ephemeris, RawGnssEpoch
+from drivers.raw.messages import Bdgim, Ephemeris, RawGnssEpoch
 from fusiond.gnss.orbit import Orbits
-from tests.drivers.raw.frames import bcnav1, bcnav2, sfrbx
+from tests.drivers.raw.frames import bcnav1, bcnav2, put, sfrbx, with_crc
 from tests.drivers.raw.test_recordings import WALK, decode
 
 B1C, B2A = 6, 8
@@ -20,7 +20,13 @@ B1C, B2A = 6, 8
 def taken(sig: int, frames: list[list[int]], prn: int = 21) -> tuple[list[Any], RawDecoder]:
     decoder = RawDecoder("gnss")
     found = [e for words in frames for e in decoder.feed(sfrbx(3, prn, sig, words), 5)]
-    return found, decoder
+    return [e for e in found if not isinstance(e, Bdgim)], decoder
+
+
+def ionosphere(sig: int, words: list[int]) -> list[Bdgim]:
+    """What a block says of it."""
+    found = RawDecoder("gnss").feed(sfrbx(3, 21, sig, words), 5)
+    return [e for e in found if isinstance(e, Bdgim)]
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +114,43 @@ def test_refused_by_name(sig: int, frames: list[list[int]], name: str) -> None:
     found, decoder = taken(sig, frames)
     assert found == []
     assert decoder.counters[name] == 1
+
+
+ALPHA = (26.25, -2.75, 9.5, 7.75, -11.25, -0.625, 0.75, 1.875, -16.0)
+"""In eighths of a TECU: 10 bits, then 8 each; the fifth is sent without its sign."""
+
+
+def coefficients() -> list[tuple[int, int]]:
+    """Value and bits of each, one behind the other."""
+    sent = [round(8 * (-a if k == 4 else a)) for k, a in enumerate(ALPHA)]
+    return [(value & 0x3FF, 10) if k == 0 else (value & 0xFF, 8) for k, value in enumerate(sent)]
+
+
+@pytest.mark.parametrize("message", ["bcnav1", "bcnav2"])
+def test_ionosphere_bit_by_bit(message: str) -> None:
+    """Page 1 of subframe 3 behind page 6 bits, health 2, flags 3, indices 4, 5 and 22; message 30
+    behind 42 bits of head, clock 69, issue 10 and two delays of 12."""
+    one = message == "bcnav1"
+    total, at, sig = (240, 42, B1C) if one else (264, 145, B2A)
+    bits = put(0, 240, 0, 6, 1) if one else put(put(0, 264, 0, 6, 21), 264, 6, 6, 30)
+    for value, length in coefficients():
+        bits = put(bits, total, at, length, value)
+        at += length
+    assert at == (116 if one else 219)
+    words = with_crc(bits, total, 9)
+    assert ionosphere(sig, words) == [Bdgim("gnss", 5, ALPHA)]
+    ill = put(bits, total, 6 if one else 30, 2, 1)
+    other = put(bits, total, 0, 6, 2) if one else put(bits, total, 6, 6, 31)
+    none = put(bits, total, 42, 74, 0) if one else put(bits, total, 145, 74, 0)
+    for changed in (ill, other, none):
+        assert ionosphere(sig, with_crc(changed, total, 9)) == []
+
+
+def test_the_same_ionosphere_is_told_once() -> None:
+    decoder = RawDecoder("gnss")
+    for words in bcnav2(4) * 3:
+        decoder.feed(sfrbx(3, 21, B2A, words), 5)
+    assert decoder.counters["ionospheres"] == 1
 
 
 def test_b1c_of_the_walk_comes_with_delays() -> None:

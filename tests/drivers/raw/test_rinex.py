@@ -10,7 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.measurements import UtcStamp
-from drivers.raw.messages import CARRIER_HZ, SPEED_OF_LIGHT_M_S, Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.raw.messages import (
+    CARRIER_HZ,
+    SPEED_OF_LIGHT_M_S,
+    Bdgim,
+    Ephemeris,
+    Klobuchar,
+    RawGnssEpoch,
+)
 from drivers.raw.rinex import ObservationReader, RinexError, version_and_type
 from drivers.raw.rinex_nav import Broadcast, navigation
 
@@ -294,6 +301,12 @@ def test_ionosphere() -> None:
     assert isinstance(new.message, Klobuchar)
     assert (new.message.system, new.message.alpha) == ("C", expected)
     assert new.message.beta == (81_920.0, 98_304.0, -65_536.0, -524_290.0)
+    alpha = (26.25, 2.75, 9.5, 7.75, -11.25, -0.625, 0.75, 1.875, 0.5)
+    first = "    2026 12 01 02 00 00" + "".join(f"{v:19.12E}" for v in alpha[:3]) + "\n"
+    text = nav4("> ION C21 CNVX\n", first, row(*alpha[3:7]), row(*alpha[7:]))
+    (third,), counters = records(text)
+    assert third.message == Bdgim("gnss", 0, alpha)
+    assert counters == {"ionospheres": 1}
 
 
 def test_damage_costs_its_record() -> None:

@@ -7,16 +7,16 @@ import random
 from collections import Counter
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import Heading, Measurement, PositionFix, TimeReport, UtcStamp
 from drivers.sbf.decoder import SbfDecoder
 from drivers.sbf.framing import BlockSplitter
-from drivers.solution import SolutionDecoding
+from tests.drivers import solutions
 from tests.drivers.sbf.blocks import (
     NO_NUMBER,
     attitude,
@@ -28,22 +28,14 @@ from tests.drivers.sbf.blocks import (
     pvt,
     receiver_time,
 )
+from tests.drivers.solutions import UTC_NS, check_refused, check_split_anywhere, fixes
 
-UTC_NS = 1_796_091_269_000_000_000
 OLD = SolutionDecoding(earliest_date=date(2010, 1, 1))
 GOLDEN = Path(__file__).with_name("golden.sbf")
 
 
-def decoded(
-    *blocks: bytes, decoding: SolutionDecoding | None = None
-) -> tuple[list[Measurement], SbfDecoder]:
-    decoder = SbfDecoder("gnss", decoding)
-    found = [m for each in blocks for m in decoder.feed(each, 7)]
-    return found + decoder.flush(), decoder
-
-
-def fixes(found: list[Any]) -> list[PositionFix]:
-    return [m for m in found if isinstance(m, PositionFix)]
+def decoded(*blocks: bytes) -> tuple[list[Measurement], SbfDecoder]:
+    return solutions.decoded(SbfDecoder, *blocks)
 
 
 def test_pvt_alone() -> None:
@@ -104,10 +96,7 @@ def test_what_is_not_given() -> None:
     ],
 )
 def test_refused_by_name(each: bytes, name: str) -> None:
-    found, decoder = decoded(each)
-    assert len(fixes(found)) == (name == "duplicate_epoch")
-    assert decoder.counters[name] == 1
-    assert decoder.refusal == name
+    check_refused(SbfDecoder, each, name)
 
 
 def test_leap_seconds() -> None:
@@ -167,12 +156,7 @@ def test_golden_log() -> None:
 
 
 def test_split_anywhere_gives_the_same() -> None:
-    stream = GOLDEN.read_bytes()
-    whole = decoded(stream)
-    for size in (1, 2, 7, 61, 300):
-        pieces = decoded(*(stream[k : k + size] for k in range(0, len(stream), size)))
-        assert pieces[0] == whole[0]
-        assert pieces[1].counters == whole[1].counters
+    check_split_anywhere(SbfDecoder, GOLDEN.read_bytes())
 
 
 SEEDS = (pvt(), covariance(5906), covariance(5908), dop(), receiver_time(), end_of_pvt(),

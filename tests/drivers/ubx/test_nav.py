@@ -7,13 +7,13 @@ import math
 import random
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import pytest
 import pyubx2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.decoding import SolutionDecoding
 from drivers.measurements import (
     ArrivalStamp,
     Heading,
@@ -24,10 +24,11 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.nmea.decoder import NmeaDecoder, NmeaDecoding
-from drivers.solution import SolutionDecoding
 from drivers.ubx.decoder import UbxDecoder
+from tests.drivers import solutions
 from tests.drivers.raw.frames import ubx
 from tests.drivers.raw.test_recordings import MIXED, WALK, read
+from tests.drivers.solutions import check_refused, check_split_anywhere, fixes
 from tests.drivers.ubx.frames import (
     cov,
     dop,
@@ -54,13 +55,7 @@ OLD = SolutionDecoding(earliest_date=date(2014, 1, 1))
 def decoded(
     *frames: bytes, decoding: SolutionDecoding | None = None
 ) -> tuple[list[Measurement], UbxDecoder]:
-    decoder = UbxDecoder("gnss", decoding)
-    found = [m for frame in frames for m in decoder.feed(frame, 7)]
-    return found + decoder.flush(), decoder
-
-
-def fixes(found: list[Any]) -> list[PositionFix]:
-    return [m for m in found if isinstance(m, PositionFix)]
+    return solutions.decoded(UbxDecoder, *frames, decoding=decoding)
 
 
 def test_pvt_alone() -> None:
@@ -149,10 +144,7 @@ def test_velocity_of_sol_is_turned_from_earth_axes() -> None:
     ],
 )
 def test_refused_by_name(frame: bytes, name: str) -> None:
-    found, decoder = decoded(frame)
-    assert len(fixes(found)) == (name == "duplicate_epoch")
-    assert decoder.counters[name] == 1
-    assert decoder.refusal == name
+    check_refused(UbxDecoder, frame, name)
 
 
 @pytest.mark.parametrize(
@@ -318,12 +310,7 @@ def test_sigma_is_that_of_gst() -> None:
 
 @pytest.mark.parametrize("path", [WALK, MIXED], ids=["walk", "zed_f9r"])
 def test_split_at_every_byte_gives_the_same(path: Path) -> None:
-    log = read(path)[:30_000]
-    whole, by_piece = UbxDecoder("gnss", OLD), UbxDecoder("gnss", OLD)
-    found = whole.feed(log, 0) + whole.flush()
-    pieces = [m for k in range(len(log)) for m in by_piece.feed(log[k : k + 1], 0)]
-    assert pieces + by_piece.flush() == found
-    assert by_piece.counters == whole.counters
+    check_split_anywhere(UbxDecoder, read(path)[:30_000], sizes=(1,), decoding=OLD)
 
 
 # --------------------------------------------------------------------------- hostile bytes

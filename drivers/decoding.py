@@ -1,0 +1,22 @@
+"""What any decoder of a GNSS receiver may be told."""
+
+from __future__ import annotations
+
+from datetime import date
+
+from drivers.base import DriverOptions
+
+BUILD_DATE = date(2026, 11, 20)
+"""No receiver can truly report a date before this software was written."""
+
+
+class SolutionDecoding(DriverOptions):
+    """How a receiver's own solutions are taken."""
+
+    heading_offset_deg: float = 0.0
+    """Added to headings: from the antenna baseline to the vehicle's forward axis, clockwise."""
+    earliest_date: date = BUILD_DATE
+    """Dates before it are refused; set it back to read old logs."""
+    allow_simulator: bool = False
+    """Accept positions that the receiver calls simulated or put in by hand (of NMEA quality 7 and
+    8)."""

@@ -1,0 +1,117 @@
+"""What the decoders `ubx`, `bestpos` and `sbf` share: messages of bytes, epochs of messages.
+
+An epoch is closed as `drivers.cycle` finds, and judged by `drivers.solution`. No I/O, no clock.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Hashable, Iterable
+from typing import Generic, TypeVar
+
+from drivers.cycle import Cycle, Name
+from drivers.decoding import SolutionDecoding
+from drivers.measurements import Measurement
+from drivers.solution import Solution, SolutionJudge
+from drivers.splitter import Splitter
+
+Message = TypeVar("Message")
+Epoch = TypeVar("Epoch")
+
+
+class SolutionDecoder(ABC, Generic[Message, Epoch]):
+    """`feed` bytes, get measurements; `flush` at the end of the file.
+
+    Who derives from it splits the bytes, takes messages into `_epoch`, and makes a `Solution` of
+    one that is closed.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        decoding: SolutionDecoding | None = None,
+        counters: Counter[str] | None = None,
+    ) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._decoding = decoding or SolutionDecoding()
+        self._splitter = self._make_splitter()
+        self._judge = SolutionJudge(source, self._decoding, self.counters)
+        self._cycle = Cycle(self.counters)
+        self._epoch: Epoch | None = None
+        self._t_seen_ns = 0
+
+    @property
+    def refusal(self) -> str:
+        """Why the last epoch gave no fix, by counter name."""
+        return self._judge.refusal
+
+    @property
+    def gga(self) -> bytes:
+        """The last fix as a GGA; empty before one."""
+        return self._judge.gga
+
+    @property
+    def epoch_open(self) -> bool:
+        """Whether `silence` would close an epoch."""
+        return self._epoch is not None
+
+    def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
+        """The measurements that `data`, seen at `t_seen_ns`, completes."""
+        self._t_seen_ns = t_seen_ns
+        found: list[Measurement] = []
+        self._take_all(self._splitter.feed(data), found)
+        return found
+
+    def silence(self) -> list[Measurement]:
+        """The line has been silent for longer than any receiver pauses inside an epoch (50 ms)."""
+        found: list[Measurement] = []
+        self._end(found, learn=True)
+        return found
+
+    def flush(self) -> list[Measurement]:
+        """The stream ended, or broke: everything that can still be had from what came."""
+        found: list[Measurement] = []
+        self._take_all(self._splitter.finish(), found)
+        self._end(found, learn=False)
+        return found
+
+    def _take_all(self, messages: Iterable[Message], found: list[Measurement]) -> None:
+        for message in messages:
+            self._take(message, found)
+
+    # ----------------------------------------------------------------- of each protocol
+
+    @abstractmethod
+    def _make_splitter(self) -> Splitter[Message]:
+        """What finds messages; it counts in `self.counters`."""
+
+    @abstractmethod
+    def _take(self, message: Message, found: list[Measurement]) -> None:
+        """Take a message in; what it completes is `found`."""
+
+    @abstractmethod
+    def _solution(self, epoch: Epoch) -> Solution | None:
+        """What a closed epoch says; None where it has no position to judge."""
+
+    # ----------------------------------------------------------------- epochs
+
+    def _belongs(self, key: Hashable, name: Name, found: list[Measurement]) -> bool:
+        """Whether a message of instant `key` goes into the epoch that is open, or a new one; what
+        it closes is `found`."""
+        if self._cycle.begins_anew(key, name):
+            self._close(found, learn=True)
+        return not self._cycle.late(key, name)
+
+    def _close(self, found: list[Measurement], *, learn: bool, at_once: bool = False) -> None:
+        epoch, self._epoch = self._epoch, None
+        if epoch is None:
+            return
+        self._cycle.close(learn=learn, at_once=at_once)
+        solution = self._solution(epoch)
+        if solution is not None:
+            found += self._judge.epoch(solution)
+
+    def _end(self, found: list[Measurement], *, learn: bool) -> None:
+        """No more will come of what is open."""
+        self._close(found, learn=learn)

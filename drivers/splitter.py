@@ -1,0 +1,43 @@
+"""What splitters of byte streams share: any pieces in, verified messages out, memory bounded."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from typing import Generic, TypeVar
+
+SLICE = 4096
+"""Bytes scanned at a time, whatever `feed` gets, so that the buffer stays bounded."""
+
+Message = TypeVar("Message")
+
+
+class Splitter(ABC, Generic[Message]):
+    """A buffer of what is not yet whole. Who derives from it finds messages in it (`_scan`)."""
+
+    def __init__(self, counters: Counter[str] | None = None) -> None:
+        self.counters: Counter[str] = Counter() if counters is None else counters
+        self._buffer = bytearray()
+
+    @property
+    def waiting(self) -> int:
+        """Bytes kept until more come."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages that `data` completes, in order."""
+        found: list[Message] = []
+        for start in range(0, len(data), SLICE):
+            self._buffer += data[start : start + SLICE]
+            self._scan(found, final=False)
+        return found
+
+    def finish(self) -> list[Message]:
+        """End of the stream: what waits for more bytes is incomplete, what is inside it counts."""
+        found: list[Message] = []
+        self._scan(found, final=True)
+        return found
+
+    @abstractmethod
+    def _scan(self, found: list[Message], *, final: bool) -> None:
+        """Take what is whole out of the buffer; all of it when `final`."""
