@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from drivers.rdss.envelope import Carriage
 from drivers.rdss.fraction import FractionUnit
+from drivers.rdss.mail import Mail
 from drivers.rdss.messages import Family, Fix, Outcome
 
 SECOND = 1_000_000_000
@@ -20,7 +22,15 @@ FEEDBACK_NS = 3 * SECOND
 FIX_EXPECTED_NS = 5 * SECOND
 GIVE_UP_NS = 10 * SECOND
 """After the request was written; all three PROTOCOLS 1.5."""
-SPACING_MARGIN_NS = SECOND
+LEAST_MARGIN_NS = SECOND // 10
+"""Over the service frequency, whose clock is the terminal's: a late wake-up of either side (our
+choice). It doubles with each refusal for the spacing."""
+MOST_MARGIN_NS = SECOND
+"""The margin of PROTOCOLS 1.5."""
+WAIT_MARGIN_NS = SECOND
+"""Over a wait that is stated in whole seconds (PROTOCOLS 1.5)."""
+BITS_A_BYTE = 10
+"""On the wire: start, eight, stop."""
 BEAM_POLL_NS = 5 * SECOND
 USABLE_LEVEL = 2
 """Least beam level that carries a transmission (PROTOCOLS 1.2, ZJXX)."""
@@ -52,6 +62,7 @@ class State(StrEnum):
     READY = "ready"
     AWAIT_FEEDBACK = "await_feedback"
     AWAIT_FIX = "await_fix"
+    AWAIT_MESSAGE = "await_message"
     NO_BEAM = "no_beam"
     HOLDING = "holding"
     SUPPRESSED = "suppressed"
@@ -59,6 +70,7 @@ class State(StrEnum):
 
 
 IN_FLIGHT = frozenset({State.AWAIT_FEEDBACK, State.AWAIT_FIX})
+"""A request for a fix."""
 OFFLINE = frozenset({State.CLOSED, State.PROBING})
 
 SendKind = Literal["read", "request"]
@@ -90,6 +102,13 @@ class FixReady:
 
 
 @dataclass(frozen=True, slots=True)
+class MailReady:
+    """A short message that came, or another card's place."""
+
+    mail: Mail
+
+
+@dataclass(frozen=True, slots=True)
 class Notice:
     """What an operator should know."""
 
@@ -97,12 +116,13 @@ class Notice:
     text: str
 
 
-Action = Send | SetBaud | FixReady | Notice
+Action = Send | SetBaud | FixReady | MailReady | Notice
 
 
 @dataclass(frozen=True, slots=True)
 class TerminalOptions:
-    """`bauds` and `families` are tried in order. None: not given, or no limit of our own."""
+    """`bauds` and `families` are tried in order. None: not given, or no limit of our own. `source`
+    is the driver's name."""
 
     bauds: tuple[int, ...] = PROBE_BAUDS
     families: tuple[Family, ...] = ("4.0", "2.1")
@@ -114,6 +134,10 @@ class TerminalOptions:
     suppression_hold_s: float = 600.0
     timeout_s: float = 30.0
     transmit: bool = True
+    message_share: float = 0.5
+    message_expiry_s: float = 3600.0
+    message_carriage: Carriage = "binary"
+    source: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,16 +176,18 @@ ALWAYS = frozenset(
     }
 )
 POSITION_COMMANDS = frozenset({None, "DWSQ", "DWA"})
-INBOUND_COMMANDS = frozenset({"DWSQ", "DWA", "TXSQ", "TXA", "WAA", "WBA", "TCQ"})
+MESSAGE_COMMANDS = frozenset({"TXSQ", "TXA", "TCQ"})
+INBOUND_COMMANDS = MESSAGE_COMMANDS | {"DWSQ", "DWA", "WAA", "WBA"}
 
 DETAIL = {
     State.CLOSED: "line closed",
     State.PROBING: "asking at {baud} baud who is there (family {families})",
     State.NO_CARD: f"no card in the terminal, asking every {POLL_NS // SECOND} s",
     State.CHECKING: "reading beam power",
-    State.READY: "card {card}, {service} s: next request in {due} s, {beams}",
+    State.READY: "card {card}, {service} s: next request in {due} s, {beams}{waiting}",
     State.AWAIT_FEEDBACK: "request sent, awaiting feedback",
     State.AWAIT_FIX: "awaiting the fix asked for {age} s ago",
+    State.AWAIT_MESSAGE: "message written, awaiting feedback{waiting}",
     State.NO_BEAM: f"no beam: {{beams}}, polling every {BEAM_POLL_NS // SECOND} s",
     State.HOLDING: "{why}: next attempt in {hold} s",
     State.SUPPRESSED: "suppressed by the system: not transmitting, for {hold} s unless lifted",

@@ -122,11 +122,15 @@ class PositionRequest:
 
 
 TextEncoding = Literal["chinese", "code", "mixed"]
+"""Chinese characters (GB 2312, two bytes each), digits of 4 bits, or 0xA4 and any bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class TextRequest:
-    """TXSQ, CCTXA: send a short message; `acknowledge` only in 4.0, `category` only in 2.1."""
+    """TXSQ, CCTXA: send a short message; `acknowledge` only in 4.0, `category` only in 2.1.
+
+    `odd`: a code's number of digits is odd, and the last half byte of `payload` means nothing.
+    """
 
     receiver: int
     payload: bytes
@@ -134,6 +138,7 @@ class TextRequest:
     user: int = 0
     acknowledge: bool = False
     category: int = 1
+    odd: bool = False
 
 
 # --------------------------------------------------------------------------- terminal to host
@@ -287,7 +292,10 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """TXXX, BDTXR: a short message received; `minute_of_day` as printed."""
+    """TXXX, BDTXR: a short message received; `minute_of_day` as printed, `odd` as in TextRequest.
+
+    `user` is whom it is for, 0 where the frame does not say (2.1).
+    """
 
     sender: int
     payload: bytes
@@ -295,6 +303,7 @@ class Text:
     user: int = 0
     minute_of_day: int | None = None
     crc_ok: bool = True
+    odd: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ import numpy as np
 from drivers.base import Driver, Emitted
 from drivers.measurements import DeviceEvent, ImuSample, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar
+from drivers.rdss.mail import Mail
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
@@ -83,6 +84,8 @@ class Heard:
         if isinstance(item, DeviceEvent):
             self.events.append(f"{item.code}: {item.text}")
             return
+        if isinstance(item, Mail):
+            return  # whom it is for will have it from the daemon; its counters are told
         kind = self.kinds.setdefault(type(item).__name__, Kind(Values(type(item))))
         kind.count += 1
         kind.values.take(item)

@@ -20,6 +20,7 @@ from drivers.base import Driver, Emitted
 from drivers.inputs import Inputs
 from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.rdss.mail import Mail
 from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import driver_entry_points
@@ -69,6 +70,8 @@ class Sources:
         self.imu = ImuChoice(config.imu, on_event)
         self.on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None] | None = None
         """Hears every measurement with its instant."""
+        self.on_mail: Callable[[Mail], None] = lambda mail: None
+        """Hears of short messages."""
         self.all: dict[str, Source] = {}
         points = driver_entry_points()
         for name, section in config.sources.items():
@@ -112,6 +115,9 @@ class Sources:
                 return
             if isinstance(item, Ephemeris | Klobuchar):
                 self._navigator.learn(item)
+                return
+            if isinstance(item, Mail):
+                self.on_mail(item)
                 return
         source = self.all[item.source]
         source.received += 1

@@ -55,7 +55,7 @@ class Referee(Bench):
             assert not self.forbidden, "a request while suppressed or silent"
             if self.asked_s is not None:
                 apart = self.t - self.asked_s
-                assert apart >= self.card_s + 1 - 1e-6, "closer than the card allows"
+                assert apart >= self.card_s - 1e-6, "closer than the card allows"
                 assert self.settled or apart >= 10 - 1e-6, "two requests in flight"
             self.asked_s, self.settled = self.t, False
         super().hear(message, family)
