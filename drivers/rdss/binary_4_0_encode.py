@@ -204,6 +204,8 @@ def _encode(m: Message) -> bytes:
         case PositionRequest():
             return _encode_position_request(m)
         case TextRequest():
+            if not 0 <= m.receiver <= MAX_USER:
+                raise EncodeError(f"{m.receiver} is no card of family 4.0")
             info = 0x44 if m.encoding == "chinese" else 0x46
             head = bytes((info,)) + m.receiver.to_bytes(3, "big") + _text_bits(m)
             return frame("TXSQ", m.user, head + bytes((m.acknowledge,)) + m.payload)

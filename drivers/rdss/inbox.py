@@ -23,8 +23,8 @@ from drivers.rdss.report import PositionReport, decode_report
 from drivers.rdss.session import Session
 from drivers.rdss.wording import Wording, plain_text
 
-MOST_REMEMBERED = 256
-"""Texts that asked for a receipt: four hours of a card that is sent one a minute (our choice)."""
+MOST_REMEMBERED = 128
+"""Texts that asked for a receipt: two hours of a card that is sent one a minute (our choice)."""
 Seen = tuple[int, int, int]
 """Sender, number, CRC."""
 

@@ -25,8 +25,9 @@ Stage = Literal[
 """`queued`: waits for its turn, or for another attempt. `sent`: the terminal has taken it and a
 receipt is awaited, or none was asked for, and that is its end.
 
-Ends: `delivered` (its receipt came), `unconfirmed` (written as often as it may be, and nobody said
-that it left or arrived), `failed` (refused as often), `expired`, `superseded` (a report, by a newer
+Ends: `delivered` (its receipt came), `unconfirmed` (written as often or as long as it may be, and
+nobody said that it left or arrived), `failed` (refused as often), `expired` (it never left),
+`superseded` (a report, by a newer
 one), `too_long` (for the card), `forbidden` (the card's level allows no message), `no_permission`
 (the terminal says so), `unsayable` (in the terminal's family)."""
 ENDS: frozenset[Stage] = frozenset(

@@ -34,8 +34,8 @@ from drivers.rdss.report import (
 )
 from drivers.rdss.wording import Wording, level_bits, worded
 
-MOST_WAITING = 64
-"""An hour of a card of 60 s; who queues more gets a refusal (our choice)."""
+MOST_WAITING = 32
+"""Half an hour of a card of 60 s; who queues more gets a refusal (our choice)."""
 MOST_ATTEMPTS = 5
 """Of ten messages, each lost with its receipt in three of ten, one in fifty is then told as
 unconfirmed: 1 - 0.7^2 is 0.51, to the fifth 0.03 (our choice)."""
@@ -277,9 +277,9 @@ class Outbox:
         """End what has expired, and queue again what has no receipt."""
         for message in [m for m in self.waiting if m is not self.in_flight]:
             if t_ns >= self._end_ns(message):
-                late = "its receipt did not come" if message.stage == "sent" else message.why
-                stage: Stage = "unconfirmed" if message.stage == "sent" else "expired"
-                self._end(message, stage, late)
+                # Written before: it may have left, or arrived.
+                stage: Stage = "unconfirmed" if message.attempts else "expired"
+                self._end(message, stage, f"its time is over; {message.why or 'never sent'}")
             elif message.stage == "sent" and t_ns >= message.not_before_ns:
                 self.counters["timeout_receipt"] += 1
                 if message.attempts >= MOST_ATTEMPTS:

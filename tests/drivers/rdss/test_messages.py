@@ -124,7 +124,7 @@ def test_a_text_is_sent_and_ends_so() -> None:
 def test_fixes_and_messages_share_the_card_as_configured(share: float, messages: int) -> None:
     b = MailBench(replace(OPTIONS, message_share=share), service_s=10)
     b.run(3)
-    for n in range(40):
+    for n in range(30):
         b.post("x", key=str(n))
     b.run(304)
     times = [t for t, _ in b.bursts]
