@@ -47,7 +47,8 @@ BEAMS_STALE_NS = 30 * SECOND
 BEAM_ATTEMPTS = 3
 """Beam reads without an answer before the terminal is taken not to support them."""
 HINT_SD_M = 10.0
-"""A height better than this is given to the centre: a 10 m horizontal result needs it (1.5)."""
+"""A height better than this is given to the centre, if it is not known what the centre has itself:
+a 10 m horizontal result needs it (1.5)."""
 HINT_AGE_NS = 5 * SECOND
 """A 10 % grade at 72 km/h changes the height by 10 m in this time."""
 TIMEOUTS_ALARM = 3
@@ -92,13 +93,15 @@ class SetBaud:
 @dataclass(frozen=True, slots=True)
 class FixReady:
     """An own fix: its time of day (s, zone unknown), the bound of what the fraction leaves open
-    (s), when its request was written, and whether that gave a height."""
+    (s), when its request was written, whether that gave a height (or a pressure), and the height's
+    sigma where it is known."""
 
     fix: Fix
     time_of_day_s: float
     uncertainty_s: float
     requested_ns: int
     height_given: bool
+    height_sd_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +133,8 @@ class TerminalOptions:
     antenna_height_m: float = 0.0
     height_m: float | None = None
     use_solution_height: bool = True
+    use_barometer: bool = False
+    pressure_unit_pa: float = 1.0
     request_interval_s: float | None = None
     suppression_hold_s: float = 600.0
     timeout_s: float = 30.0

@@ -69,7 +69,12 @@ class RdssOptions(DriverOptions):
     ) = None
     """Ellipsoidal height of the antenna where it is known and constant (a ship)."""
     use_solution_height: bool = True
-    """Give the navigation solution's height to the centre while its sigma is below 10 m."""
+    """Give the navigation solution's height to the centre while it knows it better than the centre
+    does: its sigma is below the `height_sd_m` of the source's `aiding`."""
+    use_barometer: bool = False
+    """Without a height to give, give the pressure of the vehicle's own barometer."""
+    pressure_unit: Literal["Pa", "0.1 Pa"] = "Pa"
+    """Of the pressure in a request: public sources disagree."""
     request_interval_s: PositiveFloat | None = None
     """Wanted spacing of requests; the card's service frequency is never undercut."""
     suppression_hold_s: Annotated[float, Field(ge=60.0)] = 600.0
@@ -124,6 +129,8 @@ class RdssDriver:
                 antenna_height_m=options.antenna_height_m,
                 height_m=options.height_m,
                 use_solution_height=options.use_solution_height,
+                use_barometer=options.use_barometer,
+                pressure_unit_pa=1.0 if options.pressure_unit == "Pa" else 0.1,
                 request_interval_s=options.request_interval_s,
                 suppression_hold_s=options.suppression_hold_s,
                 timeout_s=options.timeout_s,
@@ -155,9 +162,16 @@ class RdssDriver:
             tasks.create_task(serve)
             tasks.create_task(self._keep_time())
 
-    def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
-        """Ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one sigma."""
-        self._terminal.height_hint(height_m, sd_m, t_ns)
+    def height_hint(
+        self, height_m: float, sd_m: float, t_ns: int, centre_sd_m: float | None = None
+    ) -> None:
+        """Ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one sigma;
+        `centre_sd_m` is that of the height that the centre takes by itself, if known."""
+        self._terminal.height.hint(height_m, sd_m, t_ns, centre_sd_m)
+
+    def pressure_hint(self, pressure_pa: float, t_ns: int) -> None:
+        """What the vehicle's own barometer measures."""
+        self._terminal.height.pressure(pressure_pa, t_ns)
 
     def request_now(self, t_ns: int) -> str:
         """Ask for a fix as soon as the card's spacing allows; when, or why not, in words."""
@@ -361,6 +375,7 @@ class RdssDriver:
             float(fix.precision_class_m),
             fix.multi_value,
             ready.height_given,
+            ready.height_sd_m,
         )
 
     def _report_time(self, clock: DeviceClock, t_ns: int) -> None:

@@ -178,6 +178,14 @@ class BeamPower:
     time_difference_beam: int = 0
 
 
+def serving_beam(beams: BeamPower) -> int | None:
+    """The beam that answers, from 1: the one that the terminal names, else the strongest."""
+    if beams.response_beam:
+        return beams.response_beam
+    best = max(beams.levels, default=0)
+    return beams.levels.index(best) + 1 if best else None
+
+
 CARD_FAULTS = {
     7: "card_handling",
     6: "card_id",

@@ -7,6 +7,7 @@ card count whenever they are told. A fix counts once, for the last request writt
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 from drivers.plausible import HEIGHT_M, within
 from drivers.rdss.cycle import (
@@ -154,6 +155,8 @@ class Replies:
             self._faults = test.faults
             actions.append(Notice("rdss_self_test", f"faults: {', '.join(test.faults) or 'none'}"))
         if any(test.levels):  # all zero: not filled in, or no beam, which the next GLZK says
+            said = self._session.beams_said or BeamPower(())
+            self._session.beams_said = replace(said, levels=test.levels)
             self._on_levels(test.levels, t_ns, actions)
         if self._session.permit.lifted_by_self_test(test.inbound_state):
             self._lift(t_ns, actions)
@@ -307,5 +310,6 @@ class Replies:
                 uncertainty,
                 session.pace.requested_ns,
                 session.height_given,
+                session.height_sd_m,
             )
         )

@@ -27,9 +27,9 @@ class Session:
 
     `levels` and `levels_ns`: beam levels and when they were read, `beam_reads` how often they were
     asked for since; `beams_said` is all that was said of the beams last. `answerable`: the last
-    request may still bring a fix; `height_given`: it gave a height. `timeouts`: requests in a row
-    without one. Spacing (`pace`), suppression and silence (`permit`) and messages (`outbox`)
-    outlive the line.
+    request may still bring a fix; `height_given`: it gave a height, of `height_sd_m` where that is
+    known. `timeouts`: requests in a row without one. Spacing (`pace`), suppression and silence
+    (`permit`) and messages (`outbox`) outlive the line.
     """
 
     def __init__(self, options: TerminalOptions, counters: Counter[str]) -> None:
@@ -48,6 +48,7 @@ class Session:
         self.beam_reads = 0
         self.answerable = False
         self.height_given = False
+        self.height_sd_m: float | None = None
         self.timeouts = 0
         self.pace = Pace(options.request_interval_s)
         self.permit = TransmitPermit(options.suppression_hold_s)

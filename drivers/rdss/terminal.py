@@ -103,7 +103,7 @@ class Terminal:
         self._options = options
         self._session = Session(options, self.counters)
         self._replies = Replies(self._session)
-        self._height = HeightSource(options)
+        self.height = HeightSource(options)
         self._t_ns = 0
         self._polls = 0
         self._quiet_until_ns = 0
@@ -148,10 +148,6 @@ class Terminal:
                 session.search(t_ns)
             _DUE[session.state](self, t_ns, actions)
         return actions
-
-    def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
-        """Ellipsoidal height of the terminal's antenna from the navigation solution, one sigma."""
-        self._height.hint(height_m, sd_m, t_ns)
 
     def request_now(self, t_ns: int) -> Notice:
         """An operator asks for a fix: as soon as the card's spacing allows, or why not."""
@@ -399,7 +395,7 @@ class Terminal:
     def _request(self, user: int, family: Family, t_ns: int, actions: list[Action]) -> None:
         session = self._session
         try:
-            request = self._height.request(user, t_ns)
+            request = self.height.request(user, t_ns)
             data = ENCODE[family](request)
         except EncodeError as error:
             session.hold(t_ns, str(error))
@@ -408,7 +404,8 @@ class Terminal:
         self.counters["requested"] += 1
         session.pace.written(t_ns, len(data), self.baud, fix=True)
         session.answerable = True
-        session.height_given = request.height_mode is HeightMode.GIVEN
+        session.height_given = request.height_mode is not HeightMode.NONE
+        session.height_sd_m = self.height.given_sd_m
         session.enter(State.AWAIT_FEEDBACK, t_ns + FEEDBACK_NS)
 
 

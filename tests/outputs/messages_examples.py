@@ -23,6 +23,7 @@ from fusiond.outputs.messages.events import events_message
 from fusiond.outputs.messages.fault import fault_report
 from fusiond.outputs.messages.fleet import of_report
 from fusiond.outputs.messages.health import (
+    BeamHealth,
     OutputHealth,
     SchedulerStatus,
     SourceHealth,
@@ -151,6 +152,7 @@ EXAMPLES: dict[str, Any] = {
                 service=Service.NOMINAL,
                 series={"rdss": Service.NOMINAL},
                 verdict="coloured",
+                beams=BeamHealth(levels=(0, 1, 1, 0, 0, 0), serving=2, time_difference=None),
             ),
         },
         outputs={

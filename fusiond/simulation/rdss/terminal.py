@@ -49,6 +49,7 @@ from drivers.rdss.messages import (
     VersionRequest,
 )
 from drivers.rdss.wording import Wording, level_bits
+from drivers.standard_atmosphere import pressure_height_m
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions
 
@@ -291,6 +292,8 @@ class RdssTerminal:
             self.counters["dropped"] += 1
             return
         given = request.height_m if request.height_mode is HeightMode.GIVEN else None
+        if request.height_mode is HeightMode.ALTIMETER_1 and request.pressure_pa:
+            given = pressure_height_m(request.pressure_pa)  # the weather is the standard's
         fix = self._centre.fix(t_s + o.response_s, given)
         local = self._local(fix.t_s, o.zone_h)
         seconds = local.hour * 3600 + local.minute * 60 + local.second
