@@ -28,6 +28,7 @@ from drivers.rdss.binary_4_0_encode import (
     frame,
 )
 from drivers.rdss.framing import FrameDecoder, checksum
+from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     CARD_FAULTS,
     HARDWARE_FAULTS,
@@ -49,7 +50,6 @@ from drivers.rdss.messages import (
     StopRequest,
     Subordinates,
     Text,
-    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,

@@ -1,13 +1,17 @@
-"""What an RDSS driver hands over of short messages: those that came, and how those sent fare."""
+"""What an RDSS driver hands over of short messages: those that came, and how those sent fare.
+
+It stands by itself: a daemon without a terminal loads no more than this.
+"""
 
 from __future__ import annotations
 
 from typing import Literal
 
 from drivers.immutable import immutable
-from drivers.rdss.messages import TextEncoding
 from drivers.rdss.report import PositionReport
 
+TextEncoding = Literal["chinese", "code", "mixed"]
+"""Chinese characters (GB 2312, two bytes each), digits of 4 bits, or 0xA4 and any bytes."""
 Kind = Literal["text", "report", "receipt"]
 Stage = Literal[
     "queued",
@@ -102,6 +106,14 @@ class FleetFix:
     lon_deg: float
     height_m: float
     precision_class_m: float
+
+
+class MessageRefusedError(ValueError):
+    """A message that cannot be queued; the text says why, `counter` names it."""
+
+    def __init__(self, counter: str, text: str) -> None:
+        super().__init__(text)
+        self.counter = counter
 
 
 Mail = MessageReceived | MessageStage | FleetFix

@@ -13,6 +13,8 @@ from datetime import date
 from enum import IntEnum, StrEnum
 from typing import Literal, Protocol
 
+from drivers.rdss.mail import TextEncoding
+
 Family = Literal["4.0", "2.1"]
 
 FORBIDDEN = frozenset({"JJZH", "ZHSQ", "JMSZ", "CCJMS"})
@@ -121,10 +123,6 @@ class PositionRequest:
     high_altitude: bool = False
 
 
-TextEncoding = Literal["chinese", "code", "mixed"]
-"""Chinese characters (GB 2312, two bytes each), digits of 4 bits, or 0xA4 and any bytes."""
-
-
 @dataclass(frozen=True, slots=True)
 class TextRequest:
     """TXSQ, CCTXA: send a short message; `acknowledge` only in 4.0, `category` only in 2.1.
@@ -177,13 +175,13 @@ class BeamPower:
     response_beam: int = 0
     time_difference_beam: int = 0
 
-
-def serving_beam(beams: BeamPower) -> int | None:
-    """The beam that answers, from 1: the one that the terminal names, else the strongest."""
-    if beams.response_beam:
-        return beams.response_beam
-    best = max(beams.levels, default=0)
-    return beams.levels.index(best) + 1 if best else None
+    @property
+    def serving(self) -> int | None:
+        """The beam that answers, from 1: the one that the terminal names, else the strongest."""
+        if self.response_beam:
+            return self.response_beam
+        best = max(self.levels, default=0)
+        return self.levels.index(best) + 1 if best else None
 
 
 CARD_FAULTS = {

@@ -23,7 +23,7 @@ from drivers.rdss.envelope import (
     sealed,
     text_body,
 )
-from drivers.rdss.mail import Kind, Stage
+from drivers.rdss.mail import Kind, MessageRefusedError, Stage
 from drivers.rdss.messages import Outcome
 from drivers.rdss.report import (
     REPORT,
@@ -52,14 +52,6 @@ BLOCKED = frozenset(
     }
 )
 """What passes by itself, or by somebody: no attempt."""
-
-
-class MessageRefusedError(ValueError):
-    """A message that cannot be queued; the text says why, `counter` names it."""
-
-    def __init__(self, counter: str, text: str) -> None:
-        super().__init__(text)
-        self.counter = counter
 
 
 @dataclass(slots=True)

@@ -44,6 +44,7 @@ from drivers.rdss.cycle import (
 )
 from drivers.rdss.height import HeightSource
 from drivers.rdss.inbox import Inbox
+from drivers.rdss.mail import MessageRefusedError
 from drivers.rdss.messages import (
     BeamPower,
     BeamPowerRequest,
@@ -62,7 +63,7 @@ from drivers.rdss.messages import (
     TextRequest,
     TimeRequest,
 )
-from drivers.rdss.outbox import MessageRefusedError, Outbox, Outgoing
+from drivers.rdss.outbox import Outbox, Outgoing
 from drivers.rdss.probe import ENCODE
 from drivers.rdss.replies import Replies
 from drivers.rdss.report import PositionReport

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable
 
 from drivers.rdss.framing import FrameDecoder, checksum
+from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     ZTI_FAULTS,
     BeamPower,
@@ -30,7 +31,6 @@ from drivers.rdss.messages import (
     SelfTest,
     SelfTestRequest,
     Text,
-    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,

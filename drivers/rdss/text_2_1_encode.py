@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from drivers.rdss.framing import checksum, whole_frame
+from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     FORBIDDEN,
     ZTI_FAULTS,
@@ -24,7 +25,6 @@ from drivers.rdss.messages import (
     SelfTest,
     SelfTestRequest,
     Text,
-    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,

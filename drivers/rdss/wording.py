@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.rdss.messages import TextEncoding
+from drivers.rdss.mail import TextEncoding
 
 PLAIN_BITS = (110, 408, 628, 848)
 ENCRYPTED_BITS = (140, 360, 580, 1680)

@@ -20,7 +20,7 @@ from drivers.base import Driver, Emitted
 from drivers.measurements import DeviceEvent, ImuSample, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar
 from drivers.rdss.mail import Mail
-from drivers.rdss.messages import BeamPower, serving_beam
+from drivers.rdss.messages import BeamPower
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
@@ -202,7 +202,7 @@ def _kind_line(name: str, kind: Kind) -> str:
 def _beams_line(beams: BeamPower) -> str:
     """The power of an RDSS terminal's beams, and which of them serve."""
     levels = " ".join(map(str, beams.levels))
-    serving = serving_beam(beams)
+    serving = beams.serving
     if serving is None:
         return f"beams {levels}: none is heard"
     second = beams.time_difference_beam

@@ -91,9 +91,7 @@ class Daemon:
         if saved is None or "saved" not in config.alignment.heading:
             # A vehicle that stood knows more by what it kept then.
             self._warm.offer(self.navigator)
-        messages = self._messages.load()
-        if messages is not None:
-            self._chain.messaging.resume(messages)
+        messages = self._messages.load(self._chain.messaging)
         self._loaded = Loaded(saved, self._warm.loaded, self.navigator.calibration, messages)
         self.service = ServiceManager()
         self.scheduler = Scheduler(

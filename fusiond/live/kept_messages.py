@@ -12,8 +12,8 @@ from pydantic.dataclasses import dataclass
 
 from drivers.rdss.envelope import Receipted, opened, read_text
 from drivers.rdss.inbox import Inbox
-from drivers.rdss.mail import Kind, Stage
-from drivers.rdss.messages import FieldError, TextEncoding
+from drivers.rdss.mail import Kind, Stage, TextEncoding
+from drivers.rdss.messages import FieldError
 from drivers.rdss.outbox import Outbox, Outgoing
 from drivers.rdss.wording import Wording, plain_text
 from fusiond.outputs.messages.short_message import ShortMessage

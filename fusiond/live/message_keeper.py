@@ -12,10 +12,10 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
-from fusiond.live.kept_messages import KEPT_MESSAGES, KeptBox, KeptMessages
 from fusiond.live.messaging import Messaging
 from fusiond.live.state_keeper import state_file
 from fusiond.navigator.state_file import (
@@ -25,6 +25,9 @@ from fusiond.navigator.state_file import (
     set_aside,
     write_state,
 )
+
+if TYPE_CHECKING:  # a vehicle without a terminal does without them
+    from fusiond.live.kept_messages import KeptBox, KeptMessages
 
 log = logging.getLogger("fusiond")
 
@@ -50,10 +53,13 @@ class MessageKeeper:
         self._error = ""
         self._working: asyncio.Task[None] | None = None
 
-    def load(self) -> KeptMessages | None:
-        """What the last run kept, aged by the time since; None where there is nothing."""
-        if self._path is None:
+    def load(self, messaging: Messaging) -> str | None:
+        """Let messages go on from what the last run kept, aged by the time since; that in JSON,
+        None where there is nothing."""
+        if self._path is None or not os.path.lexists(self._path):
             return None
+        from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+
         try:
             kept = read_state(self._path, KEPT_MESSAGES)
         except DamagedStateError as error:
@@ -67,7 +73,9 @@ class MessageKeeper:
         if utc_ns is not None and kept.utc_s is not None:
             passed_s = max(0.0, utc_ns * 1e-9 - kept.utc_s)
         boxes = {name: _aged(box, passed_s) for name, box in kept.boxes.items()}
-        return replace(kept, boxes=boxes, taken_up_ns=t_ns)
+        kept = replace(kept, boxes=boxes, taken_up_ns=t_ns)
+        messaging.resume(kept)
+        return KEPT_MESSAGES.dump_json(kept).decode()
 
     def keep(self, t_ns: int, messaging: Messaging) -> None:
         """Write what has changed, unless a write is under way; at every tick."""
@@ -112,6 +120,8 @@ def _aged(box: KeptBox, passed_s: float) -> KeptBox:
 
 def _text(kept: KeptMessages) -> bytes:
     """As JSON, with as many of those that nobody was told as a state file has room for."""
+    from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+
     text = KEPT_MESSAGES.dump_json(kept)
     while len(text) > MOST_BYTES - 100 and kept.untold:
         kept = replace(kept, untold=kept.untold[1:])

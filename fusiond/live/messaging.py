@@ -10,15 +10,18 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping
 from math import atan2, degrees, hypot, isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from drivers.rdss.driver import RdssDriver
-from drivers.rdss.mail import FleetFix, Mail, MessageReceived, MessageStage
-from drivers.rdss.outbox import MessageRefusedError
+from drivers.rdss.mail import (
+    FleetFix,
+    Mail,
+    MessageReceived,
+    MessageRefusedError,
+    MessageStage,
+)
 from drivers.rdss.report import DAY_S, PositionReport
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
-from fusiond.live.kept_messages import KeptMessages, kept_box, restore
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.navigation.solution import Solution
 from fusiond.outputs.commands import CommandRefusedError, SendMessage
@@ -26,6 +29,10 @@ from fusiond.outputs.messages.base import Message
 from fusiond.outputs.messages.fleet import FleetMessage, of_centre, of_report
 from fusiond.outputs.messages.short_message import ShortMessage, of_received, of_stage
 from fusiond.outputs.topics import MESSAGE, Topic, fleet
+
+if TYPE_CHECKING:  # a vehicle without a terminal does without them
+    from drivers.rdss.driver import RdssDriver
+    from fusiond.live.kept_messages import KeptMessages
 
 MOST_UNTOLD = 40
 """Messages that a broker has yet to confirm: what a minute of all cards brings at the most."""
@@ -48,7 +55,9 @@ class Messaging:
         self._options = config.position_reports
         self._clock = clock
         self._on_event = on_event
-        self._terminals = {n: d for n, d in drivers.items() if isinstance(d, RdssDriver)}
+        self._terminals: dict[str, RdssDriver] = {
+            name: driver for name, driver in drivers.items() if hasattr(driver, "post_text")
+        }
         self._waiting: deque[tuple[Topic, Message]] = deque()
         self._untold: OrderedDict[int, ShortMessage] = OrderedDict()
         self._serial = 0
@@ -192,6 +201,8 @@ class Messaging:
 
     def state(self, t_ns: int) -> KeptMessages:
         """All that has to outlive the process."""
+        from fusiond.live.kept_messages import KeptMessages, kept_box  # noqa: PLC0415
+
         utc_ns = self._clock.utc_ns(t_ns)
         return KeptMessages(
             self._serial,
@@ -202,6 +213,8 @@ class Messaging:
 
     def resume(self, kept: KeptMessages) -> None:
         """Go on from what the run before has kept, at the instant when that was taken up."""
+        from fusiond.live.kept_messages import restore  # noqa: PLC0415
+
         t_ns = kept.taken_up_ns or 0
         self._serial = max(self._serial, kept.serial)
         for message in kept.untold:

@@ -21,7 +21,6 @@ from drivers.inputs import Inputs
 from drivers.measurements import DeviceEvent, Height, ImuSample, Measurement, TimeReport
 from drivers.raw.messages import Ephemeris, Klobuchar, RawGnssEpoch
 from drivers.rdss.mail import Mail
-from drivers.rdss.messages import BeamPower, serving_beam
 from drivers.standard_atmosphere import standard_pressure_pa
 from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
@@ -280,11 +279,11 @@ class Sources:
 
 
 def _beams(driver: Driver) -> BeamHealth | None:
-    said: BeamPower | None = getattr(driver, "beams", None)
+    said = getattr(driver, "beams", None)
     if said is None:
         return None
     difference = said.time_difference_beam or None
-    return BeamHealth(levels=said.levels, serving=serving_beam(said), time_difference=difference)
+    return BeamHealth(levels=said.levels, serving=said.serving, time_difference=difference)
 
 
 def _satellite(seen: Seen) -> SatelliteHealth:

@@ -273,9 +273,7 @@ async def again(desk: Desk, folder: Path) -> Desk:
     kept, _ = keeper(desk, folder)
     assert await kept.kept(desk.messaging.revision, desk.messaging) == ""
     other = Desk()
-    found = keeper(other, folder)[0].load()
-    assert found is not None
-    other.messaging.resume(found)
+    assert keeper(other, folder)[0].load(other.messaging) is not None
     return other
 
 
@@ -325,9 +323,10 @@ async def test_messages_age_while_nobody_runs(tmp_path: Path) -> None:
     assert state is not None
     assert state.utc_s is not None
     path.write_bytes(KEPT_MESSAGES.dump_json(replace(state, utc_s=state.utc_s - 1000.0)))
-    found = keeper(Desk(), tmp_path)[0].load()
+    found = keeper(desk, tmp_path)[0].load(Desk().messaging)
     assert found is not None
-    assert found.boxes["rdss"].waiting[0].age_s == pytest.approx(1000.0, abs=5.0)
+    aged = KEPT_MESSAGES.validate_json(found)
+    assert aged.boxes["rdss"].waiting[0].age_s == pytest.approx(1000.0, abs=5.0)
 
 
 async def test_a_terminal_that_is_no_more_gives_its_messages_up_and_says_so(tmp_path: Path) -> None:
@@ -336,9 +335,7 @@ async def test_a_terminal_that_is_no_more_gives_its_messages_up_and_says_so(tmp_
     kept, _ = keeper(desk, tmp_path)
     await kept.kept(desk.messaging.revision, desk.messaging)
     other = Desk(("a",))
-    found = keeper(other, tmp_path)[0].load()
-    assert found is not None
-    other.messaging.resume(found)
+    assert keeper(other, tmp_path)[0].load(other.messaging) is not None
     assert [code for _, code, _ in other.events] == ["message_failed"]
 
 
@@ -388,16 +385,14 @@ def test_whatever_lies_there_a_start_outlives_it(tmp_path: Path, data: bytes) ->
         (tmp_path / "v.messages.json").write_bytes(text)
         other = Desk()
         kept, events = keeper(other, tmp_path)
-        found = kept.load()
+        found = kept.load(other.messaging)
         assert (found is None) == (bool(events) and events[0][0] == "messages_damaged")
-        if found is not None:
-            other.messaging.resume(found)
 
 
 def test_a_directory_or_a_pipe_is_put_aside(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "v.messages.json")
     kept, events = keeper(Desk(), tmp_path)
-    assert kept.load() is None
+    assert kept.load(Desk().messaging) is None
     assert events[0][0] == "messages_damaged"
 
 

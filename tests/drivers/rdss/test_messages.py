@@ -24,7 +24,7 @@ from drivers.rdss.envelope import (
     sealed,
     text_body,
 )
-from drivers.rdss.mail import ENDS, FleetFix, MessageReceived
+from drivers.rdss.mail import ENDS, FleetFix, MessageReceived, MessageRefusedError
 from drivers.rdss.messages import (
     Family,
     Feedback,
@@ -36,7 +36,7 @@ from drivers.rdss.messages import (
     Text,
     TextRequest,
 )
-from drivers.rdss.outbox import MOST_ATTEMPTS, MOST_WAITING, Change, MessageRefusedError, Turns
+from drivers.rdss.outbox import MOST_ATTEMPTS, MOST_WAITING, Change, Turns
 from drivers.rdss.report import REPORT, PositionReport, decode_report, encode_report
 from drivers.rdss.wording import Wording, mixed
 from tests.drivers.rdss.bench import FIX, OK, USER, Bench

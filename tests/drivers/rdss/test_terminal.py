@@ -20,7 +20,6 @@ from drivers.rdss.messages import (
     Outcome,
     PositionRequest,
     SelfTest,
-    serving_beam,
 )
 from tests.drivers.rdss.bench import FIX, OK, USER, Bench, say
 
@@ -207,13 +206,13 @@ def test_beams_say_which_one_serves() -> None:
     bench = Bench(levels=(0, 3, 4, 0, 2, 0))
     bench.run(5)
     assert bench.cycle.beams is not None
-    assert serving_beam(bench.cycle.beams) == 3
+    assert bench.cycle.beams.serving == 3
     named = BeamPower((0, 3, 4), response_beam=2, time_difference_beam=3)
-    assert serving_beam(named) == 2
-    assert serving_beam(BeamPower((0, 0))) is None
+    assert named.serving == 2
+    assert BeamPower((0, 0)).serving is None
     bench.say(SelfTest(80.0, levels=(4, 0, 0, 0, 0, 2)))
     bench.run(1)
-    assert serving_beam(bench.cycle.beams) == 1
+    assert bench.cycle.beams.serving == 1
 
 
 # --------------------------------------------------------------------------- which fixes
