@@ -133,8 +133,12 @@ class Pace:
         self._not_before_ns = max(self._not_before_ns, t_ns)
 
     def too_early(self, t_ns: int, stated_s: float | None) -> None:
-        """The terminal refuses a transmission for its spacing: wait, and keep a greater margin."""
-        self.margin_ns = min(2 * self.margin_ns, MOST_MARGIN_NS)
+        """The terminal refuses a transmission for its spacing: wait, and keep a greater margin.
+
+        Not where seconds are left to wait: then somebody else has used the card.
+        """
+        if stated_s is None or stated_s <= 1.0:
+            self.margin_ns = min(2 * self.margin_ns, MOST_MARGIN_NS)
         self.wait(t_ns, stated_s)
 
     def wait(self, t_ns: int, stated_s: float | None) -> None:

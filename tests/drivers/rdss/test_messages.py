@@ -168,6 +168,9 @@ def test_a_fast_card_is_used_as_soon_as_it_and_the_cycle_allow() -> None:
 
 def test_a_terminal_that_finds_it_too_early_gets_a_greater_margin() -> None:
     b = bench(service_s=10)
+    b.answer = lambda _: [(0.1, Feedback(Outcome.FREQUENCY, None, 5.0))]
+    b.run(40)
+    assert b.cycle._session.pace.margin_ns == SECOND // 10, "somebody else has used the card"
     b.answer = lambda _: [(0.1, Feedback(Outcome.FREQUENCY, None, 1.0))]
     b.run(120)
     b.answer = lambda _: [(0.1, OK), (0.5, FIX)]
