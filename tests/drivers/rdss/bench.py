@@ -101,7 +101,8 @@ class Bench:
         replies: Iterable[tuple[float, Message]] = ()
         match message:
             case IdentityRequest():
-                replies = [(0.1, Identity(self.user, self.service_s if self.user else 0))]
+                service_s = self.service_s if self.user else 0
+                replies = [(0.1, Identity(self.user, service_s, comm_level=3))]
             case BeamPowerRequest() if self.answers_beams:
                 replies = [(0.1, BeamPower(self.levels, self.user))]
             case SelfTestRequest():
