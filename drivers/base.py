@@ -18,8 +18,9 @@ from pydantic import BaseModel, ConfigDict
 
 from drivers.measurements import DeviceEvent, Measurement
 from drivers.raw.messages import RawEvent
+from drivers.rdss.mail import Mail
 
-Emitted = Measurement | RawEvent | DeviceEvent
+Emitted = Measurement | RawEvent | DeviceEvent | Mail
 """All that a driver may hand over. A `NavigationMessage` has no stamp: it says itself what it is
 valid for."""
 Emit = Callable[[Emitted], None]

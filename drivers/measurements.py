@@ -126,7 +126,8 @@ class DelayedFix:
 
     `precision_class_m` is the class the centre states (20 or 100 m). `height_m` is what went into
     the solution, not an independent measurement. `multi_value` says two solutions were possible,
-    `height_given` that the height was ours: the request gave it, and it says nothing new.
+    `height_given` that the height was ours: the request gave it, or our barometer's pressure, and
+    it says nothing new; `height_sd_m` is then its sigma, None where that is not known.
     """
 
     source: str
@@ -138,6 +139,7 @@ class DelayedFix:
     precision_class_m: float
     multi_value: bool = False
     height_given: bool = False
+    height_sd_m: float | None = None
 
 
 @immutable()

@@ -19,7 +19,7 @@ from fusiond.recording.channels import InnovationMessage
 
 SHOWN = (
     *("nav", "status", "health", "consistency", "calibration"),
-    *("innovation", "innovations", "event", "events", "reply"),
+    *("innovation", "innovations", "event", "events", "reply", "message", "fleet"),
 )
 """What `fusiond.dashboard.vehicle` takes, beside `online`; `innovation` is a recording's."""
 FILE = Path("fusiond/dashboard/topics.json")

@@ -28,6 +28,7 @@ from drivers.rdss.binary_4_0_encode import (
     frame,
 )
 from drivers.rdss.framing import FrameDecoder, checksum
+from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     CARD_FAULTS,
     HARDWARE_FAULTS,
@@ -49,7 +50,6 @@ from drivers.rdss.messages import (
     StopRequest,
     Subordinates,
     Text,
-    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,
@@ -129,33 +129,37 @@ def _text_kind(payload: bytes, code: bool) -> TextEncoding:
     return "mixed" if payload.startswith(b"\xa4") else "code"
 
 
-def _text_length(bits: int, text: bytes) -> None:
+def _odd_digits(bits: int, text: bytes, encoding: TextEncoding) -> bool:
+    """Whether a code ends with half a byte. FieldError where the length is not the text's."""
     if (bits + 7) // 8 != len(text):
         raise FieldError(f"{bits} bits of text in {len(text)} bytes")
+    return encoding == "code" and 0 < bits % 8 <= 4
 
 
 def _text_request(user: int, p: bytes) -> Message:
     text = p[7:]
-    _text_length(int.from_bytes(p[4:6], "big"), text)
+    encoding = _text_kind(text, bool(p[0] & 2))
     return TextRequest(
         user=user,
         receiver=int.from_bytes(p[1:4], "big"),
         payload=text,
-        encoding=_text_kind(text, bool(p[0] & 2)),
+        encoding=encoding,
         acknowledge=bool(p[6]),
+        odd=_odd_digits(int.from_bytes(p[4:6], "big"), text, encoding),
     )
 
 
 def _text(user: int, p: bytes) -> Message:
     text = p[8:-1]
-    _text_length(int.from_bytes(p[6:8], "big"), text)
+    encoding = _text_kind(text, bool(p[0] & 0x20))
     return Text(
         user=user,
         sender=int.from_bytes(p[1:4], "big"),
         payload=text,
-        encoding=_text_kind(text, bool(p[0] & 0x20)),
+        encoding=encoding,
         minute_of_day=_time(p[4], p[5], 0) // 60,
         crc_ok=p[-1] == 0,
+        odd=_odd_digits(int.from_bytes(p[6:8], "big"), text, encoding),
     )
 
 

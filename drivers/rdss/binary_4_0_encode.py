@@ -177,10 +177,10 @@ def _encode_self_test(m: SelfTest) -> bytes:
     return frame("ZJXX", m.user, head + levels)
 
 
-def _text_bits(payload: bytes) -> bytes:
-    if len(payload) > MAX_TEXT:
-        raise EncodeError(f"{len(payload)} bytes of text: {MAX_TEXT} at most")
-    return (8 * len(payload)).to_bytes(2, "big")
+def _text_bits(m: Text | TextRequest) -> bytes:
+    if len(m.payload) > MAX_TEXT:
+        raise EncodeError(f"{len(m.payload)} bytes of text: {MAX_TEXT} at most")
+    return (8 * len(m.payload) - 4 * m.odd).to_bytes(2, "big")
 
 
 def _encode(m: Message) -> bytes:
@@ -204,13 +204,15 @@ def _encode(m: Message) -> bytes:
         case PositionRequest():
             return _encode_position_request(m)
         case TextRequest():
+            if not 0 <= m.receiver <= MAX_USER:
+                raise EncodeError(f"{m.receiver} is no card of family 4.0")
             info = 0x44 if m.encoding == "chinese" else 0x46
-            head = bytes((info,)) + m.receiver.to_bytes(3, "big") + _text_bits(m.payload)
+            head = bytes((info,)) + m.receiver.to_bytes(3, "big") + _text_bits(m)
             return frame("TXSQ", m.user, head + bytes((m.acknowledge,)) + m.payload)
         case Text():
             info = 0x40 if m.encoding == "chinese" else 0x60
             when = bytes(divmod(m.minute_of_day or 0, 60))
-            head = bytes((info,)) + m.sender.to_bytes(3, "big") + when + _text_bits(m.payload)
+            head = bytes((info,)) + m.sender.to_bytes(3, "big") + when + _text_bits(m)
             return frame("TXXX", m.user, head + m.payload + bytes((not m.crc_ok,)))
         case Identity():
             payload = (

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+from drivers.rdss.envelope import Carriage
 from drivers.rdss.fraction import FractionUnit
+from drivers.rdss.mail import Mail
 from drivers.rdss.messages import Family, Fix, Outcome
 
 SECOND = 1_000_000_000
@@ -20,7 +22,15 @@ FEEDBACK_NS = 3 * SECOND
 FIX_EXPECTED_NS = 5 * SECOND
 GIVE_UP_NS = 10 * SECOND
 """After the request was written; all three PROTOCOLS 1.5."""
-SPACING_MARGIN_NS = SECOND
+LEAST_MARGIN_NS = SECOND // 10
+"""Over the service frequency, whose clock is the terminal's: a late wake-up of either side (our
+choice). It doubles with each refusal for the spacing."""
+MOST_MARGIN_NS = SECOND
+"""The margin of PROTOCOLS 1.5."""
+WAIT_MARGIN_NS = SECOND
+"""Over a wait that is stated in whole seconds (PROTOCOLS 1.5)."""
+BITS_A_BYTE = 10
+"""On the wire: start, eight, stop."""
 BEAM_POLL_NS = 5 * SECOND
 USABLE_LEVEL = 2
 """Least beam level that carries a transmission (PROTOCOLS 1.2, ZJXX)."""
@@ -37,7 +47,8 @@ BEAMS_STALE_NS = 30 * SECOND
 BEAM_ATTEMPTS = 3
 """Beam reads without an answer before the terminal is taken not to support them."""
 HINT_SD_M = 10.0
-"""A height better than this is given to the centre: a 10 m horizontal result needs it (1.5)."""
+"""A height better than this is given to the centre, if it is not known what the centre has itself:
+a 10 m horizontal result needs it (1.5)."""
 HINT_AGE_NS = 5 * SECOND
 """A 10 % grade at 72 km/h changes the height by 10 m in this time."""
 TIMEOUTS_ALARM = 3
@@ -52,6 +63,7 @@ class State(StrEnum):
     READY = "ready"
     AWAIT_FEEDBACK = "await_feedback"
     AWAIT_FIX = "await_fix"
+    AWAIT_MESSAGE = "await_message"
     NO_BEAM = "no_beam"
     HOLDING = "holding"
     SUPPRESSED = "suppressed"
@@ -59,6 +71,7 @@ class State(StrEnum):
 
 
 IN_FLIGHT = frozenset({State.AWAIT_FEEDBACK, State.AWAIT_FIX})
+"""A request for a fix."""
 OFFLINE = frozenset({State.CLOSED, State.PROBING})
 
 SendKind = Literal["read", "request"]
@@ -80,13 +93,22 @@ class SetBaud:
 @dataclass(frozen=True, slots=True)
 class FixReady:
     """An own fix: its time of day (s, zone unknown), the bound of what the fraction leaves open
-    (s), when its request was written, and whether that gave a height."""
+    (s), when its request was written, whether that gave a height (or a pressure), and the height's
+    sigma where it is known."""
 
     fix: Fix
     time_of_day_s: float
     uncertainty_s: float
     requested_ns: int
     height_given: bool
+    height_sd_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MailReady:
+    """A short message that came, or another card's place."""
+
+    mail: Mail
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +119,13 @@ class Notice:
     text: str
 
 
-Action = Send | SetBaud | FixReady | Notice
+Action = Send | SetBaud | FixReady | MailReady | Notice
 
 
 @dataclass(frozen=True, slots=True)
 class TerminalOptions:
-    """`bauds` and `families` are tried in order. None: not given, or no limit of our own."""
+    """`bauds` and `families` are tried in order. None: not given, or no limit of our own. `source`
+    is the driver's name."""
 
     bauds: tuple[int, ...] = PROBE_BAUDS
     families: tuple[Family, ...] = ("4.0", "2.1")
@@ -110,10 +133,16 @@ class TerminalOptions:
     antenna_height_m: float = 0.0
     height_m: float | None = None
     use_solution_height: bool = True
+    use_barometer: bool = False
+    pressure_unit_pa: float = 1.0
     request_interval_s: float | None = None
     suppression_hold_s: float = 600.0
     timeout_s: float = 30.0
     transmit: bool = True
+    message_share: float = 0.5
+    message_expiry_s: float = 3600.0
+    message_carriage: Carriage = "binary"
+    source: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,16 +181,18 @@ ALWAYS = frozenset(
     }
 )
 POSITION_COMMANDS = frozenset({None, "DWSQ", "DWA"})
-INBOUND_COMMANDS = frozenset({"DWSQ", "DWA", "TXSQ", "TXA", "WAA", "WBA", "TCQ"})
+MESSAGE_COMMANDS = frozenset({"TXSQ", "TXA", "TCQ"})
+INBOUND_COMMANDS = MESSAGE_COMMANDS | {"DWSQ", "DWA", "WAA", "WBA"}
 
 DETAIL = {
     State.CLOSED: "line closed",
     State.PROBING: "asking at {baud} baud who is there (family {families})",
     State.NO_CARD: f"no card in the terminal, asking every {POLL_NS // SECOND} s",
     State.CHECKING: "reading beam power",
-    State.READY: "card {card}, {service} s: next request in {due} s, {beams}",
+    State.READY: "card {card}, {service} s: next request in {due} s, {beams}{waiting}",
     State.AWAIT_FEEDBACK: "request sent, awaiting feedback",
     State.AWAIT_FIX: "awaiting the fix asked for {age} s ago",
+    State.AWAIT_MESSAGE: "message written, awaiting feedback{waiting}",
     State.NO_BEAM: f"no beam: {{beams}}, polling every {BEAM_POLL_NS // SECOND} s",
     State.HOLDING: "{why}: next attempt in {hold} s",
     State.SUPPRESSED: "suppressed by the system: not transmitting, for {hold} s unless lifted",

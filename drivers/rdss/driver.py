@@ -1,7 +1,8 @@
 """Driver of a BeiDou RDSS user terminal on a serial line, family 4.0 or 2.1.
 
 Ties the codecs and the request cycle to a `SerialLine`. Emits `DelayedFix` for every own fix,
-`TimeReport` for the terminal's clock, `DeviceEvent` for what an operator should know.
+`TimeReport` for the terminal's clock, `Mail` for short messages and other cards' places,
+`DeviceEvent` for what an operator should know.
 """
 
 from __future__ import annotations
@@ -21,17 +22,24 @@ from drivers.measurements import DelayedFix, DeviceEvent, TimeOfDayStamp, TimeRe
 from drivers.rdss import binary_4_0, text_2_1
 from drivers.rdss.binary_4_0_encode import MAX_ORDINARY_ANTENNA_M, MAX_ORDINARY_HEIGHT_M
 from drivers.rdss.cycle import (
+    BITS_A_BYTE,
     PROBE_BAUDS,
     SECOND,
     Action,
     FixReady,
+    MailReady,
     Notice,
     Send,
     SetBaud,
     TerminalOptions,
 )
+from drivers.rdss.envelope import Carriage
 from drivers.rdss.fraction import FractionUnit
-from drivers.rdss.messages import Decoder, DeviceClock, Family, Message, Unknown
+from drivers.rdss.inbox import Inbox
+from drivers.rdss.mail import MessageStage
+from drivers.rdss.messages import BeamPower, Decoder, DeviceClock, Family, Message, Unknown
+from drivers.rdss.outbox import Outbox
+from drivers.rdss.report import PositionReport
 from drivers.rdss.terminal import Terminal
 from drivers.serial_line import SerialLine
 
@@ -39,7 +47,6 @@ log = logging.getLogger(__name__)
 
 ZONES_H = (0, 8)
 """T is UTC or Beijing time, by vendor; whoever holds the clock finds out which."""
-BITS_A_BYTE = 10
 FRAME_SLACK_NS = SECOND // 2
 """A frame that has begun is overdue after its own length on the wire and this (PROTOCOLS 1.2)."""
 NAMES_LOGGED = 32
@@ -62,13 +69,25 @@ class RdssOptions(DriverOptions):
     ) = None
     """Ellipsoidal height of the antenna where it is known and constant (a ship)."""
     use_solution_height: bool = True
-    """Give the navigation solution's height to the centre while its sigma is below 10 m."""
+    """Give the navigation solution's height to the centre while it knows it better than the centre
+    does: its sigma is below the `height_sd_m` of the source's `aiding`."""
+    use_barometer: bool = False
+    """Without a height to give, give the pressure of the vehicle's own barometer."""
+    pressure_unit: Literal["Pa", "0.1 Pa"] = "Pa"
+    """Of the pressure in a request: public sources disagree."""
     request_interval_s: PositiveFloat | None = None
     """Wanted spacing of requests; the card's service frequency is never undercut."""
     suppression_hold_s: Annotated[float, Field(ge=60.0)] = 600.0
     """After a suppression that nobody lifts, try again after this."""
     transmit: bool = True
     """False: the terminal is read, and never asked for a fix, with which it would transmit."""
+    message_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Of the transmissions that the card allows, what messages have while fixes wait too."""
+    message_expiry_s: PositiveFloat = 3600.0
+    """A message that could not be sent or confirmed for so long is given up."""
+    message_carriage: Carriage = "binary"
+    """How reports, receipts and texts that ask for one are carried: `binary`, `ascii` where only
+    printable characters pass, `bcd` where only digits do."""
     timeout_s: Annotated[float, Field(ge=20.0)] = 30.0
     """Nothing intelligible for this long: look again who is there. Reads go out every 10 s."""
 
@@ -110,10 +129,16 @@ class RdssDriver:
                 antenna_height_m=options.antenna_height_m,
                 height_m=options.height_m,
                 use_solution_height=options.use_solution_height,
+                use_barometer=options.use_barometer,
+                pressure_unit_pa=1.0 if options.pressure_unit == "Pa" else 0.1,
                 request_interval_s=options.request_interval_s,
                 suppression_hold_s=options.suppression_hold_s,
                 timeout_s=options.timeout_s,
                 transmit=options.transmit,
+                message_share=options.message_share,
+                message_expiry_s=options.message_expiry_s,
+                message_carriage=options.message_carriage,
+                source=name,
             ),
             self.counters,
         )
@@ -137,15 +162,83 @@ class RdssDriver:
             tasks.create_task(serve)
             tasks.create_task(self._keep_time())
 
-    def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
-        """Ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one sigma."""
-        self._terminal.height_hint(height_m, sd_m, t_ns)
+    def height_hint(
+        self, height_m: float, sd_m: float, t_ns: int, centre_sd_m: float | None = None
+    ) -> None:
+        """Ellipsoidal height of the terminal's antenna from the solution at `t_ns`, one sigma;
+        `centre_sd_m` is that of the height that the centre takes by itself, if known."""
+        self._terminal.height.hint(height_m, sd_m, t_ns, centre_sd_m)
+
+    def pressure_hint(self, pressure_pa: float, t_ns: int) -> None:
+        """What the vehicle's own barometer measures."""
+        self._terminal.height.pressure(pressure_pa, t_ns)
 
     def request_now(self, t_ns: int) -> str:
         """Ask for a fix as soon as the card's spacing allows; when, or why not, in words."""
         text = self._terminal.request_now(t_ns).text
         self._wake.set()
         return text
+
+    # ------------------------------------------------------------------ short messages
+
+    def post_text(self, key: str, receiver: int, text: str, receipt: bool, t_ns: int) -> None:
+        """Queue a text for a card under the sender's own name for it.
+
+        Raises `MessageRefusedError`.
+        """
+        self._terminal.post_text(key, receiver, text, receipt, t_ns)
+        self._posted(t_ns)
+
+    def post_report(self, key: str, receiver: int, report: PositionReport, t_ns: int) -> None:
+        """Queue a position report, in place of one that waits. Raises `MessageRefusedError`."""
+        self._terminal.post_report(key, receiver, report, t_ns)
+        self._posted(t_ns)
+
+    @property
+    def outbox(self) -> Outbox:
+        """The messages that wait, for whoever keeps them."""
+        return self._terminal.outbox
+
+    @property
+    def inbox(self) -> Inbox:
+        """What is remembered of the messages that came, for whoever keeps it."""
+        return self._terminal.inbox
+
+    @property
+    def card(self) -> int | None:
+        """The card's number, once it is known."""
+        identity = self._terminal.identity
+        return None if identity is None else identity.user or None
+
+    @property
+    def beams(self) -> BeamPower | None:
+        """What the terminal said of its beams last."""
+        return self._terminal.beams
+
+    def _posted(self, t_ns: int) -> None:
+        self.tell_stages(t_ns)
+        self._wake.set()
+
+    def tell_stages(self, t_ns: int) -> None:
+        """Hand over where messages are that have come further."""
+        for change in self.outbox.take_changes():
+            m = change.message
+            wording = m.wordings[0]
+            self._emit(
+                MessageStage(
+                    self.name,
+                    t_ns,
+                    m.key,
+                    m.receiver,
+                    m.kind,
+                    wording.payload,
+                    m.text,
+                    change.stage,
+                    change.why,
+                    m.attempts,
+                    m.receipted is not None,
+                )
+            )
 
     # ------------------------------------------------------------------ line
 
@@ -256,8 +349,11 @@ class RdssDriver:
                     self._listen()
                 case FixReady():
                     self._emit(self._delayed_fix(action, t_ns))
+                case MailReady():
+                    self._emit(action.mail)
                 case Notice():
                     self._notify(t_ns, action.code, action.text)
+        self.tell_stages(t_ns)
 
     def _listen(self) -> None:
         """Start afresh for every family that may speak: what came before means nothing now."""
@@ -279,6 +375,7 @@ class RdssDriver:
             float(fix.precision_class_m),
             fix.multi_value,
             ready.height_given,
+            ready.height_sd_m,
         )
 
     def _report_time(self, clock: DeviceClock, t_ns: int) -> None:

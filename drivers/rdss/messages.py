@@ -13,6 +13,8 @@ from datetime import date
 from enum import IntEnum, StrEnum
 from typing import Literal, Protocol
 
+from drivers.rdss.mail import TextEncoding
+
 Family = Literal["4.0", "2.1"]
 
 FORBIDDEN = frozenset({"JJZH", "ZHSQ", "JMSZ", "CCJMS"})
@@ -121,12 +123,12 @@ class PositionRequest:
     high_altitude: bool = False
 
 
-TextEncoding = Literal["chinese", "code", "mixed"]
-
-
 @dataclass(frozen=True, slots=True)
 class TextRequest:
-    """TXSQ, CCTXA: send a short message; `acknowledge` only in 4.0, `category` only in 2.1."""
+    """TXSQ, CCTXA: send a short message; `acknowledge` only in 4.0, `category` only in 2.1.
+
+    `odd`: a code's number of digits is odd, and the last half byte of `payload` means nothing.
+    """
 
     receiver: int
     payload: bytes
@@ -134,6 +136,7 @@ class TextRequest:
     user: int = 0
     acknowledge: bool = False
     category: int = 1
+    odd: bool = False
 
 
 # --------------------------------------------------------------------------- terminal to host
@@ -171,6 +174,14 @@ class BeamPower:
     user: int = 0
     response_beam: int = 0
     time_difference_beam: int = 0
+
+    @property
+    def serving(self) -> int | None:
+        """The beam that answers, from 1: the one that the terminal names, else the strongest."""
+        if self.response_beam:
+            return self.response_beam
+        best = max(self.levels, default=0)
+        return self.levels.index(best) + 1 if best else None
 
 
 CARD_FAULTS = {
@@ -287,7 +298,10 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """TXXX, BDTXR: a short message received; `minute_of_day` as printed."""
+    """TXXX, BDTXR: a short message received; `minute_of_day` as printed, `odd` as in TextRequest.
+
+    `user` is whom it is for, 0 where the frame does not say (2.1).
+    """
 
     sender: int
     payload: bytes
@@ -295,6 +309,7 @@ class Text:
     user: int = 0
     minute_of_day: int | None = None
     crc_ok: bool = True
+    odd: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,15 @@ them is noticed here.
 
 from __future__ import annotations
 
-from drivers.rdss.cycle import DEFAULT_SERVICE_S, FEEDBACK_NS, SECOND, SPACING_MARGIN_NS
+from drivers.rdss.cycle import (
+    BITS_A_BYTE,
+    DEFAULT_SERVICE_S,
+    FEEDBACK_NS,
+    LEAST_MARGIN_NS,
+    MOST_MARGIN_NS,
+    SECOND,
+    WAIT_MARGIN_NS,
+)
 from drivers.rdss.messages import Feedback, Outcome
 
 
@@ -47,7 +55,7 @@ class TransmitPermit:
         """A request was accepted: the inbound state last read is that of a free terminal."""
         self._inbound_free = self._inbound
 
-    def lifted_by_feedback(self, feedback: Feedback, t_ns: int, requested_ns: int | None) -> bool:
+    def lifted_by_feedback(self, feedback: Feedback, t_ns: int, written_ns: int | None) -> bool:
         """Does this feedback say that transmission is allowed again?
 
         Flag 8 while suppressed is read as "lifted" (one vendor); if it means radio silence, the
@@ -56,7 +64,7 @@ class TransmitPermit:
         """
         if self.granted:
             return False
-        if requested_ns is not None and t_ns - requested_ns <= FEEDBACK_NS:
+        if written_ns is not None and t_ns - written_ns <= FEEDBACK_NS:
             return False
         if feedback.outcome is Outcome.SILENCE_OR_LIFTED:
             return not self.silent
@@ -75,40 +83,67 @@ class TransmitPermit:
 
 
 class Pace:
-    """The spacing of requests: the card's service frequency and one second, at the least.
+    """The spacing of transmissions, requests and messages alike: the card's service frequency, from
+    the last byte of the one before.
 
-    `service_s` is the card's (None: not read yet), `requested_ns` when the last request was
-    written. `asap` waives the wanted interval once, never the card's.
+    `service_s` is the card's (None: not read yet), `requested_ns` when the last request for a fix
+    was written, `written_ns` when the last transmission of any kind. `asap` waives the wanted
+    interval of fixes once, never the card's. The margin is small, and grows when the terminal
+    finds a transmission too early.
     """
 
     def __init__(self, interval_s: float | None) -> None:
         self.service_s: int | None = None
         self.requested_ns: int | None = None
+        self.written_ns: int | None = None
         self.asap = False
+        self.margin_ns = LEAST_MARGIN_NS
         self._interval_ns = int((interval_s or 0.0) * SECOND)
+        self._wire_ns = 0
         self._not_before_ns = 0
 
     @property
-    def due_ns(self) -> int:
-        """When the next request may be written."""
-        if self.requested_ns is None:
-            return self._not_before_ns
-        spacing = (self.service_s or DEFAULT_SERVICE_S) * SECOND + SPACING_MARGIN_NS
-        if not self.asap:
-            spacing = max(spacing, self._interval_ns)
-        return max(self._not_before_ns, self.requested_ns + spacing)
+    def spacing_ns(self) -> int:
+        """From one transmission to the next, at the least."""
+        return (self.service_s or DEFAULT_SERVICE_S) * SECOND + self.margin_ns + self._wire_ns
 
-    def written(self, t_ns: int) -> None:
-        """A request was written."""
-        self.requested_ns, self.asap = t_ns, False
+    @property
+    def free_ns(self) -> int:
+        """When the next transmission may be written."""
+        if self.written_ns is None:
+            return self._not_before_ns
+        return max(self._not_before_ns, self.written_ns + self.spacing_ns)
+
+    @property
+    def due_ns(self) -> int:
+        """When the next request for a fix may be written."""
+        if self.requested_ns is None or self.asap:
+            return self.free_ns
+        return max(self.free_ns, self.requested_ns + self._interval_ns)
+
+    def written(self, t_ns: int, size: int, baud: int, *, fix: bool) -> None:
+        """A transmission of so many bytes was written."""
+        self.written_ns = t_ns
+        self._wire_ns = size * BITS_A_BYTE * SECOND // baud
+        if fix:
+            self.requested_ns, self.asap = t_ns, False
 
     def not_before(self, t_ns: int) -> None:
         """Nothing before this instant."""
         self._not_before_ns = max(self._not_before_ns, t_ns)
 
+    def too_early(self, t_ns: int, stated_s: float | None) -> None:
+        """The terminal refuses a transmission for its spacing: wait, and keep a greater margin.
+
+        Not where seconds are left to wait: then somebody else has used the card.
+        """
+        if stated_s is None or stated_s <= 1.0:
+            self.margin_ns = min(2 * self.margin_ns, MOST_MARGIN_NS)
+        self.wait(t_ns, stated_s)
+
     def wait(self, t_ns: int, stated_s: float | None) -> None:
-        """Not before the stated wait and one second. No wait, or one above twice the service
-        frequency, which nobody can mean, is the service frequency (PROTOCOLS 1.2)."""
+        """Not before the stated wait, of whole seconds, and one second. No wait, or one above twice
+        the service frequency, which nobody can mean, is the service frequency (PROTOCOLS 1.2)."""
         service = self.service_s or DEFAULT_SERVICE_S
         wait_s = stated_s if stated_s is not None and stated_s <= 2 * service else service
-        self.not_before(t_ns + int(wait_s * SECOND) + SPACING_MARGIN_NS)
+        self.not_before(t_ns + int(wait_s * SECOND) + WAIT_MARGIN_NS)

@@ -7,6 +7,7 @@ card count whenever they are told. A fix counts once, for the last request writt
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 from drivers.plausible import HEIGHT_M, within
 from drivers.rdss.cycle import (
@@ -17,6 +18,7 @@ from drivers.rdss.cycle import (
     GIVE_UP_NS,
     IN_FLIGHT,
     INBOUND_COMMANDS,
+    MESSAGE_COMMANDS,
     POLL_NS,
     POSITION_COMMANDS,
     REFUSALS,
@@ -27,6 +29,7 @@ from drivers.rdss.cycle import (
     State,
 )
 from drivers.rdss.fraction import FractionReader
+from drivers.rdss.inbox import Inbox
 from drivers.rdss.messages import (
     BeamPower,
     Family,
@@ -37,6 +40,7 @@ from drivers.rdss.messages import (
     Outcome,
     Request,
     SelfTest,
+    Text,
     Unknown,
 )
 from drivers.rdss.session import Session
@@ -47,6 +51,7 @@ class Replies:
 
     def __init__(self, session: Session) -> None:
         self._session = session
+        self.inbox = Inbox(session)
         self._fraction = FractionReader(session.options.t_fraction)
         self._faults: tuple[str, ...] = ()
         self._refused: Counter[Outcome] = Counter()
@@ -68,6 +73,7 @@ class Replies:
             case Identity():
                 self._on_identity(message, t_ns, family, actions)
             case BeamPower():
+                session.beams_said = message
                 self._on_levels(message.levels, t_ns, actions)
             case SelfTest():
                 self._on_self_test(message, t_ns, actions)
@@ -75,6 +81,8 @@ class Replies:
                 self._on_feedback(message, t_ns, actions)
             case Fix():
                 self._on_fix(message, t_ns, actions)
+            case Text():
+                actions.append(self.inbox.take(message, t_ns))
             case _:
                 pass
         return actions
@@ -97,6 +105,8 @@ class Replies:
             self._refused.clear()
         session.identity = card
         session.pace.service_s = card.service_frequency_s or DEFAULT_SERVICE_S
+        session.outbox.comm_level = card.comm_level
+        session.outbox.spacing_ns = session.pace.spacing_ns
         arrived = probing or changed or session.state is State.NO_CARD
         if arrived or (before and before.service_frequency_s != card.service_frequency_s):
             actions.append(
@@ -145,6 +155,8 @@ class Replies:
             self._faults = test.faults
             actions.append(Notice("rdss_self_test", f"faults: {', '.join(test.faults) or 'none'}"))
         if any(test.levels):  # all zero: not filled in, or no beam, which the next GLZK says
+            said = self._session.beams_said or BeamPower(())
+            self._session.beams_said = replace(said, levels=test.levels)
             self._on_levels(test.levels, t_ns, actions)
         if self._session.permit.lifted_by_self_test(test.inbound_state):
             self._lift(t_ns, actions)
@@ -152,10 +164,12 @@ class Replies:
     def _on_feedback(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> None:
         session = self._session
         outcome = feedback.outcome
-        if session.permit.lifted_by_feedback(feedback, t_ns, session.pace.requested_ns):
+        if session.permit.lifted_by_feedback(feedback, t_ns, session.pace.written_ns):
             self._lift(t_ns, actions)
         elif outcome in ALWAYS:
             self._on_state_of_terminal(outcome, t_ns, actions)
+        elif self._on_message(feedback, t_ns, actions):
+            pass
         elif feedback.command not in POSITION_COMMANDS or session.state not in IN_FLIGHT:
             session.counters["feedback_unmatched"] += 1
             if outcome is Outcome.OK and feedback.command in INBOUND_COMMANDS:
@@ -170,6 +184,34 @@ class Replies:
         else:
             self._on_refusal(feedback, t_ns, actions)
 
+    def _on_message(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> bool:
+        """Whether a feedback is for a message of ours, and what it changes."""
+        session = self._session
+        awaited = session.state is State.AWAIT_MESSAGE
+        outcome = feedback.outcome
+        if not (awaited and feedback.command is None) and feedback.command not in MESSAGE_COMMANDS:
+            return False
+        if not awaited:
+            late = session.outbox.doubtful is not None and outcome is Outcome.OK
+            if late:
+                session.counters["late_feedback"] += 1
+                session.outbox.accepted(t_ns)
+            return late
+        session.enter(State.READY, None)
+        if outcome is Outcome.OK:
+            self._refused.clear()
+            session.permit.accepted()
+            session.outbox.accepted(t_ns)
+            return True
+        session.outbox.refused(outcome, t_ns)
+        session.counters[REFUSALS[outcome].counter] += 1
+        if outcome is Outcome.FREQUENCY:
+            session.pace.too_early(t_ns, feedback.wait_s)
+        elif REFUSALS[outcome].state is State.NO_BEAM:
+            session.levels = ()
+            self._lose_beam(t_ns, actions)
+        return True
+
     def _on_refusal(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> None:
         session = self._session
         outcome = feedback.outcome
@@ -179,7 +221,7 @@ class Replies:
         self._forget_refused()
         session.enter(State.READY, None)
         if outcome is Outcome.FREQUENCY:
-            session.pace.wait(t_ns, feedback.wait_s)
+            session.pace.too_early(t_ns, feedback.wait_s)
         elif refusal.state is State.NO_BEAM:
             session.levels = ()
             self._lose_beam(t_ns, actions)
@@ -196,6 +238,8 @@ class Replies:
     def _on_state_of_terminal(self, outcome: Outcome, t_ns: int, actions: list[Action]) -> None:
         session = self._session
         self._forget_refused()
+        if session.state is State.AWAIT_MESSAGE:
+            session.outbox.refused(outcome, t_ns)
         session.abandon()
         if outcome is Outcome.NO_CARD:
             self._on_no_card(t_ns, actions)
@@ -231,6 +275,9 @@ class Replies:
         session = self._session
         if fix.kind != "own" or session.identity is None or fix.user != session.identity.user:
             session.counters["foreign_fix"] += 1
+            other = self.inbox.place(fix, t_ns)
+            if other is not None:
+                actions.append(other)
             return
         if not session.answerable or session.pace.requested_ns is None:
             session.counters["unsolicited"] += 1
@@ -263,5 +310,6 @@ class Replies:
                 uncertainty,
                 session.pace.requested_ns,
                 session.height_given,
+                session.height_sd_m,
             )
         )

@@ -7,8 +7,17 @@ from __future__ import annotations
 
 from collections import Counter
 
-from drivers.rdss.cycle import GIVE_UP_NS, HOLD_NS, IN_FLIGHT, OFFLINE, State, TerminalOptions
-from drivers.rdss.messages import Family, Identity
+from drivers.rdss.cycle import (
+    GIVE_UP_NS,
+    HOLD_NS,
+    IN_FLIGHT,
+    OFFLINE,
+    SECOND,
+    State,
+    TerminalOptions,
+)
+from drivers.rdss.messages import BeamPower, Family, Identity
+from drivers.rdss.outbox import Outbox, Turns
 from drivers.rdss.permit import Pace, TransmitPermit
 from drivers.rdss.probe import Probe
 
@@ -17,9 +26,10 @@ class Session:
     """State, deadline of the state, and what was read. Instants are monotonic ns.
 
     `levels` and `levels_ns`: beam levels and when they were read, `beam_reads` how often they were
-    asked for since. `answerable`: the last request may still bring a fix; `height_given`: it
-    gave a height. `timeouts`: requests in a
-    row without one. Spacing (`pace`), suppression and silence (`permit`) outlive the line.
+    asked for since; `beams_said` is all that was said of the beams last. `answerable`: the last
+    request may still bring a fix; `height_given`: it gave a height, of `height_sd_m` where that is
+    known. `timeouts`: requests in a row without one. Spacing (`pace`), suppression and silence
+    (`permit`) and messages (`outbox`) outlive the line.
     """
 
     def __init__(self, options: TerminalOptions, counters: Counter[str]) -> None:
@@ -33,14 +43,19 @@ class Session:
         self.probe = Probe(options.bauds, options.families)
         self.next_poll_ns = 0
         self.levels: tuple[int, ...] = ()
+        self.beams_said: BeamPower | None = None
         self.levels_ns: int | None = None
         self.beam_reads = 0
         self.answerable = False
         self.height_given = False
+        self.height_sd_m: float | None = None
         self.timeouts = 0
         self.pace = Pace(options.request_interval_s)
         self.permit = TransmitPermit(options.suppression_hold_s)
         self.hold_why, self.hold_until_ns = "", 0
+        expiry_ns = int(options.message_expiry_s * SECOND)
+        self.outbox = Outbox(counters, expiry_ns, carriage=options.message_carriage)
+        self.turns = Turns(options.message_share)
 
     @property
     def answered(self) -> bool:
@@ -91,6 +106,9 @@ class Session:
         self.enter(State.HOLDING, t_ns)
 
     def abandon(self) -> None:
-        """Stop waiting for the request in flight; the next keeps clear of its late answer."""
+        """Stop waiting for the request in flight, of which the next keeps clear of its late answer,
+        or for the feedback on a message."""
+        if self.state is State.AWAIT_MESSAGE:
+            self.outbox.unanswered()
         if self.state in IN_FLIGHT and self.pace.requested_ns is not None:
             self.pace.not_before(self.pace.requested_ns + GIVE_UP_NS)

@@ -5,13 +5,15 @@ Inputs: `opened`, `closed`, `received`, `tick`, each with the host's monotonic c
 the actions they return, and `next_deadline_ns`, when to call `tick` next. Only `tick` sends.
 
     PROBING ──identity──► CHECKING ──beam >= 2──► READY ──► AWAIT_FEEDBACK ──► AWAIT_FIX ──► READY
+                 │              │                    └────► AWAIT_MESSAGE ──► READY
                  │ no card      │ none                         │ refused
                  ▼              ▼                              ▼
               NO_CARD        NO_BEAM            NO_BEAM, HOLDING, SUPPRESSED, SILENT, READY
 
-What is never sent: a lift of radio silence, an emergency request, a request while another is in
-flight, earlier than the card's service frequency and one second after the one before, while the
-terminal has said that it is suppressed or silent, or at all without the option `transmit`.
+What is never sent: a lift of radio silence, an emergency request; a request or a message while
+another is in flight, earlier than the card's service frequency after the one before, while the
+terminal has said that it is suppressed or silent, or at all without the option `transmit`. Where a
+request and a message both wait, `outbox.Turns` says which goes.
 Figures: PROTOCOLS 1.1 and 1.5.
 """
 
@@ -41,20 +43,30 @@ from drivers.rdss.cycle import (
     TerminalOptions,
 )
 from drivers.rdss.height import HeightSource
+from drivers.rdss.inbox import Inbox
+from drivers.rdss.mail import MessageRefusedError
 from drivers.rdss.messages import (
+    BeamPower,
     BeamPowerRequest,
     EncodeError,
     Family,
+    Feedback,
+    Fix,
     HeightMode,
     Identity,
     IdentityRequest,
     Message,
+    Reply,
     Request,
     SelfTestRequest,
+    Text,
+    TextRequest,
     TimeRequest,
 )
+from drivers.rdss.outbox import Outbox, Outgoing
 from drivers.rdss.probe import ENCODE
 from drivers.rdss.replies import Replies
+from drivers.rdss.report import PositionReport
 from drivers.rdss.session import Session
 
 _POLLS: tuple[Callable[[int], Request], ...] = (
@@ -78,6 +90,13 @@ class Terminal:
     `refused_frequency`, `no_beam`, `not_sent`, `encryption_error`, `crc_error`, `no_permission`,
     `low_battery`, `suppressed`, `silence`, `no_card`; `feedback_unmatched`, `bad_fraction`,
     `height_implausible`, `beams_unknown`, `probes`, `echo`, `before_identity`.
+
+    Of messages: `messages_queued`, `messages_written`, `messages_sent`, `messages_refused`,
+    `messages_received`, `message_<stage>` for each end, `message_<fault>` for what came faulty,
+    `message_repeated`; `timeout_message` (no feedback), `late_feedback`, `timeout_receipt`,
+    `receipt_unmatched`, `receipt_waiting`, `receipt_queue_full`, `receipt_forbidden`, and the
+    refusals above; refused before they were queued: `message_queue_full`, `message_known`,
+    `message_read_only`.
     """
 
     def __init__(self, options: TerminalOptions, counters: Counter[str] | None = None) -> None:
@@ -85,7 +104,7 @@ class Terminal:
         self._options = options
         self._session = Session(options, self.counters)
         self._replies = Replies(self._session)
-        self._height = HeightSource(options)
+        self.height = HeightSource(options)
         self._t_ns = 0
         self._polls = 0
         self._quiet_until_ns = 0
@@ -108,12 +127,15 @@ class Terminal:
     def received(self, message: Message, t_ns: int, family: Family) -> list[Action]:
         """A message that the codec of `family` decoded."""
         self._t_ns = t_ns
+        if isinstance(message, Reply) and not isinstance(message, Feedback | Fix | Text):
+            self._quiet_until_ns = min(self._quiet_until_ns, t_ns)
         return self._replies.take(message, t_ns, family)
 
     def tick(self, t_ns: int) -> list[Action]:
         """Do what is due. Call at `next_deadline_ns` or at any other time."""
         session = self._session
         self._t_ns = t_ns
+        self.outbox.settle(t_ns)
         actions: list[Action] = []
         for _ in State:  # each state hands on at most once in one call
             due = self.next_deadline_ns
@@ -128,10 +150,6 @@ class Terminal:
             _DUE[session.state](self, t_ns, actions)
         return actions
 
-    def height_hint(self, height_m: float, sd_m: float, t_ns: int) -> None:
-        """Ellipsoidal height of the terminal's antenna from the navigation solution, one sigma."""
-        self._height.hint(height_m, sd_m, t_ns)
-
     def request_now(self, t_ns: int) -> Notice:
         """An operator asks for a fix: as soon as the card's spacing allows, or why not."""
         session = self._session
@@ -139,12 +157,44 @@ class Terminal:
         code = "rdss_request"
         if session.state in IN_FLIGHT:
             return Notice(code, "a request is in flight already")
-        if session.state is not State.READY or not self._options.transmit:
+        if session.state not in (State.READY, State.AWAIT_MESSAGE) or not self._options.transmit:
             return Notice(code, f"refused: {self.detail}")
         session.pace.asap = True
         return Notice(code, f"request in {self._seconds_to(session.pace.due_ns)} s")
 
+    def post_text(self, key: str, receiver: int, text: str, receipt: bool, t_ns: int) -> None:
+        """Queue a text for a card. Raises `MessageRefusedError`."""
+        self._post(lambda: self.outbox.post_text(key, receiver, text, receipt, t_ns))
+
+    def post_report(self, key: str, receiver: int, report: PositionReport, t_ns: int) -> None:
+        """Queue a position report for a card. Raises `MessageRefusedError`."""
+        self._post(lambda: self.outbox.post_report(key, receiver, report, t_ns))
+
+    def _post(self, post: Callable[[], None]) -> None:
+        try:
+            if not self._options.transmit:
+                raise MessageRefusedError("message_read_only", "transmit = false: it is only read")
+            post()
+        except MessageRefusedError as error:
+            self.counters[error.counter] += 1
+            raise
+
     # ------------------------------------------------------------------ outputs
+
+    @property
+    def outbox(self) -> Outbox:
+        """The messages that wait."""
+        return self._session.outbox
+
+    @property
+    def inbox(self) -> Inbox:
+        """What is remembered of those that came."""
+        return self._replies.inbox
+
+    @property
+    def beams(self) -> BeamPower | None:
+        """What was last read of the beams, with their levels."""
+        return self._session.beams_said
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -155,6 +205,8 @@ class Terminal:
             due = session.next_poll_ns
             if self._options.transmit:
                 due = min(due, session.pace.due_ns)
+                if session.outbox.next_ns is not None:
+                    due = min(due, max(session.pace.free_ns, session.outbox.next_ns))
             due = max(due, self._quiet_until_ns)
         if due is not None and session.answered:
             due = min(due, session.heard_ns + int(self._options.timeout_s * SECOND))
@@ -194,6 +246,7 @@ class Terminal:
     def detail(self) -> str:
         """What it is doing, in words."""
         session = self._session
+        waiting = len(session.outbox.waiting)
         words = DETAIL[session.state]
         if session.state is State.READY and not self._options.transmit:
             words = READ_ONLY_DETAIL
@@ -203,6 +256,7 @@ class Terminal:
             card=f"{session.identity.user:07d}" if session.identity is not None else "none",
             service=session.pace.service_s,
             beams=session.beams,
+            waiting=f", messages waiting: {waiting}" if waiting else "",
             due=self._seconds_to(session.pace.due_ns),
             age=self._seconds_since(session.pace.requested_ns),
             why=session.hold_why,
@@ -264,7 +318,7 @@ class Terminal:
         elif session.levels_ns is None or t_ns - session.levels_ns > BEAMS_STALE_NS:
             session.proceed(t_ns)
         else:
-            self._request(t_ns, actions)
+            self._transmit(t_ns, actions)
 
     def _due_feedback(self, t_ns: int, actions: list[Action]) -> None:
         self.counters["timeout_feedback"] += 1
@@ -279,6 +333,10 @@ class Terminal:
                 Notice("rdss_no_fixes", f"{TIMEOUTS_ALARM} requests in a row brought no fix")
             )
         session.enter(State.READY, None)
+
+    def _due_message(self, t_ns: int, actions: list[Action]) -> None:
+        self._session.outbox.unanswered()
+        self._session.enter(State.READY, None)
 
     def _due_blocked(self, t_ns: int, actions: list[Action]) -> None:
         """HOLDING, SUPPRESSED and SILENT: reads only, until the hold is over if it has an end."""
@@ -296,24 +354,59 @@ class Terminal:
             session.next_poll_ns if until is None else min(session.next_poll_ns, until)
         )
 
-    # ------------------------------------------------------------------ requests
+    # ------------------------------------------------------------------ requests and messages
 
-    def _request(self, t_ns: int, actions: list[Action]) -> None:
+    def _transmit(self, t_ns: int, actions: list[Action]) -> None:
         session = self._session
         if session.family is None or session.identity is None:
             session.search(t_ns)
             return
+        fix_due = t_ns >= session.pace.due_ns
+        message = session.outbox.next(t_ns) if t_ns >= session.pace.free_ns else None
+        user = session.identity.user
+        if message is not None and (session.turns.message_first or not fix_due):
+            if self._send(message, user, session.family, t_ns, actions):
+                session.turns.took(message=True, other_waits=fix_due)
+        elif fix_due:
+            self._request(user, session.family, t_ns, actions)
+            session.turns.took(message=False, other_waits=message is not None)
+
+    def _send(
+        self, message: Outgoing, user: int, family: Family, t_ns: int, actions: list[Action]
+    ) -> bool:
+        """Write a message; False if it cannot be sent from this card, which is its end."""
+        session = self._session
+        wording = session.outbox.wording(message)
+        if wording is None:
+            return False
+        text = TextRequest(
+            message.receiver, wording.payload, wording.encoding, user, odd=wording.odd
+        )
         try:
-            request = self._height.request(session.identity.user, t_ns)
-            data = ENCODE[session.family](request)
+            data = ENCODE[family](text)
+        except EncodeError as error:
+            session.outbox.unsayable(message, str(error))
+            return False
+        actions.append(Send(data, "request"))
+        session.pace.written(t_ns, len(data), self.baud, fix=False)
+        session.outbox.written(message)
+        session.enter(State.AWAIT_MESSAGE, t_ns + FEEDBACK_NS)
+        return True
+
+    def _request(self, user: int, family: Family, t_ns: int, actions: list[Action]) -> None:
+        session = self._session
+        try:
+            request = self.height.request(user, t_ns)
+            data = ENCODE[family](request)
         except EncodeError as error:
             session.hold(t_ns, str(error))
             return
         actions.append(Send(data, "request"))
         self.counters["requested"] += 1
-        session.pace.written(t_ns)
+        session.pace.written(t_ns, len(data), self.baud, fix=True)
         session.answerable = True
-        session.height_given = request.height_mode is HeightMode.GIVEN
+        session.height_given = request.height_mode is not HeightMode.NONE
+        session.height_sd_m = self.height.given_sd_m
         session.enter(State.AWAIT_FEEDBACK, t_ns + FEEDBACK_NS)
 
 
@@ -324,6 +417,7 @@ _DUE: dict[State, Callable[[Terminal, int, list[Action]], None]] = {
     State.READY: Terminal._due_ready,
     State.AWAIT_FEEDBACK: Terminal._due_feedback,
     State.AWAIT_FIX: Terminal._due_fix,
+    State.AWAIT_MESSAGE: Terminal._due_message,
     State.NO_BEAM: Terminal._due_beams,
     State.HOLDING: Terminal._due_blocked,
     State.SUPPRESSED: Terminal._due_blocked,

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable
 
 from drivers.rdss.framing import FrameDecoder, checksum
+from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     ZTI_FAULTS,
     BeamPower,
@@ -30,7 +31,6 @@ from drivers.rdss.messages import (
     SelfTest,
     SelfTestRequest,
     Text,
-    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,
@@ -264,26 +264,28 @@ def _self_test(f: Fields) -> Message | None:
     )
 
 
-def _text_payload(field: str, encoding: TextEncoding) -> bytes:
-    """Code and mixed text is printed as hex; Chinese text stands as it is."""
+def _text_payload(field: str, encoding: TextEncoding) -> tuple[bytes, bool]:
+    """Code and mixed text is printed as hex, of a code perhaps an odd number of digits; Chinese
+    text stands as it is."""
     if encoding == "chinese":
-        return field.encode("latin-1")
-    return bytes.fromhex(field)
+        return field.encode("latin-1"), False
+    odd = encoding == "code" and len(field) % 2 == 1
+    return bytes.fromhex(field + "0" * odd), odd
 
 
 def _text_request(f: Fields) -> Message:
     _count(f, 4)
     encoding = ENCODINGS[_int(f[2], 0, 2)]
-    return TextRequest(
-        _user(f[0]), _text_payload(f[3], encoding), encoding, category=_int(f[1], 0, 9)
-    )
+    payload, odd = _text_payload(f[3], encoding)
+    return TextRequest(_user(f[0]), payload, encoding, category=_int(f[1], 0, 9), odd=odd)
 
 
 def _text(f: Fields) -> Message:
     _count(f, 5)
     encoding = ENCODINGS[_int(f[2], 0, 2)]
     when = int(_time(f[3] + "00")) // 60 if f[3] else None
-    return Text(_user(f[1]), _text_payload(f[4], encoding), encoding, minute_of_day=when)
+    payload, odd = _text_payload(f[4], encoding)
+    return Text(_user(f[1]), payload, encoding, minute_of_day=when, odd=odd)
 
 
 def _identity_request(f: Fields) -> Message:

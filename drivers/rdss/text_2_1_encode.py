@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from drivers.rdss.framing import checksum, whole_frame
+from drivers.rdss.mail import TextEncoding
 from drivers.rdss.messages import (
     FORBIDDEN,
     ZTI_FAULTS,
@@ -24,7 +25,6 @@ from drivers.rdss.messages import (
     SelfTest,
     SelfTestRequest,
     Text,
-    TextEncoding,
     TextRequest,
     TimeRequest,
     Unknown,
@@ -128,10 +128,13 @@ def _encode_self_test(m: SelfTest) -> bytes:
     return sentence("BDZTI", text.encode())
 
 
-def _hex_text(payload: bytes, encoding: TextEncoding) -> bytes:
-    if encoding == "chinese" and b"," in payload:
-        raise EncodeError("a comma in a Chinese text would end the field")
-    return payload if encoding == "chinese" else payload.hex().upper().encode()
+def _printed(m: Text | TextRequest) -> bytes:
+    if m.encoding == "chinese":
+        if b"," in m.payload:
+            raise EncodeError("a comma in a Chinese text would end the field")
+        return m.payload
+    digits = m.payload.hex().upper().encode()
+    return digits[:-1] if m.odd else digits
 
 
 def _encode(m: Message) -> bytes:
@@ -156,7 +159,7 @@ def _encode(m: Message) -> bytes:
             return sentence("CCDWA", text.encode())
         case TextRequest():
             head = f"{m.receiver:07d},{m.category},{ENCODINGS.index(m.encoding)},"
-            return sentence("CCTXA", head.encode() + _hex_text(m.payload, m.encoding))
+            return sentence("CCTXA", head.encode() + _printed(m))
         case Text():
             when = (
                 ""
@@ -164,7 +167,7 @@ def _encode(m: Message) -> bytes:
                 else "{:02d}{:02d}".format(*divmod(m.minute_of_day, 60))
             )
             head = f"1,{m.sender:07d},{ENCODINGS.index(m.encoding)},{when},"
-            return sentence("BDTXR", head.encode() + _hex_text(m.payload, m.encoding))
+            return sentence("BDTXR", head.encode() + _printed(m))
         case Identity():
             text = (
                 f"{m.user:07d},{m.serial:08d},{m.broadcast_id:07d},{m.user_class},"

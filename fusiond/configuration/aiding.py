@@ -132,7 +132,8 @@ class RdssAiding(Aiding):
     range_sd_m: PositiveFloat = 15.3
     """Of a slant range after differential correction: 8 m satellite drift and 13 m ranging."""
     height_sd_m: PositiveFloat = 10.0
-    """Of the height that the centre solves with."""
+    """Of the height that the centre solves with; where the request gave the solution's height, its
+    sigma stands in place of this."""
     fix_height_sd_m: PositiveFloat | None = 30.0
     """The fix's height aids with this sigma, unless the request gave it (then it says nothing new).
     Without any height an inertial height runs away."""

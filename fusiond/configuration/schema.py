@@ -34,6 +34,7 @@ from fusiond.configuration.estimator import Estimator
 from fusiond.configuration.integrity import Integrity
 from fusiond.configuration.outputs import Outputs
 from fusiond.configuration.plausibility import PLAUSIBILITY, Plausibility, VehicleClass
+from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.sensor_class import CLASSES, SensorClass
 
@@ -256,7 +257,13 @@ class ClockOptions(Section):
 
 
 CommandName = Literal[
-    "set_position", "request_fix", "reset_filter", "start_recording", "stop_recording", "inject"
+    "set_position",
+    "request_fix",
+    "send_message",
+    "reset_filter",
+    "start_recording",
+    "stop_recording",
+    "inject",
 ]
 
 
@@ -315,6 +322,7 @@ class Config(Section):
     scheduler: Scheduler = Field(default_factory=Scheduler.unsaid)
     clock: ClockOptions = Field(default_factory=ClockOptions.unsaid)
     mqtt: Mqtt = Field(default_factory=Mqtt.unsaid)
+    position_reports: PositionReports = Field(default_factory=PositionReports.unsaid)
     recording: Recording = Field(default_factory=Recording.unsaid)
     outputs: Outputs = Field(default_factory=Outputs.unsaid)
 
@@ -356,6 +364,20 @@ class Config(Section):
         raw = [name for name, section in self.aiding.items() if isinstance(section, RawAiding)]
         if len(raw) > 1:
             raise ValueError(f"{' and '.join(raw)}: one receiver's raw data at most, one clock")
+        return self
+
+    @model_validator(mode="after")
+    def _reports_have_a_terminal(self) -> Config:
+        o = self.position_reports
+        if o.card is None:
+            return self
+        terminals = [name for name, source in self.sources.items() if source.driver == "rdss"]
+        if not terminals:
+            raise ValueError("position_reports.card needs a source with driver 'rdss'")
+        if o.source is None and len(terminals) > 1:
+            raise ValueError(f"position_reports.source: one of {', '.join(terminals)}")
+        if o.source is not None and o.source not in terminals:
+            raise ValueError(f"position_reports.source: no terminal {o.source!r}")
         return self
 
     @property

@@ -58,6 +58,7 @@ class Broker:
             try:
                 async with self._client() as client:
                     await client.subscribe(f"{BASE}/+/+", qos=0)
+                    await client.subscribe(f"{BASE}/+/fleet/+", qos=0)
                     self._hub.linked("up")
                     await self._serve(client)
             except aiomqtt.MqttError as error:
@@ -94,8 +95,9 @@ class Broker:
     async def _listen(self, client: aiomqtt.Client) -> None:
         async for message in client.messages:
             levels = message.topic.value.split("/")
-            if isinstance(message.payload, bytes) and len(levels) == 3:
-                self._hub.take(levels[1], levels[2], message.payload, message.retain)
+            if isinstance(message.payload, bytes):
+                topic = "/".join(levels[2:])
+                self._hub.take(levels[1], topic, message.payload, message.retain)
 
     async def _ask(self, client: aiomqtt.Client) -> None:
         while True:

@@ -76,6 +76,8 @@ class Hub:
 
     def take(self, vehicle: str, topic: str, payload: bytes, kept: bool = False) -> None:
         """A message of `topic` below a vehicle's base; what cannot be used is counted."""
+        if topic.startswith("fleet/"):  # of each card one
+            topic = "fleet"
         if topic not in self._topics and topic != "online":
             self.counters["other_topic"] += 1
             return

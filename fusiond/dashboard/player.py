@@ -10,7 +10,10 @@ from pathlib import Path
 from fusiond.dashboard.hub import Hub
 from fusiond.recording.reader import Log
 
-TOPICS = ("/status", "/nav", "/health", "/consistency", "/calibration", "/event", "/innovation")
+TOPICS = (
+    *("/status", "/nav", "/health", "/consistency", "/calibration", "/event", "/innovation"),
+    *("/message", "/fleet"),
+)
 SECOND = 1_000_000_000
 AT_ONCE = 64
 """Messages handed over before the browsers get their turn, where the log is played fast."""

@@ -28,12 +28,14 @@ INTERVALS = 8
 """Intervals of a topic, by whose median its rate is known: one long silence does not change it."""
 ROW_EVERY_S = 0.5
 """Spacing of the rows of a solution: ten minutes are 1200 points, about a plot's pixels."""
-MOST_ROWS = {"nav": 1200, "nis": 4800, "delay": 500, "event": 200}
+MOST_ROWS = {"nav": 1200, "nis": 4800, "delay": 500, "event": 200, "message": 200}
 """By kind. `nis`: eight sources for ten minutes at 1 Hz."""
-KINDS = {"nav": "ddo" + 10 * "d", "nis": "doddd", "delay": "dod", "event": "do"}
+KINDS = {"nav": "ddo" + 10 * "d", "nis": "doddd", "delay": "dod", "event": "do", "message": "do"}
 """By column, as `history` has them: those of `nav` are `nav_row`'s."""
 MOST_INNOVATIONS = 12000
 """20 a second for ten minutes: position and velocity of a receiver at 10 Hz."""
+MOST_CARDS = 256
+"""Other vehicles that are kept: as many as a daemon tells."""
 CARRIED = ("nav", "status", "health", "consistency", "calibration")
 
 
@@ -76,6 +78,10 @@ class Vehicle:
             self._innovation(said, number(said, "t_ns"), at_s)
         elif topic == "innovations":
             self._bundle(said, at_s)
+        elif topic == "message":
+            self._row("message", [None if kept else at_s, said])
+        elif topic == "fleet":
+            self._other(said, None if kept else at_s)
         elif topic == "reply":
             self._put(topic, said, at_s)
         elif topic in CARRIED:
@@ -119,6 +125,13 @@ class Vehicle:
             if at_s is not None and before.at_s is not None:
                 heard.intervals.append(at_s - before.at_s)
         self._latest[topic] = heard
+
+    def _other(self, said: Said, at_s: float | None) -> None:
+        """Where another vehicle is: a message of its own for each card."""
+        topic = f"fleet/{said.get('card')}"
+        others = sum(name.startswith("fleet/") for name in self._latest)
+        if topic in self._latest or others < MOST_CARDS:
+            self._put(topic, said, at_s)
 
     def _row(self, kind: str, row: list[Any]) -> None:
         self.count += 1

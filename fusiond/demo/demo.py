@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from drivers.shipped import shipped
 from fusiond.configuration.load import load_config
+from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
 from fusiond.configuration.schema import Config, Source
 from fusiond.demo.broker import DemoBroker
@@ -37,6 +38,7 @@ from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.simulation.can.imu import SIM_IMU
+from fusiond.simulation.rdss.network import ConvoyVehicle
 from fusiond.simulation.scenarios import SCENARIOS, Scenario
 from fusiond.simulation.trajectories import Leg, follow
 from fusiond.simulation.trajectories import Path as Motion
@@ -50,6 +52,8 @@ REST_S = 8.0
 OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S = 18.0, 12.0, 60.0
 SERVICE_FREQUENCY_S = 5
 """Of the simulated RDSS card: several fixes in an outage (a civil card has 60 s)."""
+REPORTS_S = 30.0
+"""Position reports to the other vehicle of the convoy: one of the card's turns in six."""
 _SCORE_NS = 100_000_000
 """Spacing of the solutions that the summary compares with the truth."""
 _TOWN = (
@@ -104,13 +108,16 @@ def demo_config(port: int, gnss_link: Path, rdss_link: Path) -> Config:
         "rdss": Source.model_validate({"driver": "rdss", "port": str(rdss_link)}),
     }
     mqtt = config.mqtt.model_copy(update={"host": "127.0.0.1", "port": port})
-    return config.model_copy(update={"vehicle": VEHICLE, "sources": sources, "mqtt": mqtt})
+    reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
+    return config.model_copy(
+        update={"vehicle": VEHICLE, "sources": sources, "mqtt": mqtt, "position_reports": reports}
+    )
 
 
 def demo_scenario(config: Config) -> Scenario:
     """The demo's drive with the sensors of `config`."""
     scenario = replace(SCENARIOS["drive"].fitted(config), path=drive)
-    rdss = replace(scenario.rdss, service_frequency_s=SERVICE_FREQUENCY_S)
+    rdss = replace(scenario.rdss, service_frequency_s=SERVICE_FREQUENCY_S, convoy=True)
     return replace(scenario, rdss=rdss)
 
 

@@ -19,6 +19,8 @@ import numpy as np
 from drivers.base import Driver, Emitted
 from drivers.measurements import DeviceEvent, ImuSample, TimeReport
 from drivers.raw.messages import NavigationMessage
+from drivers.rdss.mail import Mail
+from drivers.rdss.messages import BeamPower
 from fusiond.clock.clock import Clock
 from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
@@ -83,6 +85,8 @@ class Heard:
         if isinstance(item, DeviceEvent):
             self.events.append(f"{item.code}: {item.text}")
             return
+        if isinstance(item, Mail):
+            return  # whom it is for will have it from the daemon; its counters are told
         kind = self.kinds.setdefault(type(item).__name__, Kind(Values(type(item))))
         kind.count += 1
         kind.values.take(item)
@@ -159,6 +163,9 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
         report.facts.append(_kind_line(name, kind))
         report.facts += [f"  {line}" for line in kind.values.lines()]
     report.facts += list(dict.fromkeys(heard.events))[-_SHOWN_EVENTS:]
+    beams: BeamPower | None = getattr(heard.driver, "beams", None)
+    if beams is not None:
+        report.facts.append(_beams_line(beams))
     counters = {name: count for name, count in heard.driver.counters.items() if count}
     if counters:
         report.facts.append(", ".join(f"{name} {count}" for name, count in counters.items()))
@@ -190,6 +197,16 @@ def _kind_line(name: str, kind: Kind) -> str:
         ages = np.array(kind.age_s) * 1e3
         age = f", age {np.median(ages):.1f} ms (at most {ages.max():.1f})"
     return f"{name}: {kind.count}{rate}{age}"
+
+
+def _beams_line(beams: BeamPower) -> str:
+    """The power of an RDSS terminal's beams, and which of them serve."""
+    levels = " ".join(map(str, beams.levels))
+    serving = beams.serving
+    if serving is None:
+        return f"beams {levels}: none is heard"
+    second = beams.time_difference_beam
+    return f"beams {levels}: beam {serving} serves" + (f", with beam {second}" if second else "")
 
 
 def _damage(counters: Counter[str], said: list[str]) -> list[str]:

@@ -14,6 +14,7 @@ from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
 from fusiond.live.injection import Injection
 from fusiond.live.innovations import Innovations
+from fusiond.live.messaging import Messaging
 from fusiond.live.operator import Operator
 from fusiond.live.scheduler import SECOND_NS, Every
 from fusiond.live.sources import Sources
@@ -38,17 +39,27 @@ class Chain:
         self.config = config
         self.clock = clock
         self.events = events
-        navigator_event = partial(events.report, "navigator")
+        self._hears: Callable[[str], None] | None = None
+        navigator_event = partial(self._report, "navigator")
         self.innovations = Innovations(clock)
         self._on_outcome = on_outcome
         self.navigator = Navigator(config, saved, navigator_event, self._ended)
         self.injection = Injection(events.report)
-        self.sources = Sources(config, clock, self.navigator, self.injection, events.report)
-        self.operator = Operator(self.navigator, self.sources, self.injection)
+        self.sources = Sources(config, clock, self.navigator, self.injection, self._report)
+        drivers = {name: source.driver for name, source in self.sources.all.items()}
+        self.messaging = Messaging(config, clock, drivers, events.report)
+        self.sources.on_mail, self._hears = self.messaging.take, self.messaging.heard
+        self.operator = Operator(self.navigator, self.sources, self.injection, self.messaging)
         self.solution: Solution | None = None
         self.changed = False
         """Whether the last tick brought another mode."""
         self._second = Every(SECOND_NS)
+
+    def _report(self, source: str, code: str, text: str) -> None:
+        """An event of a device or of the navigator."""
+        self.events.report(source, code, text)
+        if self._hears is not None:  # not yet while the parts are made
+            self._hears(code)
 
     def _ended(self, entry: Entry) -> None:
         self.innovations.take(entry)
@@ -66,8 +77,9 @@ class Chain:
         before, self.solution = self.solution, solution
         self.changed = before is None or before.mode is not solution.mode
         if self.changed:
-            self.events.report("navigator", f"mode_{solution.mode}", solution.reason)
+            self._report("navigator", f"mode_{solution.mode}", solution.reason)
         navigating = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if (self._second.due(t_ns) or self.changed) and navigating:
             self.sources.height_hint(solution.height_m, solution.sd_ned_m[2], t_ns)
+        self.messaging.tick(t_ns, solution)
         return solution

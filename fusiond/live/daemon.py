@@ -10,7 +10,7 @@ import asyncio
 import logging
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +24,7 @@ from fusiond.live.chain import Chain
 from fusiond.live.events import Events
 from fusiond.live.journal import handler
 from fusiond.live.loaded import LOADED, Loaded
+from fusiond.live.message_keeper import MessageKeeper
 from fusiond.live.process_usage import release_compiler_pages
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
@@ -42,12 +43,14 @@ from fusiond.outputs.commands import (
     NAMES,
     Command,
     CommandRefusedError,
+    SendMessage,
     SetGates,
     StartRecording,
     StopRecording,
 )
 from fusiond.outputs.guests import Guests
 from fusiond.outputs.messages.event import EventMessage
+from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
@@ -75,6 +78,7 @@ class Daemon:
         self._state = StateKeeper(config, self.clock, navigator_event)
         self._warm = WarmKeeper(config, self.clock, navigator_event)
         self._calibration = CalibrationKeeper(config, navigator_event)
+        self._messages = MessageKeeper(config, self.clock, partial(self._events.report, "messages"))
         recording_event = partial(self._events.report, "recording")
         self.recorder = Recorder(config, self.clock, recording_event)
         saved = self._state.load()
@@ -87,7 +91,8 @@ class Daemon:
         if saved is None or "saved" not in config.alignment.heading:
             # A vehicle that stood knows more by what it kept then.
             self._warm.offer(self.navigator)
-        self._loaded = Loaded(saved, self._warm.loaded, self.navigator.calibration)
+        messages = self._messages.load(self._chain.messaging)
+        self._loaded = Loaded(saved, self._warm.loaded, self.navigator.calibration, messages)
         self.service = ServiceManager()
         self.scheduler = Scheduler(
             config.scheduler.rate_hz,
@@ -124,6 +129,9 @@ class Daemon:
             guests=self._guests,
             kept=kept,
         )
+        mqtt = made.get("mqtt")
+        if isinstance(mqtt, MqttPublisher):
+            mqtt.on_confirmed = self._chain.messaging.told
         if config.recording.directory is not None:
             made["recording"] = self.recorder
         return made
@@ -202,6 +210,7 @@ class Daemon:
             await self._warm.close(self.solution, self.navigator)
             await self._calibration.close(self.navigator)
             await self._serving.stop()
+            await self._messages.close(self.clock.now_ns(), self._chain.messaging)
             self.service.close()
             log.info(
                 "stopped after %d ticks, %d overruns", self.scheduler.ticks, self.scheduler.overruns
@@ -224,6 +233,7 @@ class Daemon:
         self._state.keep(t_ns, solution, confirmed=not self.navigator.unconfirmed)
         self._warm.keep(t_ns, solution, self.navigator)
         self._calibration.keep(t_ns, self.navigator)
+        self._messages.keep(t_ns, self._chain.messaging)
 
     def _keep_in_log(self, t_ns: int, solution: Solution) -> None:
         """A state that a part of the log can be replayed from, now and then."""
@@ -235,7 +245,7 @@ class Daemon:
     def _on_outcome(self, entry: Entry) -> None:
         self.recorder.innovation(entry)
 
-    def _carry_out(self, command: Command) -> str:
+    def _carry_out(self, command: Command) -> str | Awaitable[str]:
         """An operator's command, and what was done. Raises `CommandRefusedError`."""
         try:
             match command:
@@ -247,7 +257,14 @@ class Daemon:
             raise CommandRefusedError(str(error)) from error
         t_ns = self.clock.now_ns()
         self.recorder.command(t_ns, NAMES[type(command)], command)
-        return self._chain.operator.carry_out(command, t_ns)
+        text = self._chain.operator.carry_out(command, t_ns)
+        return self._when_kept(text) if isinstance(command, SendMessage) else text
+
+    async def _when_kept(self, text: str) -> str:
+        """What is said of a message that was queued, once it is on disk."""
+        messaging = self._chain.messaging
+        missing = await self._messages.kept(messaging.revision, messaging)
+        return f"{text}; {missing}" if missing else text
 
     def _each_second(self, t_ns: int, solution: Solution) -> None:
         """Tell the service manager how it stands."""

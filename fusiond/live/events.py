@@ -47,6 +47,8 @@ WARNINGS = (
     "protection_level",
     "injected",
     "restart_needed",
+    "message_",
+    "messages_not_kept",
 )
 ERRORS = ("fault", "failed", "bus_off", "no_card")
 

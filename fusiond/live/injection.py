@@ -29,6 +29,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage, RawGnssEpoch
+from drivers.rdss.mail import FleetFix, Mail, MessageReceived, MessageStage
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.outputs.commands import Inject
 
@@ -71,7 +72,7 @@ class Injection:
     def pass_on(self, item: Emitted) -> Iterator[Emitted]:
         """What a fault leaves of an item."""
         fault = self.faults.get(item.source)
-        if fault is None or fault.over or isinstance(item, DeviceEvent):
+        if fault is None or fault.over or isinstance(item, DeviceEvent | Mail):
             yield item
         else:
             yield from fault.pass_on(item)
@@ -105,7 +106,7 @@ class Fault:
             case "drop":
                 return
             case "delay":
-                assert not isinstance(item, NavigationMessage | DeviceEvent)
+                assert not isinstance(item, NavigationMessage | DeviceEvent | Mail)
                 delay_ns = round(self.command.size * SECOND_NS)
                 self.held.append((item.t_seen_ns + delay_ns, item))
                 if len(self.held) > MOST_HELD:
@@ -172,6 +173,8 @@ class Fault:
             case RawGnssEpoch() | TimeReport() | DeviceEvent():
                 return item
             case Ephemeris() | Klobuchar() | Bdgim():
+                return item
+            case MessageReceived() | MessageStage() | FleetFix():
                 return item
 
 

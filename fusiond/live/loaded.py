@@ -20,11 +20,17 @@ class Loaded:
     saved: SavedState | None = None
     warm: KeptState | None = None
     calibration: SavedCalibration | None = None
+    messages: str | None = None
+    """As `fusiond.live.kept_messages` has them in JSON."""
 
     def offer(self, chain: Chain) -> None:
         """Let a chain that was made with `saved` go on from the rest. Raises `DamagedStateError`
         for a state of another model."""
         chain.navigator.calibration = self.calibration
+        if self.messages is not None:
+            from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+
+            chain.messaging.resume(KEPT_MESSAGES.validate_json(self.messages))
         if self.warm is not None:
             chain.navigator.warm = WarmStart(self.warm.navigation, chain.navigator.model)
             chain.clock.resume(self.warm.utc)

@@ -6,6 +6,7 @@ import math
 
 from fusiond.configuration.settings import DEG
 from fusiond.live.injection import Injection
+from fusiond.live.messaging import Messaging
 from fusiond.live.sources import Sources
 from fusiond.navigator.navigator import Navigator
 from fusiond.outputs.commands import (
@@ -14,6 +15,7 @@ from fusiond.outputs.commands import (
     Inject,
     RequestFix,
     ResetFilter,
+    SendMessage,
     SetGates,
     SetPosition,
 )
@@ -24,7 +26,10 @@ EARTH_RADIUS_M = 6.371e6  # mean; the distance is told to people
 class Operator:
     """Carries out the commands of `outputs.commands`, whichever way they come in."""
 
-    def __init__(self, navigator: Navigator, sources: Sources, injection: Injection) -> None:
+    def __init__(
+        self, navigator: Navigator, sources: Sources, injection: Injection, messaging: Messaging
+    ) -> None:
+        self._messaging = messaging
         self._navigator = navigator
         self._sources = sources
         self._injection = injection
@@ -48,6 +53,8 @@ class Operator:
                 if not said:
                     raise CommandRefusedError("there is no RDSS terminal")
                 return "; ".join(said)
+            case SendMessage():
+                return self._messaging.send(command, t_ns)
             case ResetFilter():
                 self._navigator.reset("reset by an operator")
                 return "aligning anew"

@@ -54,6 +54,7 @@ class Publishing:
         self._navigator = chain.navigator
         self._sources = chain.sources
         self._injection = chain.injection
+        self._messaging = chain.messaging
         self._scheduler = scheduler
         self._recording = recording
         self._innovations = chain.innovations
@@ -85,6 +86,7 @@ class Publishing:
             self._mode, self._since_ns = solution.mode, t_ns
         utc_ns = self._clock.utc_ns(t_ns)
         self._publish_nav(t_ns, utc_ns, solution)
+        self._publish_messages()
         if self._health.due(t_ns):
             self._publish_waiting(most=len(self._waiting))
             self._waiting.extend(self._of_health(t_ns, utc_ns))
@@ -109,6 +111,12 @@ class Publishing:
             settled = message.model_copy(update={"t_utc": None, "t_ms": None})
         for output in due:
             output.take(NAV, settled if output.sets_clocks else message)
+
+    def _publish_messages(self) -> None:
+        for topic, message in self._messaging.take_waiting():
+            self._tell(topic, message)
+            if "mqtt" not in self._outputs:
+                self._messaging.told(message)
 
     def _publish_calibration(self, t_ns: int, utc_ns: int | None) -> None:
         watch = self._navigator.calibrating

@@ -18,10 +18,13 @@ from numpy.typing import NDArray
 
 from drivers.base import Driver, Emitted
 from drivers.inputs import Inputs
-from drivers.measurements import DeviceEvent, ImuSample, Measurement, TimeReport
+from drivers.measurements import DeviceEvent, Height, ImuSample, Measurement, TimeReport
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
+from drivers.rdss.mail import Mail
+from drivers.standard_atmosphere import standard_pressure_pa
 from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
+from fusiond.configuration.aiding import RdssAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.live.injection import Injection
@@ -31,7 +34,7 @@ from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.navigator.navigator import Navigator
 from fusiond.navigator.raw_gnss import Seen
 from fusiond.outputs.messages.fault import FaultReport, fault_report
-from fusiond.outputs.messages.health import SatelliteHealth, SkyHealth, SourceHealth
+from fusiond.outputs.messages.health import BeamHealth, SatelliteHealth, SkyHealth, SourceHealth
 
 Array = NDArray[np.float64]
 EventSink = Callable[[str, str, str], None]
@@ -69,6 +72,8 @@ class Sources:
         self.imu = ImuChoice(config.imu, on_event)
         self.on_arrival: Callable[[Measurement | RawGnssEpoch, Instant], None] | None = None
         """Hears every measurement with its instant."""
+        self.on_mail: Callable[[Mail], None] = lambda mail: None
+        """Hears of short messages."""
         self.all: dict[str, Source] = {}
         points = driver_entry_points()
         for name, section in config.sources.items():
@@ -113,6 +118,9 @@ class Sources:
             if isinstance(item, NavigationMessage):
                 self._navigator.learn(item)
                 return
+            if isinstance(item, Mail):
+                self.on_mail(item)
+                return
         source = self.all[item.source]
         source.received += 1
         source.last_seen_ns = item.t_seen_ns
@@ -120,6 +128,8 @@ class Sources:
         source.latency_s = (item.t_seen_ns - instant.t_valid_ns) * 1e-9
         if self.on_arrival is not None:
             self.on_arrival(item, instant)
+        if isinstance(item, Height) and item.barometric:
+            self._pressure_hint(item)
         if isinstance(item, ImuSample):
             self.imu.take(item, instant.t_valid_ns)
             return
@@ -156,7 +166,15 @@ class Sources:
             if hint is not None:
                 section = self._config.aiding.get(name)
                 down = section.lever_arm_m[2] if section is not None else 0.0
-                hint(height_m - down, sd_m, t_ns)
+                centre_sd_m = section.height_sd_m if isinstance(section, RdssAiding) else None
+                hint(height_m - down, sd_m, t_ns, centre_sd_m)
+
+    def _pressure_hint(self, barometer: Height) -> None:
+        """Tell the terminals that can use it the pressure that a barometer's height stands for."""
+        for source in self.all.values():
+            hint = getattr(source.driver, "pressure_hint", None)
+            if hint is not None:
+                hint(standard_pressure_pa(barometer.height_m), barometer.t_seen_ns)
 
     def request_fix(self, t_ns: int) -> list[str]:
         """Ask every terminal for a fix; what each said. Empty if there is no terminal."""
@@ -243,6 +261,7 @@ class Sources:
                 **diagnosed(name),
                 verdict=navigator.verdicts.verdict(name),
                 sky=self._sky(name),
+                beams=_beams(source.driver),
             )
         return health
 
@@ -257,6 +276,14 @@ class Sources:
         rounded = {k: None if v is None else round(v, 2) for k, v in figures.items()}
         satellites = {name: _satellite(seen) for name, seen in sky.seen.items()}
         return SkyHealth(used=sky.used, refused=sky.refused, satellites=satellites, **rounded)
+
+
+def _beams(driver: Driver) -> BeamHealth | None:
+    said = getattr(driver, "beams", None)
+    if said is None:
+        return None
+    difference = said.time_difference_beam or None
+    return BeamHealth(levels=said.levels, serving=said.serving, time_difference=difference)
 
 
 def _satellite(seen: Seen) -> SatelliteHealth:

@@ -32,6 +32,7 @@ from drivers.measurements import (
     UtcStamp,
 )
 from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, RawGnssEpoch
+from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
 from fusiond.clock import dates
 from fusiond.clock.clock import Clock
 from fusiond.clock.recorder import (
@@ -290,6 +291,8 @@ class _Replay:
                 self._clock.report(item)
             case Ephemeris() | Klobuchar() | Bdgim() | RawGnssEpoch():
                 raise AssertionError("no driver on a CAN bus has raw observations")
+            case MessageReceived() | MessageStage() | FleetFix():
+                raise AssertionError("no driver on a CAN bus has short messages")
             case _:
                 instant = self._clock.resolve(item.stamp, item.source, item.t_seen_ns)
                 if isinstance(item, ImuSample):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
 from pydantic import BaseModel
@@ -9,6 +10,8 @@ from pydantic.json_schema import models_json_schema
 
 from fusiond.outputs.commands import COMMANDS
 from fusiond.outputs.topics import TOPICS, Topic, base_topic
+
+PARAMETER = re.compile(r"\{(\w+)\}")
 
 
 def asyncapi(vehicle: str) -> dict[str, Any]:
@@ -27,9 +30,10 @@ def asyncapi(vehicle: str) -> dict[str, Any]:
     }
 
     def add(topic: str, message: str, action: str, qos: int, retained: bool) -> None:
-        key = topic.replace("/", "_")
+        key = PARAMETER.sub(r"\1", topic).replace("/", "_")
         channels[key] = {
             "address": f"{base}/{topic}",
+            **({"parameters": {n: {} for n in PARAMETER.findall(topic)}} if "{" in topic else {}),
             "messages": {message: {"$ref": f"#/components/messages/{message}"}},
         }
         operations[f"{action}_{key}"] = {
@@ -46,7 +50,7 @@ def asyncapi(vehicle: str) -> dict[str, Any]:
         name = topic.message.__name__
         payload = next(v for (m, k), v in names.items() if m is topic.message and k == mode)
         messages[name] = {"contentType": "application/json", "payload": payload}
-        add(topic.name, name, action, topic.qos, topic.retained)
+        add(topic.path, name, action, topic.qos, topic.retained)
     return {
         "asyncapi": "3.0.0",
         "info": {"title": "fusiond", "version": "1", "description": f"Vehicle {vehicle}"},

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Coroutine
 
 from fusiond.outputs.commands import (
     COMMANDS,
@@ -35,6 +35,8 @@ REMEMBERED = 1000
 """Commands whose ids are kept: 200 s of them at the greatest rate; 100 kB."""
 # The longest command name is 13 characters; of what is none so much is repeated.
 _NAME_SHOWN = 40
+Answer = ReplyMessage | Coroutine[None, None, ReplyMessage]
+"""At once, or when what was done is on disk."""
 
 
 class CommandIntake:
@@ -64,7 +66,7 @@ class CommandIntake:
         self._limiting = False
         self._done: OrderedDict[tuple[str, str], None] = OrderedDict()
 
-    def answer(self, name: str, payload: bytes, retained: bool) -> ReplyMessage | None:
+    def answer(self, name: str, payload: bytes, retained: bool) -> Answer | None:
         """Carry the command out; the reply, None for one of too many that is not answered."""
         now_s = self._now()
         self._tokens = min(BURST, self._tokens + RATE_HZ * (now_s - self._filled_s))
@@ -80,7 +82,7 @@ class CommandIntake:
         text = f"too many commands: {RATE_HZ:.0f} a second are taken, the rest is not answered"
         return self._reply(name, None, False, text)
 
-    def _answer(self, name: str, payload: bytes, retained: bool) -> ReplyMessage:
+    def _answer(self, name: str, payload: bytes, retained: bool) -> Answer:
         sent_id: str | None = None
         ok = False
         try:
@@ -97,9 +99,13 @@ class CommandIntake:
                 self._counters["mqtt_commands_repeated"] += 1
                 text = "carried out already under this id: nothing done; a new command has a new id"
                 raise CommandRefusedError(text)
-            text = self._handler(command)
+            said = self._handler(command)
             ok = True
             self._remember(name, sent_id)
+            if not isinstance(said, str):
+                self._counters["mqtt_commands"] += 1
+                return self._later(name, sent_id, said)
+            text = said
         except BadCommandError as error:
             sent_id, text = error.id, str(error)
         except CommandRefusedError as error:
@@ -109,6 +115,13 @@ class CommandIntake:
             self._on_event("mqtt_command_failed", f"{name}: {error!r}")
         self._counters["mqtt_commands" if ok else "mqtt_commands_refused"] += 1
         return self._reply(name, sent_id, ok, text)
+
+    async def _later(self, name: str, sent_id: str, said: Awaitable[str]) -> ReplyMessage:
+        try:
+            return self._reply(name, sent_id, True, await said)
+        except Exception as error:  # a fault of ours must not cost the connection
+            self._on_event("mqtt_command_failed", f"{name}: {error!r}")
+            return self._reply(name, sent_id, False, f"failed: {error!r}")
 
     def _remember(self, name: str, sent_id: str) -> None:
         self._done[name, sent_id] = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -35,6 +35,19 @@ class SetPosition(Command):
 
 class RequestFix(Command):
     """Ask the RDSS terminal for a fix as soon as its service frequency allows."""
+
+
+class SendMessage(Command):
+    """Send a text to another card by the RDSS terminal.
+
+    With `receipt` the other side, which must be fusiond's, confirms it, and it goes again until it
+    has: see `docs/rdss-messages.md`. `source` names the terminal where there are several.
+    """
+
+    card: Annotated[int, Field(ge=1, le=9_999_999)]
+    text: Annotated[str, Field(min_length=1, max_length=210)]
+    receipt: bool = False
+    source: Annotated[str, Field(min_length=1, max_length=64)] | None = None
 
 
 class ResetFilter(Command):
@@ -86,6 +99,7 @@ class SetGates(Command):
 COMMANDS: dict[str, type[Command]] = {
     "set_position": SetPosition,
     "request_fix": RequestFix,
+    "send_message": SendMessage,
     "reset_filter": ResetFilter,
     "start_recording": StartRecording,
     "stop_recording": StopRecording,
@@ -96,8 +110,9 @@ CARRIED_OUT: dict[str, type[Command]] = {**COMMANDS, "set_gates": SetGates}
 """What a recording holds, and a replay carries out again."""
 NAMES = {command: name for name, command in CARRIED_OUT.items()}
 
-Handler = Callable[[Command], str]
-"""Carries a command out at once and says what was done, or raises `CommandRefusedError`."""
+Handler = Callable[[Command], str | Awaitable[str]]
+"""Carries a command out at once and says what was done, or raises `CommandRefusedError`; what can
+be said only when a disk has answered comes later."""
 
 
 class CommandRefusedError(Exception):

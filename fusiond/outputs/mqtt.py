@@ -14,7 +14,7 @@ import contextlib
 import logging
 import socket
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 
 import aiomqtt
 from pydantic import BaseModel
@@ -26,6 +26,7 @@ from fusiond.outputs.command_intake import CommandIntake
 from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.events import MOST_KEPT, events_message
+from fusiond.outputs.messages.reply import ReplyMessage
 from fusiond.outputs.reconnecting import Reconnecting
 from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
@@ -98,6 +99,9 @@ class MqttPublisher:
             self._commands = CommandIntake(
                 options.commands, on_command, self.counters, on_event, utc_now
             )
+        self._replying: set[asyncio.Task[None]] = set()
+        self.on_confirmed: Callable[[BaseModel], None] = lambda message: None
+        """Hears each queued message that the broker has taken."""
         self._reconnecting = Reconnecting()
         self._quiet = incoming.quiet()
         self.status = DriverStatus()
@@ -295,6 +299,7 @@ class MqttPublisher:
                 await self._confirm(client, address, _encoded(queued), topic.retained)
                 if self._queue and self._queue[0] is first:
                     self._queue.popleft()
+                    self.on_confirmed(queued)
 
     async def _confirm(
         self, client: aiomqtt.Client, address: str, payload: bytes, retain: bool
@@ -342,8 +347,20 @@ class MqttPublisher:
             elif self._commands is not None:
                 name = message.topic.value.removeprefix(prefix)
                 reply = self._commands.answer(name, payload, message.retain)
-                if reply is not None:
+                if isinstance(reply, ReplyMessage):
                     self._enqueue(REPLY, reply)
+                elif reply is not None:
+                    self._reply_later(reply)
+
+    def _reply_later(self, reply: Coroutine[None, None, ReplyMessage]) -> None:
+        """The connection may be another by then: the reply waits like any other."""
+
+        async def wait() -> None:
+            self._enqueue(REPLY, await reply)
+
+        task = asyncio.create_task(wait())
+        self._replying.add(task)
+        task.add_done_callback(self._replying.discard)
 
 
 def _encoded(message: BaseModel) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from pydantic import BaseModel
@@ -11,27 +11,38 @@ from fusiond.outputs.messages.calibration import CalibrationMessage
 from fusiond.outputs.messages.consistency import ConsistencyMessage
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.events import EventsMessage
+from fusiond.outputs.messages.fleet import FleetMessage
 from fusiond.outputs.messages.health import HealthMessage
 from fusiond.outputs.messages.innovations import InnovationsMessage
 from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.messages.reply import ReplyMessage
+from fusiond.outputs.messages.short_message import ShortMessage
 from fusiond.outputs.messages.status import StatusMessage
 from fusiond.outputs.messages.tracker import TrackerMessage
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic below `fusiond/<vehicle>`: what it carries and how it is delivered."""
+    """One topic below `fusiond/<vehicle>`: what it carries and how it is delivered.
+
+    `below` is the rest of the address of a topic of which there are several.
+    """
 
     name: str
     message: type[BaseModel]
     qos: Literal[0, 1]
     retained: bool
     absolute: bool = False
+    below: str = ""
+
+    @property
+    def path(self) -> str:
+        """Its name, with what stands below it."""
+        return f"{self.name}/{self.below}" if self.below else self.name
 
     def address(self, base: str) -> str:
         """Where it stands at the broker; an `absolute` one stands outside `base`."""
-        return self.name if self.absolute else f"{base}/{self.name}"
+        return self.path if self.absolute else f"{base}/{self.path}"
 
 
 NAV = Topic("nav", NavMessage, 0, False)
@@ -44,10 +55,18 @@ TRACKER = Topic("tracker", TrackerMessage, 1, True)
 EVENT = Topic("event", EventMessage, 1, False)
 EVENTS = Topic("events", EventsMessage, 1, True)
 REPLY = Topic("reply", ReplyMessage, 1, False)
+MESSAGE = Topic("message", ShortMessage, 1, False)
+FLEET = Topic("fleet", FleetMessage, 1, True, below="{card}")
+"""Of all cards; `fleet(card)` is that of one."""
 TOPICS = (
     *(NAV, STATUS, HEALTH, CONSISTENCY, INNOVATIONS, CALIBRATION, TRACKER),
-    *(EVENT, EVENTS, REPLY),
+    *(EVENT, EVENTS, REPLY, MESSAGE, FLEET),
 )
+
+
+def fleet(card: int) -> Topic:
+    """Where another vehicle is, by the number of its card."""
+    return replace(FLEET, below=str(card))
 
 
 def base_topic(vehicle: str) -> str:

@@ -40,6 +40,7 @@ from fusiond.simulation.gnss.raw_stream import GnssRawStream, RawFormat
 from fusiond.simulation.gnss.receiver import GnssReceiver
 from fusiond.simulation.imu_truth import States
 from fusiond.simulation.pty_line import PtyLine
+from fusiond.simulation.rdss.network import ConvoyVehicle
 from fusiond.simulation.rdss.terminal import RdssTerminal
 from fusiond.simulation.scenarios import SCENARIOS, Scenario, random_streams
 from fusiond.simulation.trajectories import drive
@@ -76,6 +77,7 @@ class SimulatedVehicle:
         self.imu = scenario.imu_output(self.truth, imu_rng)
         self.gnss = GnssReceiver(self.truth, scenario.gnss, gnss_rng)
         self.terminal = RdssTerminal(self.truth, scenario.rdss, rdss_rng, 0)
+        self.convoy = ConvoyVehicle(self.truth, self.terminal) if scenario.rdss.convoy else None
         self.raw: GnssRawStream | None = None
         if gnss_raw is not None:
             receiver = GnssRaw(self.truth, scenario.gnss_raw, raw_rng)
@@ -193,6 +195,8 @@ class SimulatedVehicle:
         if "rdss" in self.lines:
             if data := self.lines["rdss"].read():
                 self.terminal.receive(data, t_s)
+            if self.convoy is not None:
+                self.convoy.tick(t_s)
             if data := self.terminal.take(t_s):
                 self._write("rdss", data)
 

@@ -40,6 +40,7 @@ SECTIONS = {
     "[scheduler]": config.Scheduler,
     "[clock]": config.ClockOptions,
     "[mqtt]": config.Mqtt,
+    "[position_reports]": config.PositionReports,
     "[recording]": config.Recording,
     "[outputs]": outputs.Outputs,
     "[outputs.gpsd]": outputs.Gpsd,

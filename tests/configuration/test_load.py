@@ -84,8 +84,8 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             '[mqtt]\ncommands = ["reset"]',
             "mqtt.commands[0] = \"reset\": did you mean 'reset_filter'? "
-            "allowed: inject, request_fix, reset_filter, set_position, start_recording,"
-            " stop_recording",
+            "allowed: inject, request_fix, reset_filter, send_message, set_position,"
+            " start_recording, stop_recording",
         ),
         (
             "[aiding.gnss]\ngate_probability = 1",

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from fusiond.dashboard.vehicle import LIMITS_S, MOST_INNOVATIONS, MOST_ROWS, ROW_EVERY_S, Vehicle
+from fusiond.dashboard.vehicle import (
+    LIMITS_S,
+    MOST_CARDS,
+    MOST_INNOVATIONS,
+    MOST_ROWS,
+    ROW_EVERY_S,
+    Vehicle,
+)
 from tests.dashboard.serving import NAMES, said
 
 
@@ -21,14 +28,28 @@ def test_every_topic_is_taken() -> None:
         vehicle.take(topic, said(topic), 1.0 + k)
     new = vehicle.since(0)
     for k, topic in enumerate(NAMES):
-        if topic == "event":
-            assert new["rows"]["event"] == [[1.0 + k, said("event")]]
+        if topic in ("event", "message"):
+            assert new["rows"][topic] == [[1.0 + k, said(topic)]]
+        elif topic == "fleet":
+            assert new["messages"]["fleet/242407"]["said"] == said("fleet")
         elif topic not in ("tracker", "innovations", "events"):  # `nav` says it better; rows do
             assert new["messages"][topic]["said"] == said(topic)
             assert new["messages"][topic]["at"] == 1.0 + k
     assert new["rows"]["nav"][0][3:5] == [said("nav")["lat_deg"], said("nav")["lon_deg"]]
     assert [row[1:] for row in new["rows"]["nis"]] == [["rdss", 0.893, 0.7422, 1.2956]]
     assert new["messages"]["online"]["said"] == "online"
+
+
+def test_other_vehicles_are_kept_by_card_and_no_more_than_a_daemon_tells() -> None:
+    vehicle = Vehicle("truck")
+    for card in range(MOST_CARDS + 5):
+        vehicle.take("fleet", {**said("fleet"), "card": card}, 1.0)
+    vehicle.take("fleet", {**said("fleet"), "card": 0, "lat_deg": 1.0}, 2.0)
+    messages = heard(vehicle)
+    assert len(messages) == MOST_CARDS
+    first = messages["fleet/0"]["said"]
+    assert isinstance(first, dict)
+    assert first["lat_deg"] == 1.0
 
 
 def test_events_before_the_first_look_are_those_that_the_broker_has_kept() -> None:

@@ -30,6 +30,15 @@ PARSERS = {
     "rinex": Parser(("drivers.raw.rinex", "drivers.raw.rinex_nav"), 1200),
     "rdss_binary": Parser(("drivers.rdss.framing", "drivers.rdss.binary_4_0"), 128),
     "rdss_text": Parser(("drivers.rdss.framing", "drivers.rdss.text_2_1"), 128),
+    "rdss_mail": Parser(
+        (
+            "drivers.rdss.envelope",
+            "drivers.rdss.inbox",
+            "drivers.rdss.report",
+            "drivers.rdss.wording",
+        ),
+        212,
+    ),
     "can": Parser(tuple(f"drivers.can.{m}" for m in ("dbc", "decoder", "layout", "pairing")), 162),
     "ntrip": Parser(("drivers.ntrip.reply",), 200),
     "commands": Parser(("fusiond.outputs.commands",), 256),

@@ -30,6 +30,7 @@ from drivers.rdss.framing import FrameDecoder, checksum
 from drivers.rdss.messages import Message
 from tests.drivers.raw.frames import beidou_words, inav_words, lnav_words, with_crc
 from tests.fuzz.documents import commands, csv, hub, input_of, log, state
+from tests.fuzz.mail import rdss_mail
 from tests.fuzz.pieces import EARLIEST, UNTRACED, mended_lines, pieces_of, whole_and_cut
 from tests.fuzz.recordings import can_log, dbc
 from tests.fuzz.solutions import bestpos, rinex, sbf, ubx
@@ -340,5 +341,18 @@ def can(data: bytes) -> None:
 
 
 _STREAMS = (splitter, nmea, raw, words, ubx, bestpos, sbf, rinex)
-_MORE = (rdss_binary, rdss_text, can, ntrip, commands, hub, log, state, csv, can_log, dbc)
+_MORE = (
+    rdss_binary,
+    rdss_text,
+    rdss_mail,
+    can,
+    ntrip,
+    commands,
+    hub,
+    log,
+    state,
+    csv,
+    can_log,
+    dbc,
+)
 TARGETS: dict[str, Callable[[bytes], None]] = {one.__name__: one for one in (*_STREAMS, *_MORE)}

@@ -5,6 +5,9 @@ from __future__ import annotations
 from math import radians
 from typing import Any
 
+from drivers.rdss.mail import MessageStage
+from drivers.rdss.report import PositionReport
+from drivers.rdss.wording import worded
 from fusiond.clock.answers import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
@@ -18,7 +21,9 @@ from fusiond.outputs.messages.consistency import consistency_message
 from fusiond.outputs.messages.event import event_message
 from fusiond.outputs.messages.events import events_message
 from fusiond.outputs.messages.fault import fault_report
+from fusiond.outputs.messages.fleet import of_report
 from fusiond.outputs.messages.health import (
+    BeamHealth,
     OutputHealth,
     SchedulerStatus,
     SourceHealth,
@@ -27,6 +32,7 @@ from fusiond.outputs.messages.health import (
 from fusiond.outputs.messages.innovations import Innovation, innovations_message
 from fusiond.outputs.messages.nav import nav_message
 from fusiond.outputs.messages.reply import ReplyMessage
+from fusiond.outputs.messages.short_message import of_stage
 from fusiond.outputs.messages.status import RecordingStatus, status_message
 from fusiond.outputs.messages.tracker import tracker_message
 
@@ -146,6 +152,7 @@ EXAMPLES: dict[str, Any] = {
                 service=Service.NOMINAL,
                 series={"rdss": Service.NOMINAL},
                 verdict="coloured",
+                beams=BeamHealth(levels=(0, 1, 1, 0, 0, 0), serving=2, time_difference=None),
             ),
         },
         outputs={
@@ -239,5 +246,38 @@ EXAMPLES: dict[str, Any] = {
         command="set_position",
         ok=True,
         text="position fused: it was 3 m from the solution",
+    ),
+    "message": of_stage(
+        MessageStage(
+            "rdss",
+            0,
+            "m1",
+            242407,
+            "text",
+            worded("Report fuel").payload,
+            "Report fuel",
+            "sent",
+            "",
+            1,
+            False,
+        ),
+        17,
+        UTC_NS,
+    ),
+    "fleet": of_report(
+        PositionReport(
+            UTC_NS * 1e-9 - 4.0,
+            31.0251234,
+            121.4409876,
+            "navigating",
+            (1.7, 1.6, 3.1),
+            16.2,
+            8.44,
+            346.5,
+        ),
+        242407,
+        "rdss",
+        UTC_NS - 4_000_000_000,
+        UTC_NS,
     ),
 }

@@ -76,7 +76,9 @@ def documented() -> dict[str, list[object]]:
     found: dict[str, list[object]] = {}
     for section in re.split(r"^### ", DOCS.read_text(), flags=re.M)[1:]:
         topic = section.split("`")[1]
-        found[topic] = [json.loads(b) for b in re.findall(r"```json\n(.*?)```", section, re.S)]
+        found[topic.partition("/<")[0]] = [
+            json.loads(b) for b in re.findall(r"```json\n(.*?)```", section, re.S)
+        ]
     return found
 
 
@@ -105,7 +107,7 @@ def test_asyncapi_is_complete_and_its_references_resolve() -> None:
     addresses = {c["address"] for c in document["channels"].values()}
     assert addresses == {
         f"fusiond/truck/{t}"
-        for t in ("online", *(t.name for t in TOPICS), *(f"cmd/{n}" for n in COMMANDS))
+        for t in ("online", *(t.path for t in TOPICS), *(f"cmd/{n}" for n in COMMANDS))
     }
     qos = {
         o["channel"]["$ref"].rsplit("/", 1)[1]: o["bindings"]["mqtt"]

@@ -4,6 +4,7 @@ import { showHeader } from "./header.js";
 import { bindKeys } from "./keys.js";
 import { Socket } from "./link.js";
 import { TrackMap } from "./map.js";
+import { showMessages } from "./messages.js";
 import { Plots } from "./plots.js";
 import { showRdss } from "./rdss.js";
 import { showSky } from "./sky.js";
@@ -36,6 +37,7 @@ const SLOWER = [
   showVerdicts,
   showSky,
   showRdss,
+  showMessages,
   showEvents,
   showCalibration,
   showSystem,

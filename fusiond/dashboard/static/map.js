@@ -1,6 +1,7 @@
 // The track from above on a metric grid, north up: follow or drag, wheel or keys to zoom. The land
 // below it comes from a file that the dashboard serves, or there is none: no other host is asked.
 import { BaseMap } from "./basemap.js";
+import { drawFleet } from "./fleet.js";
 import { colour, element, known, mark, prepared } from "./text.js";
 
 const EARTH_A = 6378137,
@@ -186,6 +187,7 @@ export class TrackMap {
     this.below(ctx);
     this.grid(ctx);
     this.line(ctx);
+    drawFleet(ctx, this, this.store.fleet);
     if (here) {
       this.ellipse(ctx, here, nav);
       this.arrow(ctx, here, nav);

@@ -23,6 +23,32 @@ const NAMES = [
   ["foreign_fix", "of another card"],
   ["unsolicited", "not asked for"],
 ];
+const MESSAGES = [
+  ["messages_written", "written"],
+  ["messages_sent", "sent"],
+  ["messages_received", "received"],
+  ["messages_refused", "refused"],
+  ["timeout_message", "without feedback"],
+  ["timeout_receipt", "without receipt"],
+  ["message_delivered", "delivered"],
+  ["message_unconfirmed", "unconfirmed"],
+  ["message_failed", "failed"],
+  ["message_expired", "expired"],
+];
+
+// The power of each beam, and which of them serve.
+function beams(said) {
+  const levels = said.levels.map((n, k) => (k + 1 === said.serving ? `[${n}]` : n)).join(" ");
+  if (!known(said.serving)) return `${levels}: none is heard`;
+  const second = known(said.time_difference) ? `, with ${said.time_difference}` : "";
+  return `${levels}: beam ${said.serving} serves${second}`;
+}
+
+const listed = (names, counters) =>
+  names
+    .filter(([key]) => counters[key])
+    .map(([key, word]) => `${whole(counters[key])} ${word}`)
+    .join(", ");
 
 function histogram(delays) {
   const surface = prepared(canvas);
@@ -71,10 +97,10 @@ export function showRdss(store) {
         : `${stretch(source.age_s + (store.age("health") || 0))} ago, ${stretch(source.latency_s)} late`,
     ],
   ];
-  const told = NAMES.filter(([key]) => counters[key]).map(
-    ([key, word]) => `${whole(counters[key])} ${word}`,
-  );
-  rows.push(["since the start", told.join(", ") || "nothing asked yet"]);
+  if (source.beams) rows.push(["beams", beams(source.beams)]);
+  rows.push(["since the start", listed(NAMES, counters) || "nothing asked yet"]);
+  const messages = listed(MESSAGES, counters);
+  if (messages) rows.push(["messages", messages]);
   fillRows(body, rows);
   histogram(
     store.rows.delay.filter((row) => row[1] === name && known(row[2])).map((row) => row[2]),

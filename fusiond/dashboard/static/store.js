@@ -2,7 +2,7 @@
 import { ageOf, hubNow, isOld } from "./age.js";
 
 // A little more than the dashboard keeps: it is what ten minutes hold.
-const MOST = { nav: 1300, nis: 4800, delay: 500, event: 200 };
+const MOST = { nav: 1300, nis: 4800, delay: 500, event: 200, message: 200 };
 const MOST_INNOVATIONS = 12000;
 const here = () => performance.now() / 1000;
 
@@ -70,6 +70,13 @@ export class Store {
   said(topic) {
     const heard = this.heard[topic];
     return heard ? heard.said : null;
+  }
+
+  // Where other vehicles are, the last of each card.
+  get fleet() {
+    return Object.entries(this.heard)
+      .filter(([topic]) => topic.startsWith("fleet/"))
+      .map(([topic, heard]) => ({ ...heard.said, age: this.age(topic) }));
   }
 
   age(topic) {

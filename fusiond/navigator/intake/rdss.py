@@ -32,8 +32,9 @@ def aids(m: DelayedFix, sections: Sections, when: Instants) -> list[Aid] | str:
     class_m = m.precision_class_m
     r = np.eye(2) * class_m**2
     if o.noise == "geometry":
+        height_sd_m = o.height_sd_m if m.height_sd_m is None else m.height_sd_m
         geometry = RdssGeometry(o.satellites_deg).covariance(
-            m.lat_rad, m.lon_rad, m.height_m, o.range_sd_m, o.height_sd_m
+            m.lat_rad, m.lon_rad, m.height_m, o.range_sd_m, height_sd_m
         )
         if isinstance(geometry, NotApplicable):
             return geometry.outcome

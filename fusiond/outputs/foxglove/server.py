@@ -145,7 +145,7 @@ class FoxgloveServer:
 
     def _place(self, topic: Topic, message: Message) -> None:
         for channel in CHANNELS:
-            if channel.topic is not topic:
+            if channel.topic.name != topic.name:
                 continue
             self._encoded.pop(channel.id, None)
             wanted = [

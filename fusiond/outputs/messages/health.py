@@ -45,6 +45,20 @@ class SkyHealth(BaseModel):
     )
 
 
+class BeamHealth(BaseModel):
+    """What an RDSS terminal said of its beams last; they are numbered from 1."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    levels: tuple[Count, ...] = Field(description="of power, 0 to 4; one of 2 or more is usable")
+    serving: Count | None = Field(
+        description="that answers: named by the terminal, else the strongest; null: none is heard"
+    )
+    time_difference: Count | None = Field(
+        description="the second satellite's, where the terminal names it"
+    )
+
+
 class SourceHealth(BaseModel):
     """One device: what it is doing, and what became of its measurements."""
 
@@ -73,6 +87,7 @@ class SourceHealth(BaseModel):
     )
     verdict: Verdict | None = Field(default=None, description="on sigma, see `consistency`")
     sky: SkyHealth | None = Field(default=None, description="of raw GNSS data")
+    beams: BeamHealth | None = Field(default=None, description="of an RDSS terminal")
 
 
 class OutputHealth(BaseModel):

@@ -23,6 +23,8 @@ class RdssOptions:
     family: Family = "4.0"
     user: int = 242286
     service_frequency_s: int = 10
+    comm_level: int = 3
+    """Of the card: how long a message may be; 0 allows none."""
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     precision_class_m: Literal[20, 100] = 20
     error_sd_m: float | None = None
@@ -51,6 +53,11 @@ class RdssOptions:
     refuse_probability: float = 0.0
     """A request is refused by chance: no beam at this moment or, as often, the service frequency
     is not reached because another host of the card has used it."""
+    mute_probability: float = 0.0
+    """A request or a message is swallowed by a terminal that is busy: no feedback, no burst."""
+    convoy: bool = False
+    """Another vehicle of a convoy reports its place, sends a text now and then and confirms those
+    that ask for it (simulation.rdss.network)."""
     multi_value_probability: float = 0.0
     foreign_probability: float = 0.0
 
@@ -116,6 +123,11 @@ class RdssCentre:
     def dropped(self) -> bool:
         """Whether this request is lost on the way."""
         return bool(self._rng.random() < self._options.drop_probability)
+
+    def mute(self) -> bool:
+        """Whether the terminal says nothing to this one."""
+        p = self._options.mute_probability
+        return p > 0.0 and bool(self._rng.random() < p)
 
     def refused(self) -> Literal["no_beam", "other_host"] | None:
         """Whether and why this request is refused by chance."""

@@ -15,6 +15,7 @@ import heapq
 import math
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import count
 
@@ -41,13 +42,19 @@ from drivers.rdss.messages import (
     SelfTestRequest,
     StopRequest,
     Subordinates,
+    Text,
     TextRequest,
     TimeRequest,
     Unknown,
     VersionRequest,
 )
+from drivers.rdss.wording import Wording, level_bits
+from drivers.standard_atmosphere import pressure_height_m
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssCentre, RdssOptions
+
+Carry = Callable[[int, TextRequest, float], None]
+"""Takes a message that has left: the sender's card, the message, the instant (s)."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FOREIGN_USER = 242407
@@ -62,8 +69,9 @@ class RdssTerminal:
 
     `beam_levels`, `battery_percent`, `suppressed`, `silent` and `utc_start_ns` may be set from
     outside; `lift` ends a suppression or a silence as a terminal does, with a notice. Counters: the
-    name of every request class, `fixes`, `foreign`, `dropped`, `unsayable` (the family has no such
-    message), `refused_<outcome>`, `too_early` (transmissions asked for within the card's spacing).
+    name of every request class, `fixes`, `foreign`, `dropped`, `muted`, `texts` (handed over),
+    `unsayable` (the family has no such message), `refused_<outcome>`, `too_early` (transmissions
+    asked for within the card's spacing). `bursts_s` are the instants of all transmissions.
     """
 
     def __init__(
@@ -80,6 +88,8 @@ class RdssTerminal:
         binary = options.family == "4.0"
         self._decoder: Decoder = binary_4_0.Decoder() if binary else text_2_1.Decoder()
         self._encode = binary_4_0.encode if binary else text_2_1.encode
+        self.carry: Carry = lambda card, message, t_s: None
+        self.bursts_s: list[float] = []
         self._last_burst_s = -math.inf
         self._queue: list[tuple[float, int, bytes]] = []
         self._order = count()
@@ -126,6 +136,12 @@ class RdssTerminal:
         )
         self._say(t_s + self.options.reply_s, notice)
 
+    def hand_over(self, text: Text, due_s: float) -> None:
+        """A message has come for this card; it is printed with the centre's time."""
+        local = self._local(due_s, self.options.zone_h)
+        self.counters["texts"] += 1
+        self._say(due_s, replace(text, minute_of_day=local.hour * 60 + local.minute))
+
     def _say(self, due_s: float, message: Reply | Unknown) -> None:
         try:
             heapq.heappush(self._queue, (due_s, next(self._order), self._encode(message)))
@@ -147,7 +163,9 @@ class RdssTerminal:
         o = self.options
         match message:
             case IdentityRequest(index=0):
-                identity = Identity(o.user, o.service_frequency_s, 11, 6, 3, serial=o.user)
+                identity = Identity(
+                    o.user, o.service_frequency_s, 11, 6, o.comm_level, serial=o.user
+                )
                 self._say(t_s + o.reply_s, identity)
             case IdentityRequest():
                 self._say(t_s + o.reply_s, Subordinates(o.user, message.index, ()))
@@ -169,7 +187,10 @@ class RdssTerminal:
                     "DWSQ", t_s, message.period_s, lambda due: self._position(message, due)
                 )
             case TextRequest():
-                self._transmit("TXSQ", "TXA", t_s)
+                wording = Wording(message.payload, message.encoding, message.odd)
+                fits = wording.bits <= level_bits(o.comm_level)
+                if self._transmit("TXSQ", "TXA", t_s, None if fits else Outcome.FAILED):
+                    self.carry(o.user, message, t_s)
 
     def _say_beams(self, t_s: float) -> None:
         o = self.options
@@ -235,13 +256,20 @@ class RdssTerminal:
                 return Outcome.FREQUENCY, float(round(self._last_burst_s + spacing - t_s))
         return None
 
-    def _transmit(self, command_4_0: str, command_2_1: str, t_s: float) -> bool:
-        """Say the feedback; whether a burst left the antenna."""
+    def _transmit(
+        self, command_4_0: str, command_2_1: str, t_s: float, wrong: Outcome | None = None
+    ) -> bool:
+        """Say the feedback; whether a burst left the antenna. `wrong`: what is wrong with what is
+        to be sent."""
         o = self.options
-        refusal = self._refusal(t_s)
+        if self._centre.mute():
+            self.counters["muted"] += 1
+            return False
+        refusal = self._refusal(t_s) if wrong is None else (wrong, None)
         outcome, wait = refusal or (Outcome.OK, None)
         if refusal is None:
             self._last_burst_s = t_s
+            self.bursts_s.append(t_s)
         else:
             self.counters[f"refused_{outcome}"] += 1
         local = self._local(t_s, o.zone_h)
@@ -264,6 +292,8 @@ class RdssTerminal:
             self.counters["dropped"] += 1
             return
         given = request.height_m if request.height_mode is HeightMode.GIVEN else None
+        if request.height_mode is HeightMode.ALTIMETER_1 and request.pressure_pa:
+            given = pressure_height_m(request.pressure_pa)  # the weather is the standard's
         fix = self._centre.fix(t_s + o.response_s, given)
         local = self._local(fix.t_s, o.zone_h)
         seconds = local.hour * 3600 + local.minute * 60 + local.second

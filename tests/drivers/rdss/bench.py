@@ -22,6 +22,7 @@ from drivers.rdss.messages import (
     PositionRequest,
     SelfTest,
     SelfTestRequest,
+    TextRequest,
 )
 from drivers.rdss.terminal import Terminal
 
@@ -83,7 +84,7 @@ class Bench:
                 case Send(data, kind):
                     module = binary_4_0 if data[5] == 0 else text_2_1
                     (message,) = module.Decoder().feed(data)
-                    assert (kind == "request") == isinstance(message, PositionRequest)
+                    assert (kind == "request") == isinstance(message, PositionRequest | TextRequest)
                     self.sent.append((self.t, message))
                     if self.line_baud == self.baud and not self.mute:
                         self.hear(message, "4.0" if module is binary_4_0 else "2.1")
@@ -100,7 +101,8 @@ class Bench:
         replies: Iterable[tuple[float, Message]] = ()
         match message:
             case IdentityRequest():
-                replies = [(0.1, Identity(self.user, self.service_s if self.user else 0))]
+                service_s = self.service_s if self.user else 0
+                replies = [(0.1, Identity(self.user, service_s, comm_level=3))]
             case BeamPowerRequest() if self.answers_beams:
                 replies = [(0.1, BeamPower(self.levels, self.user))]
             case SelfTestRequest():

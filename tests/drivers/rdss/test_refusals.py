@@ -34,7 +34,7 @@ def test_refused_goes_on_at_normal_cadence(outcome: Outcome, counter: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("stated", "earliest"), [(90.0, 91), (None, 61), (100000.0, 61), (5.0, 61)]
+    ("stated", "earliest"), [(90.0, 91), (None, 61), (100000.0, 61), (5.0, 60.1)]
 )
 def test_refused_by_frequency_waits(stated: float | None, earliest: float) -> None:
     bench = Bench(answer=refuse(Outcome.FREQUENCY, stated))

@@ -1,0 +1,140 @@
+"""Short messages that came: whose they are, what they say, and the receipts that they ask for."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from drivers.rdss.cycle import MailReady
+from drivers.rdss.envelope import (
+    RECEIPT,
+    TEXT,
+    CutError,
+    DamagedError,
+    Envelope,
+    Receipted,
+    VersionError,
+    opened,
+    read_receipt,
+    read_text,
+)
+from drivers.rdss.mail import Fault, FleetFix, Kind, MessageReceived
+from drivers.rdss.messages import Fix, Text
+from drivers.rdss.report import PositionReport, decode_report
+from drivers.rdss.session import Session
+from drivers.rdss.wording import Wording, plain_text
+
+MOST_REMEMBERED = 128
+"""Texts that asked for a receipt: two hours of a card that is sent one a minute (our choice)."""
+Seen = tuple[int, int, int]
+"""Sender, number, CRC."""
+
+
+class Inbox:
+    """Hands on all that comes, whatever is wrong with it. `seen` are the texts that asked for a
+    receipt, by which one that comes again is known."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.seen: OrderedDict[Seen, None] = OrderedDict()
+
+    def take(self, message: Text, t_ns: int) -> MailReady:
+        """A message that the terminal has handed over."""
+        session = self._session
+        session.counters["messages_received"] += 1
+        wording = Wording(message.payload, message.encoding, message.odd)
+        card = session.identity.user if session.identity is not None else 0
+        receiver = message.user or card
+        fault: Fault = ""
+        envelope: Envelope | None = None
+        if receiver != card:
+            fault = "other_card"
+        elif not message.crc_ok:
+            fault = "crc"
+        else:
+            envelope, fault = _opened(wording)
+        kind: Kind = "text"
+        text = None if fault in ("cut", "damaged", "version") else plain_text(wording)
+        report: PositionReport | None = None
+        number: int | None = None
+        repeated = False
+        if envelope is not None:
+            if envelope.kind == TEXT:
+                number, data = read_text(envelope.body)
+                text = plain_text(Wording(data, "mixed"))
+                repeated = self._asks(message.sender, Receipted(number, envelope.crc), t_ns)
+            elif envelope.kind == RECEIPT:
+                kind, text = "receipt", None
+                receipted = read_receipt(envelope.body)
+                number = receipted.number
+                session.outbox.receipt(message.sender, receipted)
+            else:
+                kind, text = "report", None
+                try:
+                    report = decode_report(envelope.kind, envelope.body)
+                except ValueError:
+                    fault = "damaged"
+        if fault:
+            session.counters[f"message_{fault}"] += 1
+        return MailReady(
+            MessageReceived(
+                session.options.source,
+                t_ns,
+                message.sender,
+                receiver,
+                kind,
+                message.payload,
+                message.encoding,
+                text,
+                message.minute_of_day,
+                number,
+                report,
+                repeated,
+                fault,
+            )
+        )
+
+    def place(self, fix: Fix, t_ns: int) -> MailReady | None:
+        """Where another card is by the centre; None for a fix that names no other."""
+        own = self._session.identity
+        card = fix.queried or fix.user
+        if fix.kind == "own" or own is None or card in (0, own.user):
+            return None
+        return MailReady(
+            FleetFix(
+                self._session.options.source,
+                t_ns,
+                card,
+                fix.time_of_day_s,
+                fix.lat_deg,
+                fix.lon_deg,
+                fix.height_m,
+                float(fix.precision_class_m),
+            )
+        )
+
+    def _asks(self, sender: int, receipted: Receipted, t_ns: int) -> bool:
+        """Queue the receipt for a text; whether the text came before."""
+        session = self._session
+        if session.options.transmit:
+            session.outbox.post_receipt(sender, receipted, t_ns)
+        else:
+            session.counters["receipt_read_only"] += 1
+        seen = (sender, *receipted)
+        repeated = seen in self.seen
+        session.counters["message_repeated"] += repeated
+        self.seen[seen] = None
+        if len(self.seen) > MOST_REMEMBERED:
+            self.seen.popitem(last=False)
+        return repeated
+
+
+def _opened(wording: Wording) -> tuple[Envelope | None, Fault]:
+    """The envelope, or what is wrong with it."""
+    try:
+        return opened(wording), ""
+    except CutError:
+        return None, "cut"
+    except DamagedError:
+        return None, "damaged"
+    except VersionError:
+        return None, "version"

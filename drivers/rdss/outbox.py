@@ -1,0 +1,330 @@
+"""Messages on their way out: their order, attempts, receipts and ends. No I/O and no clock.
+
+Every message ends with a stage of `mail.Stage`; each change is handed over. What blocks a terminal
+(no beam, suppression, a low battery, the card's spacing) is no attempt: the message waits, until it
+expires. Receipts go first, then texts, then reports, of which the latest counts.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from drivers.rdss.cycle import GIVE_UP_NS
+from drivers.rdss.envelope import (
+    RECEIPT,
+    TEXT,
+    Carriage,
+    Receipted,
+    carried,
+    crc_of,
+    receipt_body,
+    sealed,
+    text_body,
+)
+from drivers.rdss.mail import Kind, MessageRefusedError, Stage
+from drivers.rdss.messages import Outcome
+from drivers.rdss.report import (
+    REPORT,
+    SHORT_REPORT,
+    PositionReport,
+    encode_report,
+    encode_short,
+)
+from drivers.rdss.wording import Wording, level_bits, worded
+
+MOST_WAITING = 32
+"""Half an hour of a card of 60 s; who queues more gets a refusal (our choice)."""
+MOST_ATTEMPTS = 5
+"""Of ten messages, each lost with its receipt in three of ten, one in fifty is then told as
+unconfirmed: 1 - 0.7^2 is 0.51, to the fifth 0.03 (our choice)."""
+MOST_REFUSALS = 3
+"""In a row, without a reason that passes by itself: public code asks three times (1.5)."""
+RECEIPT_SPACINGS = 6
+"""Turns of a card like ours in which a receipt may come: every other turn is the other's fixes',
+and two messages may go before it (our choice)."""
+RANKS: dict[Kind, int] = {"receipt": 0, "text": 1, "report": 2}
+BLOCKED = frozenset(
+    {
+        *(Outcome.FREQUENCY, Outcome.NOT_LOCKED, Outcome.NOT_SENT, Outcome.LOW_BATTERY),
+        *(Outcome.SUPPRESSED, Outcome.SILENCE, Outcome.SILENCE_OR_LIFTED, Outcome.NO_CARD),
+    }
+)
+"""What passes by itself, or by somebody: no attempt."""
+
+
+@dataclass(slots=True)
+class Outgoing:
+    """One message. `wordings` in order of preference: the first that the card allows is sent.
+
+    `receipted` is what its receipt will name, None where it asks for none. Instants are monotonic
+    ns; `stage` is `queued`, or `sent` while the receipt is awaited.
+    """
+
+    key: str
+    receiver: int
+    kind: Kind
+    wordings: tuple[Wording, ...]
+    created_ns: int
+    text: str | None = None
+    receipted: Receipted | None = None
+    attempts: int = 0
+    refusals: int = 0
+    stage: Stage = "queued"
+    not_before_ns: int = 0
+    why: str = ""
+
+
+@dataclass(slots=True)
+class Change:
+    """A message has come to another stage, or is queued again: as it was then."""
+
+    message: Outgoing
+    stage: Stage
+    why: str
+
+
+@dataclass(slots=True)
+class Outbox:
+    """See the module. `changes` are those that nobody has taken yet; `number` the last given."""
+
+    counters: Counter[str]
+    expiry_ns: int
+    waiting: list[Outgoing] = field(default_factory=list)
+    changes: list[Change] = field(default_factory=list)
+    number: int = 0
+    carriage: Carriage = "binary"
+    """Of texts that ask for a receipt, and of receipts."""
+    comm_level: int | None = None
+    spacing_ns: int = 0
+    in_flight: Outgoing | None = None
+    doubtful: Outgoing | None = None
+    """Written, and no feedback came: a late one still counts."""
+
+    # ------------------------------------------------------------------ queueing
+
+    def post_text(self, key: str, receiver: int, text: str, receipt: bool, t_ns: int) -> None:
+        """Queue a text. Raises `MessageRefusedError`."""
+        if any(m.key == key for m in self.waiting):
+            raise MessageRefusedError("message_known", "it is queued already under this id")
+        if sum(m.kind == "text" for m in self.waiting) >= MOST_WAITING:
+            raise MessageRefusedError("message_queue_full", f"{MOST_WAITING} messages wait already")
+        try:
+            wording, receipted = self._worded(text, receipt)
+        except ValueError as error:
+            raise MessageRefusedError("message_unsayable", str(error)) from None
+        self._look_at(wording)
+        self._queue(Outgoing(key, receiver, "text", (wording,), t_ns, text, receipted))
+
+    def post_report(self, key: str, receiver: int, report: PositionReport, t_ns: int) -> None:
+        """Queue a report in place of one that waits. Raises `MessageRefusedError`."""
+        try:
+            full = sealed(REPORT, encode_report(report))
+            short = sealed(SHORT_REPORT, encode_short(report))
+        except ValueError as error:
+            raise MessageRefusedError("message_unsayable", str(error)) from None
+        wordings = carried(full, self.carriage), carried(short, self.carriage)
+        self._look_at(wordings[-1])
+        for older in [m for m in self.waiting if m.kind == "report" and m.receiver == receiver]:
+            if older is not self.in_flight:
+                self._end(older, "superseded", "a newer report is due")
+        self._queue(Outgoing(key, receiver, "report", wordings, t_ns))
+
+    def post_receipt(self, receiver: int, receipted: Receipted, t_ns: int) -> None:
+        """Queue the receipt for a message that came; the same one again waits once."""
+        key = f"receipt-{receiver}-{receipted.number}-{receipted.crc:04x}"
+        if any(m.key == key for m in self.waiting):
+            self.counters["receipt_waiting"] += 1
+            return
+        if sum(m.kind == "receipt" for m in self.waiting) >= MOST_WAITING:
+            self.counters["receipt_queue_full"] += 1
+            return
+        if self.comm_level is not None and not level_bits(self.comm_level):
+            self.counters["receipt_forbidden"] += 1
+            return
+        wording = carried(sealed(RECEIPT, receipt_body(receipted)), self.carriage)
+        self._queue(Outgoing(key, receiver, "receipt", (wording,), t_ns))
+
+    def restore(self, messages: Sequence[Outgoing], number: int) -> None:
+        """Go on with what a run before left: what was in flight may go twice."""
+        self.waiting = list(messages)
+        self.number = number
+        for message in self.waiting:
+            self._tell(message, message.stage, "kept over a restart")
+
+    def _worded(self, text: str, receipt: bool) -> tuple[Wording, Receipted | None]:
+        if not receipt:
+            return worded(text), None
+        number = self.number % 0xFFFF + 1
+        envelope = sealed(TEXT, text_body(number, text.encode("gb18030")))
+        self.number = number
+        return carried(envelope, self.carriage), Receipted(number, crc_of(envelope))
+
+    def _look_at(self, wording: Wording) -> None:
+        """Refuse what the card, once it is known, will never send."""
+        if self.comm_level is None:
+            return
+        most = level_bits(self.comm_level)
+        if not most:
+            text = f"the card's communication level, {self.comm_level}, allows no message"
+            raise MessageRefusedError("message_forbidden", text)
+        if wording.bits > most:
+            text = f"{wording.bits} bits, and a card of level {self.comm_level} sends {most}"
+            raise MessageRefusedError("message_too_long", text)
+
+    def _queue(self, message: Outgoing) -> None:
+        self.waiting.append(message)
+        self.counters["messages_queued"] += 1
+        self._tell(message, "queued", "")
+
+    # ------------------------------------------------------------------ sending
+
+    def next(self, t_ns: int) -> Outgoing | None:
+        """The message whose turn it is."""
+        due = [m for m in self.waiting if m.stage == "queued" and m.not_before_ns <= t_ns]
+        return min(due, key=lambda m: (RANKS[m.kind], m.attempts > 0, m.created_ns), default=None)
+
+    @property
+    def next_ns(self) -> int | None:
+        """When something is due here by itself: a message, a receipt that did not come, an end."""
+        return min((min(m.not_before_ns, self._end_ns(m)) for m in self.waiting), default=None)
+
+    def wording(self, message: Outgoing) -> Wording | None:
+        """How it is sent from this card; None, and its end, if it cannot be."""
+        most = level_bits(self.comm_level or 0)
+        for wording in message.wordings:
+            if wording.bits <= most:
+                return wording
+        if most:
+            self._end(message, "too_long", f"a card of level {self.comm_level} sends {most} bits")
+        else:
+            self._end(message, "forbidden", f"a card of level {self.comm_level} sends no message")
+        return None
+
+    def unsayable(self, message: Outgoing, why: str) -> None:
+        """The terminal's family has no words for it."""
+        self._end(message, "unsayable", why)
+
+    def written(self, message: Outgoing) -> None:
+        """It is in the terminal's hands."""
+        self.in_flight, self.doubtful = message, None
+        message.attempts += 1
+        self.counters["messages_written"] += 1
+
+    def accepted(self, t_ns: int) -> None:
+        """The terminal says that it has sent what is in flight, or what it was silent about."""
+        message = self.in_flight or self.doubtful
+        self.in_flight = self.doubtful = None
+        if message is None or message not in self.waiting:
+            return
+        self.counters["messages_sent"] += 1
+        message.refusals = 0
+        if message.receipted is None:
+            self._end(message, "sent", "")
+            return
+        message.stage = "sent"
+        wait_ns = max(GIVE_UP_NS, RECEIPT_SPACINGS * self.spacing_ns) * message.attempts
+        message.not_before_ns = t_ns + wait_ns
+        self._tell(message, "sent", "awaiting its receipt")
+
+    def refused(self, outcome: Outcome, t_ns: int) -> None:
+        """The terminal refuses what is in flight."""
+        message, self.in_flight = self.in_flight, None
+        if message is None:
+            return
+        self.counters["messages_refused"] += 1
+        message.attempts -= 1
+        if outcome is Outcome.NO_PERMISSION:
+            self._end(message, "no_permission", "the card has no permission to send messages")
+            return
+        if outcome not in BLOCKED:
+            message.refusals += 1
+            if message.refusals >= MOST_REFUSALS:
+                self._end(message, "failed", f"refused {message.refusals} times: {outcome}")
+                return
+        self._tell(message, "queued", f"refused: {outcome}")
+
+    def unanswered(self) -> None:
+        """No feedback came for what is in flight: it may have left, and goes again."""
+        message, self.in_flight = self.in_flight, None
+        if message is None:
+            return
+        self.counters["timeout_message"] += 1
+        self.doubtful = message
+        if message.attempts >= MOST_ATTEMPTS:
+            self._end(message, "unconfirmed", f"written {message.attempts} times, no feedback")
+        else:
+            self._tell(message, "queued", "no feedback: it may have left")
+
+    def receipt(self, sender: int, receipted: Receipted) -> None:
+        """A receipt has come from this card."""
+        for message in self.waiting:
+            if message.receiver == sender and message.receipted == receipted:
+                self._end(message, "delivered", "")
+                return
+        self.counters["receipt_unmatched"] += 1
+
+    def settle(self, t_ns: int) -> None:
+        """End what has expired, and queue again what has no receipt."""
+        for message in [m for m in self.waiting if m is not self.in_flight]:
+            if t_ns >= self._end_ns(message):
+                # Written before: it may have left, or arrived.
+                stage: Stage = "unconfirmed" if message.attempts else "expired"
+                self._end(message, stage, f"its time is over; {message.why or 'never sent'}")
+            elif message.stage == "sent" and t_ns >= message.not_before_ns:
+                self.counters["timeout_receipt"] += 1
+                if message.attempts >= MOST_ATTEMPTS:
+                    text = f"sent {message.attempts} times, no receipt"
+                    self._end(message, "unconfirmed", text)
+                else:
+                    message.stage = "queued"
+                    self._tell(message, "queued", "no receipt: it goes again")
+
+    # ------------------------------------------------------------------ inside
+
+    def _end_ns(self, message: Outgoing) -> int:
+        return message.created_ns + self.expiry_ns
+
+    def _end(self, message: Outgoing, stage: Stage, why: str) -> None:
+        self.waiting.remove(message)
+        if self.in_flight is message:
+            self.in_flight = None
+        if self.doubtful is message:
+            self.doubtful = None
+        self.counters[f"message_{stage}"] += 1
+        self._tell(message, stage, why)
+
+    def _tell(self, message: Outgoing, stage: Stage, why: str) -> None:
+        message.why = why
+        self.changes.append(Change(message, stage, why))
+
+    def take_changes(self) -> Iterator[Change]:
+        """Those since the last call."""
+        changes, self.changes = self.changes, []
+        return iter(changes)
+
+
+class Turns:
+    """Whose turn a transmission is, where fixes and messages both wait: messages have `share`.
+
+    Stride scheduling (Waldspurger and Weihl, MIT/LCS/TM-528, 1995): each turn costs its class the
+    inverse of its share, and the class that has spent less goes next. Who does not want turns does
+    not save them up.
+    """
+
+    def __init__(self, share: float) -> None:
+        self._cost = {"message": 1.0 / share, "fix": 1.0 / (1.0 - share)}
+        self._spent = {"message": 0.0, "fix": 0.0}
+
+    @property
+    def message_first(self) -> bool:
+        """Where both wait, at equal cost the fix goes first."""
+        return self._spent["message"] < self._spent["fix"]
+
+    def took(self, message: bool, other_waits: bool) -> None:
+        """A turn was used."""
+        mine, other = ("message", "fix") if message else ("fix", "message")
+        if not other_waits:
+            self._spent[other] = max(self._spent[other], self._spent[mine])
+        self._spent[mine] += self._cost[mine]

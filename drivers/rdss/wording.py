@@ -1,0 +1,85 @@
+"""Texts as a terminal carries them, and how much of a card's allowance each takes.
+
+    chinese   GB 2312, two bytes a character          7 bits a byte in the air
+    code      decimal digits, two a byte              4 bits a digit
+    mixed     0xA4, then any bytes; a text in GB 18030   8 bits a byte, 0xA4 included
+
+The most that a card may send at once is set by its communication level, 1 to 4. Public code has two
+tables, for plain and for encrypted cards, and reads the card's flag for that in opposite ways: the
+lesser of both is what either kind may send. A card of level 0 may send none. A level above 4 is of
+a later system, and has the most of level 4.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from drivers.rdss.mail import TextEncoding
+
+PLAIN_BITS = (110, 408, 628, 848)
+ENCRYPTED_BITS = (140, 360, 580, 1680)
+LEVEL_BITS = (0, *map(min, PLAIN_BITS, ENCRYPTED_BITS))
+"""By communication level: 0, 110, 360, 580, 848."""
+MIXED = b"\xa4"
+
+
+class Wording(NamedTuple):
+    """A payload as TXSQ and CCTXA take it; `odd` as in `TextRequest`."""
+
+    payload: bytes
+    encoding: TextEncoding
+    odd: bool = False
+
+    @property
+    def bits(self) -> int:
+        """What it takes of a card's allowance."""
+        if self.encoding == "chinese":
+            return 7 * len(self.payload)
+        return 8 * len(self.payload) - 4 * self.odd
+
+
+def level_bits(comm_level: int) -> int:
+    """The most bits of one message of a card of this level."""
+    return LEVEL_BITS[min(comm_level, len(LEVEL_BITS) - 1)]
+
+
+def worded(text: str) -> Wording:
+    """A text in the encoding that takes least. ValueError for what GB 18030 cannot say."""
+    if text and text.isascii() and text.isdigit():
+        return digits(text)
+    try:
+        chinese = text.encode("gb2312")
+    except UnicodeEncodeError:
+        return mixed(text.encode("gb18030"))
+    if text and len(chinese) == 2 * len(text):
+        return Wording(chinese, "chinese")
+    return mixed(chinese)
+
+
+def mixed(data: bytes) -> Wording:
+    """Any bytes."""
+    return Wording(MIXED + data, "mixed")
+
+
+def digits(text: str) -> Wording:
+    """Decimal digits, two a byte."""
+    odd = len(text) % 2 == 1
+    return Wording(bytes.fromhex(text + "0" * odd), "code", odd)
+
+
+def plain_text(wording: Wording) -> str | None:
+    """What a person reads; None for bytes that are no text. Control characters are left out."""
+    if wording.encoding == "code":
+        text = wording.payload.hex().upper()
+        return text[:-1] if wording.odd else text
+    try:
+        text = wording.payload.removeprefix(MIXED).decode("gb18030")
+    except UnicodeDecodeError:
+        return None
+    return text if text.isprintable() else _printable(text)
+
+
+def _printable(text: str) -> str | None:
+    """Without line ends and tabs; None where other control characters say that it is no text."""
+    flat = text.replace("\r", " ").replace("\n", " ").replace("\t", " ")
+    return flat if flat.isprintable() else None

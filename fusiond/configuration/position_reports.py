@@ -1,0 +1,30 @@
+"""`[position_reports]`: where the vehicle says by RDSS short message where it is."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, PositiveFloat, model_validator
+
+from fusiond.configuration.aiding import Section
+
+EventCode = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+class PositionReports(Section):
+    """Reports of the solution to another card; see `docs/rdss-messages.md`."""
+
+    card: Annotated[int, Field(ge=1, le=9_999_999)] | None = None
+    """The card that gets them; without it there are none."""
+    source: str | None = None
+    """The terminal that sends them, where there are several."""
+    interval_s: PositiveFloat | None = None
+    """A report every so often, as far as the card's turns allow; the latest counts."""
+    events: tuple[EventCode, ...] = ()
+    """Codes of events of devices and navigator with each of which a report goes out."""
+
+    @model_validator(mode="after")
+    def _when(self) -> PositionReports:
+        if self.card is not None and self.interval_s is None and not self.events:
+            raise ValueError("position_reports.card needs interval_s, events or both")
+        return self

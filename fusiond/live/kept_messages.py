@@ -1,0 +1,128 @@
+"""Short messages as they are kept over a restart: those that wait, and those that nobody was told.
+
+Instants are ages: a monotonic clock may start anew.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from drivers.rdss.envelope import Receipted, opened, read_text
+from drivers.rdss.inbox import Inbox
+from drivers.rdss.mail import Kind, Stage, TextEncoding
+from drivers.rdss.messages import FieldError
+from drivers.rdss.outbox import Outbox, Outgoing
+from drivers.rdss.wording import Wording, plain_text
+from fusiond.outputs.messages.short_message import ShortMessage
+
+SECOND_NS = 1_000_000_000
+Hex = Annotated[str, Field(pattern=r"^([0-9a-f]{2}){0,256}$")]
+Natural = Annotated[int, Field(ge=0, le=2**62)]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptWording:
+    """A `Wording` with its bytes in hex."""
+
+    payload: Hex
+    encoding: TextEncoding
+    odd: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMessage:
+    """An `Outgoing`. `age_s` since it was queued."""
+
+    key: Annotated[str, Field(max_length=64)]
+    receiver: Natural
+    kind: Kind
+    wordings: Annotated[tuple[KeptWording, ...], Field(min_length=1, max_length=4)]
+    age_s: Annotated[float, Field(ge=0.0)]
+    receipted: tuple[Natural, Natural] | None
+    attempts: Natural
+    refusals: Natural
+    stage: Stage
+
+
+@dataclass(frozen=True, slots=True)
+class KeptBox:
+    """One terminal's: `number` the last given to a text that asks for a receipt, `seen` those that
+    came and asked for one."""
+
+    number: Natural
+    waiting: tuple[KeptMessage, ...]
+    seen: tuple[tuple[Natural, Natural, Natural], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMessages:
+    """By terminal; `untold` are messages that no broker has confirmed. `utc_s` is when it was
+    written, None where that was not known; `taken_up_ns` when a start took it up."""
+
+    serial: Natural
+    boxes: dict[str, KeptBox]
+    untold: tuple[ShortMessage, ...]
+    utc_s: float | None = None
+    taken_up_ns: int | None = None
+
+
+KEPT_MESSAGES = TypeAdapter(KeptMessages)
+
+
+def kept_box(outbox: Outbox, inbox: Inbox, t_ns: int) -> KeptBox:
+    """A terminal's messages as they are at `t_ns`."""
+    return KeptBox(
+        outbox.number,
+        tuple(_kept(m, t_ns) for m in outbox.waiting),
+        tuple(inbox.seen),
+    )
+
+
+def restore(box: KeptBox, outbox: Outbox, inbox: Inbox, t_ns: int) -> None:
+    """Let a terminal go on from what was kept, at `t_ns`."""
+    inbox.seen.update(dict.fromkeys(box.seen))
+    outbox.restore([_outgoing(m, t_ns) for m in box.waiting], box.number)
+
+
+def _kept(m: Outgoing, t_ns: int) -> KeptMessage:
+    return KeptMessage(
+        m.key,
+        m.receiver,
+        m.kind,
+        tuple(KeptWording(w.payload.hex(), w.encoding, w.odd) for w in m.wordings),
+        max(0.0, (t_ns - m.created_ns) / SECOND_NS),
+        m.receipted,
+        m.attempts,
+        m.refusals,
+        m.stage,
+    )
+
+
+def _outgoing(kept: KeptMessage, t_ns: int) -> Outgoing:
+    """What awaited its receipt goes on waiting, at the most as long as the first time again."""
+    wordings = tuple(Wording(bytes.fromhex(w.payload), w.encoding, w.odd) for w in kept.wordings)
+    return Outgoing(
+        kept.key,
+        kept.receiver,
+        kept.kind,
+        wordings,
+        t_ns - round(kept.age_s * SECOND_NS),
+        _text(wordings[0]) if kept.kind == "text" else None,
+        None if kept.receipted is None else Receipted(*kept.receipted),
+        kept.attempts,
+        kept.refusals,
+        "queued",
+    )
+
+
+def _text(wording: Wording) -> str | None:
+    try:
+        envelope = opened(wording)
+    except FieldError:
+        return None
+    if envelope is None:
+        return plain_text(wording)
+    return plain_text(Wording(read_text(envelope.body)[1], "mixed"))

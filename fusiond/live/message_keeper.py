@@ -1,0 +1,129 @@
+"""Short messages on disk: those that wait and those that nobody was told outlive the process.
+
+Written whenever something has changed, in a thread, whole or not at all; what comes meanwhile is
+written next. Whoever queues a message is answered when it is on disk.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.schema import Config
+from fusiond.live.messaging import Messaging
+from fusiond.live.state_keeper import state_file
+from fusiond.navigator.state_file import (
+    MOST_BYTES,
+    DamagedStateError,
+    read_state,
+    set_aside,
+    write_state,
+)
+
+if TYPE_CHECKING:  # a vehicle without a terminal does without them
+    from fusiond.live.kept_messages import KeptBox, KeptMessages
+
+log = logging.getLogger("fusiond")
+
+
+class MessageKeeper:
+    """Keeps one vehicle's messages beside its saved state, where that is kept.
+
+    `on_event(code, text)` hears `messages_damaged`, and `messages_not_kept` once a row of failures.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        clock: Clock,
+        on_event: Callable[[str, str], None],
+        environ: Mapping[str, str] = os.environ,
+    ) -> None:
+        beside = state_file(config, environ)
+        self._path = None if beside is None else beside.with_suffix(".messages.json")
+        self._clock = clock
+        self._event = on_event
+        self._written = 0
+        self._error = ""
+        self._working: asyncio.Task[None] | None = None
+
+    def load(self, messaging: Messaging) -> str | None:
+        """Let messages go on from what the last run kept, aged by the time since; that in JSON,
+        None where there is nothing."""
+        if self._path is None or not os.path.lexists(self._path):
+            return None
+        from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+
+        try:
+            kept = read_state(self._path, KEPT_MESSAGES)
+        except DamagedStateError as error:
+            self._event("messages_damaged", f"{self._path}: {error}; {set_aside(self._path)}")
+            return None
+        if kept is None:
+            return None
+        t_ns = self._clock.now_ns()
+        utc_ns = self._clock.utc_ns(t_ns)
+        passed_s = 0.0
+        if utc_ns is not None and kept.utc_s is not None:
+            passed_s = max(0.0, utc_ns * 1e-9 - kept.utc_s)
+        boxes = {name: _aged(box, passed_s) for name, box in kept.boxes.items()}
+        kept = replace(kept, boxes=boxes, taken_up_ns=t_ns)
+        messaging.resume(kept)
+        return KEPT_MESSAGES.dump_json(kept).decode()
+
+    def keep(self, t_ns: int, messaging: Messaging) -> None:
+        """Write what has changed, unless a write is under way; at every tick."""
+        busy = self._working is not None and not self._working.done()
+        if self._path is None or busy or messaging.revision == self._written:
+            return
+        revision, text = messaging.revision, _text(messaging.state(t_ns))
+        self._working = asyncio.create_task(self._write(self._path, revision, text))
+
+    async def kept(self, revision: int, messaging: Messaging) -> str:
+        """Wait until this revision is on disk; "" or why it is not."""
+        if self._path is None:
+            return "not kept over a restart: no state_file"
+        while self._written < revision and not self._error:
+            self.keep(self._clock.now_ns(), messaging)
+            if self._working is not None:
+                await asyncio.wait([self._working])
+        return self._error and f"not kept on disk: {self._error}"
+
+    async def close(self, t_ns: int, messaging: Messaging) -> None:
+        """Keep the last state, after what is under way has ended."""
+        if self._working is not None:
+            await asyncio.wait([self._working])
+        if self._path is not None and messaging.revision != self._written:
+            await self._write(self._path, messaging.revision, _text(messaging.state(t_ns)))
+
+    async def _write(self, path: Path, revision: int, text: bytes) -> None:
+        try:
+            await asyncio.to_thread(write_state, path, text, True)
+        except OSError as error:
+            if not self._error:
+                self._event("messages_not_kept", f"{path}: {error}")
+            self._error = error.strerror or str(error)
+        else:
+            self._error = ""
+        self._written = revision
+
+
+def _aged(box: KeptBox, passed_s: float) -> KeptBox:
+    return replace(box, waiting=tuple(replace(m, age_s=m.age_s + passed_s) for m in box.waiting))
+
+
+def _text(kept: KeptMessages) -> bytes:
+    """As JSON, with as many of those that nobody was told as a state file has room for."""
+    from fusiond.live.kept_messages import KEPT_MESSAGES  # noqa: PLC0415
+
+    text = KEPT_MESSAGES.dump_json(kept)
+    while len(text) > MOST_BYTES - 100 and kept.untold:
+        kept = replace(kept, untold=kept.untold[1:])
+        text = KEPT_MESSAGES.dump_json(kept)
+    return text
