@@ -114,6 +114,10 @@ class RawAiding(Aiding):
     """Random walk of the receiver clock's offset; a temperature-compensated crystal's."""
     clock_drift_m_s_sqrt_s: PositiveFloat = 0.2
     """Random walk of its drift; likewise."""
+    clock_drift_tau_s: PositiveFloat | None = None
+    """Correlation time of the drift as a first-order Markov process about zero (paper 003), of the
+    same density for as long as that; without it the drift walks. Not for a crystal that is off
+    by a constant."""
     start_velocity_sd_m_s: PositiveFloat = 0.2
     """One sigma of the velocity from one epoch's rates, which alignment starts with."""
 

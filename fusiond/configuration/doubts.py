@@ -14,6 +14,7 @@ from math import hypot
 from pathlib import Path
 
 from fusiond.configuration.aiding import CompassAiding
+from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
 
@@ -56,6 +57,7 @@ def doubts(config: Config) -> list[str]:
         *_files(config),
         *_start(config),
         *_filter(config),
+        *model_doubts(config),
         *_outputs(config),
     ]
 

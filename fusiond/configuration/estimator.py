@@ -62,7 +62,7 @@ class Unscented(Section):
 class Estimator(Section):
     filter: Literal["kalman", "unscented", "federated", "multiscale"] = "kalman"
     """Which estimator; see `docs/estimators.md`."""
-    model: Literal["ins15", "ins21", "ins17", "ins23", "planar10", "planar15"] = "ins21"
+    model: Literal["ins15", "ins21", "ins17", "ins20", "ins23", "planar10", "planar15"] = "ins21"
     """Error state; see `docs/navigation.md`."""
     buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0
     """History that late measurements may rewind into; at least 10 s."""

@@ -49,9 +49,19 @@ def imu_range(imu: Imu) -> tuple[float, float]:
 
 
 def clock_noise(raw: RawAiding) -> ClockNoise:
-    """The receiver clock's error model."""
+    """The receiver clock's error model. A Markov drift of correlation time tau has the density
+    q = 2 sigma^2 / tau of its walk."""
+    phase, walk = raw.clock_phase_m_sqrt_s**2, raw.clock_drift_m_s_sqrt_s**2
+    tau_s = raw.clock_drift_tau_s
+    if tau_s is None:
+        return ClockNoise(offset_white=phase, drift_white=walk)
+    steady = math.sqrt(0.5 * walk * tau_s)
     return ClockNoise(
-        offset_white=raw.clock_phase_m_sqrt_s**2, drift_white=raw.clock_drift_m_s_sqrt_s**2
+        drift_initial=steady,
+        offset_white=phase,
+        drift_white=0.0,
+        drift_tau_s=tau_s,
+        drift_steady=steady,
     )
 
 

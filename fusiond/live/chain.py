@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 
 from fusiond.clock.clock import Clock
+from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.schema import Config
 from fusiond.live.events import Events
 from fusiond.live.injection import Injection
@@ -44,6 +45,8 @@ class Chain:
         self.innovations = Innovations(clock)
         self._on_outcome = on_outcome
         self.navigator = Navigator(config, saved, navigator_event, self._ended)
+        for doubt in model_doubts(config):
+            navigator_event("states_absent", doubt)
         self.injection = Injection(events.report)
         self.sources = Sources(config, clock, self.navigator, self.injection, self._report)
         drivers = {name: source.driver for name, source in self.sources.all.items()}

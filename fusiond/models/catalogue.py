@@ -1,8 +1,9 @@
 """The shipped models as lists of blocks.
 
 The papers' models: 000 (15 states, planar, constant and Markov gyro drift, Markov accelerometer),
-001 (10 states, planar), 002 (23 and 17 states with a receiver clock and a SAR's misalignment); the
-15 and 21 states for vehicles are those of Groves, 2nd ed., section 14.2.
+001 (10 states, planar), 002 (23 and 17 states with a receiver clock and a SAR's misalignment), 003
+(20 states, constant and Markov gyro drift, Markov accelerometer, receiver clock); the 15 and 21
+states for vehicles are those of Groves, 2nd ed., section 14.2.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from fusiond.models.blocks import (
     navigation_blocks,
     parameter,
 )
+from fusiond.models.left_out import with_force_biases_as_noise
 from fusiond.models.model import Model
 
 
@@ -108,11 +110,32 @@ def _ins21(noise: ImuNoise) -> list[Block]:
 
 
 def _ins17(noise: ImuNoise) -> list[Block]:
+    # Accelerometer biases are noise (paper 002), gyro constants part of the Markov states.
     return [
-        *navigation_blocks(noise, planar=False),
+        *navigation_blocks(with_force_biases_as_noise(noise), planar=False),
         _gyro_markov(noise, math.hypot(noise.rate_bias_initial, noise.rate_bias_instability)),
         *clock_blocks(),
         misalignment(SAR_MISALIGNMENT, SAR_MISALIGNMENT_SD),
+    ]
+
+
+def _ins20(noise: ImuNoise) -> list[Block]:
+    # One Markov state an axis for all of the accelerometer's bias, of its whole variance.
+    force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
+    accel_markov = parameter(
+        "accel_markov",
+        "m/s^2",
+        "accel",
+        initial=force,
+        steady=force,
+        tau_s=noise.bias_correlation_s,
+    )
+    return [
+        *navigation_blocks(noise, planar=False),
+        _gyro_bias(noise),
+        _gyro_markov(noise, noise.rate_bias_instability),
+        accel_markov,
+        *clock_blocks(),
     ]
 
 
@@ -131,9 +154,10 @@ MODELS: dict[str, Callable[[ImuNoise], list[Block]]] = {
     "ins15": _ins15,
     "ins21": _ins21,
     "ins17": _ins17,
+    "ins20": _ins20,
     "ins23": _ins23,
     "planar10": _planar10,
     "planar15": _planar15,
 }
-"""The shipped models: 10 states as paper 001, 15 as paper 000, 17 and 23 as paper 002; the 15 and
-21 states for vehicles."""
+"""The shipped models: 10 states as paper 001, 15 as paper 000, 17 and 23 as paper 002, 20 as paper
+003; the 15 and 21 states for vehicles."""

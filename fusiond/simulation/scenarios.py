@@ -17,7 +17,7 @@ from fusiond.simulation.gnss.receiver import GnssOptions
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.rdss.centre import RdssOptions
 from fusiond.simulation.sensor_errors import ImuOutput, Vibration, imu_output
-from fusiond.simulation.trajectories import Path, drive, flight, static
+from fusiond.simulation.trajectories import Path, drive, flight, level_flight, static
 
 ANTENNA_M = (0.0, 0.0, -1.0)
 """Both antennas: on the roof, 1 m above the IMU."""
@@ -37,6 +37,21 @@ AIRCRAFT_IMU = Imu(
     accel_scale_ppm=300.0,
 )
 """As in `config/tactical.toml`: 1 deg/h and 50 ug, 0.05 deg/sqrt(h), 0.02 m/s/sqrt(h)."""
+
+
+MICRO_IMU = Imu(
+    rate_hz=50.0,
+    gyro_noise_deg_sqrt_h=0.3,
+    accel_noise_m_s_sqrt_h=0.0832,
+    gyro_bias_initial_deg_h=1e-9,
+    gyro_bias_instability_deg_h=360.0,
+    accel_bias_initial_mg=1e-9,
+    accel_bias_instability_mg=1e-9,
+    bias_correlation_s=3600.0,
+    gyro_scale_ppm=1e-9,
+    accel_scale_ppm=1e-9,
+)
+"""Of paper 001 (study `multiscale`): 0.1 deg/s of Markov drift, 1e-3 g white in each sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +130,8 @@ FLIGHT = Scenario(
     rdss=RdssOptions(lever_arm_m=ANTENNA_M, service_frequency_s=60),
     no_slip_m=(0.0, 0.0, 0.0),
 )
-# Car and aircraft fit the shipped configurations `vehicle.toml`, `tactical.toml` and
-# `flight_sar.toml` unchanged.
+# Car and aircraft fit the shipped configurations `vehicle.toml`, `tactical.toml`,
+# `flight_sar.toml` and `flight_star.toml` unchanged.
 SCENARIOS = {
     scenario.name: scenario
     for scenario in (
@@ -128,6 +143,16 @@ SCENARIOS = {
             name="flight-sar",
             star_tracker=StarTrackerOptions(),
             sar=SarOptions(FLIGHT_POINTS),
+        ),
+        Scenario(
+            "flight-star",
+            level_flight,
+            400.0,
+            (29.0, 118.0, 50.0),
+            imu=MICRO_IMU,
+            gnss=GnssOptions(rate_hz=1.0, white_sd_m=(8.0, 8.0), velocity_sd_m_s=(0.5, 0.5)),
+            no_slip_m=(0.0, 0.0, 0.0),
+            star_tracker=StarTrackerOptions(misalignment_sd_arcsec=0.0),
         ),
     )
 }

@@ -293,3 +293,9 @@ def flight(duration_s: float) -> Path:
         bank_ratio=1.0,
         incidence_deg=2.0,
     )
+
+
+def level_flight(duration_s: float) -> Path:
+    """A micro air vehicle, as paper 001 begins: level, due east; at rest for half a minute, then at
+    12 m/s."""
+    return follow([Leg(30), Leg(10, speed_m_s=12.0), Leg(duration_s)], duration_s, course_deg=90.0)

@@ -79,7 +79,7 @@ def test_examples_carry_the_data_sheets_figures() -> None:
         (
             '[estimator]\nmodel = "ins12"',
             "estimator.model = \"ins12\": did you mean 'ins23'?"
-            " allowed: ins15, ins17, ins21, ins23, planar10, planar15",
+            " allowed: ins15, ins17, ins20, ins21, ins23, planar10, planar15",
         ),
         (
             '[mqtt]\ncommands = ["reset"]',

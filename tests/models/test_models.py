@@ -20,7 +20,15 @@ from fusiond.models.model import Model
 from tests import runs
 
 IMU = Imu(rate_hz=50.0)
-SIZES = {"planar10": 10, "planar15": 15, "ins15": 15, "ins17": 17, "ins21": 21, "ins23": 23}
+SIZES = {
+    "planar10": 10,
+    "planar15": 15,
+    "ins15": 15,
+    "ins17": 17,
+    "ins20": 20,
+    "ins21": 21,
+    "ins23": 23,
+}
 
 
 def states(model: Model) -> int:

@@ -1,0 +1,68 @@
+r"""Whether the error state of a configuration holds the errors of its inertial sensor.
+
+An error that no state models and no noise of the model covers makes the filter wrong and sure of
+itself. The measure is a minute without aids, t = 60 s, one sigma of the displacement:
+
+    an accelerometer bias b       b t^2 / 2
+    what the model knows          sqrt(N^2 t^3 / 3 + g^2 n^2 t^5 / 20)
+
+N and n the densities of velocity and attitude in the model, which is where a bias that it takes for
+noise is (`fusiond.models.left_out`). The bias is missing where it does more in that minute than the
+model knows. Every shipped model has gyro states. Scale factors do less than the gyro's noise in the
+classes that there are: 10000 ppm of a quarter turn at 10 m/s 9 m, the noise of that class 11 m.
+
+Source: Groves, 2nd ed., section 5.7 (short-term straight-line error propagation).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from fusiond.configuration.schema import Config
+from fusiond.configuration.settings import DEG, MILLI_G, imu_noise
+from fusiond.models.catalogue import make_model
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
+from fusiond.navigation.error_model import FORCE_ERROR
+
+MINUTE_S = 60.0
+
+
+def after_a_minute(force_noise: float, rate_noise: float) -> float:
+    """Metres, one sigma, that white noise of force (m/s^2/sqrt(Hz)) and rate makes in a minute."""
+    t, g = MINUTE_S, STANDARD_GRAVITY_M_S2
+    return math.sqrt(force_noise**2 * t**3 / 3.0 + (g * rate_noise) ** 2 * t**5 / 20.0)
+
+
+def model_doubts(config: Config) -> Iterator[str]:
+    """A sentence where the model lacks the accelerometer's bias, or takes it for noise."""
+    name, noise = config.estimator.model, imu_noise(config.imu)
+    model = make_model(name, noise)
+    velocity = math.sqrt(next(b.white for b in model.blocks if b.name == "velocity"))
+    attitude = math.sqrt(next(b.white for b in model.blocks if b.name == "attitude"))
+    known_m = after_a_minute(velocity, attitude)
+    planar, g = model.hold_height, STANDARD_GRAVITY_M_S2
+    kind = config.imu.sensor_class
+    of = "[imu]" if kind is None else f"sensor class {kind!r}"
+    states = "planar15" if planar else "ins23"
+    instead = f"choose {states!r} or 'ins21'"
+
+    force = math.hypot(noise.force_bias_initial, noise.force_bias_instability)
+    moved_m = 0.5 * force * MINUTE_S**2
+    if not all(model.parameters(FORCE_ERROR + axis) for axis in range(2 if planar else 3)):
+        said = f"estimator.model = {name!r} has no accelerometer bias, and {of} has one of "
+        said += f"{force / MILLI_G:.3g} mg, one sigma"
+        if moved_m > known_m:
+            yield (
+                f"{said}: {_metres(moved_m)} in a minute without aids, where the filter knows of "
+                f"{_metres(known_m)}, and a tilt of {math.atan(force / g) / DEG:.2g} deg; {instead}"
+            )
+        elif velocity > 2.0 * noise.force_noise:
+            yield (
+                f"{said}, which is noise to it: sigma grows by {_metres(known_m)} in a minute "
+                f"without aids, where the bias does {_metres(moved_m)}; {instead}"
+            )
+
+
+def _metres(value: float) -> str:
+    return f"{value:,.0f} m" if value >= 10.0 else f"{value:.2g} m"

@@ -1,0 +1,82 @@
+"""What `check` and the daemon say of a model that lacks its sensor's errors, and that it is so."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fusiond.clock.clock import Clock
+from fusiond.configuration.model_fit import MINUTE_S, after_a_minute, model_doubts
+from fusiond.configuration.schema import ClockOptions, Config, Imu
+from fusiond.configuration.sensor_class import CLASSES
+from fusiond.configuration.settings import imu_noise
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.live.chain import Chain
+from fusiond.live.events import Events
+from fusiond.models.catalogue import MODELS, make_model
+from fusiond.outputs.messages.event import EventMessage
+from fusiond.simulation.imu_truth import Truth
+from fusiond.simulation.trajectories import static
+from tests import runs
+
+FULL = ("ins15", "ins20", "ins21", "ins23", "planar15")
+
+
+def configured(model: str, **imu: object) -> Config:
+    return Config.model_validate({"imu": imu, "estimator": {"model": model}})
+
+
+@pytest.mark.parametrize("kind", [None, *CLASSES])
+@pytest.mark.parametrize("name", MODELS)
+def test_models_with_the_states_leave_no_doubt(name: str, kind: str | None) -> None:
+    said = list(model_doubts(configured(name, **({} if kind is None else {"sensor_class": kind}))))
+    assert len(said) == (0 if name in FULL else 1)
+
+
+def test_an_accelerometer_without_bias_needs_no_state() -> None:
+    """That of paper 001, whose 1e-3 g is white."""
+    white = {
+        "accel_noise_m_s_sqrt_h": 0.083,
+        "accel_bias_initial_mg": 1e-9,
+        "accel_bias_instability_mg": 1e-9,
+    }
+    for name in ("planar10", "ins17"):
+        assert list(model_doubts(configured(name, **white))) == []
+
+
+def test_the_figures_are_those_of_the_filter() -> None:
+    """A minute at rest without aids: what 10 mg moves, and what noise alone makes of sigma."""
+    imu = Imu(rate_hz=20.0)
+    model = make_model("ins15", imu_noise(imu))
+    truth = Truth(static(MINUTE_S), (0.5, 2.0, 50.0), imu.rate_hz, MINUTE_S)
+    buffer = runs.filled_buffer(imu, runs.sample_times(truth), runs.imu_run(imu, truth, 1).samples)
+    sigma = {}
+    for name, bias in (("bias", 0.0980665), ("noise", 0.0)):
+        sd = np.zeros(model.size)
+        sd[model.slots_of("accel_bias")] = bias
+        estimator = KalmanEstimator(model, imu.gap_s)
+        state = truth.at(np.zeros(1))
+        nav = np.concatenate([state.position[0], np.zeros(3), [1.0, 0.0, 0.0, 0.0]])
+        estimator.initialise(0, 0, nav, np.zeros(model.size), np.diag(sd**2))
+        estimator.propagate(buffer, round(MINUTE_S * 1e9))
+        sigma[name] = math.sqrt(estimator.covariance[6, 6])
+    noise = imu_noise(imu)
+    # Beside the white noise the biases' own walk.
+    assert sigma["bias"] == pytest.approx(0.5 * 0.0980665 * MINUTE_S**2, rel=0.01)
+    known = after_a_minute(noise.force_noise, noise.rate_noise)
+    assert known < sigma["noise"] < 1.2 * known
+
+
+def test_the_daemon_says_it_once() -> None:
+    heard: list[EventMessage] = []
+    clock = Clock(ClockOptions())
+    events = Events(clock)
+    events.listen(heard.append)
+    Chain(configured("planar10"), clock, events)
+    (said,) = [e for e in heard if e.code == "states_absent"]
+    assert (said.source, said.level) == ("navigator", "warning")
+    assert "177 m in a minute" in said.text
+    Chain(configured("ins21"), clock, events)
+    assert [e.code for e in heard].count("states_absent") == 1
