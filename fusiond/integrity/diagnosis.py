@@ -326,7 +326,8 @@ def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
         if isinstance(offer, PositionOffer):
             north = (offer.lat_rad - lat) * meridian_radius(lat)
             east = (offer.lon_rad - lon) * transverse_radius(lat) * math.cos(lat)
-            for row, apart in enumerate((north, east, offer.height_m - height)):
+            down = 0.0 if offer.height_m is None else height - offer.height_m
+            for row, apart in enumerate((north, east, down)):
                 spread[PLACE_ROW + row, PLACE_ROW + row] = apart * apart
     return Correction(np.zeros(len(spread)), spread)
 
