@@ -6,9 +6,11 @@ a fault begins, each with its source; by which signature it enters the motion or
 
 Rates are an engineer's, of devices on vehicles in streets, where no standard counts them, and the
 same for all kinds for that reason: one an hour; but a device that is late by half a second or more
-from an instant on, that is carried off, or a wheel whose scale changes is one in a thousand hours.
+from an instant on, or a wheel whose scale changes, is one in a thousand hours, and one that is
+carried off, position and velocity together, one in ten thousand.
 Ten times the rate is what a chi-square of 4.6 is: it moves no decision by an epoch. Sizes are one
-sigma of a normal prior: a fault of four times that is told as soon.
+sigma of a normal prior, which bounds an estimate and tells no kinds apart but those that are known
+to be of a size.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ DEG = math.degrees(1.0)
 BODY = ("x", "y", "z")
 SENSOR, PLACE, MOTION, TIME, OWN, OVER = range(6)
 """Classes: between kinds of one class nobody has to choose before something is done."""
-RECEIVER_PER_H, LATE_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1.0
+RECEIVER_PER_H, LATE_PER_H, SPOOFED_PER_H, SENSOR_PER_H = 1.0, 1e-3, 1e-4, 1.0
 TOGETHER = "all receivers"
 """The device of a kind that is of all of them."""
 LAGGED_S = 0.5
@@ -183,7 +185,7 @@ def carried_kinds(device: str) -> list[Kind]:
     """Of a device whose positions are carried off at the velocity that it adds: what is spoofed."""
     of = Kind(
         *("carried_off", f"{device} is carried off", "m/s", CARRIED, TIME),
-        *((1.0, 1.0, 1.0), LATE_PER_H),
+        *((1.0, 1.0, 1.0), SPOOFED_PER_H),
         device=device,
     )
     return [of]

@@ -243,7 +243,8 @@ class Diagnosis:
         """What a fault spoils leaves service, and what those of its device spoil that fit as well:
         nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a straight
         may be off, or late, and the velocity with it."""
-        fits = bank.explains & (bank.log_odds > 0.0) & (bank.log_likelihood >= fit - APART)
+        fits = bank.explains & (bank.log_odds > max(0.0, finding.log_odds - DECIDED))
+        fits &= bank.log_likelihood >= fit - APART
         found = []
         for row in np.flatnonzero(fits.any(axis=1)).tolist():
             kind = self._kinds[row]
