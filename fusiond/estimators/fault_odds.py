@@ -88,6 +88,9 @@ drift that began a seventh of its age before or after it loses a twentieth. An o
 missed is as near as half the youngest period."""
 MOST_OFF = 3.0
 """Sigmas of its prior by which the size of a kind that is known to be of it may differ."""
+MOST_OF_UNIT = 10.0
+"""Sigmas of its prior beyond which no unit's fault is: 10 deg/s, half a g, more than a right angle.
+A velocity that is reversed is no force of four g."""
 _NOTHING = -40.0
 """Log of what counts nothing beside one: a sum of doubles does not show it."""
 APART = 4.0
@@ -179,9 +182,9 @@ def _gains(bank: Array, lanes: Array) -> None:
             bank[j + unsigned(UNEXPLAINED)] = left
 
 
-@compiled("void(f8[::1], f8[:, ::1], f8[::1], i8)")
-def _odds(bank: Array, numbers: Array, lanes: Array, number: int) -> None:
-    """Write the log odds of a group."""
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])")
+def _odds(bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int, m: Array) -> None:
+    """Write the log odds of a group; m (12,) is work space."""
     threes, at, kind = int(bank[THREES]), group_at(bank, number), number // RESTARTS
     size = 3.0 if number < threes else 1.0
     a, bank[at + WEIGHT] = bank[at + WEIGHT], 0.0
@@ -198,6 +201,12 @@ def _odds(bank: Array, numbers: Array, lanes: Array, number: int) -> None:
         if abs(off) > MOST_OFF * numbers[kind, PRIOR]:
             bank[at + UNEXPLAINED] = np.inf  # it is of another size than this kind has
     bank[at + LOG_ODDS] = rate + gained
+    # A likely one of the unit: is it of a size that a unit can have?
+    if rate + gained > 0.0 and ints[kind, CLASS] == 0 and bank[at + UNEXPLAINED] <= 0.0:
+        solve(bank, at, int(size), numbers[kind], 1.0, m)
+        for c in range(int(size)):
+            if abs(m[9 + c]) > MOST_OF_UNIT * numbers[kind, PRIOR + c]:
+                bank[at + UNEXPLAINED] = np.inf
 
 
 @compiled("f8(f8[::1], i8[:, ::1], i8, i8)")
@@ -236,11 +245,11 @@ def judge(
     less: what fits as well is not told apart by rates alone. Compared are those of one onset; else
     the source's may have lost something.
     """
-    groups = int(bank[ALL])
+    groups, m = int(bank[ALL]), np.empty(12)
     _gains(bank, lanes)
     largest = 0.0
     for number in range(groups):
-        _odds(bank, numbers, lanes, number)
+        _odds(bank, ints, numbers, lanes, number, m)
         at = group_at(bank, number)
         if bank[at + UNEXPLAINED] <= 0.0:
             largest = max(largest, bank[at + LOG_ODDS])

@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
     ALL,
-    ANY,
     CLASS,
-    DEVICE,
     FOLLOWED,
     LEAST_WEIGHT,
     RESTARTS,
@@ -29,28 +27,20 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], i8, f8[::1], i8, f8[::1])", allocates=True)
+@compiled("f8(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])", allocates=True)
 def nis_if_sensors_fail(
-    bank: Array,
-    ints: Indices,
-    numbers: Array,
-    device: int,
-    y: Array,
-    columns: int,
-    work: Array,
+    bank: Array, ints: Indices, numbers: Array, y: Array, columns: int, work: Array
 ) -> float:
     """nu^T S^-1 nu of a whitened innovation y (m,), with what faults of the inertial unit (class 0)
     and those of sources that are over leave open, as they are weighed; `work` as
-    `sensitivity_rows` leaves it. Infinite where faults of its own
-    `device` are likelier."""
+    `sensitivity_rows` leaves it. Infinite unless they are likelier than all else
+    together."""
     rows = y.shape[0]
-    c, m, likely, theirs = np.eye(rows), np.empty(12), 0.0, 0.0
+    c, m, likely = np.eye(rows), np.empty(12), 0.0
     for number in range(int(bank[ALL])):
         kind, at = number // RESTARTS, group_at(bank, number)
         weight = bank[at + WEIGHT]
         ours = ints[kind, CLASS] == 0 or ints[kind, SIGNATURE] == FOLLOWED
-        if ints[kind, SIGNATURE] > FOLLOWED and ints[kind, DEVICE] in (ANY, device):
-            theirs += weight
         if not ours or weight < LEAST_WEIGHT:
             continue
         likely += weight
@@ -64,7 +54,7 @@ def nis_if_sensors_fail(
                         x = weight * (m[3 * i + j] + m[9 + i] * m[9 + j])
                         s_b = work[b * columns + column_of(bank, number, j)]
                         c[a, b] += s_a * s_b * x
-    if likely < theirs:
+    if likely < 0.5:
         return np.inf
     # y^T C^-1 y by elimination.
     left, nis = y.copy(), 0.0
@@ -116,7 +106,7 @@ def fold_and_account(
     columns = sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
     judged = nis
     if nis > threshold:
-        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, device, y, columns, work))
+        judged = min(nis, nis_if_sensors_fail(bank, ints, numbers, y, columns, work))
     account(bank, n, y, g, judged <= threshold, work)
     if judged <= threshold:
         dx[:] = 0.0

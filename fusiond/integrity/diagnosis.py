@@ -43,7 +43,7 @@ from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.finding import Finding, Lasting
-from fusiond.integrity.service import DISAGREES, REPEATS, Series, value_of
+from fusiond.integrity.service import DISAGREES, REPEATS, STILL, Series, value_of
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON, STEP_RESTS_S, VE, VN
 
@@ -135,7 +135,7 @@ class Diagnosis:
             own = [s for s in self._series.values() if s.device == device]
             if not all(s.out for s in own):
                 continue
-            unexplained = all(s.reason == DISAGREES for s in own)
+            unexplained = all(s.reason in (DISAGREES, STILL) for s in own)
             if agreement.lasted_ns > (FITS_NS if unexplained else FITS_AGAINST_NS):
                 return device
         return None
@@ -302,13 +302,15 @@ class Diagnosis:
             self._series[name].exclude(t_ns, reason)
 
     def _goes_its_own_way(self, one: Series) -> bool:
-        """Whether a position is out for nothing that lasts, and goes the way that the velocity of
-        its device says, which is in service: it is the filter that is somewhere else."""
-        if not (one.out and one.locates and one.reason == DISAGREES):
+        """Whether a position whose fault is over has gone the way that the velocity of its device
+        says, which is in service, for a minute: it is the filter that is somewhere else."""
+        if not (one.out and one.locates and one.reason == STILL):
             return False
         moves = [s for s in self._series.values() if s.device == one.device and s.moves]
         known = self._agreement.get(one.device)
-        return bool(known and known.lasted_ns > FITS_NS and moves and not any(s.out for s in moves))
+        return bool(
+            known and known.lasted_ns > FITS_AGAINST_NS and moves and not any(s.out for s in moves)
+        )
 
     def _agrees(self, aid: Aid, one: Series) -> None:
         """One of a device that is out, or was, has come: does the device fit itself?"""

@@ -44,7 +44,7 @@ REFUSED_IN_A_ROW, READMIT_COUNT = 3, 5
 LASTS_S, RETURNS, MOST_TOLD = 60.0, 2.0, 12.0
 """A fault's mean duration, an engineer's; log odds of its end at which it is believed again, seven
 to one; and the most (chi-square) that one measurement tells of that."""
-REPEATS, DISAGREES = "repeats itself", "disagrees"
+REPEATS, DISAGREES, STILL = "repeats itself", "disagrees", "disagrees though its fault is over"
 # Position repeated to the bit so often while the vehicle moves: receivers print metres to the
 # centimetre or finer, so that two alike are chance, three are not.
 REPEATED = 2
@@ -156,7 +156,7 @@ class Series:
             if self.over + prior < RETURNS:
                 return
             if not passes:  # what was wrong is over, and it is not where the filter is
-                self.reason = DISAGREES
+                self.reason = STILL
         if self.passed >= READMIT_COUNT:
             self.readmit(t_ns)
 
