@@ -389,7 +389,7 @@ class ErrorStateFilter:
         m = self._memory
         self.t_ns, self.sample, m.kept[:], _, self._holding, extra = s
         m.head[AHEAD] = s.held is not None
-        self.passing = s.held is not None or (self.hypotheses is not None and self.hypotheses.waits)
+        self.passing = s.held is not None or bool(self.hypotheses and self.hypotheses.waits)
         if s.held is not None:
             m.held[:] = s.held
         self._own_restore(extra)

@@ -44,6 +44,10 @@ HEADING_SOURCES: dict[str, HeadingSource] = {
 }
 
 
+SAID_NS = 100_000_000
+"""While nothing but samples comes, what is missing is said anew so often: as people read it."""
+
+
 class Aligner:
     """Tries a start whenever asked; `known` takes in what may lead to one."""
 
@@ -60,17 +64,21 @@ class Aligner:
         self.known = Collected(options, noise, saved, on_event)
         self._track = Track(options, model)
         self._journal = Journal(on_event)
+        self._news, self._said = True, -1
+        """Whether anything has come since the reason was said, and when (`SAID_NS`) that was."""
         self._basis = Basis(options, noise, model, saved, self.known, self._track)
 
     def aids(self, aids: Sequence[Aid]) -> None:
         """A measurement has arrived, as the aids it stands for."""
         self.known.aids(aids)
         self._track.hear(aids)
+        self._news = True
 
     def felt(self, windows: Sequence[Window], aids: Sequence[Aid]) -> None:
         """Windows of the standstill detector have ended; constraints that hold."""
         for window in windows:
             self.known.window(window)
+            self._news = True
         self._track.hear(aids)
 
     def waits(self, start: Start, lateness: Lateness) -> bool:
@@ -97,9 +105,13 @@ class Aligner:
             if start is not None and self.known.contradicted_ns is not None:
                 start = replace(start, contradicted=True)
         if start is None:
-            latitude = None if place is None else float(place[1][0])
             upside_down = self.known.upside_down
-            self.reason = self.known.why if upside_down else why_not(self._basis, imu, latitude)
+            if upside_down:
+                self.reason = self.known.why
+            elif self._news or imu.latest_ns // SAID_NS != self._said:
+                latitude = None if place is None else float(place[1][0])
+                self.reason = why_not(self._basis, imu, latitude)
+                self._news, self._said = False, imu.latest_ns // SAID_NS
             if not upside_down:  # that has been told
                 self._journal.keep(self.reason, imu.latest_ns)
         return start

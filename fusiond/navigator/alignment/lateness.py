@@ -80,7 +80,7 @@ LEAST_PRIOR_S = 0.05
 # and handed on the last of them.
 KEPT_NS, MOST_KEPT, HANDED_ON, FEWEST = 15_000_000_000, 600, 300, 5
 # The valley is sought with `motion.MOST_FIXES`, its bottom with all of a receiver of 5 Hz.
-ALL_FIXES = 75
+ALL_FIXES = 5 * KEPT_NS // 1_000_000_000
 # A lateness that is known worse (s) is waited for so long (ns) to be known better: half the sigma
 # of the filter's own state for it, which takes over.
 SETTLED_SD_S, PATIENCE_NS = 0.05, 10_000_000_000

@@ -40,6 +40,8 @@ from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
 from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
+from fusiond.navigator.constraints import GATE
+from fusiond.navigator.timeline import MOST_WAITING
 
 Array = NDArray[np.float64]
 
@@ -54,8 +56,6 @@ KNOWN_SD_RAD = math.radians(10.0)
 KNOWN_SD_M_S = 2.0
 # Fixes that a start needs: place, heading and speed are four numbers, and one fix may be wrong.
 FEWEST_FIXES = 3
-# Aids that may wait: more than the bank's delay holds of all that a vehicle sends.
-MOST_WAITING = 4096
 # Fixes at rest that are used for the place at its end.
 MOST_AT_REST = 20
 # The first fix is taken by all cells; until then the place is known to this (m).
@@ -69,8 +69,6 @@ ACROSS_SD_M_S = 1.0
 # No slip (m/s) sideways and down, as `[constraints.non_holonomic]` has it, where that is off.
 SLIP_SD_M_S, HEAVE_SD_M_S, LEAST_SPEED_M_S = 0.2, 0.5, 2.0
 SLIP_NS = 500_000_000
-# Gate probability, as the measured aids' default.
-GATE = 0.9999
 HOW = "positions on the way"
 
 

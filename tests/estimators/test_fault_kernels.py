@@ -1,0 +1,160 @@
+"""Kernels of the bank, eight groups side by side, against the same in plain matrices."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fusiond.estimators.fault_bank import (
+    E_ROWS,
+    HEAD,
+    J_AT,
+    KIND_INTS,
+    KIND_NUMBERS,
+    L_ROWS,
+    LEVEL_OF,
+    LOG_RATE,
+    MEAN,
+    N_AT,
+    PATH,
+    PERIODS_S,
+    PHI,
+    POINT,
+    PRIOR,
+    RESTARTS,
+    RING,
+    SIZE,
+    WAITS,
+    fault_table,
+)
+from fusiond.estimators.fault_carried import settle
+from fusiond.estimators.fault_rows import _at_past, _past, walk_path
+from fusiond.estimators.hypotheses import Hypotheses
+from fusiond.estimators.kalman import KalmanEstimator
+from fusiond.estimators.reading import opened_variances
+from tests.estimators.test_fault_bank import LAST_NS, MODEL, run
+
+Array = NDArray[np.float64]
+
+
+def faulty() -> tuple[KalmanEstimator, Hypotheses]:
+    """A filter three seconds after its velocities have stepped, judged."""
+    made = run("velocity", np.array([0.4, -0.2, 0.0]))
+    assert made.hypotheses is not None
+    made.hypotheses.judge(LAST_NS)
+    return made, made.hypotheses
+
+
+def matrices(bank: Hypotheses, number: int) -> tuple[Array, Array]:
+    """L and e of a group."""
+    row, restart = divmod(number, RESTARTS)
+    size = int(bank.table.ints[row, SIZE])
+    at = np.ix_(range(size), range(size))
+    information = [[bank.each(int(f))[row, restart] for f in part] for part in L_ROWS]
+    evidence = [bank.each(int(f))[row, restart] for f in E_ROWS[:size]]
+    return np.array(information)[at] if size == 3 else np.array([[information[0][0]]]), np.array(
+        evidence
+    )
+
+
+def test_odds_are_those_of_the_theory() -> None:
+    """(e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2 + e^T m - m^T L m / 2, and what is left of
+    J against chi-square's."""
+    _, bank = faulty()
+    found, explains = bank.log_odds, bank.explains
+    compared = 0
+    for number in range(bank.table.groups):
+        row, restart = divmod(number, RESTARTS)
+        rows = bank.each(N_AT)[row, restart]
+        if rows == 0.0:
+            assert found[row, restart] == -math.inf
+            continue
+        size, numbers = int(bank.table.ints[row, SIZE]), bank.table.numbers[row]
+        information, e = matrices(bank, number)
+        s, mean = np.diag(numbers[PRIOR : PRIOR + size] ** 2), np.full(size, numbers[MEAN])
+        m = np.linalg.inv(information + np.linalg.inv(s))
+        left = e - information @ mean
+        odds = numbers[LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
+        odds += 0.5 * left @ m @ left + e @ mean - 0.5 * mean @ information @ mean
+        odds -= 0.5 * np.linalg.slogdet(np.eye(size) + s @ information)[1]
+        assert found[row, restart] == pytest.approx(odds, abs=1e-7)
+        share = np.linalg.inv(information + 1e-9 * np.linalg.inv(s))
+        degrees = max(rows - size, 1.0)
+        most = degrees + 4.0 * math.sqrt(2.0 * degrees)
+        unexplained = bank.each(J_AT)[row, restart] - e @ share @ e - most
+        shift = abs((m @ left)[0]) / numbers[PRIOR]
+        other = numbers[MEAN] != 0.0 and shift > 3.0
+        assert explains[row, restart] == (unexplained <= 0.0 and not other)
+        compared += 1
+    assert compared > 100
+    assert not explains.all()  # nor does the stepped velocity fit all that began before it
+
+
+def test_what_is_published_is_wider_by_the_whole_mixture() -> None:
+    made, bank = faulty()
+    whole, wider = np.empty(9), np.empty(9)
+    opened_variances(bank.opened(), made.step, whole)
+    bank.widen(made.step, wider)
+    assert whole.max() > 1e-4
+    assert wider == pytest.approx(whole, rel=1e-12)
+
+
+def test_what_lies_between_two_aids_is_multiplied_once() -> None:
+    """V <- Phi V: rows that mix, that decay, and that stay."""
+    _, bank = faulty()
+    n, width = MODEL.size, MODEL.width
+    rng = np.random.default_rng(3)
+    phi = np.eye(width)
+    phi[:9, :n] += rng.standard_normal((9, n)) * (rng.random((9, n)) < 0.5)
+    phi[11, 11], phi[12, 13] = 0.9, 0.02
+    at = int(bank.bank[PHI])
+    bank.bank[at : at + width * width] = phi.ravel()
+    bank.bank[WAITS] = 1.0
+    expected = phi[:n, :n] @ bank.sensitivities
+    settle(bank.bank, n, width)
+    assert bank.sensitivities == pytest.approx(expected, rel=1e-12, abs=1e-12)
+    assert not bank.waits
+    kept = bank.sensitivities.copy()
+    settle(bank.bank, n, width)
+    assert np.array_equal(kept, bank.sensitivities)
+
+
+def test_the_path_is_known_for_six_seconds() -> None:
+    """Linear between its points, from the first one that is kept; nothing before it."""
+    bank, nav = np.zeros(HEAD + RING * POINT), np.zeros(10)
+    rng = np.random.default_rng(4)
+    times, places, place = [], [], 0.0
+    now_s = 0.0
+    for _ in range(900):
+        step_s = float(rng.choice([0.005, 0.02, 0.07]))
+        nav[3] = rng.normal()
+        now_s += step_s
+        walk_path(bank, nav, now_s, step_s)
+        place += step_s * nav[3]
+        if not times or now_s - times[-1] >= 0.1 - 1e-6:
+            times.append(now_s)
+            places.append(place)
+    assert bank[PATH] == pytest.approx(place)
+    kept_s, kept = np.array(times[-RING:]), np.array(places[-RING:])
+    for t_s in rng.uniform(kept_s[0], kept_s[-1], 200).tolist():
+        back = _past(bank, t_s)
+        assert back > 0
+        assert _at_past(bank, back, t_s, 0) == pytest.approx(np.interp(t_s, kept_s, kept))
+    assert _past(bank, float(kept_s[0]) - 1e-3) == -1
+    assert kept_s[-1] - kept_s[0] > 6.0
+
+
+@pytest.mark.parametrize(
+    ("sizes", "means"), [((1, 3), (0.0, 0.0)), ((2,), (0.0,)), ((3,), (1.0,)), ((4, 1), (0.0, 0.0))]
+)
+def test_a_table_that_the_kernels_cannot_read_is_refused(
+    sizes: tuple[int, ...], means: tuple[float, ...]
+) -> None:
+    ints = np.zeros((len(sizes), KIND_INTS), dtype=np.int64)
+    numbers = np.ones((len(sizes), KIND_NUMBERS))
+    ints[:, SIZE], numbers[:, MEAN] = sizes, means
+    with pytest.raises(ValueError, match="number"):
+        fault_table(ints, numbers, ())
