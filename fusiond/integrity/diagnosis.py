@@ -181,8 +181,12 @@ class Diagnosis:
                 one = self._series[aid.source]
         if not used:
             correction = self._looked_at(aid, one, outcome, estimator)
-        elif not one.out:  # by that decision
-            self._counts(aid, one, outcome, explained)
+        elif one.out:  # by that decision
+            return correction
+        elif outcome.name == "fused":
+            one.fused(t_ns, () if aid.constraint else outcome.whitened)
+        elif outcome.name == "gated" and (not aid.constraint or aid.no_slip):
+            one.gated(t_ns, explained)
         return correction
 
     def _looked_at(
@@ -204,14 +208,6 @@ class Diagnosis:
             if bank is not None:
                 bank.begin_again(aid, estimator.nav, estimator.step)
         return correction
-
-    @staticmethod
-    def _counts(aid: Aid, one: Series, outcome: Outcome, explained: bool) -> None:
-        """One in service has passed or failed its gate."""
-        if outcome.name == "fused":
-            one.fused(aid.t_ns, () if aid.constraint else outcome.whitened)
-        elif outcome.name == "gated" and (not aid.constraint or aid.no_slip):
-            one.gated(aid.t_ns, explained)
 
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
         """What is identified."""

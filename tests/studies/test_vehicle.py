@@ -31,6 +31,6 @@ def test_axes_out_of_square_are_noise_while_the_vehicle_turns() -> None:
     known = {r["block"]: r["nees"] for r in rows_of("askew", cars("askew", 2))}
     without = cars("askew, no noise for it", 2)
     unknown = {r["block"]: r["nees"] for r in rows_of("askew", without)}
-    for block in ("attitude", "velocity", "position"):
+    for block in ("attitude", "velocity", "position", "mounting"):
         assert known[block] < MOST, block
     assert unknown["attitude"] > 3.0 * MOST

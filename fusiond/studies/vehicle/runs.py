@@ -81,7 +81,9 @@ def run_once(config: Config, path: str, seed: int, number: int, known: bool = Tr
     outcomes = _drive(config, car, estimator, seconds, known)
     errors, sigmas, priors, nees = {}, {}, {}, {}
     of_nav = nav_error(estimator.nav, car.nav(seconds))
-    p, xi = estimator.covariance, estimator.xi
+    p, xi = estimator.covariance.copy(), estimator.xi
+    if known:  # of the housing, as published: the filter's own is that of the axes of its gyros
+        p[range(3), range(3)] += (config.imu.misalignment_deg * DEG) ** 2
     for name in (*NAVIGATION, *car.true):
         slots = model.slots_of(name)
         error = of_nav[slots] if name in NAVIGATION else car.true[name] - xi[slots]

@@ -8,8 +8,8 @@ drive that shows everything, and straight on at one speed, which shows little. O
 averaged over the runs is 1 where sigma is honest; `interval` is that of a matched filter (99 %, one
 block at a time). `kept` is sigma at the end over that at the start: 1 where nothing was seen.
 
-A third set has an IMU whose axes are out of square, with the noise for it and without: there the
-attitude, and the mounting against it, are defined no better than the axes are.
+A third set has an IMU whose axes are out of square, with the noise for it and without. The attitude
+is that of the housing, and its P what is published of it, with what the axes are out of square by.
 
 Source: Bar-Shalom, Li, Kirubarajan (2001), section 5.4.2.
 """
