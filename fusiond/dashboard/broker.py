@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import aiomqtt
 
 from fusiond.dashboard.hub import LARGEST_BYTES, Hub
+from fusiond.dashboard.schemas import topics
+from fusiond.outputs.incoming import SOCKET_OPTIONS
 from fusiond.outputs.packet_limit import limit
 
 BASE = "fusiond"
@@ -57,8 +59,9 @@ class Broker:
         while True:
             try:
                 async with self._client() as client:
-                    await client.subscribe(f"{BASE}/+/+", qos=0)
-                    await client.subscribe(f"{BASE}/+/fleet/+", qos=0)
+                    named = {"fleet": "fleet/+"}  # of each card one
+                    shown = ("online", *(named.get(topic, topic) for topic in topics()))
+                    await client.subscribe([(f"{BASE}/+/{topic}", 0) for topic in shown])
                     self._hub.linked("up")
                     await self._serve(client)
             except aiomqtt.MqttError as error:
@@ -76,6 +79,7 @@ class Broker:
             keepalive=KEEPALIVE_S,
             max_queued_incoming_messages=MOST_WAITING,
             logger=_LOG,
+            socket_options=SOCKET_OPTIONS,
         )
         limit(client, LARGEST_BYTES)
         return client

@@ -56,10 +56,12 @@ async def test_from_broker_to_browser_and_back_after_the_broker_was_away(tmp_pat
             async with at_work(hub, broker.run) as address, browsing(address) as page:
                 kept = await page.until(lambda p: p.heard.get("status"))
                 assert kept["at"] is None  # nobody knows how long the broker has had it
+                await daemon.publish(f"{BASE}/of_others", b"{}", qos=1)
                 for topic in NAMES:
                     await daemon.publish(f"{BASE}/{topic}", payload(topic), qos=1)
                 await page.until(lambda p: {"nav", "health", "reply"} <= set(p.heard))
                 await page.until(lambda p: p.heard["status"]["at"] is not None)
+                assert hub.counters["other_topic"] == 0, "not asked for"
                 assert page.heard["nav"]["said"] == said("nav")
                 assert page.heard["nav"]["at"] <= page.last["now"]
                 assert page.last["vehicle"] == "truck"
