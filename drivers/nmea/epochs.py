@@ -334,7 +334,8 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
 def _take_gll(epoch: Epoch, fields: Fields) -> None:
     place, status = _position(fields, 0), _letter(fields, "status")
     epoch.modes |= set(_letter(fields, "posMode"))
-    epoch.gll_valid = status == "A"
+    if status:  # before NMEA 2.0 it has neither time nor status, and says nothing
+        epoch.gll_valid = status == "A"
     if epoch.gll_valid and epoch.plain is None:
         epoch.plain = place
 
