@@ -32,7 +32,6 @@ from drivers.nmea.epochs import (
     BadFieldError,
     Epoch,
     time_of_day_ns,
-    time_step_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.geoid import Geoid
@@ -46,7 +45,15 @@ from drivers.nmea.reasons import (
     note,
     nothing_verified,
 )
-from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, one_time, posix_ns
+from drivers.nmea.time import (
+    SECOND_NS,
+    Calendar,
+    EpochOrder,
+    TimeTrust,
+    one_time,
+    posix_ns,
+    time_step_ns,
+)
 from drivers.plausible import SIGMA_M
 
 PLAIN_AFTER = 2
