@@ -32,7 +32,6 @@ from drivers.nmea.epochs import (
     BadFieldError,
     Epoch,
     time_of_day_ns,
-    time_step_ns,
 )
 from drivers.nmea.framing import NmeaSplitter, Sentence, is_rdss_sentence
 from drivers.nmea.geoid import Geoid
@@ -46,7 +45,15 @@ from drivers.nmea.reasons import (
     note,
     nothing_verified,
 )
-from drivers.nmea.time import SECOND_NS, Calendar, EpochOrder, TimeTrust, one_time, posix_ns
+from drivers.nmea.time import (
+    SECOND_NS,
+    Calendar,
+    EpochOrder,
+    TimeTrust,
+    one_time,
+    posix_ns,
+    time_step_ns,
+)
 from drivers.plausible import SIGMA_M
 
 PLAIN_AFTER = 2
@@ -314,10 +321,10 @@ class NmeaDecoder:
                 return "manual_refused"
             if epoch.quality == 8 or "S" in epoch.modes:
                 return "simulator_refused"
-        if epoch.quality == 0 or epoch.plain_valid is False:
+        if epoch.quality == 0 or epoch.rmc_valid is False:
             return "no_fix"
         if epoch.quality is None:
-            return None
+            return "no_fix" if epoch.plain_valid is False else None
         if epoch.place is None:
             return "no_fix"
         simulated = self._decoding.allow_simulator and epoch.quality in (7, 8)
@@ -335,7 +342,7 @@ class NmeaDecoder:
         if epoch.day is None:
             return self._calendar.date_of(epoch.time_of_day_ns, epoch.t_seen_ns)
         # RMC says itself whether its time is valid; for ZDA the position of its epoch does.
-        told = epoch.plain_valid
+        told = epoch.plain_valid if epoch.quality is None else epoch.rmc_valid
         believed = valid and bool(epoch.quality) if told is None else told
         if believed:
             self._calendar.dated(epoch.day, epoch.time_of_day_ns, epoch.t_seen_ns)

@@ -30,7 +30,7 @@ from typing import NamedTuple
 from drivers.measurements import Vector3
 from drivers.nmea.fields import Fields, typed
 from drivers.nmea.framing import Sentence
-from drivers.nmea.time import parse_time_of_day
+from drivers.nmea.time import parse_time_of_day, printed_time
 from drivers.plausible import HEIGHT_M, SIGMA_M, SPEED_M_S, within
 from drivers.rounding import NEAREST_SD
 
@@ -62,8 +62,6 @@ beside 8 to 14)."""
 MINUTE_M = 1852.0
 """Of latitude."""
 _PRINTED_POSITION = re.compile(r"\d\d[0-5]\d\.\d*,[NS],\d{2,3}[0-5]\d\.\d*,[EW]\Z")
-_TIME_AT = {**dict.fromkeys(("GSA", "VTG", "HDT", "THS"), -1), "GLL": 4}
-"""Which field is the time, where it is not the first; -1: none."""
 
 
 class Printed(NamedTuple):
@@ -200,17 +198,6 @@ class Epoch:
         return (self.speed_m_s * math.cos(course), self.speed_m_s * math.sin(course), None)
 
 
-def printed_time(sentence: Sentence) -> str:
-    """As it is printed; empty where this kind has none, or the field is."""
-    at = _TIME_AT.get(sentence.formatter, 0)
-    return sentence.fields[at] if 0 <= at < len(sentence.fields) else ""
-
-
-def time_step_ns(sentence: Sentence) -> int:
-    """One step of the last digit of its time."""
-    return int(10 ** (9 - min(9, len(printed_time(sentence).partition(".")[2]))))
-
-
 def time_of_day_ns(sentence: Sentence) -> int | None:
     """Its time of day; None where this kind has none or the field is empty. BadFieldError."""
     try:
@@ -334,7 +321,8 @@ def _take_rmc(epoch: Epoch, fields: Fields) -> None:
 def _take_gll(epoch: Epoch, fields: Fields) -> None:
     place, status = _position(fields, 0), _letter(fields, "status")
     epoch.modes |= set(_letter(fields, "posMode"))
-    epoch.gll_valid = status == "A"
+    if status:  # before NMEA 2.0 it has neither time nor status, and says nothing
+        epoch.gll_valid = status == "A"
     if epoch.gll_valid and epoch.plain is None:
         epoch.plain = place
 

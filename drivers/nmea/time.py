@@ -11,6 +11,8 @@ import re
 from collections import Counter
 from datetime import date
 
+from drivers.nmea.framing import Sentence
+
 ROUNDED_NS = 10_000_000
 """A time with fewer decimals than two is cut: rounded, it would be that of another epoch."""
 SECOND_NS = 1_000_000_000
@@ -27,6 +29,8 @@ BACKWARD_EPOCHS = 3
 LATEST = date(2099, 12, 31)
 """No two-digit year of RMC can say more."""
 
+_TIME_AT = {**dict.fromkeys(("GSA", "VTG", "HDT", "THS"), -1), "GLL": 4}
+"""Which field is the time, where it is not the first; -1: none."""
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d{1,9}))?\Z")
 _EPOCH_ORDINAL = date(1970, 1, 1).toordinal()
 
@@ -53,6 +57,17 @@ def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
         return a_ns == b_ns
     step_ns, beyond = max((a_step_ns, b_ns - a_ns), (b_step_ns, a_ns - b_ns))
     return 0 <= beyond < step_ns or (step_ns <= ROUNDED_NS and 2 * abs(beyond) <= step_ns)
+
+
+def printed_time(sentence: Sentence) -> str:
+    """As it is printed; empty where this kind has none, or the field is."""
+    at = _TIME_AT.get(sentence.formatter, 0)
+    return sentence.fields[at] if 0 <= at < len(sentence.fields) else ""
+
+
+def time_step_ns(sentence: Sentence) -> int:
+    """One step of the last digit of its time."""
+    return int(10 ** (9 - min(9, len(printed_time(sentence).partition(".")[2]))))
 
 
 def posix_ns(day: date, time_of_day_ns: int) -> int:

@@ -56,6 +56,19 @@ FLAWS = {
         'BO_ 1303 FOO: 8 X\n SG_ A : 0|0@1+ (1,0) [0|1] "" X\n',
         {"FOO"},
     ),
+    "signal of half a gigabit": (
+        'BO_ 1311 FOO: 8 X\n SG_ A : 0|419358976@1+ (1,0) [0|1] "" X\n'
+        ' SG_ B : 8|8@1+ (1,0) [0|1] "" X\n',
+        {"FOO.A"},
+    ),
+    "signal that begins far behind": (
+        'BO_ 1312 FOO: 8 X\n SG_ A : 419358976|8@1+ (1,0) [0|1] "" X\n',
+        {"FOO"},
+    ),
+    "message of half a gigabyte": (
+        'BO_ 1313 FOO: 419358976 X\n SG_ A : 0|8@1+ (1,0) [0|1] "" X\n',
+        {"FOO"},
+    ),
     "selector in a small letter": (
         'BO_ 1310 FOO: 8 X\n SG_ S m : 6|2@1+ (1,0) [0|3] "" X\n'
         ' SG_ A m3 : 0|6@1+ (1,0) [0|1] "" X\n',

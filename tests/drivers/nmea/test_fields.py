@@ -225,7 +225,7 @@ GLL = made("GNGLL,3958.12345,N,11619.54321,E,021429.00,A,D")
         ("A", "S", None, "simulator_refused"),
         ("V", "D", None, "no_fix"),
         ("V", "N", None, "no_fix"),
-        ("", "", None, "no_fix"),
+        ("", "", None, ""),
     ],
 )
 def test_gll_alone(status: str, mode: str, quality: int | None, refusal: str) -> None:
@@ -250,6 +250,16 @@ def test_gll_before_mode_of_the_standard() -> None:
     assert one.counters["gll_alone"] == 2
     assert one.counters["gga_awaited"] == 1
     assert fixes(found)[0].rounding_sd_ned_m[0] == pytest.approx(1.852 / math.sqrt(12.0))
+
+
+@pytest.mark.parametrize(
+    "body", ["GPGLL,3958.12,N,11619.54,E", "GPGLL,3958.12,N,11619.54,E,021429.00,V,N"]
+)
+def test_gll_is_no_judge_of_gga(body: str) -> None:
+    """One of before NMEA 2.0, without time and status, and one that says V beside a fix."""
+    for said in ((made(body), GGA), (GGA, made(body))):
+        assert fix_of(*said).quality == 4
+        assert isinstance(fix_of(ZDA, *said).stamp, UtcStamp)
 
 
 @pytest.mark.parametrize("fuller", [GGA, RMC, GNS])
