@@ -173,7 +173,7 @@ def _all_sections() -> dict[str, type[BaseModel]]:
     kinds = get_args(get_args(aiding.AnyAiding)[0])
     found = dict(_PARTS)
     found |= {f"aiding.{kind.model_fields['kind'].default}": kind for kind in kinds}
-    for name in ("imu", "estimator", "integrity", "recording", "outputs"):
+    for name in ("imu", "estimator", "integrity", "position_reports", "recording", "outputs"):
         (model,) = _sections(schema.Config.model_fields[name].annotation)
         found[name] = model
         for key, model_field in model.model_fields.items():

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 from drivers.rdss.messages import FieldError
 from drivers.rdss.report import FULL, REPORT, SHORT, SHORT_REPORT
@@ -38,7 +38,6 @@ OVERHEAD = 3
 MOST_TEXT = 255
 
 Carriage = Literal["binary", "ascii", "bcd"]
-CARRIAGES: tuple[Carriage, ...] = get_args(Carriage)
 
 
 class CutError(FieldError):

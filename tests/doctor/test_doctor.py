@@ -18,11 +18,12 @@ from typing import Any
 
 import pytest
 
+from drivers.rdss.messages import BeamPower
 from fusiond.clock.clock import Clock
 from fusiond.clock.host import SystemTime
 from fusiond.configuration.schema import Config
 from fusiond.doctor import devices as doctor_devices
-from fusiond.doctor.doctor import doctor, examine
+from fusiond.doctor.doctor import _beams_line, doctor, examine
 from fusiond.simulation.can.imu import SIM_IMU
 from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
@@ -364,3 +365,15 @@ async def test_system_clock_that_is_off(tmp_path: Path, monkeypatch: pytest.Monk
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert doctor(config(tmp_path, sources={}), 0.1) == 1
     assert "1 finding\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("beams", "line"),
+    [
+        (BeamPower((0, 3, 4)), "beams 0 3 4: beam 3 serves"),
+        (BeamPower((0, 3, 4), 0, 2, 3), "beams 0 3 4: beam 2 serves, with beam 3"),
+        (BeamPower((0, 0)), "beams 0 0: none is heard"),
+    ],
+)
+def test_beams_of_a_terminal_in_words(beams: BeamPower, line: str) -> None:
+    assert _beams_line(beams) == line

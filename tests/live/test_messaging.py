@@ -25,7 +25,10 @@ from drivers.rdss.report import (
 )
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import Config
+from fusiond.live.chain import Chain
+from fusiond.live.events import Events
 from fusiond.live.kept_messages import KEPT_MESSAGES, KeptMessages
+from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.message_keeper import MessageKeeper
 from fusiond.live.messaging import MOST_CARDS, MOST_UNTOLD, Messaging
 from fusiond.navigation.solution import Mode, Solution
@@ -404,3 +407,23 @@ def test_what_is_kept_round_trips() -> None:
     assert isinstance(state, KeptMessages)
     with pytest.raises(DamagedStateError):
         read_state(Path("/dev/null"), KEPT_MESSAGES)
+
+
+async def test_a_replay_starts_from_the_messages_that_the_daemon_had_loaded(tmp_path: Path) -> None:
+    desk = Desk()
+    desk.send(receipt=True)
+    kept, _ = keeper(desk, tmp_path)
+    await kept.kept(desk.messaging.revision, desk.messaging)
+    daemon = Chain(desk.config, desk.clock, Events(desk.clock))
+    messages = keeper(desk, tmp_path)[0].load(daemon.messaging)
+    recorded = json.dumps(LOADED.dump_python(Loaded(messages=messages), mode="json"))
+    again = Chain(desk.config, desk.clock, Events(desk.clock))
+    LOADED.validate_json(recorded).offer(again)
+    boxes = [c.sources.all["rdss"].driver.outbox.waiting for c in (daemon, again)]  # type: ignore[attr-defined]
+    assert boxes[0] == boxes[1] != []
+    assert [m for _, m in daemon.messaging.take_waiting()] == [
+        m for _, m in again.messaging.take_waiting()
+    ]
+    command = SendMessage(id="m2", card=OTHER, text="bye")
+    said = {c.operator.carry_out(command, desk.clock.now_ns()) for c in (daemon, again)}
+    assert said == {"queued for card 0242407, 2 waiting"}

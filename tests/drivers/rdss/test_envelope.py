@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import contextlib
 import math
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.rdss.envelope import (
-    CARRIAGES,
     RECEIPT,
     TEXT,
     Carriage,
@@ -52,7 +52,7 @@ reports = st.builds(
     speed_m_s=st.one_of(st.none(), st.floats(0.0, 600.0)),
     course_deg=st.one_of(st.none(), st.floats(0.0, 360.0)),
 )
-carriages = st.sampled_from(CARRIAGES)
+carriages = st.sampled_from(get_args(Carriage))
 
 
 def close(a: float | None, b: float | None, step: float) -> bool:
