@@ -35,7 +35,7 @@ def first_run(case: Case, traces: dict[str, Trace]) -> dict[str, Any]:
 
 
 def _there(way: Array) -> list[list[float]]:
-    return way[np.isfinite(way).all(axis=1)].T.tolist()
+    return [axis.tolist() for axis in way[np.isfinite(way).all(axis=1)].T]
 
 
 def rows(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
