@@ -19,6 +19,7 @@ RUNS = {
     "rdss-static": 60,
     "rdss-map": 200,
     "rdss-correlated": 3,
+    "multiscale": 2,
     "federated": 2,
     "ukf": 2,
     "reduced-order": 2,

@@ -81,6 +81,23 @@ def test_every_strategy_has_its_figures(result: Any) -> None:
     json.dumps(found)
 
 
+def test_the_papers_rows_stand_beside_ours() -> None:
+    title, header, rows = tables(static())[-1]
+    assert "rho(1) is not" in title
+    assert {len(row) for row in rows} == {len(header)}
+    paper, run, mean = rows[:3]
+    assert paper[1:5] == ["50", "0.893", "0.74 to 1.30", "-0.405"]
+    assert run[1] == mean[1] == "47"
+    # 40 runs: a mean rho is known to 0.15 / sqrt(40), one sigma.
+    assert all(abs(float(rho)) < 0.12 for rho in mean[4:])
+    first = static()["strategies"]["rewind"]["first_window"]
+    assert float(rows[3][2]) == pytest.approx(first["nis"], abs=1e-3)
+    for found, moved_m in ((static(), 0.0), (dynamic(), 1000.0)):
+        run_0 = found["first_run"]
+        assert len(run_0["innovations"][0]) > 50
+        assert np.ptp(run_0["way_m"]["truth"][0]) >= moved_m
+
+
 def test_at_rest_every_strategy_beats_the_fixes_and_the_ins() -> None:
     s = static()["strategies"]
     for name in ("rewind", "optimal_prediction", "position_compensation", "none"):
@@ -234,7 +251,9 @@ def test_pictures_have_a_panel_for_each_case(tmp_path: Path) -> None:
     plot(static(), tmp_path / "static.png")
     sizes = [(tmp_path / f"{name}.png").read_bytes()[20:24] for name in ("dynamic", "static")]
     heights = [int.from_bytes(size, "big") for size in sizes]
-    assert heights[0] == pytest.approx(len(rdss_dynamic.CASES) * heights[1], rel=0.02)
+    # And two of the paper's figures each.
+    panels = [len(rdss_dynamic.CASES) + 2, 1 + 2]
+    assert heights[0] / panels[0] == pytest.approx(heights[1] / panels[1], rel=0.02)
 
 
 def test_studies_are_named_by_what_they_are() -> None:

@@ -1,4 +1,14 @@
-"""What the RDSS centre makes of a request: the fix, its error and its delay, or nothing.
+r"""What the RDSS centre makes of a request: the fix, its error and its delay, or nothing.
+
+The error is that of eq. 4 of paper 000 at the place (`fusiond.aiding.rdss_geometry`): slant ranges
+that are too long by d rho and a height that is too great by dH give
+
+    [dN, dE]^T = G d rho + g dH + f
+
+so that north and east hang together, and the height's part of the fix is that of the very height
+that it states (with a height given in the request, of that). f is what a fix has beyond its
+geometry, up to the class, which is a floor. Where the geometry gives no fix the class is all that
+is known.
 
 Source: delays and accuracy classes from the BeiDou RDSS literature (two geostationary hops up and
 down, 20 m and 100 m classes).
@@ -11,9 +21,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.rdss.messages import Family
+from fusiond.aiding.base import NotApplicable
+from fusiond.aiding.rdss_geometry import LONGITUDES_DEG, RdssGeometry, with_floor
 from fusiond.simulation.imu_truth import Truth, metres_to_geodetic
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +43,11 @@ class RdssOptions:
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     precision_class_m: Literal[20, 100] = 20
     error_sd_m: float | None = None
-    """Horizontal error; None: as large as the class."""
+    """Horizontal error, alike and independent north and east; None: that of eq. 4."""
+    satellites_deg: tuple[float, float] = LONGITUDES_DEG
+    """Longitudes of the two geostationary satellites, east positive."""
+    range_sd_m: float = 15.3
+    """Of a slant range after differential correction, as the paper's 8 and 13 m are together."""
     error_correlation_s: float = 0.0
     """Correlation time of the error between fixes; 0: independent."""
     height_sd_m: float = 10.0
@@ -82,18 +101,15 @@ class RdssCentre:
         self._truth = truth
         self._options = options
         self._rng = rng
-        self._error = np.zeros(2)
+        self._unit = np.zeros(2)
         self._last_s = -math.inf
 
     def fix(self, burst_s: float, given_height_m: float | None) -> SimulatedFix:
         """The fix for a burst at `burst_s`."""
         o, rng = self._options, self._rng
-        sd = float(o.precision_class_m) if o.error_sd_m is None else o.error_sd_m
         age = burst_s - self._last_s
         kept = math.exp(-age / o.error_correlation_s) if o.error_correlation_s > 0 else 0.0
-        self._error = kept * self._error + (
-            sd * math.sqrt(1.0 - kept * kept) * rng.standard_normal(2)
-        )
+        self._unit = kept * self._unit + math.sqrt(1.0 - kept * kept) * rng.standard_normal(2)
         self._last_s = burst_s
         multi_value = bool(rng.random() < o.multi_value_probability)
         height_error = float(rng.standard_normal()) * o.height_sd_m
@@ -103,7 +119,9 @@ class RdssCentre:
         else:
             delay = least + float(rng.exponential(max(o.mean_delay_s - least, 0.0)))
         state = self._truth.at(np.array([burst_s]), o.lever_arm_m)
-        north, east = (float(x) for x in self._error)
+        if given_height_m is not None:
+            height_error = given_height_m - float(state.position[0, 2])
+        north, east = (float(x) for x in self._horizontal(state.position[0], height_error))
         if multi_value:  # the other of the two solutions: far off, as an ambiguous fix may be
             north -= 3000.0
         offset = metres_to_geodetic(
@@ -115,10 +133,24 @@ class RdssCentre:
             t_arrival_s=burst_s + min(delay, greatest),
             lat_deg=math.degrees(lat),
             lon_deg=math.degrees(lon),
-            height_m=height + height_error if given_height_m is None else given_height_m,
+            height_m=height + height_error,
             precision_class_m=o.precision_class_m,
             multi_value=multi_value,
         )
+
+    def _horizontal(self, place: Array, height_error_m: float) -> Array:
+        """Error (2,) north and east at a geodetic place (3,), of the fix's height error."""
+        o = self._options
+        if o.error_sd_m is not None:
+            return o.error_sd_m * self._unit
+        lat, lon, height = (float(x) for x in place)
+        geometry = RdssGeometry(o.satellites_deg)
+        found = geometry.covariance(lat, lon, height, o.range_sd_m, o.height_sd_m)
+        by = geometry.sensitivity(lat, lon, height)
+        if isinstance(found, NotApplicable) or isinstance(by, NotApplicable):
+            return o.precision_class_m * self._unit
+        beside_height = with_floor(found.total, o.precision_class_m) - found.height
+        return np.linalg.cholesky(beside_height) @ self._unit + by.height * height_error_m
 
     def dropped(self) -> bool:
         """Whether this request is lost on the way."""

@@ -215,7 +215,7 @@ def _metres(position: Array) -> Array:
     return np.asarray((position - start) * metres(float(start[0]), float(start[2])))
 
 
-def _figures(traces: Sequence[Trace], counted: NDArray[np.bool_]) -> dict[str, float | None]:
+def _figures(traces: Sequence[Trace], counted: NDArray[np.bool_]) -> dict[str, Any]:
     error = np.concatenate([t.error[counted] for t in traces])
     nees = np.concatenate([t.nees[counted] for t in traces])
     filtered = bool(np.isfinite(nees).any())

@@ -24,6 +24,7 @@ from scipy.stats import norm
 
 from fusiond.integrity.consistency import LAGS, Consistency, judge
 from fusiond.studies.monte_carlo import Progress, nees_interval, step_counter
+from fusiond.studies.rdss import paper
 from fusiond.studies.rdss.runs import (
     NEES_DOF,
     RDSS_ALONE,
@@ -103,6 +104,7 @@ def figures(case: Case, results: Runs) -> dict[str, Any]:
             }
             for name in names
         },
+        "first_run": paper.first_run(case, results[0]) if paper.SHOWN in names else None,
         "series": {
             "t_s": t_s[::every].tolist(),
             "horizontal_rms_m": {name: _course(results, name)[::every].tolist() for name in names},
@@ -168,6 +170,15 @@ def _consistency(results: Runs, name: str, k: int) -> dict[str, Any]:
         "nis_pass_rate": float(np.mean([w.nis_inside for w in windows])) if windows else None,
         "rho_pass_rate": float(np.mean([w.rho_inside for w in windows])) if windows else None,
         "rho_1_mean": float(np.mean([w.rho[0] for w in windows])) if windows else None,
+        "rho_mean": np.mean([w.rho for w in windows], axis=0).tolist() if windows else None,
+        "first_window": {
+            "k": windows[0].k,
+            "nis": windows[0].nis_average,
+            "nis_interval": list(windows[0].nis_interval),
+            "rho": list(windows[0].rho),
+        }
+        if windows
+        else None,
         "verdicts": dict(Counter(w.verdict for w in windows)),
         "gated": sum(traces[name].gated for traces in results),
     }
@@ -240,6 +251,8 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
             for name, figure in case["strategies"].items()
         ]
         found.append((title, ["", *COLUMNS], rows))
+    if result["study"] == "rdss-static":
+        found.append(paper.rows(result))
     return found
 
 
@@ -248,12 +261,17 @@ def _cell(value: float | None, form: str) -> str:
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Horizontal RMS over time by filter, one panel a case, to `path`."""
+    """Horizontal RMS over time by filter, one panel a case; below them the paper's figures 1 and 2,
+    or 3 and 4, of run 0; to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
 
     cases = [result, *result.get("variants", {}).values()]
-    figure = Figure(figsize=(9.0, 3.6 * len(cases)), layout="constrained")
-    for axes, case in zip(figure.subplots(len(cases), squeeze=False)[:, 0], cases, strict=True):
+    own = 2 if paper.SHOWN in result["strategies"] else 0
+    figure = Figure(figsize=(9.0, 3.6 * (len(cases) + own)), layout="constrained")
+    panels = figure.subplots(len(cases) + own, squeeze=False)[:, 0]
+    if own:
+        paper.draw(panels[len(cases) :], result)
+    for axes, case in zip(panels, cases, strict=False):
         series = case["series"]
         for number, (name, values) in enumerate(series["horizontal_rms_m"].items()):
             width = 4.0 if number == 0 else 1.2  # others may lie on the first
