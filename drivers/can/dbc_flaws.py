@@ -43,9 +43,8 @@ _ATTRIBUTE = re.compile(rf"\s*BA_\w*\s+(?:(?:BO_|SG_)\s+)?\"({'|'.join(_ATTRIBUT
 _ATTRIBUTE_OWNER = re.compile(r'\s*BA_\s+"\w+"\s+(BO_|SG_)\s+(\d+)(?:\s+(\w+))?')
 UNSELECTED = "it shares its bits with other signals, and none (M) says which of them a frame holds"
 LAST_STANDARD, LAST_EXTENDED, EXTENDED = 0x7FF, 0x1FFFFFFF, 1 << 31
-_SIZES = re.compile(
-    r"^[ \t]*(?:BO_\s+\d+\s+[^\s:]+\s*:\s*(\d+)|SG_[^:\n]*:\s*(\d+)\|(\d+))", re.MULTILINE
-)
+_SIZES = re.compile(r"\bBO_\s+\d+\s+[^\s:]+\s*:\s*(\d+)|\bSG_\s[^:]{0,200}:\s*(\d+)\s*\|\s*(\d+)")
+"""Wherever they stand: a signal may be on its message's line."""
 MOST_BITS = 2048 * 8
 """Of CAN XL, the longest frame there is. cantools makes room for as many as a file says."""
 _AT_LINE = re.compile(r"at line \d+, column \d+: ")

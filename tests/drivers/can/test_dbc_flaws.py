@@ -61,6 +61,10 @@ FLAWS = {
         ' SG_ B : 8|8@1+ (1,0) [0|1] "" X\n',
         {"FOO.A"},
     ),
+    "signal of half a gigabit on its message's line": (
+        'BO_ 1314 FOO: 8 X SG_ A : 0|419358976@1+ (1,0) [0|1] "" X\n',
+        {"FOO"},
+    ),
     "signal that begins far behind": (
         'BO_ 1312 FOO: 8 X\n SG_ A : 419358976|8@1+ (1,0) [0|1] "" X\n',
         {"FOO"},
