@@ -14,7 +14,7 @@ A velocity that lags behind the position of the same stamp, by tau_p - tau, has 
 filtered for about twice as long. Of a vehicle that speeds up evenly that is a delay; of one that
 begins or ends to, or shakes, within that time it is not:
 
-    var = (AVERAGED (tau_p - tau) a_i)^2
+    var = (AVERAGED (tau_p - tau) a_i)^2    no velocity is ahead of its position: else 0
 
 Source: Groves, 2nd ed., eq. 14.109.
 """
@@ -108,7 +108,7 @@ def velocity_rows(
         r[2] = sd2 * sd2
     square = sd_time * sd_time
     if time.size and fix_time.size:
-        square += (AVERAGED * (xi[fix_time[0]] - xi[time[0]])) ** 2
+        square += (AVERAGED * max(xi[fix_time[0]] - xi[time[0]], 0.0)) ** 2
     if square > 0.0:
         r[0] += f0 * f0 * square
         r[1] += f1 * f1 * square
