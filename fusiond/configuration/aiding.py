@@ -65,7 +65,7 @@ class GnssAiding(Aiding):
     """Where the receiver states none."""
     min_position_sd_m: PositiveFloat | None = None
     """No smaller sigma is believed; without it by the fix's quality: 0.3 m by code (0.5 m of
-    height), 0.05 m RTK float and a stated sigma that is carrier phase's, 0.02 m RTK fixed."""
+    height), 0.05 m RTK float, 0.02 m RTK fixed."""
     min_velocity_sd_m_s: PositiveFloat = 0.02
     """No smaller sigma is believed."""
     velocity_delay_s: NonNegativeFloat = 0.0

@@ -37,8 +37,8 @@ RANGE_FACTOR = {1: 1.0, 2: 0.5, 4: 0.01, 5: 0.15}
 # better, and one that claims it counts noise alone, not what successive fixes share. By code:
 # differentially 0.4 to 0.5 m horizontally and 0.5 to 0.7 m in height (data sheets of Trimble 5700
 # and Septentrio mosaic-X5), 0.3 m an axis and 0.5 m. By phase with ambiguities in doubt: a fraction
-# of the wavelength of 0.19 m; so a fix whose stated sigma alone says that it is by phase. Fixed: 1
-# cm + 1 ppm (both sheets and u-blox ZED-F9P's), 2 cm at a base 10 km away.
+# of the wavelength of 0.19 m. Fixed: 1 cm + 1 ppm (both sheets and u-blox ZED-F9P's), 2 cm at a
+# base 10 km away.
 CODE_FLOOR_M, CODE_HEIGHT_FLOOR_M = 0.3, 0.5
 FLOOR_M = {4: 0.02, 5: 0.05}
 RTK = (4, 5)
@@ -99,12 +99,11 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     o, stated = receiver.section, m.sd_ned_m
     if stated is not None and min(stated) <= 0.0:
         return "no_sigma"
-    by_phase = _by_phase(m, sections)
     least = o.min_position_sd_m
     if least is not None:
         least_d = least
-    elif by_phase:
-        least = least_d = FLOOR_M.get(m.quality, FLOOR_M[5])
+    elif m.quality in FLOOR_M:
+        least = least_d = FLOOR_M[m.quality]
     else:
         least, least_d = CODE_FLOOR_M, CODE_HEIGHT_FLOOR_M
     (n, e, d), rounding, scale = _position_sd(m, o), m.rounding_sd_ned_m, o.sigma_scale
@@ -114,6 +113,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         math.hypot(max(d * scale, least_d), rounding[2]),
     )
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
+    by_phase = _by_phase(m, sections)
     share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
     height = m.height_m
     if receiver.holds:
