@@ -12,8 +12,7 @@ import aiomqtt
 
 from fusiond.dashboard.hub import LARGEST_BYTES, Hub
 from fusiond.dashboard.schemas import topics
-from fusiond.outputs.incoming import SOCKET_OPTIONS
-from fusiond.outputs.packet_limit import limit
+from fusiond.outputs.packet_limit import SOCKET_OPTIONS, limit
 
 BASE = "fusiond"
 RETRY_S = 1.0

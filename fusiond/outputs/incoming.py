@@ -13,7 +13,6 @@ megabytes that it would take otherwise.
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 from collections import Counter
 from typing import Any
@@ -32,14 +31,6 @@ QUIET_S, LONGEST_QUIET_S = 10.0, 60.0
 """Nobody is listened to after a flood, doubling with each that follows."""
 PEACE_S = 60.0
 """Without a flood for so long the next one is the first again."""
-HELD_BYTES = 131_072
-"""Asked of the kernel, which takes twice as much: some thousand small messages, which take 0.1 s to
-drop, and enough that large ones are read as fast as they come."""
-SOCKET_OPTIONS = (
-    # Else a message waits for the broker's word on the one before (Nagle): 20 ms of gap.
-    (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),
-    (socket.SOL_SOCKET, socket.SO_RCVBUF, HELD_BYTES),
-)
 
 
 class Incoming:

@@ -207,7 +207,7 @@ class MqttPublisher:
             max_queued_incoming_messages=_INCOMING,
             logger=_LOG,
             tls_context=self._tls,
-            socket_options=incoming.SOCKET_OPTIONS,
+            socket_options=packet_limit.SOCKET_OPTIONS,
         )
         packet_limit.limit(client, MAX_PAYLOAD_BYTES)
         return client

@@ -9,6 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from fusiond.estimators.fault_bank import (
+    BOUNDED,
+    CLASS,
+    COUNTS_BY,
     E_ROWS,
     HEAD,
     J_AT,
@@ -31,6 +34,7 @@ from fusiond.estimators.fault_bank import (
     fault_table,
 )
 from fusiond.estimators.fault_carried import settle
+from fusiond.estimators.fault_odds import MOST_OF_UNIT
 from fusiond.estimators.fault_rows import _at_past, _past, walk_path
 from fusiond.estimators.hypotheses import Hypotheses
 from fusiond.estimators.kalman import KalmanEstimator
@@ -61,8 +65,8 @@ def matrices(bank: Hypotheses, number: int) -> tuple[Array, Array]:
 
 
 def test_odds_are_those_of_the_theory() -> None:
-    """(e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2 + e^T m - m^T L m / 2, and what is left of
-    J against chi-square's."""
+    """l / 2 - p log(N) / 2, or of a size that is known (e - L m)^T M (e - L m) / 2
+    - log det(I + S L) / 2 + e^T m - m^T L m / 2, and what is left of J against chi-square's."""
     _, bank = faulty()
     found, explains = bank.log_odds, bank.explains
     compared = 0
@@ -77,16 +81,21 @@ def test_odds_are_those_of_the_theory() -> None:
         s, mean = np.diag(numbers[PRIOR : PRIOR + size] ** 2), np.full(size, numbers[MEAN])
         m = np.linalg.inv(information + np.linalg.inv(s))
         left = e - information @ mean
-        odds = numbers[LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
-        odds += 0.5 * left @ m @ left + e @ mean - 0.5 * mean @ information @ mean
-        odds -= 0.5 * np.linalg.slogdet(np.eye(size) + s @ information)[1]
-        assert found[row, restart] == pytest.approx(odds, abs=1e-7)
         share = np.linalg.inv(information + 1e-9 * np.linalg.inv(s))
+        odds = numbers[LOG_RATE] + math.log(PERIODS_S[LEVEL_OF[restart]])
+        odds += bank.each(COUNTS_BY)[row, restart]
+        if numbers[BOUNDED]:
+            odds += 0.5 * left @ m @ left + e @ mean - 0.5 * mean @ information @ mean
+            odds -= 0.5 * np.linalg.slogdet(np.eye(size) + s @ information)[1]
+        else:
+            odds += 0.5 * e @ share @ e - 0.5 * size * math.log(rows)
+        assert found[row, restart] == pytest.approx(odds, abs=1e-6)
         degrees = max(rows - size, 1.0)
         most = degrees + 4.0 * math.sqrt(2.0 * degrees)
         unexplained = bank.each(J_AT)[row, restart] - e @ share @ e - most
-        shift = abs((m @ left)[0]) / numbers[PRIOR]
-        other = numbers[MEAN] != 0.0 and shift > 3.0
+        off = np.abs(m @ left) / numbers[PRIOR : PRIOR + size]
+        other = bool(numbers[BOUNDED]) and off[0] > 3.0
+        other |= bank.table.ints[row, CLASS] == 0 and odds > 0.0 and off.max() > MOST_OF_UNIT
         assert explains[row, restart] == (unexplained <= 0.0 and not other)
         compared += 1
     assert compared > 100

@@ -231,7 +231,7 @@ CHANGED: dict[str, dict[str, Any]] = {
 }
 NO_FILE_KNOWS = {
     # What leaves the daemon, and how its process runs.
-    *("vehicle", "log_level", "mqtt", "recording", "outputs"),
+    *("vehicle", "log_level", "mqtt", "recording", "outputs", "position_reports"),
     # Where a daemon of before was: a file is not of today.
     *("state_file", "alignment.saved_max_age_s"),
     # What turns a device's stamps into instants; tables have instants. Of a recorded bus below.
