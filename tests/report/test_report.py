@@ -48,12 +48,12 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """The demo's car for 16 s, 4 s of them navigating, and its page with the truth."""
+    """The demo's car for 26 s, 14 s of them navigating, and its page with the truth."""
     folder = tmp_path_factory.mktemp("drive")
-    drive = Drive(folder, 20.0)
-    drive.run(16.0)
+    drive = Drive(folder, 30.0)
+    drive.run(26.0)
     (log,) = drive.close()
-    states = drive.vehicle.truth.at(np.arange(0.0, 18.0, 0.1))
+    states = drive.vehicle.truth.at(np.arange(0.0, 28.0, 0.1))
     path = folder / "truth.csv"
     n = len(states.t_s)
     with SolutionWriter(path) as file:
