@@ -156,8 +156,7 @@ def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> Faul
             lanes[row, P_AT + LANES * c + lane] = 1.0 / (sd * sd)
         lanes[row, MEAN_AT + lane] = numbers[kind, MEAN]
         odds = numbers[kind, LOG_RATE] + math.log(PERIODS_S[level])
-        known = numbers[kind, BOUNDED] != 0.0
-        lanes[row, ODDS_AT + lane] = odds - np.log(prior).sum() if known else odds
+        lanes[row, ODDS_AT + lane] = odds - np.log(prior).sum()
     return FaultTable(ints, numbers, lanes.ravel(), devices)
 
 

@@ -1,6 +1,6 @@
 r"""Odds of the hypotheses of a bank, and what they leave open of what the filter publishes.
 
-    log odds            log(rate T) + l / 2 - p log(N) / 2
+    log odds            log(rate T) + l / 2 - max(p log(N) / 2, log det(I + S L) / 2)
                         of a kind that is known to be of a size
                         log(rate T) + (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2
                         + e^T m - m^T L m / 2
@@ -10,9 +10,9 @@ r"""Odds of the hypotheses of a bank, and what they leave open of what the filte
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
 
-Sizes of faults have no one scale, and of kinds that fit alike none is to be accused for the size
-that it was expected to have: what p unknowns gain by chance is taken off by the number of rows
-alone (Schwarz). The prior of a size bounds its estimate.
+What p unknowns gain by chance is taken off, by the number of rows (Schwarz) or by the size that such
+a fault is expected to have, whichever takes more: what is far smaller than it is what no model knows
+of a sound receiver. Between kinds that fit alike neither decides (`judge`).
 
 Source: as of fusiond.estimators.fault_bank; Schwarz, Estimating the dimension of a model, Annals of
 Statistics 6 (1978), 461; Blom, Bar-Shalom, IEEE Trans. AC 33 (1988), 780, for the moments of a
@@ -136,8 +136,9 @@ def solve(bank: Array, at: int, size: int, numbers: Array, share: float, m: Arra
 
 @compiled("void(f8[::1], f8[::1])")
 def _gains(bank: Array, lanes: Array) -> None:
-    """Write, of all groups, what they explain and what is left unexplained; of those of one number
-    also what the log odds gain by it with the prior, for log odds, and L + S^-1, for the weight."""
+    """Write, of all groups, what they explain and what is left unexplained, and for the weight the
+    determinant of L + S^-1; of those of one number also what the log odds gain by it with the
+    prior, for log odds."""
     length = int(bank[LENGTH])
     threes = (int(bank[THREES]) + LANES - 1) // LANES
     ones = (int(bank[ALL]) - int(bank[THREES]) + LANES - 1) // LANES
@@ -163,6 +164,14 @@ def _gains(bank: Array, lanes: Array) -> None:
                 e_2 = bank[j + unsigned(E2)] - l_2 * e_0 - l_3 * e_1
                 gained = e_0 * e_0 / d_0 + e_1 * e_1 / d_1 + e_2 * e_2 / d_2
                 bank[j + unsigned(EXPLAINED)] = gained
+                # det (L + S^-1)
+                b_0 = bank[j + unsigned(L_AT)] + lanes[c + unsigned(P_AT)]
+                m_1, m_2 = a_1 / b_0, a_2 / b_0
+                b_1 = bank[j + unsigned(L11)] + lanes[c + unsigned(P_AT + LANES)] - m_1 * a_1
+                m_3 = bank[j + unsigned(L21)] - m_2 * a_1
+                b_2 = bank[j + unsigned(L22)] + lanes[c + unsigned(P_AT + 2 * LANES)]
+                b_2 -= m_2 * a_2 + m_3 * m_3 / b_1
+                bank[j + unsigned(WEIGHT)] = b_0 * b_1 * b_2
         else:
             for k in range(length):
                 j, c = at + unsigned(k), constants + unsigned(k)
@@ -193,10 +202,14 @@ def _odds(bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int,
         return
     place = number if number < threes else number + -threes % LANES
     rate = lanes[place // LANES * CONSTANTS + place % LANES + ODDS_AT] + bank[at + COUNTS_BY]
+    by_size = 0.5 * math.log(a)
     if numbers[kind, BOUNDED] == 0.0:
-        gained = 0.5 * (bank[at + EXPLAINED] - size * math.log(bank[at + N_AT]))
+        by_rows = 0.5 * size * math.log(bank[at + N_AT])
+        for c in range(int(size)):
+            by_rows -= math.log(numbers[kind, PRIOR + c])
+        gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
-        gained = bank[at + LOG_ODDS] - 0.5 * math.log(a)
+        gained = bank[at + LOG_ODDS] - by_size
         off = (bank[at + E_AT] - bank[at + L_AT] * numbers[kind, MEAN]) / a
         if abs(off) > MOST_OFF * numbers[kind, PRIOR]:
             bank[at + UNEXPLAINED] = np.inf  # it is of another size than this kind has
