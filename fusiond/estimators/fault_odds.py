@@ -10,8 +10,8 @@ r"""Odds of the hypotheses of a bank, and what they leave open of what the filte
     left open           sum of w_f V_f (M_f + b_f b_f^T) V_f^T: the mixture's second moment about
                         the estimate of the filter, which is that of nothing wrong
 
-What p unknowns gain by chance is taken off, by the number of rows (Schwarz) or by the size that such
-a fault is expected to have, whichever takes more: what is far smaller than it is what no model knows
+What p unknowns gain by chance is taken off, by the number of rows (Schwarz) or by the size that
+such a fault is expected to have, whichever takes more: what is far smaller is what no model knows
 of a sound receiver. Between kinds that fit alike neither decides (`judge`).
 
 Source: as of fusiond.estimators.fault_bank; Schwarz, Estimating the dimension of a model, Annals of

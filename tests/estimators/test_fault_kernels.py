@@ -65,8 +65,9 @@ def matrices(bank: Hypotheses, number: int) -> tuple[Array, Array]:
 
 
 def test_odds_are_those_of_the_theory() -> None:
-    """l / 2 - max(p log(N) / 2, log det(I + S L) / 2), or of a size that is known (e - L m)^T M (e - L m) / 2
-    - log det(I + S L) / 2 + e^T m - m^T L m / 2, and what is left of J against chi-square's."""
+    """l / 2 - max(p log(N) / 2, log det(I + S L) / 2), or of a size that is known
+    (e - L m)^T M (e - L m) / 2 - log det(I + S L) / 2 + e^T m - m^T L m / 2, and what is left of J
+    against chi-square's."""
     _, bank = faulty()
     found, explains = bank.log_odds, bank.explains
     compared = 0

@@ -118,27 +118,13 @@ def sigmas(change: dict[str, Any], section: GnssAiding | None = None) -> tuple[A
 
 
 @pytest.mark.parametrize(
-    ("quality", "floor", "height"),
-    [(1, 0.05, 0.5), (2, 0.05, 0.5), (4, 0.02, 0.02), (5, 0.05, 0.05)],
+    ("quality", "floor", "height"), [(1, 0.3, 0.5), (2, 0.3, 0.5), (4, 0.02, 0.02), (5, 0.05, 0.05)]
 )
 def test_no_fix_is_better_than_its_quality(quality: int, floor: float, height: float) -> None:
-    """One of 1 cm is by phase, whatever its quality says, with ambiguities in doubt."""
     tight: dict[str, Any] = {"sd_ned_m": (0.002, 0.01, 0.7), "quality": quality}
     assert sigmas(tight)[0] == (floor, floor, 0.7)
     assert sigmas(tight, GnssAiding(min_position_sd_m=0.005))[0] == (0.005, 0.01, 0.7)
     assert sigmas(tight | {"sd_ned_m": (2.0, 2.0, 0.01)})[0] == (2.0, 2.0, height)
-
-
-@pytest.mark.parametrize("quality", [1, 2])
-def test_no_fix_by_code_is_better_than_the_best(quality: int) -> None:
-    """Nor one that has stated a sigma of code, and whose sigma then collapses."""
-    tight: dict[str, Any] = {"sd_ned_m": (0.15, 0.2, 0.3), "quality": quality}
-    assert sigmas(tight)[0] == (0.3, 0.3, 0.5)
-    intake = Intake({"gnss": GnssAiding()})
-    for sd in ((2.0, 2.0, 3.0), (0.01, 0.01, 0.01)):
-        position, _ = intake.aids(replace(FIX, sd_ned_m=sd, quality=quality), 7, 0.0)
-    assert isinstance(position, PositionAid)
-    assert position.sd == (0.3, 0.3, 0.5)
 
 
 def test_a_sigma_that_nobody_can_measure_is_not_stated() -> None:

@@ -61,15 +61,9 @@ def test_nothing_wrong_is_inside_and_a_step_is_told(place: Place) -> None:
     assert np.isfinite(found["recovered_s"])
 
 
-LIES = pytest.mark.xfail(strict=True, reason="a lie that is not mended: docs/faults.md")
-
-
 @pytest.mark.parametrize(
     ("fault", "event"),
-    [
-        pytest.param("drift_0.1_m_s", "isolated", marks=LIES),
-        ("mount_turned_10_deg", "sensor_fault"),
-    ],
+    [("drift_0.1_m_s", "isolated"), ("mount_turned_10_deg", "sensor_fault")],
 )
 def test_what_lied_on_it_does_not(place: Place, fault: str, event: str) -> None:
     """A drift came back while it went on, hidden by the receiver's offset in time and a vehicle
