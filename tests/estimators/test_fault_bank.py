@@ -190,6 +190,29 @@ def test_a_fault_is_found_with_its_size(fault: str, size: tuple[float, ...]) -> 
     assert odds[row, restart] > 7.0
 
 
+@pytest.mark.parametrize(
+    ("fault", "size"),
+    [
+        ("gyro", (math.radians(1.0), 0.0, 0.0)),
+        pytest.param(
+            *("accelerometer", (0.5, 0.0, 0.0)),
+            marks=pytest.mark.xfail(
+                strict=True, reason="a velocity that runs away fits as well for some seconds"
+            ),
+        ),
+        ("position", (20.0, 0.0, 0.0)),
+        ("velocity", (0.0, 2.0, 0.0)),
+    ],
+)
+def test_the_likeliest_is_of_the_faults_class(fault: str, size: tuple[float, ...]) -> None:
+    bank = run(fault, np.array(size)).hypotheses
+    assert bank is not None
+    bank.judge(LAST_NS)
+    odds = np.where(bank.explains, bank.log_odds, -np.inf)
+    row = int(np.argmax(odds)) // RESTARTS
+    assert KINDS[row].of == KINDS[row_of(fault)].of, KINDS[row].name
+
+
 def test_odds_are_those_of_schwarz_or_of_a_size_that_is_known() -> None:
     """Of a position's group and of a delay's, each by dense products."""
     made = run("position", np.array([4.0, 0.0, 0.0]))
