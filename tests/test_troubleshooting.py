@@ -29,15 +29,6 @@ def test_every_sentence_of_the_page_is_one_of_the_navigator() -> None:
     assert [row for row in rows if row not in said] == []
 
 
-def test_every_reason_of_why_not_is_on_the_page() -> None:
-    """The texts that `why.py` can say, without their numbers."""
-    text = re.sub(r'"\s*\n\s*f?"', "", (NAVIGATOR / "alignment" / "why.py").read_text())
-    rows = quoted("Alignment does not come")
-    sentences = re.findall(r'(?:return|=) \[?\s*f?"([^"]{12,})"', text)
-    assert len(sentences) >= 12
-    assert [s for s in sentences if not any(row in s for row in rows)] == []
-
-
 def test_what_doctor_says_of_a_receiver_is_what_the_code_says() -> None:
     """The sentences of the table are parts of those of the code."""
     places = (REPOSITORY / "drivers" / "nmea", REPOSITORY / "fusiond" / "doctor")

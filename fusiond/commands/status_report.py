@@ -173,4 +173,5 @@ def columns(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
 
 def _event(event: dict[str, Any]) -> str:
     when = (event["t_utc"] or "")[11:19] or "before UTC"
-    return f"{when} {event['level']}: {event['source']} {event['code']}: {event['text']}"
+    line = f"{when} {event['level']}: {event['source']} {event['code']}: {event['text']}"
+    return f"{line}\n{'':9}-> {event['advice']}" if event.get("advice") else line

@@ -1,48 +1,30 @@
-"""What to do, in the order of what it is worth to do first: from `status` and `health`.
+"""Steps for the operator, the most urgent first, from `status` and `health`.
 
-The daemon's `why` says what is wrong and where it can what helps; this adds the step that a person
-takes: a plug, a cable, a view of the sky, a key of the configuration. Nothing to do is no advice.
+The step for a `why` is that of the catalogue `fusiond.navigator.reasons`; sources, host and faults
+add theirs. Where all is well there is none.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
+
+from fusiond.navigator.reasons import REASONS, Weight, recognised
 
 Said = Mapping[str, Any]
-Level = Literal["error", "warning", "info"]
 
 
 class Advice(NamedTuple):
     """One step; `about` names the source or part that it concerns."""
 
-    level: Level
+    level: Weight
     about: str
     text: str
 
 
 _ORDER: dict[str, int] = {"error": 0, "warning": 1, "info": 2}
 
-WHY: tuple[tuple[str, Level, str], ...] = (
-    (r"^waiting for IMU data", "error", "Check power and bus of the inertial unit."),
-    (r"^IMU silent", "error", "The inertial unit has stopped: check its power and its bus."),
-    (r"multiply the|another unit", "error", "Correct the unit of the inertial data, then restart."),
-    (r"upside down|mounting_deg", "error", "Correct [imu] axes and mounting_deg, then restart."),
-    (r"correct imu\.rate_hz", "warning", "Correct imu.rate_hz in the configuration."),
-    (r"^no position yet", "warning", "Give a receiver a view of the sky, or set_position."),
-    (r"levelling needs|no level yet", "info", "Stand still until it is level."),
-    (r"gyrocompassing needs|to gyrocompass", "info", "Stand still: it seeks north by itself."),
-    (r"no velocity has come", "info", "Drive straight on, faster than a walk: the course tells."),
-    (r"drive off", "info", "Drive off: the fixes will show the heading."),
-    (r"^no heading yet", "info", "Drive straight on, faster than a walk: the course tells."),
-    (r"no fix has confirmed|no motion has confirmed", "info", "Drive on: it needs to be seen."),
-    (r"^no position fused", "warning", "Get a receiver back; meanwhile trust sigma, which grows."),
-    (r"^horizontal sigma", "error", "Get a receiver back, or set_position: it is lost."),
-)
-"""Patterns of `why` (the navigator's and the aligner's words), and what helps; the first counts."""
-
-_STATES: dict[str, tuple[Level, str]] = {
+_STATES: dict[str, tuple[Weight, str]] = {
     "absent": ("error", "cannot be opened: check plug, power and port"),
     "silent": ("warning", "is open and says nothing: check power, wiring and baud rate"),
     "failed": ("error", "cannot work as configured: correct its section, then restart"),
@@ -73,10 +55,9 @@ def _of_status(status: Said) -> Iterator[Advice]:
         yield Advice("error", "injection", f"Faults are put in ({faults}): do not navigate by it.")
     why = str(status.get("why", ""))
     if status.get("mode") != "navigating":
-        for pattern, level, text in WHY:
-            if re.search(pattern, why):
-                yield Advice(level, "navigation", text)
-                break
+        steps = [REASONS[code] for code in recognised(why) if REASONS[code].advice]
+        for weight, _, text in steps[:1]:  # the most urgent
+            yield Advice(weight, "navigation", text)
     for fault in _objects(status, "faults"):
         source, text = str(fault.get("source", "")), str(fault.get("text", ""))
         yield Advice("warning", source, f"Look after {source}: {text}.")

@@ -22,6 +22,7 @@ from fusiond.navigation.distributions import median
 from fusiond.navigation.imu_buffer import ImuBuffer, all_sound, longest_step, sound
 from fusiond.navigation.imu_check import AXIS_DEAD, OUTCOMES, TAKEN, Checked, ImuCheck
 from fusiond.navigator.imu_units import other_unit
+from fusiond.navigator.reasons import reason
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -82,8 +83,8 @@ class ImuDoor:
         last = max(self._troubles.items(), key=lambda t: t[1].last_ns, default=None)
         why = "" if last is None else f": {TEXTS[last[0]]}"
         if silent_s is None:
-            return f"waiting for IMU data{why}"
-        return f"IMU silent for {silent_s:.1f} s{why}"
+            return reason("no_imu") + why
+        return reason("imu_silent", seconds=silent_s) + why
 
     def restarts(self, imu: ImuBuffer) -> bool:
         """Whether stamps went back for good; then the next may have any."""
@@ -91,7 +92,7 @@ class ImuDoor:
         if stuck_s <= self._config.gap_s:
             return False
         # A clock set back: nothing would be taken until it is made up.
-        text = f"IMU stamps went back {stuck_s:.1f} s ago: aligning anew"
+        text = f"IMU stamps went back {stuck_s:.1f} s ago: aligning again"
         self._trouble("time", self._newest, imu.backward_in_a_row, text)
         self._check.restart()
         self._latest_ns = None
@@ -148,10 +149,10 @@ class ImuDoor:
         for begin, end in pairwise(sorted({0, *breaks, len(times)})):
             ends = ""
             if begin in breaks:
-                ends = "IMU was silent"
+                ends = reason("imu_was_silent")
                 imu.counters["gap"] += 1
-                silent = f"IMU silent for {intervals[begin]:.1f} s"
-                self._event("imu_gap", f"{silent}: aligning anew")
+                silent = reason("imu_silent", seconds=intervals[begin])
+                self._event("imu_gap", f"{silent}: aligning again")
             yield Run(times[begin:end], samples[begin:end], ends)
 
     def _refuse(self, checked: Checked, imu: ImuBuffer) -> str:
@@ -165,7 +166,7 @@ class ImuDoor:
             imu.counters[name] += count
             text = TEXTS[name] + _unit(checked.samples[rows])
             if self._trouble(name, checked.times[rows], count, text) and code == AXIS_DEAD:
-                ends = f"IMU: {TEXTS[name]}"
+                ends = reason("imu_axis_dead")
         return ends
 
     def _trouble(self, name: str, times: Stamps, count: int, text: str = "") -> bool:
@@ -184,7 +185,7 @@ class ImuDoor:
             if now_ns - trouble.last_ns > SOUND_NS:
                 lasted_s = (trouble.last_ns - trouble.first_ns) * 1e-9
                 counted = f"{trouble.count} refused within {lasted_s:.1f} s"
-                self._event("imu_sound", f"no more {TEXTS[name]} ({counted})")
+                self._event("imu_sound", f"Accepted again, after {TEXTS[name]} ({counted})")
                 del self._troubles[name]
 
 

@@ -30,6 +30,7 @@ from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.error_model import FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.imu_buffer import ImuBuffer, squares
 from fusiond.navigator.imu_way import PROOF, WayTurns
+from fusiond.navigator.reasons import reason
 
 # In a loop of 2 g for half of the time nobody flies, and half of gravity for as long nobody falls.
 FORCE_RANGE = (0.5, 2.0)
@@ -48,21 +49,17 @@ FITS_RANGE = (0.5, 2.0)
 # A bias so many sigmas of its data sheet off is none of that sheet: chance does that on one axis of
 # 16,000. Of rates in deg/s all three axes stay below it on one vehicle in 6,000.
 SHEET_SIGMAS = 4.0
-ADVICE = "they look like deg/s; multiply the gyro's figures by pi/180"
 
 
 def force_unit(magnitude: float) -> str | None:
     """What to say of forces of this magnitude in the median; None where they can be m/s^2."""
     if FORCE_RANGE[0] <= magnitude / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
         return None
-    found = (
-        f"the specific force is {magnitude:.4g} in the median, where gravity alone is 9.81 m/s^2"
-    )
     unit = other_unit(magnitude)
     if unit is None:
-        return f"{found}: another unit, or gravity taken out"
+        return reason("force_unknown", size=magnitude)
     name, factor = unit
-    return f"{found}: it looks like {name}; multiply the accelerometer's figures by {factor:g}"
+    return reason("force_unit", size=magnitude, unit=name, factor=factor)
 
 
 def other_unit(magnitude: float) -> tuple[str, float] | None:
@@ -77,7 +74,7 @@ def rms_unit(rms_rad_s: float) -> str | None:
     """What to say of rates of this RMS; None where a vehicle can turn with them."""
     if rms_rad_s <= MOST_RATE_RAD_S:
         return None
-    return f"the rates are {rms_rad_s:.3g} rad/s RMS, more than a vehicle turns: {ADVICE}"
+    return reason("rate_size", size=rms_rad_s)
 
 
 class CourseTurns:
@@ -126,7 +123,7 @@ class CourseTurns:
         """What to say of the rates; None where they fit, or nobody can tell."""
         if not self.decided or not DEGREES_RANGE[0] <= (factor := self._factor) <= DEGREES_RANGE[1]:
             return None
-        return f"the rates are {factor:.0f} times the turns of the fixes' course: {ADVICE}"
+        return reason("rate_turns", factor=factor)
 
     def begin_anew(self) -> None:
         """Forget the turns so far."""
@@ -173,9 +170,9 @@ class RateUnits:
             if sigmas > worst:
                 gyro, worst = column < FORCE_ERROR, sigmas
                 size, unit = (math.degrees(bias), "deg/s") if gyro else (bias, "m/s^2")
-                what = "gyro" if gyro else "accelerometer"
-                told = f"{what}'s bias of {size:.2g} {unit} is {sigmas:.0f} sigma of [imu]"
-        return told and f"the {told}: another unit or sensor; the next bends tell"
+                sensor = "Gyro" if gyro else "Accelerometer"
+                told = reason("bias_size", sensor=sensor, size=size, unit=unit, sigmas=sigmas)
+        return told
 
     def samples(self, imu: ImuBuffer, new: int) -> None:
         """The samples from row `new` on have come."""
@@ -218,7 +215,7 @@ class RateUnits:
         if abs(evidence) <= PROOF:
             return
         well = evidence > 0.0
-        self._tell(None if well else f"the rates are not those of the way between fixes: {ADVICE}")
+        self._tell(None if well else reason("rate_path"))
         self._fit = well
         way.begin_anew()
 
@@ -226,7 +223,7 @@ class RateUnits:
         if wrong is not None and self.wrong is None:
             self._event("imu_units", wrong)
         elif wrong is None and self.wrong is not None:
-            self._event("imu_units_well", "the rates fit the turns of the fixes' course again")
+            self._event("imu_units_well", "Rates fit the turns of the course again")
         self.wrong = wrong
 
 

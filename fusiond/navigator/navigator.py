@@ -45,6 +45,7 @@ from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
 from fusiond.navigator.protection import ProtectionWatch
 from fusiond.navigator.readout import publish_by_own_clock, solution_of
+from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
 from fusiond.navigator.service_events import ServiceEvents
 from fusiond.navigator.state_file import RefusedStateError
@@ -142,7 +143,7 @@ class Navigator:
                 self._feel(appended)
             taken += appended
         if self._door.restarts(self.imu):
-            self._begin_anew("IMU stamps went back")
+            self._begin_anew(reason("imu_stamps_back"))
         return taken
 
     def change_imu(self) -> None:
@@ -153,7 +154,7 @@ class Navigator:
         publish_by_axes(self.estimator, self.config.imu, spare=True)
         if self.started is not None:
             return hand_over(self.estimator, self.timeline, self.config.imu)
-        return self._begin_anew("the spare IMU is used")
+        return self._begin_anew(reason("imu_spare"))
 
     def _begin_anew(self, why: str) -> None:
         """Nothing that the samples so far have told counts any more."""
@@ -239,11 +240,11 @@ class Navigator:
             self.started = start
             self._afterwards = Afterwards(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
-            self._event("aligned", f"heading from {start.how}")
+            self._event("aligned", reason("heading_from", how=start.how))
         self.timeline.run(record)
         self.verdicts.tell()
         if (what := broken(self.estimator)) is not None:
-            self._event("filter_not_finite", f"{what}: aligning anew")
+            self._event("filter_not_finite", f"{what}: aligning again")
             self.reset(what)
             return
         if self._service_events.tell():
@@ -252,12 +253,12 @@ class Navigator:
             return
         failure = self._status.failure(self.timeline.diagnosis)
         if failure is not None:
-            self._event("diverged", f"{failure}: aligning anew")
+            self._event("diverged", f"{failure}: aligning again")
             self.reset(failure)
             return
         if self.warm is not None and self.warm.refused_by is not None:
-            why = f"{self.warm.refused_by} speaks against the state of before the restart"
-            self._event("warm_start_refused", f"{why}: aligning anew")
+            why = reason("warm_start_wrong", source=self.warm.refused_by)
+            self._event("warm_start_refused", f"{why}: aligning again")
             self.reset(why)
             return
         self._protection.tell()
@@ -269,9 +270,9 @@ class Navigator:
         if not (watch.look(e.t_ns, e.xi, e.covariance) or watch.turned) or not self.calibration:
             return
         if wrong := watch.turned or self.calibration.refuted(watch.parameters):
-            self._event("calibration_refused", f"{wrong}: without it, aligning anew")
+            self._event("calibration_refused", f"{wrong}: not used, aligning again")
             self.calibration = None
-            self.reset(f"the saved calibration is wrong: {wrong}")
+            self.reset(reason("calibration_wrong", what=wrong))
 
     def _refuted(self) -> bool:
         """Whether the start has shown to be a wrong one; alignment then begins anew."""
@@ -318,7 +319,7 @@ class Navigator:
     def unconfirmed(self) -> str:
         """What the heading hangs on and nothing has shown, in words; empty where it does not."""
         if self.warm is not None and self.warm.on_trial:
-            return "no fix has confirmed it yet"
+            return reason("not_confirmed_by_fix")
         return self._afterwards.unconfirmed if self._afterwards else ""
 
     def solution(self, t_ns: int) -> Solution:
@@ -332,7 +333,7 @@ class Navigator:
         if self.started is None or t_ns >= self.estimator.t_ns:
             return self._present(t_ns)
         if t_ns < self.timeline.oldest_ns:
-            return Solution(t_ns, Mode.INVALID, "before the history that is kept")
+            return Solution(t_ns, Mode.INVALID, reason("before_history"))
         with self.timeline.past(t_ns):
             return self._present(t_ns)
 

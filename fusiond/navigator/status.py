@@ -17,6 +17,7 @@ from fusiond.navigation.solution import Mode
 from fusiond.navigation.strapdown import VE, VN
 from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
+from fusiond.navigator.reasons import joined, reason
 
 
 class Begun(NamedTuple):
@@ -60,26 +61,28 @@ class NavigationStatus:
             return Mode.ALIGNING, aligning
         sd_m = self._horizontal_sd_m()
         if not sd_m <= self._limits.invalid_sd_m:
-            return Mode.INVALID, f"horizontal sigma {sd_m:.0f} m"
+            limit = self._limits.invalid_sd_m
+            return Mode.INVALID, reason("sigma", sd=sd_m, limit=limit)
+        heading = reason("heading_from", how=begun.how)
         if begun.unconfirmed:
-            return Mode.COASTING, f"heading from {begun.how}; {begun.unconfirmed}"
+            return Mode.COASTING, joined((heading, begun.unconfirmed))
         if (why := self._units.unproven(self._estimator)) is not None:
             return Mode.COASTING, why
         unaided = (t_ns - begun.position_ns) * 1e-9
         if unaided > self._limits.coast_after_s:
-            return Mode.COASTING, f"no position fused for {unaided:.0f} s"
-        return Mode.NAVIGATING, f"heading from {begun.how}"
+            return Mode.COASTING, reason("no_fix", seconds=unaided)
+        return Mode.NAVIGATING, heading
 
     def failure(self, diagnosis: Diagnosis) -> str | None:
         """Why navigation must begin anew; None while it need not."""
         e = self._estimator
         speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
         if speed > self._max_speed_m_s:
-            return f"{speed:.0f} m/s is faster than this vehicle can be"
+            return reason("too_fast", speed=speed)
         if (device := diagnosis.contradicts) is not None:
-            return f"positions and velocities of {device} fit each other, not the filter"
+            return reason("filter_disagrees", device=device)
         if diagnosis.positions_out and not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
-            return "no position in service, and the solution is not valid any more"
+            return reason("nothing_in_service")
         return None
 
     def _horizontal_sd_m(self) -> float:

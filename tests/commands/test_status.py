@@ -97,10 +97,12 @@ async def test_a_page_of_what_the_daemon_says(tmp_path: Path) -> None:
 
 async def test_without_a_solution_it_exits_1(tmp_path: Path) -> None:
     with Broker(tmp_path) as broker:
-        async with daemon(broker, "van", mode=Mode.ALIGNING, why="no position yet"):
+        async with daemon(
+            broker, "van", mode=Mode.ALIGNING, why="Waiting for a first position fix"
+        ):
             done = await asked("--mqtt", f"127.0.0.1:{broker.port}", "--vehicle", "van")
             assert done.exit_code == 1
-            assert "ALIGNING for 58 min 20 s: no position yet" in done.stdout
+            assert "ALIGNING for 58 min 20 s: Waiting for a first position fix" in done.stdout
 
 
 async def test_which_of_two_vehicles(tmp_path: Path) -> None:

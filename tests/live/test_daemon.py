@@ -66,7 +66,7 @@ async def test_it_aligns_navigates_and_says_how_each_device_is(bench: Bench) -> 
         modes = [mode for mode in modes if mode not in (Mode.WAITING, Mode.INVALID)]
     assert modes[-2:] == [Mode.ALIGNING, PARKED]
     assert modes[:-2] in ([], [Mode.WAITING])  # the first frames may come before the first tick
-    why = "heading from configured heading; no motion has confirmed it yet"
+    why = "Heading from configured heading; not confirmed by motion yet"
     assert solution.reason == why
     true = vehicle.truth_at(solution.t_ns)
     sd = solution.sd_ned_m
@@ -248,7 +248,7 @@ async def test_a_saved_heading_serves_the_start_and_goes_when_the_vehicle_drives
     daemon = bench.daemon(NO_MQTT)
     async with running(daemon, bench.vehicle(scenario, gnss_link=bench.folder / "gnss")):
         await bench.mode(Mode.NAVIGATING)
-        assert bench.seen[-1].reason == "heading from saved state"
+        assert bench.seen[-1].reason == "Heading from saved state"
         assert state.exists()
         # A power cut from here on must not bring the old heading back.
         await until(lambda: not state.exists())

@@ -1,4 +1,4 @@
-"""Events: their level, and who hears them."""
+"""Events: log, level, advice and listeners."""
 
 from __future__ import annotations
 
@@ -9,42 +9,11 @@ import pytest
 
 from fusiond.clock.clock import Clock
 from fusiond.configuration.schema import ClockOptions, Config
-from fusiond.live.events import Events, level_of
+from fusiond.live.events import Events
 from fusiond.live.injection import Injection
 from fusiond.live.sources import Sources
 from fusiond.outputs.messages.event import EventMessage
 from tests.clock.host_time import Host, S
-
-
-@pytest.mark.parametrize(
-    ("code", "level"),
-    [
-        ("mode_navigating", "info"),
-        ("mqtt_connected", "info"),
-        ("mqtt_lost", "warning"),
-        ("imu_gap", "warning"),
-        ("imu_spike", "warning"),
-        ("imu_axis_dead", "warning"),
-        ("imu_sound", "info"),
-        ("rdss_suppressed", "warning"),
-        ("isolated", "warning"),
-        ("readmitted", "info"),
-        ("sensor_fault", "error"),
-        ("utc_jumped", "warning"),
-        ("utc_implausible", "warning"),
-        ("system_clock_stepped", "warning"),
-        ("host_resumed", "warning"),
-        ("driver_fault", "error"),
-        ("bus_open_failed", "error"),
-        ("bus_off", "error"),
-        ("saved_state_damaged", "warning"),
-        ("warm_start_refused", "warning"),
-        ("client_name_taken", "warning"),
-        ("mqtt_flooded", "warning"),
-    ],
-)
-def test_the_code_gives_the_level(code: str, level: str) -> None:
-    assert level_of(code) == level
 
 
 def test_an_event_is_logged_and_every_listener_hears_it(caplog: pytest.LogCaptureFixture) -> None:
@@ -56,6 +25,7 @@ def test_an_event_is_logged_and_every_listener_hears_it(caplog: pytest.LogCaptur
     events.listen(first.append)
     events.listen(second.append)
     events.report("imu", "driver_fault", "a defect: restarting it")
+    assert [e.advice for e in first] == ["", "Report the text of the event as a bug."]
     heard = [(e.source, e.code, e.level, e.text) for e in first]
     assert heard == [
         ("gnss", "early", "info", "before there is a listener"),

@@ -131,11 +131,11 @@ def _assert_started(
     assert np.abs(phi / np.sqrt(np.diag(p))).max() < sigmas
     mode, reason = story.modes[-1][1:]
     if confirmed:
-        assert (mode, reason) == (Mode.NAVIGATING, f"heading from {how}")
+        assert (mode, reason) == (Mode.NAVIGATING, f"Heading from {how}")
     else:
         assert (mode, reason) == (
             Mode.COASTING,
-            f"heading from {how}; no motion has confirmed it yet",
+            f"Heading from {how}; not confirmed by motion yet",
         )
     end = runs.true_nav(truth, np.array([story.modes[-1][0]]))[0]
     e = story.navigator.estimator
@@ -203,7 +203,7 @@ def test_a_gyro_that_is_too_poor_never_gyrocompasses() -> None:
     assert story.navigator.started is None
     mode, reason = story.modes[-1][1:]
     assert mode is Mode.ALIGNING
-    assert "too poor to gyrocompass: 5 deg take 1.1 deg/h" in reason
+    assert "cannot gyrocompass: 5 deg take 1.1 deg/h" in reason
 
 
 FORWARD = [Leg(15), Leg(8, speed_m_s=12.0), Leg(20), Leg(6, turn_deg=60.0)]
@@ -276,7 +276,7 @@ def test_after_a_ferry_the_saved_heading_is_void() -> None:
     elsewhere = replace(SAVED, position=(lat + 5000.0 / 6.37e6, lon, height))
     story = _tell(truth, MEMS, _fixes(truth, 2), saved=elsewhere, heading=("saved", "gnss_course"))
     assert story.navigator.started is None
-    assert "m from where the vehicle was parked: moved while it was off" in story.modes[-1][2]
+    assert "m from the parking place: moved while off" in story.modes[-1][2]
 
 
 def test_a_claim_that_is_poor_is_no_start_where_driving_tells_the_heading() -> None:
@@ -285,7 +285,7 @@ def test_a_claim_that_is_poor_is_no_start_where_driving_tells_the_heading() -> N
     claim = {"heading_deg": YAW_DEG + 70.0, "heading_sd_deg": 60.0}
     story = _tell(truth, MEMS, _fixes(truth, 2), heading=("config", "gnss_course"), **claim)
     waiting = [reason for _, mode, reason in story.modes if mode is Mode.ALIGNING]
-    assert any("known to 60 deg: drive off, and the way will tell it" in why for why in waiting)
+    assert any("is only known to 60 deg: drive off" in why for why in waiting)
     start = story.navigator.started
     assert start is not None
     assert start.how.startswith("GNSS course")
@@ -300,14 +300,15 @@ def test_never_navigating_without_heading_and_reasons() -> None:
     assert story.navigator.started is None
     assert {mode for _, mode, _ in story.modes} == {Mode.ALIGNING}
     reasons = list(dict.fromkeys(reason for _, _, reason in story.modes))
-    assert reasons[0] == "no position yet: no fix, none configured"
+    assert reasons[0] == "Waiting for a first position fix"
     assert reasons[-1] == (
-        "no heading yet (allowed: dual_antenna); no heading of two antennas has come"
+        "No heading: waiting for dual_antenna; no two-antenna heading received; "
+        "allowed: dual_antenna"
     )
     navigator = Navigator(Config())
     assert navigator.solution(0).mode is Mode.WAITING
     navigator.advance()
-    assert navigator.solution(0).reason == "waiting for IMU data"
+    assert navigator.solution(0).reason == "Waiting for IMU data"
     silent = story.navigator.imu.latest_ns + 10 * runs.SECOND
     assert story.navigator.solution(silent).mode is Mode.WAITING
 

@@ -53,7 +53,7 @@ def test_rates_in_deg_s_are_told_in_the_first_bend_and_nothing_is_vouched_for() 
     navigator, told = _driven(in_degrees)
     texts = [text for code, text in told if code == "imu_units"]
     assert len(texts) == 1
-    factor = int(texts[0].split("the rates are ")[1].split(" times")[0])
+    factor = int(texts[0].split("Rates are ")[1].split(" times")[0])
     assert 40 <= factor <= 65  # 57, less what the course's noise takes off
     mode, why = navigator.mode(navigator.imu.latest_ns)
     assert mode is Mode.INVALID
@@ -63,8 +63,8 @@ def test_rates_in_deg_s_are_told_in_the_first_bend_and_nothing_is_vouched_for() 
 @pytest.mark.parametrize(
     ("block", "axis", "bias", "said"),
     [
-        ("gyro_bias", 2, math.radians(-0.6), "the gyro's bias of 0.6 deg/s is 6 sigma of [imu]"),
-        ("accel_bias", 0, 0.49, "the accelerometer's bias of 0.49 m/s^2 is 5 sigma of [imu]"),
+        ("gyro_bias", 2, math.radians(-0.6), "Gyro bias of 0.6 deg/s is 6 sigma of [imu]"),
+        ("accel_bias", 0, 0.49, "Accelerometer bias of 0.49 m/s^2 is 5 sigma of [imu]"),
     ],
 )
 def test_a_bias_of_no_data_sheet_is_not_vouched_for_until_a_bend_shows_the_unit(
@@ -103,7 +103,7 @@ def test_a_spare_with_such_a_bias_is_not_vouched_for_before_a_bend() -> None:
     navigator.estimator.xi[gyro_z] = math.radians(0.6)
     mode, why = navigator.mode(navigator.imu.latest_ns)
     assert mode is Mode.COASTING
-    assert "the gyro's bias of 0.6 deg/s is 6 sigma of [imu]" in why
+    assert "Gyro bias of 0.6 deg/s is 6 sigma of [imu]" in why
 
 
 def test_a_unit_that_is_corrected_is_believed_after_the_next_bend() -> None:
@@ -127,7 +127,7 @@ def test_a_carousel_of_12_rad_s_needs_no_fix() -> None:
     d = drive()
     navigator.add_imu(d.times, carousel(d.samples.copy()))
     texts = [text for code, text in told if code == "imu_units"]
-    assert texts[0].startswith("the rates are 12 rad/s RMS, more than a vehicle turns: they look")
+    assert texts[0].startswith("Rates of 12 rad/s RMS exceed a vehicle's: they look")
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_the_sentence_says_what_to_do() -> None:
         force_unit(1.0)
     )
     assert "cm/s^2" in str(force_unit(981.0)) or "milli-g" in str(force_unit(981.0))
-    assert str(force_unit(0.02)).endswith("another unit, or gravity taken out")
+    assert str(force_unit(0.02)).endswith("another unit, or gravity removed")
     assert rms_unit(1.0) is None
 
 

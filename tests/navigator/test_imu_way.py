@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from drivers.measurements import DelayedFix, MonotonicStamp
 from fusiond.configuration.schema import Config
-from fusiond.navigator.imu_units import ADVICE
 from fusiond.navigator.navigator import Navigator
+from fusiond.navigator.reasons import reason
 from fusiond.simulation.imu_truth import Truth
 from fusiond.simulation.trajectories import Leg, follow
 from tests import runs
@@ -81,12 +81,12 @@ def test_bends_between_fixes_show_that_rates_are_in_rad_s(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_and_that_they_are_in_deg_s(seed: int) -> None:
     why, told = fed(Drive(LEGS, IN_DEGREES, seed))
-    assert str(why).startswith("the gyro's bias of 0.6 deg/s is 6 sigma of [imu]")
+    assert str(why).startswith("Gyro bias of 0.6 deg/s is 6 sigma of [imu]")
     [text] = [text for code, text in told if code == "imu_units"]
-    assert text == f"the rates are not those of the way between fixes: {ADVICE}"
+    assert text == reason("rate_path")
 
 
 def test_straight_on_nobody_can_tell() -> None:
     why, told = fed(Drive(STRAIGHT, 1.0, 3))
-    assert str(why).startswith("the gyro's bias of 0.6 deg/s is 6 sigma of [imu]")
+    assert str(why).startswith("Gyro bias of 0.6 deg/s is 6 sigma of [imu]")
     assert "imu_units" not in [code for code, _ in told]

@@ -92,4 +92,4 @@ def test_a_vehicle_that_stands_does_not_guess() -> None:
     mode, why = navigator.mode(navigator.imu.latest_ns)
     assert navigator.started is None
     assert mode is Mode.ALIGNING
-    assert "drive off: the fixes will show the heading" in why
+    assert "drive off, with bends: fixes give the heading" in why

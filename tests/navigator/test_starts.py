@@ -348,7 +348,7 @@ def test_a_turning_deck_is_no_rest() -> None:
     for _ in _feed(navigator, case, samples, range(1000, 2000, EVERY), np.random.default_rng(2)):
         pass
     assert navigator.started is None
-    assert "turning at" in navigator.mode(navigator.imu.latest_ns)[1]
+    assert "Turning at" in navigator.mode(navigator.imu.latest_ns)[1]
 
 
 @pytest.mark.parametrize(("heading_deg", "events"), [(45.0, []), (130.0, ["heading_contradicted"])])

@@ -125,7 +125,7 @@ def test_the_first_sample_is_enough_and_sigma_knows_the_gap(gap_s: float) -> Non
         navigator, _ = _restarted(state, t_s + gap_s)
         mode, reason = navigator.mode(navigator.imu.latest_ns)
         assert mode is Mode.COASTING
-        assert "no fix has confirmed it yet" in reason
+        assert "not confirmed by a fix yet" in reason
         ratios = np.abs(_ratios(navigator))
         worst = max(worst, float((ratios - np.maximum(0.0, np.abs(_ratios(before)) - 2.5)).max()))
         squares.append(float(ratios @ ratios) / 9.0)
@@ -156,8 +156,8 @@ def test_a_heading_that_nothing_has_shown_is_not_shown_by_a_restart() -> None:
     navigator.advance()
     mode, reason = navigator.mode(navigator.imu.latest_ns)
     assert mode is Mode.COASTING
-    assert reason.startswith("heading from configured heading, restarted over ")
-    assert reason.endswith("; no motion has confirmed it yet")
+    assert reason.startswith("Heading from configured heading, restarted over ")
+    assert reason.endswith("; not confirmed by motion yet")
     for _ in _driven_on(navigator, row):
         pass
     assert not navigator.unconfirmed  # the course has
@@ -195,7 +195,7 @@ def test_a_fix_that_disagrees_ends_it() -> None:
     navigator.add(_fix(navigator, north_m=100.0), navigator.imu.latest_ns)
     navigator.advance()
     assert [line.partition(":")[0] for line in told] == ["aligned", "warm_start_refused"]
-    assert "gnss speaks against" in told[1]
+    assert "gnss contradicts" in told[1]
     assert navigator.mode(navigator.imu.latest_ns)[0] is Mode.ALIGNING
     navigator.advance()
     assert navigator.started is None  # it is not tried again

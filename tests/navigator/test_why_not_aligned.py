@@ -48,9 +48,9 @@ def test_a_rest_too_short_to_gyrocompass_says_how_much_is_missing() -> None:
     # At rest, and moved: two lines, however the seconds count up.
     assert len(texts) == 2
     assert needs in texts[0]
-    assert "then moved" not in texts[0]
-    assert f"s {needs}; then moved" in texts[1]
-    assert f"s {needs}; then moved" in why
+    assert ", then moved" not in texts[0]
+    assert f"s {needs}, then moved" in texts[1]
+    assert f"s {needs}, then moved" in why
 
 
 def test_samples_at_another_rate_than_configured_are_named() -> None:
@@ -64,5 +64,5 @@ def test_samples_at_another_rate_than_configured_are_named() -> None:
 def test_a_sensor_that_is_never_quiet_says_by_how_much() -> None:
     shaken = {**TACTICAL, "accel_noise_m_s_sqrt_h": 3.0}
     why, _ = _told((Leg(20),), 20.0, imu=shaken, alignment={"heading": ["gyrocompass"]})
-    assert why.startswith("not at rest: no level yet; shaken by ")
+    assert why.startswith("No level: stand still, or drive with fixes; shaken by ")
     assert "rest is below 0.5 and 0.15" in why

@@ -93,7 +93,6 @@ EVENT = event_message(
     UTC_NS,
     source="rdss",
     code="rdss_suppressed",
-    level="warning",
     text="the terminal's transmitter is suppressed",
 )
 

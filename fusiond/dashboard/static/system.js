@@ -18,7 +18,8 @@ export function showEvents(store) {
     .slice(-MOST_EVENTS)
     .reverse()
     .map(([, e]) => {
-      const line = [utc(e.t_ms), e.source, `${e.code.replaceAll("_", " ")}: ${e.text}`];
+      const said = `${e.code.replaceAll("_", " ")}: ${e.text}`;
+      const line = [utc(e.t_ms), e.source, e.advice ? `${said}. ${e.advice}` : said];
       line.rowClass = `level-${e.level}`;
       return line;
     });

@@ -13,6 +13,7 @@ from fusiond.navigation.strapdown import Q0, VN
 from fusiond.navigator.alignment.headings import CLAIMS
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Start
+from fusiond.navigator.reasons import reason
 
 Array = NDArray[np.float64]
 
@@ -46,8 +47,8 @@ class Afterwards:
         And what looks like driving backward is driving
         forward with an IMU that is mounted the other way, until it goes forward as well."""
         if self._backward:
-            return "the vehicle drives backward, or the IMU is mounted backwards"
-        return "no motion has confirmed it yet" if self._unproven else ""
+            return reason("backward_or_mounted")
+        return reason("not_confirmed_by_motion") if self._unproven else ""
 
     def refuted(
         self, t_ns: int, nav: Array, covariance: Array, measured: Witnesses, doubted: bool
@@ -61,10 +62,7 @@ class Afterwards:
             ahead = np.array(axes[::3])
             sd = math.sqrt(max(float(ahead @ covariance[3:6, 3:6] @ ahead), 0.0))
             if backward - 3.0 * sd > self._options.max_reverse_m_s:
-                return "imu_backwards", (
-                    f"driving backward at {backward:.0f} m/s, faster than the vehicle can: is the "
-                    "IMU mounted backwards? Correct [imu] axes"
-                )
+                return "imu_backwards", reason("imu_backwards", speed=backward)
         if -backward > self._options.course_speed_m_s:
             self._backward = False
         if not self._claim:
@@ -97,7 +95,7 @@ class Afterwards:
         sd = math.hypot(sd_yaw, self._options.course_sd_rad, sd_speed / speed)
         if doubted:
             return "heading_contradicted", (
-                f"the first motion did not fit the {self._claim}: aligning anew by the course"
+                f"The first motion disagrees with the {self._claim}: aligning again by the course"
             )
         if min(apart, math.pi - apart) <= HEADING_SIGMAS * sd:
             self._claim, self._unproven = "", False
@@ -107,5 +105,5 @@ class Afterwards:
         if t_ns - self._since_ns < CONTRADICTED_NS:
             return None
         return "heading_contradicted", (
-            f"the {self._claim} is {math.degrees(apart):.0f} deg from the course: aligning anew"
+            f"The {self._claim} is {math.degrees(apart):.0f} deg from the course: aligning again"
         )

@@ -30,6 +30,7 @@ from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.positions import Track, from_positions
 from fusiond.navigator.alignment.start import Place, Start
 from fusiond.navigator.alignment.why import Journal, why_not
+from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
 
 HeadingSource = Callable[[Basis, ImuBuffer, Place], Start | None]
@@ -59,7 +60,7 @@ class Aligner:
         saved: SavedState | None,
         on_event: Callable[[str, str], None],
     ) -> None:
-        self.reason = "waiting for IMU data"
+        self.reason = reason("no_imu")
         self._found: Start | None = None
         self.known = Collected(options, noise, saved, on_event)
         self._track = Track(options, model)
@@ -92,7 +93,7 @@ class Aligner:
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""
         if not imu.end:
-            self.reason = "waiting for IMU data"
+            self.reason = reason("no_imu")
             return None
         if self._found is not None:
             return self._found

@@ -26,6 +26,7 @@ from fusiond.navigator.alignment.start import (
     velocity_of,
 )
 from fusiond.navigator.alignment.trend import NO_TREND, Offset
+from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
 
 Array = NDArray[np.float64]
@@ -301,10 +302,7 @@ class Collected:
     def _gravity_points_up(self, w: Window) -> None:
         self.upside_down = bool(w.mean_force[2] > 0.5 * STANDARD_GRAVITY_M_S2)
         if self.upside_down:
-            self.tell(
-                "imu_upside_down",
-                "gravity is felt to point up: the IMU is mounted upside down. Correct [imu] axes",
-            )
+            self.tell("imu_upside_down", reason("imu_upside_down"))
 
     def _turns(self, w: Window) -> bool:
         """Whether the rate of quiet windows can be no bias that the data sheet allows."""
@@ -315,10 +313,7 @@ class Collected:
             most = EARTH_RATE_RAD_S + BIAS_SIGMAS * math.sqrt(prior + free / count)
             largest = float(np.abs(rate).max())
             if largest > most:
-                self.doubted(
-                    f"turning at {math.degrees(largest):.2f} deg/s, so not at rest; or the gyro's "
-                    "bias is larger than gyro_bias_initial_deg_h says"
-                )
+                self.doubted(reason("turning", rate=math.degrees(largest)))
                 return True
         return False
 

@@ -49,6 +49,7 @@ from fusiond.navigator.alignment.start import (
     build_start,
     velocity_of,
 )
+from fusiond.navigator.reasons import reason
 
 Array = NDArray[np.float64]
 
@@ -94,11 +95,11 @@ def from_course(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         return None  # the same data say the same
     speed = math.hypot(*latest.velocity.v_ned[:2])
     if speed < by.options.course_speed_m_s:
-        known.why = f"drive off: the course counts from {by.options.course_speed_m_s:g} m/s on"
+        known.why = reason("no_heading_course", speed=by.options.course_speed_m_s)
         return None
     known.tried_ns = latest.velocity.t_ns
     if not known.position_confirms(latest):
-        known.why = "waiting until the positions of the fixes confirm their velocity"
+        known.why = reason("confirming_course")
         return None
     s = known.standing
     here = known.place_of(latest.position, latest.velocity)
@@ -145,7 +146,7 @@ def _moved_off(
     by_course = _along(by.options, velocity, rate, backward)
     apart = wrap_angle(felt - by_course.angle)
     if abs(apart) > COURSE_AGREEMENT_RAD:
-        return by.known.doubted("the vehicle was felt to move off sideways: check [imu] axes")
+        return by.known.doubted(reason("imu_sideways"))
     if backward:
         if not by.known.seen_at_rest(standing):
             return None  # braking from twice the speed feels the same
@@ -222,16 +223,12 @@ def _reversing(by: Basis, velocity: VelocityOffer) -> str:
     """
     speed = math.hypot(*velocity.v_ned[:2])
     if speed > by.options.max_reverse_m_s or "imu_backwards" in by.known.told:
-        return by.known.tell(
-            "imu_backwards",
-            f"the vehicle is felt to drive backward at {speed:.0f} m/s: is the IMU mounted "
-            "backwards? Correct [imu] axes",
-        )
+        return by.known.tell("imu_backwards", reason("imu_backwards", speed=speed))
     for fix in by.known.fixes:
         age_ns = velocity.t_ns - fix.velocity.t_ns
         if 0 < age_ns <= SETTLED_NS:
             if speed - math.hypot(*fix.velocity.v_ned[:2]) > SETTLED_M_S:
-                return by.known.doubted("moving off backward: waiting until the speed has settled")
+                return by.known.doubted(reason("reversing"))
             break
     return ""
 
@@ -283,7 +280,7 @@ def _on_the_move(
     oldest = max(velocity.t_ns - longest, imu.oldest_ns, since_ns)
     usable = [f.velocity for f in by.known.fixes if oldest <= f.velocity.t_ns <= velocity.t_ns]
     if not usable or velocity.t_ns - usable[0].t_ns < shortest:
-        by.known.doubted("moving: collecting fixes")
+        by.known.doubted(reason("collecting"))
         return None
     lat, _, height = (float(v) for v in place[1])
     late = _sd_late_s(by, velocity)
@@ -297,10 +294,10 @@ def _on_the_move(
     ratio = 0.5 * (backward_fit.cost - forward_fit.cost) / doubt
     missed_m_s = math.sqrt(doubt) * float(np.max(velocity_of(velocity)[1][:2]))
     if missed_m_s > MISSED * by.options.course_speed_m_s:
-        by.known.doubted("the velocities of the fixes do not fit what was felt")
+        by.known.doubted(reason("fixes_disagree"))
         return None
     if not (forward_fit.converged and backward_fit.converged):
-        by.known.doubted("moving: no attitude found yet that fits what was felt")
+        by.known.doubted(reason("no_attitude"))
         return None
     speed = math.hypot(*velocity.v_ned[:2])
     if ratio < -DECIDED:
@@ -323,10 +320,7 @@ def _on_the_move(
     # The prior says forward, but not once an IMU was found to face the other way.
     assumed = moving_s >= patience and ratio > -1.0 and "imu_backwards" not in by.known.told
     if ratio < DECIDED and not assumed:
-        by.known.doubted(
-            "forward or backward is not told yet: brake, accelerate or take a bend "
-            f"(forward is assumed after {patience:.0f} s)"
-        )
+        by.known.doubted(reason("direction", seconds=patience))
         return None
     return _build(
         by,

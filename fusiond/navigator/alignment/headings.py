@@ -22,6 +22,7 @@ from fusiond.navigator.alignment.start import (
     build_start,
     turned_at_rest,
 )
+from fusiond.navigator.reasons import reason
 
 # A heading that came this long ago no longer describes a body at rest that may have been moved.
 HEADING_AGE_NS = 2_000_000_000
@@ -47,9 +48,7 @@ def _at_standstill(
     if standing is None:
         return None
     if sd > POOR_SD_RAD and ON_THE_WAY.intersection(by.options.heading):
-        by.known.poor_claims[how] = (
-            f"the {how} is known to {math.degrees(sd):.0f} deg: drive off, and the way will tell it"
-        )
+        by.known.poor_claims[how] = reason("poor_heading", heading=how, sd=math.degrees(sd))
         return None
     roll, pitch = level(standing.mean_force)
     dcm = dcm_from_rpy(roll, pitch, yaw)
@@ -82,10 +81,7 @@ def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
         metres = apart / as_geodetic(np.ones(3), float(where[0]))[:2]
         away = math.hypot(*metres.tolist())
         if away > CONTRADICTION_SIGMAS * math.hypot(sd, by.saved.sd_position_m):
-            text = (
-                f"the fix is {away:.0f} m from where the vehicle was parked: moved while it was "
-                "off, so the saved heading counts no more"
-            )
+            text = reason("parked_elsewhere", distance=away)
             by.known.poor_claims[SAVED] = text
             by.known.tell("saved_elsewhere", text)
             return None

@@ -62,6 +62,7 @@ from fusiond.navigator.alignment.leaps import (
 )
 from fusiond.navigator.alignment.motion import MOST_FIXES
 from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.reasons import reason
 
 MOST_LATE_S = 3.0
 """The longest that is searched."""
@@ -229,10 +230,7 @@ class Lateness:
         for source, receiver in self._receivers.items():
             if receiver.suspected is not None:
                 late = receiver.suspected
-                return (
-                    f"{source} is about {late.seconds:.1f} s later than its stamps: brake, "
-                    "accelerate or take a bend, to tell by how much"
-                )
+                return reason("fixes_delayed", source=source, seconds=late.seconds)
         return ""
 
     def look(self, imu: ImuBuffer) -> Found | None:
@@ -277,8 +275,8 @@ class Lateness:
             if late is None:
                 continue
             text = (
-                f"{source} is {late.seconds:.2f} s later than its stamps, sigma {late.sd:.2f}: "
-                "its fixes count as of then"
+                f"{source} is {late.seconds:.2f} s later than its stamps (sigma {late.sd:.2f}); "
+                "corrected"
             )
             self._event("fixes_late", text)
             return Found(text, late.sd)

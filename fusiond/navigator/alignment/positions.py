@@ -41,6 +41,7 @@ from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import Levelled, Place, Start, build_start
 from fusiond.navigator.constraints import GATE
+from fusiond.navigator.reasons import reason
 from fusiond.navigator.timeline import MOST_WAITING
 
 Array = NDArray[np.float64]
@@ -136,27 +137,24 @@ class Track:
         if bank.lost:
             self._bank = None
             if bank.backwards:
-                by.known.tell(
-                    "imu_backwards",
-                    "the fixes show a vehicle that drives backward, faster than it can: is the IMU "
-                    "mounted backwards? Correct [imu] axes",
-                )
+                by.known.tell("imu_backwards", reason("imu_backwards_by_fixes"))
                 return None
-            by.known.doubted("the fixes fit no heading: beginning anew")
+            by.known.doubted(reason("searching_again"))
             return None
         found = bank.mixture()
         if bank.positions < FEWEST_FIXES or found.sd_yaw > KNOWN_SD_RAD:
             by.known.doubted(
-                f"finding the heading: known to {math.degrees(found.sd_yaw):.0f} deg from "
-                f"{bank.positions} fixes, {math.degrees(KNOWN_SD_RAD):.0f} deg and {FEWEST_FIXES} "
-                "fixes are needed; drive on"
+                reason(
+                    "searching",
+                    sd=math.degrees(found.sd_yaw),
+                    fixes=bank.positions,
+                    limit=math.degrees(KNOWN_SD_RAD),
+                    least=FEWEST_FIXES,
+                )
             )
             return None
         if found.sd_speed > KNOWN_SD_M_S:
-            by.known.doubted(
-                f"heading found, speed known to {found.sd_speed:.1f} m/s, {KNOWN_SD_M_S:.1f} are "
-                "needed; drive on"
-            )
+            by.known.doubted(reason("searching_speed", sd=found.sd_speed, limit=KNOWN_SD_M_S))
             return None
         n = self._size
         return Start(bank.t_ns, found.nav, found.xi[:n], found.covariance[:n, :n], HOW, turns=True)

@@ -16,8 +16,8 @@ from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigator.alignment.basis import Basis
 from fusiond.navigator.alignment.headings import HEADING_AGE_NS, ON_THE_WAY
+from fusiond.navigator.reasons import joined, reason
 
-NO_POSITION = "no position yet: no fix, none configured"
 # What a traffic light or a short rest changes back is not worth a line.
 SETTLED_NS = 5_000_000_000
 # The IMU's rate is counted over the last seconds, from so many on.
@@ -54,11 +54,11 @@ def why_not(by: Basis, imu: ImuBuffer, latitude: float | None) -> str:
     allowed = by.options.heading
     level = bool(by.known.fixes) or by.track.running or by.known.levelled() is not None
     if latitude is None:
-        said.append(NO_POSITION)
+        said.append(reason("no_position"))
     elif not level:
-        said.append("not at rest: no level yet")
+        said.append(reason("no_level"))
     else:
-        said.append(f"no heading yet (allowed: {', '.join(allowed)})")
+        said.append(_no_heading(by))
     said += _rate(by, imu)
     if latitude is not None:
         said += [] if level else _rest(by, imu)
@@ -67,7 +67,21 @@ def why_not(by: Basis, imu: ImuBuffer, latitude: float | None) -> str:
         said += by.known.poor_claims.values()
         if by.known.why:
             said.append(by.known.why)
-    return "; ".join(dict.fromkeys(said))
+        if level:
+            said.append(reason("allowed", sources=", ".join(allowed)))
+    return joined(said)
+
+
+def _no_heading(by: Basis) -> str:
+    """What to do for a heading by the allowed sources, the quickest first."""
+    allowed = by.options.heading
+    if "gnss_course" in allowed:
+        return reason("no_heading_course", speed=by.options.course_speed_m_s)
+    if "positions" in allowed:
+        return reason("no_heading_path")
+    if allowed == ("gyrocompass",):
+        return reason("no_heading_rest")
+    return reason("no_heading", sources=", ".join(allowed))
 
 
 def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
@@ -79,7 +93,7 @@ def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
     seen, told = (imu.end - 1 - first) / (span_ns * 1e-9), by.options.rate_hz
     if max(seen / told, told / seen) < RATE_FACTOR:
         return []
-    return [f"samples come at {seen:.0f} Hz, the configuration says {told:g}: correct imu.rate_hz"]
+    return [reason("imu_rate", seen=seen, configured=told)]
 
 
 def _rest(by: Basis, imu: ImuBuffer) -> list[str]:
@@ -88,17 +102,20 @@ def _rest(by: Basis, imu: ImuBuffer) -> list[str]:
     if s is not None:
         if s.seconds >= o.levelling_s:
             return []
-        moved = "" if by.known.resting else "; then moved"
-        return [
-            f"at rest for {s.seconds:.0f} s of the {o.levelling_s:g} that levelling needs{moved}"
-        ]
+        code = "levelling" if by.known.resting else "levelling_moved"
+        return [reason(code, seconds=s.seconds, needed=o.levelling_s)]
     rows = imu.samples[imu.index_after(imu.latest_ns - round(o.window_s * 1e9)) : imu.end]
     rate, force = float(rows[:, :3].std(axis=0).max()), float(rows[:, 3:].std(axis=0).max())
     if rate < o.quiet_rad_s and force < o.quiet_m_s2:
         return []
     return [
-        f"shaken by {math.degrees(rate):.2g} deg/s and {force:.2g} m/s^2, rest is below "
-        f"{math.degrees(o.quiet_rad_s):.2g} and {o.quiet_m_s2:.2g} ([constraints.zero_velocity])"
+        reason(
+            "shaken",
+            rate=math.degrees(rate),
+            force=force,
+            rate_limit=math.degrees(o.quiet_rad_s),
+            force_limit=o.quiet_m_s2,
+        )
     ]
 
 
@@ -106,23 +123,23 @@ def _of_source(source: str, by: Basis, imu: ImuBuffer, latitude: float) -> list[
     o, known = by.options, by.known
     match source:
         case "saved" if by.saved is not None and known.ever_moved:
-            return ["the saved heading counts until the vehicle moves; it has moved"]
+            return [reason("saved_moved")]
         case "config" if known.ever_moved:
-            return ["the configured heading counts until the vehicle moves; it has moved"]
+            return [reason("configured_moved")]
         case "dual_antenna" if known.heading is not None:
             age_ns = imu.latest_ns - known.heading.t_ns
             if age_ns > HEADING_AGE_NS:
-                return [f"the last heading of two antennas is {age_ns * 1e-9:.0f} s old"]
+                return [reason("heading_old", seconds=age_ns * 1e-9)]
         case "dual_antenna" if not ON_THE_WAY.intersection(o.heading):
-            return ["no heading of two antennas has come"]
+            return [reason("no_two_antennas")]
         case "compass" if known.compass is None:
-            return ["no heading of a compass has come"]
+            return [reason("no_compass")]
         case "gyrocompass":
             return _gyrocompass(by, latitude)
         case "gnss_course" if not known.fixes:
-            return ["no velocity has come, for a course"]
+            return [reason("no_velocity")]
         case "positions" if not known.fixes and not by.track.running:
-            return ["drive off: the fixes will show the heading"]
+            return [reason("no_path")]
     return []
 
 
@@ -135,16 +152,17 @@ def _gyrocompass(by: Basis, latitude: float) -> list[str]:
         if ON_THE_WAY.intersection(o.heading):
             return []
         return [
-            f"a gyro of {bias / DEG_H:.3g} deg/h is too poor to gyrocompass: "
-            f"{math.degrees(o.gyrocompass_max_sd_rad):.2g} deg take "
-            f"{o.gyrocompass_max_sd_rad * EARTH_RATE_RAD_S * math.cos(latitude) / DEG_H:.2g} deg/h"
+            reason(
+                "gyrocompass_poor",
+                bias=bias / DEG_H,
+                limit=math.degrees(o.gyrocompass_max_sd_rad),
+                needed=o.gyrocompass_max_sd_rad * EARTH_RATE_RAD_S * math.cos(latitude) / DEG_H,
+            )
         ]
     resting = by.known.resting
     if s is None or not by.known.rested(s):
         s, resting = by.known.left, False
     if s is None:
-        return [f"stand still for {o.gyrocompass_s:g} s to gyrocompass"]
-    moved = "" if resting else "; then moved"
-    return [
-        f"at rest for {s.seconds:.0f} s of the {o.gyrocompass_s:g} that gyrocompassing needs{moved}"
-    ]
+        return [reason("gyrocompass_stand", seconds=o.gyrocompass_s)]
+    code = "gyrocompassing" if resting else "gyrocompassing_moved"
+    return [reason(code, seconds=s.seconds, needed=o.gyrocompass_s)]

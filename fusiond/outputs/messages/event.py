@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from fusiond.outputs.messages.base import Message, stamp
-
-Level = Literal["info", "warning", "error"]
+from fusiond.outputs.messages.event_catalogue import Level, entry_of
 
 
 class EventMessage(Message):
@@ -18,10 +15,13 @@ class EventMessage(Message):
     code: str = Field(description="stable, for rules")
     source: str
     text: str
+    advice: str = Field(default="", description="next step; empty: there is nothing to do")
 
 
-def event_message(
-    utc_ns: int | None, *, source: str, code: str, text: str, level: Level = "info"
-) -> EventMessage:
+def event_message(utc_ns: int | None, *, source: str, code: str, text: str) -> EventMessage:
+    """Event with level and advice of its code."""
     t_utc, t_ms = stamp(utc_ns)
-    return EventMessage(t_utc=t_utc, t_ms=t_ms, level=level, code=code, source=source, text=text)
+    level, _, advice = entry_of(code)
+    return EventMessage(
+        t_utc=t_utc, t_ms=t_ms, level=level, code=code, source=source, text=text, advice=advice
+    )

@@ -50,7 +50,7 @@ async def _start_with_nothing(daemon: DaemonProcess, broker: Broker) -> None:
     async with hearing(broker, VEHICLE) as heard:
         await heard.online(b"online")
         status = await heard.until("status")
-        assert (status["mode"], status["why"]) == ("waiting", "waiting for IMU data")
+        assert (status["mode"], status["why"]) == ("waiting", "Waiting for IMU data")
         health = await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
         assert health["sources"]["imu"]["state"] == "absent"
         assert "vcan0 is down" in health["sources"]["imu"]["detail"]
@@ -63,10 +63,10 @@ async def _start_with_nothing(daemon: DaemonProcess, broker: Broker) -> None:
 async def _align(heard: Heard, vehicle: VehicleProcess) -> None:
     """Everything appears; level at rest, heading on first motion."""
     status = await heard.until("status", lambda m: m["mode"] == "navigating")
-    assert status["why"] == "heading from GNSS course"
+    assert status["why"] == "Heading from GNSS course"
     said = heard.all("status")
     assert list(dict.fromkeys(m["mode"] for m in said)) == ["waiting", "aligning", "navigating"]
-    assert any("no heading yet" in m["why"] for m in said)
+    assert any("No heading" in m["why"] for m in said)
     await heard.until("health", lambda m: m["sources"]["rdss"]["fused"] >= 1)
     await _check_against_truth(heard, vehicle)
 
@@ -79,7 +79,7 @@ async def _lose_position(heard: Heard, vehicle: VehicleProcess) -> None:
     await vehicle.unplug("rdss")
     await heard.until("health", lambda m: m["sources"]["rdss"]["state"] == "absent")
     status = await heard.until("status", lambda m: m["mode"] == "coasting")
-    assert status["why"].startswith("no position fused for")
+    assert status["why"].startswith("No position fused for")
     fused = heard.all("health")[-1]["sources"]
     await vehicle.plug("gnss")
     await heard.until("status", lambda m: m["mode"] == "navigating")
@@ -164,7 +164,7 @@ async def _restart_at_rest(
     # On a busy host a process takes longer to begin than the vehicle stands: then the saved heading
     # is of no use, and its course counts.
     if seen[0][0] < vehicle.t_s(stands["t_ms"]) + STANDS_S - 2.0:
-        assert status["why"] == "heading from saved state", seen
+        assert status["why"] == "Heading from saved state", seen
     print(f"navigates {status['uptime_s']:.1f} s after the restart")
     await _check_against_truth(heard, vehicle)
 

@@ -85,7 +85,7 @@ def _sigma_m(nav: dict[str, Any]) -> float:
 
 async def _meet_refusals(heard: Heard, family: Family) -> None:
     """A wait, a beam that is gone and a request without an answer, each by its name."""
-    await heard.until("status", lambda m: m["why"].startswith("heading from configured heading"))
+    await heard.until("status", lambda m: m["why"].startswith("Heading from configured heading"))
     awaited = {"refused_frequency", NO_BEAM[family][0], "timeout_fix"}
     health = await heard.until(
         "health", lambda m: awaited <= m["sources"]["rdss"]["counters"].keys()
