@@ -217,7 +217,8 @@ class ErrorStateFilter:
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
-        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.groups else None
+        own = m.bank, faults, model, m.xi, m.step, m.wider
+        self.hypotheses = Hypotheses(*own) if faults.groups else None
         self._holding = False
         self._carrying = False
         self.turned = 0.0
@@ -270,6 +271,8 @@ class ErrorStateFilter:
     ) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
         `passing`, if nothing is to be folded in there."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         options = self._options
         if passing:
             options |= PASSING
@@ -297,6 +300,8 @@ class ErrorStateFilter:
 
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         out = np.empty(9)
         sigmas(self._covs[0], self.nav, self.step, *self.published, out)
         widen(self.wider, out)
@@ -304,6 +309,8 @@ class ErrorStateFilter:
 
     def speed_sigma(self) -> float:
         """One sigma (m/s) of the horizontal velocity."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         return speed_sigma(self._cov, self.nav, self.step, *self.published, self.wider)
 
     def _feed_back(self, dx: Array) -> None:
@@ -379,6 +386,8 @@ class ErrorStateFilter:
 
     def snapshot(self) -> Snapshot:
         """A copy of everything."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         m = self._memory
         held = m.held.copy() if m.head[AHEAD] else None
         extra = self._own_snapshot()

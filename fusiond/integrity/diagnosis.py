@@ -154,7 +154,9 @@ class Diagnosis:
     def comes(self, aid: Aid, estimator: Estimator) -> Series:
         """The series of an aid, before it is folded in; one that repeats itself leaves service,
         with all of its device."""
-        one = self.own(aid)
+        one, bank = self.own(aid), estimator.hypotheses
+        if bank is not None and (aid.constraint or one.out):
+            bank.conclude()  # of this instant, before what is no evidence of it is looked at
         one.hear(aid.t_ns)
         if aid.constraint or (value := value_of(aid.offers())) is None:
             return one
@@ -173,8 +175,8 @@ class Diagnosis:
         if one.out or one.device in self._agreement:
             self._agrees(aid, one)
         if bank is not None:
-            found = bank.take(t_ns, measured, used, e.xi, e.step, e.wider)
-            if measured and used:
+            found = bank.take(t_ns, measured, used, outcome.name == "fused")
+            if found is not None and measured and used:
                 if identified(found):
                     correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
