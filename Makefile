@@ -66,6 +66,7 @@ lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(YIELDING) $(BIN)/mypy
 	$(YIELDING) $(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python tools/house.py --check
+	$(BIN)/python -m tools.reader --check
 
 # The collector would look through what the compiler keeps again and again, a tenth of its time.
 kernels: $(RUNTIME)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import termios
 from collections import Counter
@@ -58,6 +59,20 @@ OpenPort = Callable[[str, int, Counter[str]], Port]
 def open_serial(path: str, baud: int, counters: Counter[str]) -> Port:
     """A serial device, and nothing else. Raises `OPEN_ERRORS`."""
     return SerialPort(path, baud)
+
+
+_WHY = {
+    errno.ENOENT: "does not exist",
+    errno.EACCES: "no permission",
+    errno.EBUSY: "in use by another program (busy)",
+    errno.EAGAIN: "in use by another program (locked)",
+}
+
+
+def why_not_open(error: Exception) -> str:
+    """Reason for a port that did not open, without what its name already says."""
+    code = getattr(error, "errno", None)
+    return _WHY.get(code, str(error)) if code is not None else str(error)
 
 
 class SerialPort:

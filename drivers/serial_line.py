@@ -14,7 +14,7 @@ from functools import partial
 from drivers.aside import aside
 from drivers.base import Backoff, Now, monotonic_ns
 from drivers.byte_budget import ByteBudget
-from drivers.port import OPEN_ERRORS, READ_BYTES, OpenPort, Port, open_serial
+from drivers.port import OPEN_ERRORS, READ_BYTES, OpenPort, Port, open_serial, why_not_open
 
 __all__ = ["PENDING_WRITE_BYTES", "READ_BYTES", "SerialLine"]
 
@@ -76,7 +76,7 @@ class SerialLine:
                 port = await self._open()
             except OPEN_ERRORS as error:
                 self.counters["open_failed"] += 1
-                self.detail = str(error)
+                self.detail = f"{why_not_open(error)}; retrying"
                 await asyncio.sleep(self._backoff.next())
                 continue
             self.counters["opened"] += 1

@@ -186,18 +186,18 @@ INBOUND_COMMANDS = MESSAGE_COMMANDS | {"DWSQ", "DWA", "WAA", "WBA"}
 
 DETAIL = {
     State.CLOSED: "line closed",
-    State.PROBING: "asking at {baud} baud who is there (family {families})",
-    State.NO_CARD: f"no card in the terminal, asking every {POLL_NS // SECOND} s",
-    State.CHECKING: "reading beam power",
+    State.PROBING: "Looking for the terminal at {baud} baud (family {families})",
+    State.NO_CARD: f"No card in the terminal; asking again every {POLL_NS // SECOND} s",
+    State.CHECKING: "Reading beam power",
     State.READY: "card {card}, {service} s: next request in {due} s, {beams}{waiting}",
-    State.AWAIT_FEEDBACK: "request sent, awaiting feedback",
-    State.AWAIT_FIX: "awaiting the fix asked for {age} s ago",
-    State.AWAIT_MESSAGE: "message written, awaiting feedback{waiting}",
-    State.NO_BEAM: f"no beam: {{beams}}, polling every {BEAM_POLL_NS // SECOND} s",
+    State.AWAIT_FEEDBACK: "Fix requested; waiting for feedback",
+    State.AWAIT_FIX: "Fix requested {age} s ago; waiting",
+    State.AWAIT_MESSAGE: "Message sent; waiting for feedback{waiting}",
+    State.NO_BEAM: f"No beam ({{beams}}); asking again every {BEAM_POLL_NS // SECOND} s",
     State.HOLDING: "{why}: next attempt in {hold} s",
-    State.SUPPRESSED: "suppressed by the system: not transmitting, for {hold} s unless lifted",
-    State.SILENT: "radio silence is set on the terminal: not transmitting until it is lifted",
+    State.SUPPRESSED: "Suppressed by the RDSS centre; transmits again in {hold} s, or when lifted",
+    State.SILENT: "Radio silence set at the terminal; lift it there",
 }
 """What a state says of itself to an operator."""
-READ_ONLY_DETAIL = "card {card}, {service} s: read only, no fix is asked for; {beams}"
+READ_ONLY_DETAIL = "card {card}, {service} s: read only, no fix is requested; {beams}"
 """READY without the option `transmit`."""

@@ -126,7 +126,7 @@ class Replies:
         if session.state is not State.NO_CARD:
             session.abandon()
             session.counters["no_card"] += 1
-            actions.append(Notice("rdss_no_card", "the terminal has no card"))
+            actions.append(Notice("rdss_no_card", "No card in the terminal"))
             session.enter(State.NO_CARD, t_ns + POLL_NS)
 
     def _on_levels(self, levels: tuple[int, ...], t_ns: int, actions: list[Action]) -> None:
@@ -136,7 +136,7 @@ class Replies:
         session.levels, session.levels_ns, session.beam_reads = levels, t_ns, 0
         usable = max(levels) >= USABLE_LEVEL
         if session.state is State.NO_BEAM and usable:
-            actions.append(Notice("rdss_beam", f"beam found: {session.beams}"))
+            actions.append(Notice("rdss_beam", f"Beam found: {session.beams}"))
             session.enter(State.READY, None)
         elif session.state is State.CHECKING and usable:
             session.enter(State.READY, None)
@@ -148,7 +148,7 @@ class Replies:
         session = self._session
         session.beam_reads = 0
         session.enter(State.NO_BEAM, t_ns + BEAM_POLL_NS)
-        actions.append(Notice("rdss_no_beam", f"no beam to transmit on: {session.beams}"))
+        actions.append(Notice("rdss_no_beam", f"No beam to transmit on: {session.beams}"))
 
     def _on_self_test(self, test: SelfTest, t_ns: int, actions: list[Action]) -> None:
         if test.faults != self._faults:
@@ -249,25 +249,25 @@ class Replies:
             if session.state not in (State.SUPPRESSED, State.SILENT, State.NO_CARD):
                 if session.state is not State.HOLDING:
                     actions.append(
-                        Notice("rdss_low_battery", "battery low: transmission inhibited")
+                        Notice("rdss_low_battery", "Battery low: the terminal does not transmit")
                     )
                 session.hold(t_ns, "battery low")
             return
         if outcome is Outcome.SUPPRESSED:
             session.counters["suppressed"] += 1
             if session.permit.suppress(t_ns):
-                actions.append(Notice("rdss_suppressed", "the system suppresses this user"))
+                actions.append(Notice("rdss_suppressed", "The RDSS centre suppresses this card"))
         else:
             session.counters["silence"] += 1
             if session.permit.silence():
-                actions.append(Notice("rdss_silence", "radio silence is set on the terminal"))
+                actions.append(Notice("rdss_silence", "Radio silence is set at the terminal"))
         if session.state is not State.NO_CARD:
             session.proceed(t_ns)
 
     def _lift(self, t_ns: int, actions: list[Action]) -> None:
         session = self._session
         session.permit.grant()
-        actions.append(Notice("rdss_lifted", "the terminal may transmit again"))
+        actions.append(Notice("rdss_lifted", "The terminal may transmit again"))
         if session.state in (State.SUPPRESSED, State.SILENT):
             session.proceed(t_ns)
 

@@ -143,7 +143,7 @@ class Terminal:
                 break
             if self._gone_quiet(t_ns):
                 actions.append(
-                    Notice("rdss_silent", f"nothing intelligible for {self._options.timeout_s:g} s")
+                    Notice("rdss_silent", f"No valid message for {self._options.timeout_s:g} s")
                 )
                 session.abandon()
                 session.search(t_ns)
@@ -345,7 +345,7 @@ class Terminal:
         if until is not None and t_ns >= until:
             if session.state is State.SUPPRESSED:
                 session.permit.grant()
-                actions.append(Notice("rdss_hold_over", "suppression never lifted: trying again"))
+                actions.append(Notice("rdss_hold_over", "Hold time over: requesting fixes again"))
             session.proceed(t_ns)
             return
         if t_ns >= session.next_poll_ns:

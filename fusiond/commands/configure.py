@@ -60,7 +60,9 @@ def init(
             help="Ask silent ports who is there, as an RDSS terminal needs; it transmits nothing.",
         ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: defaults and options.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Use defaults and options, without questions.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file.")] = False,
 ) -> None:
     """Write a first configuration: look at ports and buses, ask for the rest.
@@ -73,7 +75,7 @@ def init(
     from fusiond.configuration.sensor_class import SensorClass  # noqa: PLC0415
 
     if out.exists() and not force:
-        raise typer.BadParameter(f"{out} is there already: --force overwrites it")
+        raise typer.BadParameter(f"{out} exists: --force overwrites it")
     asks = not yes and sys.stdin.isatty()
 
     def answer(given: str | None, question: str, default: str) -> str:
@@ -88,7 +90,8 @@ def init(
     for device in devices:
         typer.echo(f"found: {device.text}")
     if not devices:
-        typer.echo("found no device that is understood")
+        heard = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
+        typer.echo(f"No supported device found on: {heard}")
     imu = next((d for d in devices if d.driver == "can_imu"), None)
     has_antenna = any(d.driver != "can_imu" for d in devices)
     arm = _vector(

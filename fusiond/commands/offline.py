@@ -82,7 +82,7 @@ def process(
     if out is not None and str(out) == "-" == json_path:
         raise typer.BadParameter("--out and --json cannot both be standard output")
     if (imu is None) == (can is None):
-        raise typer.BadParameter("--imu or --can: the samples come of one of the two")
+        raise typer.BadParameter("Give --imu or --can")
     if smooth and out is None:
         raise typer.BadParameter("--smooth: name a file to write with --out")
     loaded = load(config)
@@ -130,7 +130,7 @@ def calibrate(
     """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML."""
     aids = [_aid_argument(text) for text in aid or []]
     if (imu is None) == (can is None):
-        raise typer.BadParameter("--imu or --can: the samples come of one of the two")
+        raise typer.BadParameter("Give --imu or --can")
     loaded = load(config)
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 

@@ -64,7 +64,7 @@ def doubts(config: Config) -> list[str]:
 
 def _imu(config: Config) -> Iterator[str]:
     if not config.sources:
-        yield "sources: there is none: good for `process` over files, not for the daemon"
+        yield "sources: none; `run` needs an IMU (`process` over files does not)"
         return
     imus = [name for name, source in config.sources.items() if source.driver == "can_imu"]
     foreign = [s.driver for s in config.sources.values() if s.driver not in GIVES]

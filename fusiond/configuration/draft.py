@@ -42,7 +42,7 @@ class Draft:
 
 
 _NO_IMU = """\
-# No IMU was found. Say which, take the marks off, and see docs/can-imu.md for yours:
+# No IMU was found. Uncomment this and adapt it; docs/can-imu.md has blocks for other units:
 # [sources.imu]
 # driver = "can_imu"
 # channel = "can0"

@@ -74,7 +74,7 @@ def _of_status(status: Said) -> Iterator[Advice]:
 def _of_sources(health: Said) -> Iterator[Advice]:
     for name, source in _mappings(health, "sources"):
         state, detail = str(source.get("state", "")), str(source.get("detail", ""))
-        terminal = next((text for word, text in _TERMINAL if word in detail), None)
+        terminal = next((text for word, text in _TERMINAL if word in detail.lower()), None)
         if terminal is not None:
             yield Advice("warning", name, f"{name}: {terminal}.")
         elif state in _STATES:

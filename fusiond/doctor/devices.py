@@ -1,4 +1,4 @@
-"""Why a device is not there or not heard, and what would do: serial ports, CAN interfaces."""
+"""Findings on ports and buses: missing, forbidden, taken, down or silent."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 from drivers.base import Driver
 from drivers.network_port import on_network
+from fusiond.doctor.findings import finding
 
 SERIAL_PATTERNS = (
     "/dev/serial/by-id/*",
@@ -19,17 +20,10 @@ SERIAL_PATTERNS = (
     "/dev/ttyAMA*",
     "/dev/ttyTHS*",
 )
-HINDRANCES = {
-    "no_card": "put in the user card, or have it activated",
-    "no_beam": "give the antenna a free sky to the south (geostationary satellites)",
-    "low_battery": "charge the terminal or feed it from the vehicle",
-    "suppressed": "the centre has switched the transmitter off; only it can lift that",
-    "silence": "radio silence is set at the terminal: its operator lifts it",
-}
-"""Counters of an RDSS terminal that keep it from positioning, and what would do."""
+HINDRANCES = ("no_card", "no_beam", "low_battery", "suppressed", "silence")
+"""Counters of an RDSS terminal that keep it from positioning; findings have the same names."""
 _CAN_TYPE = "280"
 """ARPHRD_CAN of linux/if_arp.h, as /sys/class/net/*/type prints it."""
-_CAN_UP = "ip link set {0} up (with `type can bitrate 500000` where it is not set yet)"
 
 
 def device_name(options: Any) -> str:
@@ -45,81 +39,65 @@ def open_findings(name: str, driver: Driver, options: Any, seconds: float) -> li
     state, detail = driver.status.state, driver.status.detail
     port = getattr(options, "port", None)
     if state == "failed":
-        return [f"{detail}: correct [sources.{name}] or the installation"]
+        return [finding("driver_failed", detail=detail, name=name)]
     if state == "absent" or (state == "starting" and not driver.counters["opened"] and port):
         if port is not None:
             return [absent_port(name, str(port), detail)]
         return [absent_interface(name, options, detail)]
     if state == "running":
         if hasattr(driver, "request_now"):  # a terminal's detail also says what it is about to do
-            hindered = [name for name in HINDRANCES if driver.counters[name]]
-            return [f"{detail}: {HINDRANCES[name]}" for name in hindered]
+            return [finding(code, detail=detail) for code in HINDRANCES if driver.counters[code]]
         return [detail] if detail else []
     if port is None:
-        return [
-            f"{detail}: check bit rate (ip -d link show {options.channel}), wiring and power; "
-            f"`candump {options.channel}` shows what is on the bus, [sources.{name}] what is wanted"
-        ]
+        return [finding("bus_silent", detail=detail, channel=options.channel, name=name)]
     if on_network(str(port)):
         cause = getattr(driver, "cause", "")
         if cause:
             return [cause]
-        return [f"{detail}: see what {port} says with `nc` or `gpspipe`, and who may connect there"]
+        return [finding("server_silent", detail=detail, port=port)]
     if not driver.counters["bytes_in"]:
-        return [f"nothing arrives in {seconds:g} s: check power, and that its TX goes to our RX"]
+        return [finding("port_silent", seconds=seconds)]
     cause = getattr(driver, "cause", "")
     if cause:
         return [cause]
     baud = getattr(options, "baud", None)
     if baud == "auto":
-        return [
-            f"bytes arrive, but no terminal has answered yet{f' ({detail})' if detail else ''}: "
-            "listen longer (--seconds 60: every baud rate is tried), and check our TX to its RX"
-        ]
-    return [
-        f"bytes arrive, but nothing intelligible: {baud} baud is probably not the device's rate, "
-        f"correct baud in [sources.{name}]"
-    ]
+        return [finding("terminal_silent", detail=f" ({detail})" if detail else "")]
+    return [finding("port_baud", baud=baud, name=name)]
 
 
 def absent_port(name: str, path: str, detail: str) -> str:
     """A port that cannot be opened: it is not there, not allowed, or taken."""
     if on_network(path):
-        return f"{detail}: start what serves it, or correct port in [sources.{name}]"
+        return finding("server_missing", detail=detail, name=name)
     try:
         mode = os.stat(path)
     except OSError:
         there = similar_ports()
-        ports = f"there are {', '.join(there)}" if there else "there is no serial port at all"
-        return f"{path} is not there: plug it in, or correct port in [sources.{name}]; {ports}"
+        ports = f"there are {', '.join(there)}" if there else "this computer has no serial port"
+        return finding("port_missing", port=path, name=name, others=ports)
     if not stat.S_ISCHR(mode.st_mode):
-        return f"{path} is not a serial port: correct port in [sources.{name}]"
+        return finding("port_not_serial", port=path, name=name)
     if not os.access(path, os.R_OK | os.W_OK):
-        group = _group(mode.st_gid)
-        return (
-            f"no permission for {path} ({stat.filemode(mode.st_mode)}, group {group}): "
-            f"usermod -aG {group} USER, and log in again"
-        )
+        of_port = {"mode": stat.filemode(mode.st_mode), "group": _group(mode.st_gid)}
+        return finding("port_forbidden", port=path, **of_port)
     if "lock" in detail or "busy" in detail:
-        return (
-            f"{path} is in use by another program: stop it (systemctl stop fusiond ModemManager; "
-            f"fuser -v {path} names it)"
-        )
-    return f"{path} cannot be opened: {detail}"
+        return finding("port_busy", port=path)
+    return finding("port_unusable", port=path, detail=detail)
 
 
 def absent_interface(name: str, options: Any, detail: str) -> str:
     """A CAN interface that is down or does not exist."""
     channel = options.channel
     if options.interface != "socketcan":
-        return f"{detail}: correct interface and channel in [sources.{name}]"
+        return finding("bus_interface", detail=detail, name=name)
     if "is down" in detail:
-        return f"{channel} is down: {_CAN_UP.format(channel)}"
+        return finding("bus_down", channel=channel)
     if "no interface" not in detail:
-        return detail
+        return finding("bus_unusable", channel=channel, detail=detail)
     there = can_interfaces()
-    others = f"there are {', '.join(there)}" if there else "this machine has no CAN interface"
-    return f"{channel} does not exist: load its driver or correct [sources.{name}]; {others}"
+    others = f"there are {', '.join(there)}" if there else "this computer has no CAN interface"
+    return finding("bus_missing", channel=channel, name=name, others=others)
 
 
 def similar_ports() -> list[str]:

@@ -26,6 +26,7 @@ from fusiond.configuration.load import ConfigError, driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
+from fusiond.doctor.findings import finding
 from fusiond.doctor.values import KEPT, Values
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.outputs import broker_access
@@ -139,16 +140,16 @@ async def examine(config: Config, seconds: float, out: TextIO, transmit: bool = 
     await asyncio.gather(*tasks, return_exceptions=True)
     reports.append(await broker)
     if not sources:
-        reports.insert(0, Report("sources", findings=["none: add a [sources.NAME] section"]))
+        reports.insert(0, Report("sources", findings=[finding("no_sources")]))
 
     for report in reports:
         print(report.title, file=out)
         for fact in report.facts:
             print(f"    {fact}", file=out)
-        for finding in report.findings:
-            print(f"  ! {finding}", file=out)
+        for line in report.findings:
+            print(f"  ! {line}", file=out)
     found = sum(len(report.findings) for report in reports)
-    print(f"{found} finding{'s' * (found > 1)}" if found else "all is well", file=out)
+    print(f"{found} finding{'s' * (found > 1)}" if found else "No findings", file=out)
     return 1 if found else 0
 
 
@@ -170,7 +171,7 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
     if counters:
         report.facts.append(", ".join(f"{name} {count}" for name, count in counters.items()))
     if task.done() and not task.cancelled():
-        report.findings.append(f"the driver ended: {task.exception()!r}: please report this")
+        report.findings.append(finding("driver_ended", error=repr(task.exception())))
     report.findings += open_findings(heard.name, heard.driver, heard.options, seconds)
     report.findings += _damage(heard.driver.counters, report.findings)
     report.findings += getattr(heard.driver, "cautions", {}).values()
@@ -179,10 +180,7 @@ def _source(heard: Heard, task: asyncio.Task[None], config: Config, seconds: flo
     elif "PositionFix" in heard.kinds:
         oldest = max(heard.kinds["PositionFix"].age_s)
         if oldest > OLD_FIX_S:
-            report.findings.append(
-                f"fixes are up to {oldest:.1f} s old on arrival: raise the baud rate or switch off "
-                "sentences that are not needed (GSV)"
-            )
+            report.findings.append(finding("fixes_old", age=oldest))
     elif status.state == "running" and not status.detail:
         cause = getattr(heard.driver, "cause", "")
         if cause:
@@ -215,25 +213,16 @@ def _damage(counters: Counter[str], said: list[str]) -> list[str]:
     findings = []
     lost, samples = counters["lost_samples"], counters["samples"]
     if lost > DAMAGED_SHARE * max(1, samples):
-        findings.append(
-            f"{lost} of {samples + lost} IMU samples lost: look at the bus load (canbusload), at "
-            "`ip -s -d link show`, and at what else keeps this computer busy"
-        )
+        findings.append(finding("samples_lost", lost=lost, all=samples + lost))
     if counters["error_frames"]:
-        findings.append(
-            f"{counters['error_frames']} CAN error frames: check bit rate, wiring and the two "
-            "120 ohm terminators"
-        )
+        findings.append(finding("bus_errors", count=counters["error_frames"]))
     bad = counters["checksum_bad"] + counters["bad_checksum"]
     good = counters["sentences"] + counters["frames"]
     if bad > max(1, DAMAGED_SHARE * good) and not any(_CHECKSUMS in one for one in said):
-        findings.append(
-            f"{bad} {_CHECKSUMS} {good} sound: check ground, cable length and that "
-            "nobody else reads this port"
-        )
+        findings.append(finding("checksums", bad=bad, good=good))
     overflow = counters["socket_overflow"] + counters["ring_overflow"] + counters["error_overflow"]
     if overflow:
-        findings.append(f"{overflow} CAN frames overflowed: this computer was busy")
+        findings.append(finding("bus_overflow", count=overflow))
     return findings
 
 
@@ -242,9 +231,7 @@ def _imu(heard: Heard, config: Config, report: Report) -> None:
     rate = heard.kinds["ImuSample"].rate_hz
     wanted = config.imu.rate_hz
     if rate is not None and abs(rate - wanted) > RATE_TOLERANCE * wanted:
-        report.findings.append(
-            f"{rate:.1f} samples a second, but [imu] rate_hz = {wanted:g}: correct one of them"
-        )
+        report.findings.append(finding("imu_rate", seen=rate, set=wanted))
     values = np.array(heard.imu)
     mean = values.mean(axis=0)
     limits = quiet_limits(config.constraints.zero_velocity, imu_noise(config.imu))
@@ -254,7 +241,7 @@ def _imu(heard: Heard, config: Config, report: Report) -> None:
     # A wrong unit makes the noise larger too.
     quiet_force = limits.force_sd * max(1.0, force / STANDARD_GRAVITY_M_S2)
     if sd[:3].max() > limits.rate_sd or sd[3:].max() > quiet_force:
-        report.facts.append("not at rest: gravity and axes are not judged; repeat it at rest")
+        report.facts.append("not at rest: gravity and axes not judged; repeat at rest")
         return
     body = sensor_to_body(config.imu) @ mean[3:]
     tilt = float(np.degrees(np.arccos(np.clip(-body[2] / max(force, 1e-9), -1.0, 1.0))))
@@ -262,22 +249,15 @@ def _imu(heard: Heard, config: Config, report: Report) -> None:
         f"at rest: specific force {force:.3f} m/s2, {tilt:.1f} deg from up; rate {turn:.3f} deg/s"
     )
     if abs(force / STANDARD_GRAVITY_M_S2 - 1.0) > GRAVITY_TOLERANCE:
-        report.findings.append(
-            f"specific force at rest is {force:.3f} m/s2 instead of {STANDARD_GRAVITY_M_S2:.2f}: "
-            f"is the accelerometer's unit right (accel_unit of [sources.{heard.name}], or the DBC)?"
-        )
+        gravity = STANDARD_GRAVITY_M_S2
+        report.findings.append(finding("imu_force", force=force, gravity=gravity, name=heard.name))
     elif tilt > MAX_TILT_DEG:
         up = int(np.argmax(np.abs(mean[3:])))
         down = ("-" if mean[3 + up] > 0.0 else "+") + "xyz"[up]
-        report.findings.append(
-            f"gravity lies {tilt:.0f} deg off the body's down axis: the sensor axis that points "
-            f"down is {down}, so [imu] axes must end with {down!r} (now {config.imu.axes[2]!r})"
-        )
+        now = config.imu.axes[2]
+        report.findings.append(finding("imu_axes", tilt=tilt, down=down, axes=now))
     if turn > np.degrees(limits.mean_rate):
-        report.findings.append(
-            f"it says {turn:.2f} deg/s at rest: is the gyro's unit right (gyro_unit of "
-            f"[sources.{heard.name}], or the DBC), and is the unit warm?"
-        )
+        report.findings.append(finding("imu_turns", rate=turn, name=heard.name))
 
 
 # --------------------------------------------------------------------------- clock and broker
@@ -290,16 +270,11 @@ def _clock(clock: Clock, config: Config) -> Report:
         error = status.system_error_s
         report.facts.append(f"system clock minus GNSS: {error:+.3f} s")
         if abs(error) > SYSTEM_CLOCK_S:
-            report.findings.append(
-                f"the system clock is {error:+.1f} s off GNSS: timedatectl set-ntp true, or chrony "
-                "with gpsd; navigation does not need it, logs and other programs do"
-            )
+            report.findings.append(finding("system_clock", error=error))
     elif status.utc_source == "none":
-        report.findings.append(
-            "UTC is not known: the system clock is not set and no receiver has told the time"
-        )
+        report.findings.append(finding("no_utc"))
     elif config.clock.utc == "gnss":
-        report.facts.append("no receiver has told the time: the system clock serves")
+        report.facts.append("no receiver has sent the time: the system clock is used")
     return report
 
 

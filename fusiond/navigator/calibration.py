@@ -261,8 +261,19 @@ class CalibrationWatch:
         for p in self.parameters:
             if p.state is CalibrationState.SETTLED and p.name not in self._told:
                 self._told.add(p.name)
-                rest = "all that is estimated has settled" if self.settled else "others have not"
-                self._event("calibrated", f"{p.name} {p.value:+.4g}, sigma {p.sd:.2g}; {rest}")
+                rest = "all settled" if self.settled else "others still settling"
+                self._event("calibrated", f"{_label(p)}, one sigma {p.sd:.2g}; {rest}")
+
+
+_UNITS = ("deg", "m", "ms", "ppm", "percent", "s")
+
+
+def _label(p: Parameter) -> str:
+    """A parameter in words: `mounting_pitch_deg` 0.01 is "Mounting pitch 0.01 deg"."""
+    *words, unit = p.name.split("_")
+    if unit not in _UNITS:
+        words, unit = [*words, unit], ""
+    return f"{' '.join(words).capitalize()} {p.value:.2g} {unit}".rstrip()
 
 
 def _parameter(s: Slot, value: float, sd: float, before: float | None) -> Parameter:

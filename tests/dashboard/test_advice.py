@@ -59,7 +59,7 @@ def test_why_becomes_a_step(mode: str, why: str, step: str) -> None:
         ({"state": "absent"}, "gnss cannot be opened: check plug, power and port."),
         ({"state": "silent"}, "gnss is open and says nothing: check power, wiring and baud rate."),
         ({"state": "failed"}, "gnss cannot work as configured: correct its section, then restart."),
-        ({"state": "silent", "detail": "no card in the terminal"}, "gnss: put a card into the"),
+        ({"state": "silent", "detail": "No card in the terminal"}, "gnss: put a card into the"),
         ({"isolated": "jumped by 40 m"}, "gnss disagrees with the rest and is left out."),
         ({"verdict": "optimistic"}, "gnss: sigma is too small"),
     ],

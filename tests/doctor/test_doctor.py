@@ -88,7 +88,7 @@ async def test_all_is_well(tmp_path: Path) -> None:
     # A busy host serves the simulated devices in bursts, and the doctor rightly says so.
     assert all("samples a second" in f or "old on arrival" in f for f in findings), text
     assert code == (1 if findings else 0), text
-    assert findings or text.endswith("all is well\n")
+    assert findings or text.endswith("No findings\n")
     (rate,) = (line.split(", ")[1] for line in text.splitlines() if "ImuSample" in line)
     in_time = 80.0 < float(rate.removesuffix(" Hz")) < 120.0
     assert in_time or any("samples a second" in f for f in findings), text
@@ -103,8 +103,8 @@ async def test_all_is_well(tmp_path: Path) -> None:
     assert abs(float(force[3]) - 9.8) < 0.1
     assert re.search(r"^ +\|force\| 9\.\d{3} \+- 0\.\d{3} m/s2$", text, re.M)
     assert re.search(r"^ +position lat 30\.\d{7} \+- 0\.\d{7}, lon 114\.\d{7} \+- ", text, re.M)
-    assert "read only, no fix is asked for" in text
-    assert "requested" not in text
+    assert "read only, no fix is requested" in text
+    assert "Fix requested" not in text
     assert "at rest: specific force 9.8" in text
     assert "PositionFix: " in text
     assert "gnss: nmea on " in text
@@ -118,8 +118,8 @@ async def test_ports_that_are_not_there(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(doctor_devices, "SERIAL_PATTERNS", (str(tmp_path / "ttyUSB*"),))
     code, text = await report(without(config(tmp_path), "imu"), 0.5)
     assert code == 1
-    assert f"! {tmp_path}/gnss is not there" in text
-    assert f"! {tmp_path}/rdss is not there" in text
+    assert f"! {tmp_path}/gnss does not exist" in text
+    assert f"! {tmp_path}/rdss does not exist" in text
     assert "correct port in [sources.gnss]" in text
     assert f"there are {tmp_path}/ttyUSB7" in text
     assert text.endswith("2 findings\n")
@@ -127,7 +127,7 @@ async def test_ports_that_are_not_there(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_no_port_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_devices, "SERIAL_PATTERNS", ())
-    assert "there is no serial port at all" in doctor_devices.absent_port("gnss", "/dev/no", "")
+    assert "this computer has no serial port" in doctor_devices.absent_port("gnss", "/dev/no", "")
 
 
 async def test_a_file_is_no_port(tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_no_permission_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_devices.os, "access", lambda path, mode: False)
     text = doctor_devices.absent_port("gnss", "/dev/tty", "Permission denied")
     group = doctor_devices.grp.getgrgid(os.stat("/dev/tty").st_gid).gr_name
-    assert "no permission for /dev/tty (crw" in text
+    assert "No permission for /dev/tty (crw" in text
     assert f"usermod -aG {group} USER" in text
 
 
@@ -234,7 +234,7 @@ async def test_silent_line(tmp_path: Path) -> None:
     code, text = await report(without(config(tmp_path), "imu", "rdss"))
     device.unplug()
     assert code == 1
-    assert "nothing arrives in 2 s" in text
+    assert "No bytes in 2 s" in text
 
 
 async def test_terminal_that_does_not_answer(tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ async def test_axes_that_do_not_fit_gravity(tmp_path: Path) -> None:
         wrong = config(tmp_path, imu={"axes": ["+x", "+y", "+z"], "rate_hz": 100.0})
         code, text = await report(without(wrong, "gnss", "rdss"))
     assert code == 1
-    assert re.search(r"gravity lies 1[78]\d deg off", text)
+    assert re.search(r"Gravity lies 1[78]\d deg off", text)
     assert "axes must end with '-z' (now '+z')" in text
 
 
@@ -318,7 +318,7 @@ async def test_unit_and_rate_that_do_not_fit(tmp_path: Path) -> None:
         code, text = await report(base.model_copy(update={"sources": {"imu": imu}}))
     assert code == 1
     assert "[imu] rate_hz = 400" in text
-    assert "specific force at rest is 96." in text
+    assert "Specific force at rest is 96." in text
     assert "accel_unit" in text
 
 
@@ -327,7 +327,7 @@ async def test_broker_that_is_not_there(tmp_path: Path) -> None:
     code, text = await report(config(tmp_path, port, sources={}), 0.5)
     assert code == 1
     assert f"is 127.0.0.1:{port} right?" in text
-    assert "none: add a [sources.NAME] section" in text
+    assert "No [sources]: add a [sources.NAME] section" in text
 
 
 async def test_broker_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -359,7 +359,7 @@ async def test_system_clock_that_is_off(tmp_path: Path, monkeypatch: pytest.Monk
     async with vehicle(tmp_path):
         code, text = await report(without(config(tmp_path), "imu", "rdss"))
     assert code == 1
-    assert "the system clock is -3600.0 s off GNSS" in text
+    assert "The system clock is -3600.0 s off GNSS" in text
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

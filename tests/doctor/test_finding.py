@@ -77,13 +77,13 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
     arguments = ["config", "init", str(out), "--port", gone, "--can", f"virtual:{tmp_path}"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
-    assert "found no device that is understood" in done.stdout
-    assert "! sources: there is none" in done.stdout
+    assert "No supported device found on: " in done.stdout
+    assert "! sources: none; `run` needs an IMU" in done.stdout
     assert "# [sources.imu]" in out.read_text()
-    marks_off = out.read_text().replace("# [sources.imu]", "[sources.imu]")
+    uncommented = out.read_text().replace("# [sources.imu]", "[sources.imu]")
     for key in ("driver", "channel", "dbc", "gyro", "accel", "device_time"):
-        marks_off = marks_off.replace(f"# {key} =", f"{key} =")
-    assert tomllib.loads(marks_off)["sources"]["imu"]["dbc"] == "xsens_mti600"
+        uncommented = uncommented.replace(f"# {key} =", f"{key} =")
+    assert tomllib.loads(uncommented)["sources"]["imu"]["dbc"] == "xsens_mti600"
     assert CliRunner().invoke(app, ["check", str(out)]).exit_code == 0
 
 

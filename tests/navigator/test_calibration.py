@@ -166,9 +166,11 @@ def test_a_parked_vehicle_shows_nothing_and_says_so() -> None:
 
 def test_each_settled_parameter_is_told_once() -> None:
     found, events = driven()
-    told = [text.split()[0] for code, text in events if code == "calibrated"]
-    assert sorted(set(told)) == sorted(told)
-    assert set(told) >= {name for name, p in found.items() if p.state is SETTLED}
+    told = [text.split(", one sigma ")[0] for code, text in events if code == "calibrated"]
+    labels = ["_".join(words.lower().split()[:-2]) for words in told]  # without figure and unit
+    assert sorted(set(labels)) == sorted(labels)
+    settled = {name for name, p in found.items() if p.state is SETTLED}
+    assert {name for name in settled if not name.startswith(tuple(labels))} == set()
 
 
 def test_the_next_start_knows_what_this_one_has_found() -> None:

@@ -94,7 +94,7 @@ async def test_absent_at_start_then_plugged(device: Device) -> None:
     vehicle = Vehicle(device)
     async with running(vehicle):
         await until(lambda: vehicle.state() == "absent")
-        assert "No such file" in vehicle.driver.status.detail
+        assert "does not exist; retrying" in vehicle.driver.status.detail
         device.plug()
         await until(lambda: opened(vehicle))
         device.send(gga(29))

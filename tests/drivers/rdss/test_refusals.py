@@ -57,7 +57,7 @@ def test_no_lock_polls_beams_every_5_s(outcome: Outcome) -> None:
     assert len(polls) == 20
     assert all(b - a == pytest.approx(5) for a, b in itertools.pairwise(polls))
     assert len(bench.requests) == 1
-    assert bench.cycle.detail == "no beam: strongest level 1, polling every 5 s"
+    assert bench.cycle.detail == "No beam (strongest level 1); asking again every 5 s"
     assert bench.notices.count("rdss_no_beam") == 1
     bench.levels = (0, 2, 0, 0, 0, 0)
     bench.run(10)

@@ -108,7 +108,7 @@ def test_read_only_never_asks_for_a_fix_and_goes_on_reading() -> None:
     assert bench.cycle.state is State.READY
     assert (
         bench.cycle.detail
-        == "card 0242286, 60 s: read only, no fix is asked for; strongest level 4"
+        == "card 0242286, 60 s: read only, no fix is requested; strongest level 4"
     )
     reads = [t for t, m in bench.sent if isinstance(m, BeamPowerRequest)]
     assert reads[-1] > 380

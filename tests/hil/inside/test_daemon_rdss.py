@@ -73,8 +73,8 @@ NO_BEAM: dict[Family, tuple[str, str]] = {
 """What a refusal for want of a beam is called by the driver and by the terminal."""
 FEWEST_FUSED = 7
 FORBIDDEN: dict[Family, tuple[str, str, str, str]] = {
-    "4.0": ("suppress", "suppressed", "suppressed", "suppressed by the system"),
-    "2.1": ("silence", "silenced", "silence", "radio silence is set"),
+    "4.0": ("suppress", "suppressed", "suppressed", "Suppressed by the RDSS centre"),
+    "2.1": ("silence", "silenced", "silence", "Radio silence set"),
 }
 """What stops the terminal: command, answer, counter of the driver, how `health` begins."""
 
