@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from operator import attrgetter
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,21 +57,15 @@ class Innovation(NamedTuple):
 class State(NamedTuple):
     """What an aid may look at: navigation state (10,), parameters (n,), last step (28,), model, and
     the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth).
-    `lent` is what a filter lends aids to write their innovations to, by the number of rows."""
+    `lent` is what a filter lends aids to write their innovations to, by the number of rows: it
+    holds until the next innovation is asked for."""
 
     nav: Array
     xi: Array
     step: Array
     model: Model
     covariance: Array | None = None
-    lent: tuple[Innovation, ...] = ()
-
-    def rows(self, count: int) -> Innovation:
-        """To write an innovation of so many rows to, of any content. What is lent holds until the
-        next innovation is asked for."""
-        if self.lent and count <= LENT_ROWS:
-            return self.lent[count]
-        return Innovation.unwritten(count, self.model.size)
+    lent: Mapping[int, Innovation] = MappingProxyType({})
 
     @property
     def dcm(self) -> Array:
@@ -124,6 +120,12 @@ class Aid:
     no_slip: ClassVar[bool] = False
     """It holds while the vehicle moves the way it faces: refused for long, it slides, or the
     attitude or the IMU's mounting is wrong."""
+    shown: ClassVar[attrgetter[Any] | None] = None
+    """What a sensor that hangs repeats to the bit; else the first of its `offers` says it."""
+    waits: ClassVar[bool] = False
+    """Its `feedback` is not always at once."""
+    placed: ClassVar[bool] = False
+    """Its corrections depend on the place: it is folded in as it is `at` the filter's."""
     late: ClassVar[bool] = False
     """It comes seldom and long after its instant, as what must be asked for does."""
 

@@ -36,7 +36,8 @@ section 10.3.2 (second-order terms).
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,6 +208,7 @@ class PositionAid(Aid):
     """
 
     locates: ClassVar[bool] = True
+    shown: ClassVar[attrgetter[Any] | None] = attrgetter("lat_rad", "lon_rad")
 
     lat_rad: float
     lon_rad: float
@@ -226,9 +228,10 @@ class PositionAid(Aid):
         return self.bias
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, xi, step, model, p, _ = state
+        nav, xi, step, model, p, lent = state
         height, at = self.height_m, model.indices
-        rows = state.rows(2 if height is None or model.hold_height else 3)
+        m = 2 if height is None or model.hold_height else 3
+        rows = lent.get(m) or Innovation.unwritten(m, model.size)
         slots = model.column_of, at[self.bias], at[self.time], at[self.rest], at[self.wander]
         fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
         where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m

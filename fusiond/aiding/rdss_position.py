@@ -24,7 +24,8 @@ Source: paper 000, eq. 2 to 4.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -47,7 +48,9 @@ class RdssPositionAid(Aid):
     """
 
     locates: ClassVar[bool] = True
+    shown: ClassVar[attrgetter[Any] | None] = attrgetter("lat_rad", "lon_rad")
     late: ClassVar[bool] = True
+    waits: ClassVar[bool] = True
 
     lat_rad: float
     lon_rad: float
@@ -102,6 +105,8 @@ class RdssPositionAid(Aid):
 @immutable()
 class FeedBackAid(Aid):
     """The instant at which an estimate that was held is fed back."""
+
+    waits: ClassVar[bool] = True
 
     @property
     def feedback(self) -> Feedback:

@@ -21,7 +21,8 @@ Source: Groves, 2nd ed., eq. 14.109.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +123,7 @@ class VelocityAid(Aid):
     `rest` as of `PositionAid`; `fix_time` is the `time` of the position with the same stamp."""
 
     moves: ClassVar[bool] = True
+    shown: ClassVar[attrgetter[Any] | None] = attrgetter("v_ned")
 
     v_ned: tuple[float, ...]
     sd: tuple[float, ...]
@@ -135,19 +137,16 @@ class VelocityAid(Aid):
     def device(self) -> str:
         return self.source.removesuffix(SUFFIX)
 
-    @property
-    def _measured(self) -> tuple[float, float, float, float, float, float]:
-        """Velocity and sigmas, 0 where there is none down."""
-        north, east, down = self.v_ned if len(self.v_ned) == 3 else (*self.v_ned, 0.0)
-        sd_n, sd_e, sd_d = self.sd if len(self.sd) == 3 else (*self.sd, 0.0)
-        return north, east, down, sd_n, sd_e, sd_d
-
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, xi, step, model, _, _ = state
+        nav, xi, step, model, _, lent = state
         at = model.indices
-        rows = state.rows(2 if model.hold_height else len(self.v_ned))
+        m = 2 if model.hold_height else len(self.v_ned)
+        rows = lent.get(m) or Innovation.unwritten(m, model.size)
         slots = model.column_of, at[self.time], at[self.rest], at[self.fix_time]
-        velocity_rows(nav, xi, step, *slots, *self._measured, *self.lever, self.sd_time_s, *rows)
+        v, sd = self.v_ned, self.sd
+        if len(v) == 2:  # none down
+            v, sd = (*v, 0.0), (*sd[:2], 0.0)
+        velocity_rows(nav, xi, step, *slots, *v, *sd, *self.lever, self.sd_time_s, *rows)
         return rows
 
     def offers(self) -> tuple[VelocityOffer, ...]:

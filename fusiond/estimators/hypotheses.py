@@ -85,16 +85,16 @@ class Hypotheses:
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)
         """V (n, columns)."""
         self._nine = np.zeros((9, 9))
-        self._of_source: dict[str, tuple[int, int]] = {}
+        self.of_source: dict[str, tuple[int, int]] = {}
 
     def of(self, aid: Linearised) -> tuple[int, int]:
         """What an aid's rows are, as of fusiond.estimators.fault_bank, and the number of its
         device; -1 where no kind is of it."""
-        known = self._of_source.get(aid.source)
+        known = self.of_source.get(aid.source)
         if known is None:
             devices = self.table.devices
             device = devices.index(aid.device) if aid.device in devices else -1
-            known = self._of_source[aid.source] = _measures(aid, device >= 0), device
+            known = self.of_source[aid.source] = _measures(aid, device >= 0), device
         return known
 
     @property
