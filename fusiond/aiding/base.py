@@ -160,6 +160,12 @@ class Aid:
         the aid's instant: itself, unless its corrections depend on the place."""
         return self
 
+    def unturned(self) -> Aid | None:
+        """The aid for a vehicle of which nobody knows which way it faces, the state being that of
+        one that faces north and is level: of a lever arm only its upward part is known, and the
+        rest is noise. None where the measurement says nothing without an attitude."""
+        return None
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
         raise NotImplementedError
@@ -210,6 +216,11 @@ class Linearised(Protocol):
     def no_slip(self) -> bool: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
+
+
+def level_arm_m(lever: Vector3) -> float:
+    """One sigma (m) of each horizontal axis of a lever arm that may point anywhere."""
+    return math.hypot(lever[0], lever[1]) / math.sqrt(2.0)
 
 
 def rate_columns(h: Array, rows: slice, model: Model, per_rate: Array) -> None:

@@ -36,6 +36,7 @@ section 10.3.2 (second-order terms).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any, ClassVar
 
@@ -44,7 +45,7 @@ from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.antenna import Matrix, antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
@@ -226,6 +227,11 @@ class PositionAid(Aid):
     @property
     def shares(self) -> tuple[str, ...]:
         return self.bias
+
+    def unturned(self) -> PositionAid:
+        (north, east, down), arm = self.sd, level_arm_m(self.lever)
+        sd = math.hypot(north, arm), math.hypot(east, arm), down
+        return replace(self, sd=sd, lever=(0.0, 0.0, self.lever[2]), rest="")
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav, xi, step, model, p, lent = state
