@@ -166,7 +166,7 @@ def fly(config: Config, fixes: list[Measurement]) -> Course:
     covariances: list[Array] = []
     places: list[Array] = []
     count = round(DURATION_S / TICK_S)
-    instants: Array = np.arange(count) * TICK_S
+    instants: Array = np.arange(count, dtype=np.float64) * TICK_S
     true = true_nav(truth(), instants)
     for k in range(1, count):
         now_ns = round(k * TICK_S * 1e9)
