@@ -76,9 +76,11 @@ class NavigationStatus:
         speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
         if speed > self._max_speed_m_s:
             return f"{speed:.0f} m/s is faster than this vehicle can be"
+        if not diagnosis.positions_out:
+            return None
         if (device := diagnosis.contradicts) is not None:
             return f"positions and velocities of {device} fit each other, not the filter"
-        if diagnosis.positions_out and not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
+        if not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
             return "no position in service, and the solution is not valid any more"
         return None
 
