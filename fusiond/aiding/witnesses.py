@@ -120,25 +120,24 @@ class Witnesses:
                 match offer:
                     case VelocityOffer():
                         speed = _Speed(offer.t_ns, offer.v_ned[:2], max(offer.sd[:2]), 0.0, STEADY)
-                        self._keep(aid.source, speed)
                     case SpeedOffer():
                         own = offer.sd_m_s, offer.rounding_sd_m_s, offer.drifts
-                        self._keep(aid.source, _Speed(offer.t_ns, (offer.speed_m_s,), *own))
-
-    def _keep(self, source: str, speed: _Speed) -> None:
-        if speed.t_ns <= self._told_ns:
-            self._told.clear()
-            self._told_ns = 0
-        speeds = self._speeds[source]
-        if speeds and speed < speeds[-1]:
-            self._sums.clear()
-            insort(speeds, speed)
-        else:
-            speeds.append(speed)
-        if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
-            self._sums.clear()
-            self._told.clear()
-            del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
+                        speed = _Speed(offer.t_ns, (offer.speed_m_s,), *own)
+                    case _:
+                        continue
+                if speed.t_ns <= self._told_ns:
+                    self._told.clear()
+                    self._told_ns = 0
+                speeds = self._speeds[aid.source]
+                if speeds and speed < speeds[-1]:
+                    self._sums.clear()
+                    insort(speeds, speed)
+                else:
+                    speeds.append(speed)
+                if speeds[0][0] < speeds[-1][0] - 2 * KEEP_NS:
+                    self._sums.clear()
+                    self._told.clear()
+                    del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
         """What was measured from `begin_ns` to `end_ns`, both included."""

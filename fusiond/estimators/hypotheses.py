@@ -70,7 +70,6 @@ class Hypotheses:
         self, bank: Array, table: FaultTable, model: Model, xi: Array, step: Array, wider: Array
     ) -> None:
         self.bank, self.table = bank, table
-        self._xi, self._step, self._wider = xi, step, wider
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
         """What the last `judge` has found, as of fusiond.estimators.fault_odds."""
@@ -80,6 +79,9 @@ class Hypotheses:
             self._mounting[k] = slot, RARE * float(model.initial[slot]) ** 2
         self.columns = columns_of(table)
         self.work = np.zeros(max(LENT_ROWS * self.columns, OPENED_WORK))
+        self._judged = bank, table.ints, table.numbers, table.lanes, self.n
+        self._widened = xi, step, self._mounting, self.work, wider, self.found
+        """What `judge_and_widen` takes before and behind an epoch."""
         numbers = range(int(bank[ALL]))
         self._at = np.array([group_at(bank, number) for number in numbers]).reshape(-1, RESTARTS)
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)
@@ -131,21 +133,14 @@ class Hypotheses:
         if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
             self.bank[UNJUDGED] = t_ns * 1e-9
             return None
-        return self._take(t_ns * 1e-9, measured, used)
+        judge_and_widen(*self._judged, t_ns * 1e-9, measured, used, *self._widened)
+        return self.found
 
     def conclude(self) -> None:
         """Judge what waits for it."""
         epoch_s = self.bank.item(UNJUDGED)
         if epoch_s < math.inf:
-            self._take(epoch_s, measured=True, used=True)
-
-    def _take(self, epoch_s: float, measured: bool, used: bool) -> Array:
-        table, found = self.table, self.found
-        judge_and_widen(
-            *(self.bank, table.ints, table.numbers, table.lanes, self.n, epoch_s, measured, used),
-            *(self._xi, self._step, self._mounting, self.work, self._wider, found),
-        )
-        return found
+            judge_and_widen(*self._judged, epoch_s, True, True, *self._widened)
 
     def widen(self, step: Array, wider: Array) -> None:
         """Write `wider` (9,): what the weighed hypotheses leave open of what is published."""

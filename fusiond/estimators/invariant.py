@@ -62,7 +62,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.aiding.base import Innovation, Linearised, NotApplicable, State
-from fusiond.estimators.base import AS_STATED, Outcome, gate_threshold
+from fusiond.estimators.base import Outcome, gate_threshold
 from fusiond.estimators.fault_bank import NO_FAULTS, FaultTable
 from fusiond.estimators.invariant_error import (
     about_down,
@@ -147,8 +147,6 @@ class InvariantFilter(TiltAxesFilter):
     ) -> None:
         super().__init__(model, gap_s, faults)
         self._settles = settles
-        self.turns = False
-        """Whether updates run in xi: the heading may be far off."""
         self._mounts = model.indices[MOUNTING]
         self._bent = False
         """Whether the bank has missed updates: of a heading so wide that no effect is linear."""
@@ -226,10 +224,8 @@ class InvariantFilter(TiltAxesFilter):
         super().adopt(mean, spread)
         self.turns |= self._settles and bool(self.covariance[PHI + 2, PHI + 2] > LARGE_SD_RAD**2)
 
-    def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
-        """Fold one aid in, or name why not."""
-        if not self.turns or self._holding:
-            return super().update(aid, noise)
+    def _turn_in(self, aid: Linearised) -> Outcome:
+        """Fold one aid in, or name why not, by an update in xi."""
         self.turned = 0.0
         outcome = self._update(aid)
         if self._settles and self.covariance[PHI + 2, PHI + 2] < PLAIN_SD_RAD**2:

@@ -278,6 +278,8 @@ class TiltAxesFilter(KalmanEstimator):
         self._gyros = gyro_slots(model) if known else self._slots
         self._lever, self._late = antenna_slots(model)
         self._astray = self._lever.size > 0
+        self.turns = False
+        """Whether the heading may be far off, and updates are another kind's."""
         self.undoubted = True
         """Whether what gyros are wrong by is what they were wrong by when the filter started."""
         if known:
@@ -295,6 +297,8 @@ class TiltAxesFilter(KalmanEstimator):
 
     def update(self, aid: Linearised, noise: Array = AS_STATED) -> Outcome:
         """Fold one aid in, or name why not."""
+        if self.turns and not self._holding:
+            return self._turn_in(aid)
         self.turned = 0.0
         if self._holding or not (self._astray or may_part(self._covariance, self._slots)):
             return self._fold_in(aid, noise)
@@ -303,6 +307,10 @@ class TiltAxesFilter(KalmanEstimator):
         if outcome.name == "fused":
             self._carry_over(before)
         return outcome
+
+    def _turn_in(self, aid: Linearised) -> Outcome:
+        """The same while the heading may be far off."""
+        raise NotImplementedError
 
     def release(self) -> None:
         """Feed back what was carried."""

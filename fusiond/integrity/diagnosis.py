@@ -43,7 +43,7 @@ from fusiond.estimators.hypotheses import Estimated, Hypotheses
 from fusiond.integrity.agreement import Agreement
 from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.finding import Finding, Lasting
-from fusiond.integrity.service import DISAGREES, REPEATS, STILL, Series, value_of
+from fusiond.integrity.service import DISAGREES, FORGET_NS, REPEATS, STILL, Series, value_of
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
@@ -155,7 +155,9 @@ class Diagnosis:
         one, shown = self._series.get(aid.source), aid.shown
         if one is None or aid.source in self._shared:
             one = self.own(aid)
-        one.hear(aid.t_ns)
+        if aid.t_ns - one.heard_ns > FORGET_NS:
+            one.hear(aid.t_ns)
+        one.heard_ns = aid.t_ns
         if aid.constraint:
             if estimator.hypotheses is not None:  # it is no evidence of what waits to be judged
                 estimator.hypotheses.conclude()

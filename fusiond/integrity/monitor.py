@@ -219,53 +219,32 @@ class ConsistencyMonitor:
             self.restarts += self._m > 0
             self._m = rows.shape[1]
             self.reset()
+        o = self.options
         found: list[tuple[int, Verdict]] = []
         done = 0
         while done < len(rows):
             # While the window grows, its limits change with each epoch.
-            end = len(rows) if self.k == self.options.window else done + 1
-            now = slice(done, end)
-            turned = self._test(rows[now], nis[now], energy[now])
-            found += [(done + i, to) for i, to in turned]
+            end = len(rows) if self.k == o.window else done + 1
+            now, first = slice(done, end), self._count
+            self._count += end - done
+            if self._count > LAGS and self.k < o.window:
+                self.k += 1
+            k = self.k
+            if k != self._limits_k and k >= FEWEST:
+                self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
+                self._limits_k = k
+            limits, turned = self._limits, np.empty((end - done, 2), dtype=np.int64)
+            dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
+            turns = _slide_over(
+                *(self._rows, self._figures, self._products, self._sums, first, o.window),
+                *(rows[now], nis[now], energy[now], limits.weights, self._rho),
+                *(*limits.nis_limits, limits.portmanteau, dof, patience, self._held, turned),
+            )
+            if k >= FEWEST:
+                self._average = float(self._sums[0]) / dof
+            found += [(done + i, word(to, o.shared)) for i, to in turned[:turns].tolist()]
             done = end
         return found
-
-    def _test(self, rows: Array, nis: Array, energy: Array) -> list[tuple[int, Verdict]]:
-        """Take epochs in; the window's verdict, and the verdict contradicted long enough."""
-        o = self.options
-        first, self._count = self._count, self._count + len(rows)
-        if self._count > LAGS and self.k < o.window:
-            self.k += 1
-        k = self.k
-        if k != self._limits_k and k >= FEWEST:
-            self._limits = limits_of(k, k * self._m, o.alpha, o.gate, o.whitened)
-            self._limits_k = k
-        limits, turned = self._limits, np.empty((len(rows), 2), dtype=np.int64)
-        low, high = limits.nis_limits
-        dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
-        turns = _slide_over(
-            self._rows,
-            self._figures,
-            self._products,
-            self._sums,
-            first,
-            o.window,
-            rows,
-            nis,
-            energy,
-            limits.weights,
-            self._rho,
-            low,
-            high,
-            limits.portmanteau,
-            dof,
-            patience,
-            self._held,
-            turned,
-        )
-        if k >= FEWEST:
-            self._average = float(self._sums[0]) / dof
-        return [(i, word(to, o.shared)) for i, to in turned[:turns].tolist()] if turns else []
 
     def report(self) -> Consistency:
         """The figures of the window and the verdict; changes nothing."""

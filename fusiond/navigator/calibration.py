@@ -184,6 +184,8 @@ class CalibrationWatch:
     def restart(self) -> None:
         """The filter has been started anew."""
         self._cell = self._turn_cell = -1
+        self.due_ns = 0
+        """Before that instant of the filter there is nothing to look at."""
         self._past: deque[tuple[int, Array]] = deque()
         self._learned, self._variance = np.zeros((2, len(self._yaws)))
         self._looked_ns = np.full(TURN_LOOKS, NEVER_NS)
@@ -214,7 +216,7 @@ class CalibrationWatch:
         turn_cell, cell = t_ns // TURN_LOOK_NS, t_ns // LOOK_NS
         if turn_cell == self._turn_cell or not self._slots:
             return False
-        self._turn_cell = turn_cell
+        self._turn_cell, self.due_ns = turn_cell, (turn_cell + 1) * TURN_LOOK_NS
         now, variance = xi[self._indices].copy(), covariance[self._indices, self._indices]
         self._compare(t_ns, now, variance)
         if cell == self._cell:

@@ -16,13 +16,13 @@ RAISED_BY_NUMBERS = (ArithmeticError, ValueError)
 """What numerics raise: division by zero and overflow; domain errors and numpy's LinAlgError."""
 
 
-def broken(estimator: Estimator) -> str | None:
-    """What of the filter's state is not finite; None where all is.
+def broken(estimator: Estimator) -> str:
+    """What of the filter's state is not finite, in words, where `first_not_finite` finds it.
 
     An update carries a covariance that is none to its diagonal.
     """
     what = first_not_finite(estimator.nav, estimator.xi, estimator.covariance)
-    return None if what < 0 else f"{_STATE[what]} not finite"
+    return f"{_STATE[what]} not finite"
 
 
 class FailedAids:

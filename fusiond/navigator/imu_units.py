@@ -42,6 +42,7 @@ RMS_S = 10.0
 # second a bend changes it by more than its noise; changes of 30 deg in all show the factor of 57.
 COURSE_SPEED_M_S = 3.0
 COURSE_STEP_NS = (900_000_000, 2_100_000_000)
+NEVER_NS = -(1 << 62)
 LEAST_TURN_RAD = math.radians(30.0)
 DEGREES_RANGE = (10.0, 300.0)
 # Rates that fit the course: what its noise and a bias of some deg/s make of a factor of one.
@@ -82,18 +83,20 @@ class CourseTurns:
 
     def __init__(self) -> None:
         self._last: tuple[int, float] | None = None
+        self.next_ns = NEVER_NS
+        """Before then no velocity says more."""
         self._product = self._square = self._turn = 0.0
 
     def fix(self, t_ns: int, v_ned: tuple[float, ...], turned: Callable[[int, int], float]) -> None:
         """A velocity (m/s) at an instant, in order; `turned(a, b)` (rad) is the gyro's between two
         instants, NaN where it is not known."""
         last = self._last
-        if last is not None and t_ns - last[0] < COURSE_STEP_NS[0]:
+        if t_ns < self.next_ns:
             return
         if not COURSE_SPEED_M_S <= math.hypot(*v_ned[:2]) < math.inf:
             return
         course = math.atan2(v_ned[1], v_ned[0])
-        self._last = t_ns, course
+        self._last, self.next_ns = (t_ns, course), t_ns + COURSE_STEP_NS[0]
         if last is None:
             return
         last_ns, before = last
@@ -203,6 +206,8 @@ class RateUnits:
         turns = self._turns.get(m.source)
         if turns is None:
             turns = self._turns[m.source] = CourseTurns()
+        if t_ns < turns.next_ns:
+            return
         turns.fix(t_ns, m.v_ned_m_s[:2], lambda a, b: _turned(imu, a, b))
         if turns.decided:
             self._tell(turns.said())

@@ -18,6 +18,7 @@ from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise
 from fusiond.estimators.base import Estimator
+from fusiond.estimators.finite import first_not_finite
 from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.catalogue import SENSOR, Kind
 from fusiond.models.model import Model
@@ -43,7 +44,7 @@ from fusiond.navigator.imu_door import ImuDoor
 from fusiond.navigator.imu_units import RateUnits
 from fusiond.navigator.intake import Intake
 from fusiond.navigator.intake.gnss import told_by_operator
-from fusiond.navigator.protection import ProtectionWatch
+from fusiond.navigator.protection import NO_BOUND, ProtectionWatch
 from fusiond.navigator.readout import publish_by_own_clock, solution_of
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
@@ -255,7 +256,9 @@ class Navigator:
             self._event("aligned", reason("heading_from", how=start.how))
         self.timeline.run(record)
         self.verdicts.tell()
-        if (what := broken(self.estimator)) is not None:
+        e = self.estimator
+        if first_not_finite(e.nav, e.xi, e.covariance) >= 0:
+            what = broken(e)
             self._event("filter_not_finite", f"{what}: aligning again")
             self.reset(what)
             return
@@ -273,8 +276,10 @@ class Navigator:
             self._event("warm_start_refused", f"{why}: aligning again")
             self.reset(why)
             return
-        self._protection.tell()
-        self._calibrate()
+        if self._protection.watches:
+            self._protection.tell()
+        if e.t_ns >= self.calibrating.due_ns or self.calibrating.turned:
+            self._calibrate()
 
     def _calibrate(self) -> None:
         """Look at the calibration; one that was taken up and proves wrong is given up."""
@@ -356,7 +361,7 @@ class Navigator:
         if self.started is None:
             return Solution(t_ns, mode, reason, bound=self._protection.unknown())
         gap_ns = round(self.config.imu.gap_s * 1e9)
-        bound = self._protection.bound()
+        bound = self._protection.bound() if self._protection.watches else NO_BOUND
         return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound)
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:

@@ -23,6 +23,10 @@ RETURN_NS = 5_000_000_000
 moves about its limit is one alarm. An alarm begins at once."""
 
 
+NO_BOUND = Bound(BoundState.OFF)
+"""Where no alert limit is configured."""
+
+
 class ProtectionWatch:
     """Levels of an estimator; nothing where no alert limit is configured.
 
@@ -39,6 +43,8 @@ class ProtectionWatch:
             from fusiond.navigator.levels import Levels  # noqa: PLC0415
 
             self._levels = Levels(config, estimator)
+        self.watches = self._levels is not None
+        """Whether there are levels."""
         self._event = on_event
         self._limits = options.horizontal_alert_limit_m, options.vertical_alert_limit_m
         self._beyond = False

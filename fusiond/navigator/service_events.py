@@ -31,7 +31,9 @@ class ServiceEvents:
             if finding.kind.corrected:
                 over = finding.kind.of == OVER
                 self._event("fault_over" if over else "sensor_fault", finding.text)
-        now = self._timeline.estimator.isolated | diagnosis.excluded
+        estimator, now = self._timeline.estimator, diagnosis.excluded
+        if estimator.isolates:
+            now = estimator.isolated | now
         for source, reason in now.items():
             if source not in self._out:
                 self._event("isolated", f"{source} is left out of the solution: {reason}")

@@ -79,9 +79,11 @@ class NavigationStatus:
         speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
         if speed > self._max_speed_m_s:
             return reason("too_fast", speed=speed)
+        if not diagnosis.positions_out:
+            return None
         if (device := diagnosis.contradicts) is not None:
             return reason("filter_disagrees", device=device)
-        if diagnosis.positions_out and not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
+        if not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
             return reason("nothing_in_service")
         return None
 

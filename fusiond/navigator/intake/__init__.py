@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from drivers.measurements import Measurement
+from drivers.measurements import DelayedFix, Measurement, PositionFix, UtcStamp
 from drivers.raw.messages import RawGnssEpoch
 from fusiond.aiding.base import Aid
 from fusiond.configuration.aiding import AnyAiding
@@ -77,9 +77,15 @@ class Intake:
                 refused = refusal(m, self._limits) or self._pace.refusal(m, t_ns)
                 if refused is not None:
                     return refused
-                self._sections.met(m)
-                found = kind.aids(m, self._sections, when)
-                if isinstance(found, str) or not self._sections.robust(m.source):
+                sections = self._sections
+                if isinstance(m, (PositionFix, DelayedFix)):
+                    sections.place = m.lat_rad, m.lon_rad
+                    if isinstance(m.stamp, UtcStamp):
+                        sections.utc_ns = m.stamp.utc_ns
+                found = kind.aids(m, sections, when)
+                if isinstance(found, str) or not sections.any_robust:
+                    return found
+                if not sections.robust(m.source):
                     return found
                 return [replace(aid, robust=True) for aid in found]
         return "not_an_aid"

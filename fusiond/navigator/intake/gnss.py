@@ -106,7 +106,8 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         least = least_d = FLOOR_M[m.quality]
     else:
         least, least_d = CODE_FLOOR_M, CODE_HEIGHT_FLOOR_M
-    (n, e, d), rounding, scale = _position_sd(m, o), m.rounding_sd_ned_m, o.sigma_scale
+    believed = stated if stated is not None and min(stated) >= SIGMA_M[0] else _by_dop(m, o)
+    (n, e, d), rounding, scale = believed, m.rounding_sd_ned_m, o.sigma_scale
     sd = (
         math.hypot(max(n * scale, least), rounding[0]),
         math.hypot(max(e * scale, least), rounding[1]),
@@ -173,10 +174,8 @@ def _by_phase(m: PositionFix, sections: Sections) -> bool:
     return stated < PHASE_SD_M and (m.source, m.quality) not in sections.by_code
 
 
-def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:
-    """What the receiver states, or the range error times DOP where it states nothing credible."""
-    if m.sd_ned_m is not None and min(m.sd_ned_m) >= SIGMA_M[0]:
-        return m.sd_ned_m
+def _by_dop(m: PositionFix, o: GnssAiding) -> Vector3:
+    """The range error times DOP, of a receiver that states nothing credible."""
     error = o.range_error_m * RANGE_FACTOR.get(m.quality, 1.0)
     horizontal = error * (m.hdop or ASSUMED_HDOP) / math.sqrt(2.0)
     return horizontal, horizontal, error * (m.vdop or ASSUMED_VDOP)
@@ -185,22 +184,14 @@ def _position_sd(m: PositionFix, o: GnssAiding) -> Vector3:
 def _velocity(m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssAiding) -> Motion:
     """North, east, and down where it is measured, and one sigma of each."""
     north, east, down = v_ned
-    sd_n, sd_e, sd_d = m.sd_v_ned_m_s or (None, None, None)
-    horizontal, rounding = o.velocity_sd_m_s, m.rounding_sd_v_m_s
-    sds = (
-        math.hypot(_speed_sd(sd_n, horizontal, o), rounding),
-        math.hypot(_speed_sd(sd_e, horizontal, o), rounding),
-    )
-    if down is None:
-        return (north, east), sds
-    sd_down = _speed_sd(sd_d, horizontal * VERTICAL_VELOCITY_FACTOR, o)
-    return (north, east, down), (*sds, math.hypot(sd_down, rounding))
-
-
-def _speed_sd(stated: float | None, default: float, o: GnssAiding) -> float:
-    """One axis: what the receiver states, or `default` where it states nothing credible."""
-    sd = default if stated is None or stated < LEAST_SPEED_SD_M_S else stated
-    return max(sd * o.sigma_scale, o.min_velocity_sd_m_s)
+    v = (north, east) if down is None else (north, east, down)
+    horizontal, rounding, sds = o.velocity_sd_m_s, m.rounding_sd_v_m_s, []
+    defaults = horizontal, horizontal, horizontal * VERTICAL_VELOCITY_FACTOR
+    for _, stated, default in zip(v, m.sd_v_ned_m_s or (None, None, None), defaults, strict=False):
+        # What the receiver states, or the default where it states nothing credible.
+        sd = default if stated is None or stated < LEAST_SPEED_SD_M_S else stated
+        sds.append(math.hypot(max(sd * o.sigma_scale, o.min_velocity_sd_m_s), rounding))
+    return v, tuple(sds)
 
 
 def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:

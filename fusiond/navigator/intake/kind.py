@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from drivers.immutable import immutable
-from drivers.measurements import DelayedFix, PositionFix, UtcStamp
 from fusiond.aiding.base import Aid
 from fusiond.aiding.wander import Wander
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
@@ -52,6 +51,8 @@ class Sections:
         """Of each receiver whose fixes share an error."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
+        self.any_robust = any(section.robust for section in aiding.values())
+        """Whether one wants large residuals to weigh less: by default none does."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
         self._made: dict[tuple[str, object], Any] = {}
@@ -67,13 +68,6 @@ class Sections:
         self._made.clear()
         for name in self.receivers.keys() & gates:
             self.receivers[name].gate = gates[name]
-
-    def met(self, m: object) -> None:
-        """A measurement has passed the door."""
-        if isinstance(m, (PositionFix, DelayedFix)):
-            self.place = m.lat_rad, m.lon_rad
-            if isinstance(m.stamp, UtcStamp):
-                self.utc_ns = m.stamp.utc_ns
 
     def of(self, source: str, kind: type[S]) -> S:
         """The source's own section, else the one named after the kind, else its defaults."""

@@ -93,13 +93,14 @@ def _place(
     nowhere = lat_rad == 0.0 == lon_rad
     if nowhere or not (within(lat_rad, LATITUDE_RAD) and within(lon_rad, LONGITUDE_RAD)):
         return _finite((lat_rad, lon_rad)) or "position_implausible"
-    if height_m is None:
+    # Within limits is nothing that is not finite.
+    if height_m is None or (limits is not None and within(height_m, limits.height_m)):
         return None
     return _finite((height_m,)) if limits is None else _height(height_m, limits)
 
 
 def _height(height_m: float, limits: Plausibility) -> str | None:
-    if within(height_m, limits.height_m):  # which what is not finite is not
+    if within(height_m, limits.height_m):
         return None
     return _finite((height_m,)) or "height_implausible"
 
