@@ -1,4 +1,4 @@
-"""How a federated filter is set up, and which aids belong to which of its local filters."""
+"""Options of a federated filter, and which aids belong to which of its local filters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Mode = Literal["no_reset", "fusion_reset", "zero_reset", "rescale"]
 
 @immutable()
 class FederatedOptions:
-    """How a federated filter shares, resets and isolates.
+    """Options for sharing, reset and isolation of a federated filter.
 
     `shares`: relative factors by local filter, equal where there is none. `master_share` is the
     part of process noise and initial information of the master's own estimate in `rescale`,
@@ -30,8 +30,8 @@ class FederatedOptions:
 
 
 def local_of(source: str, names: tuple[str, ...]) -> int | None:
-    """Which of the local filters `names` an aid's source belongs to: the filter of that name, else
-    the longest one that it begins with (`gnss_velocity` to `gnss`); None: common to all."""
+    """Local filter among `names` of a source: the filter of that name, else the longest one that it
+    begins with (`gnss_velocity` to `gnss`); None: common to all."""
     if source in names:
         return names.index(source)
     begun = [name for name in names if source.startswith(f"{name}_")]
