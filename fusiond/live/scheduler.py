@@ -37,7 +37,7 @@ class Every:
         self._next_ns = 0
 
     def due(self, t_ns: int) -> bool:
-        """Whether a period has passed; those missed altogether are not made up for."""
+        """True if a period has passed; those missed altogether are not made up for."""
         behind_ns = t_ns - self._next_ns
         if behind_ns < 0:
             return False
@@ -98,7 +98,7 @@ class _Collector:
         self.max_ns = 0
 
     def start(self) -> None:
-        """What start-up made lives for ever: move it out of the collector's sight."""
+        """Move the objects of the start-up out of the collector's sight."""
         gc.collect()
         gc.freeze()
         gc.disable()
