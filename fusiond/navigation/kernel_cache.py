@@ -57,7 +57,7 @@ _DIGEST_SIZE = hashlib.sha256().digest_size
 
 
 class KernelCache(NullCache):
-    """What a numba dispatcher asks for its one signature; `name` is the kernel's alone.
+    """Interface to numba's dispatcher for its one signature; `name` is the kernel's alone.
 
     `on_missing` is called before the kernel is compiled, since there is nothing sound.
     """
@@ -77,7 +77,7 @@ class KernelCache(NullCache):
         return str(self._folder)
 
     def load_overload(self, _signature: object, target: Any) -> Any:
-        """What was compiled for this processor, or None where there is nothing sound."""
+        """Compiled code for this processor, or None where there is nothing sound."""
         found = self.linked(target)
         if found is None:
             self._on_missing()
@@ -138,7 +138,8 @@ def _processor(codegen: Any) -> tuple[str, str, str]:
 
 
 def _kept(made: Any) -> tuple[Any, ...]:
-    """What a file holds, the arguments of `_linked`: of what numba keeps that which a kernel needs.
+    """Contents of a file, the arguments of `_linked`: of what numba keeps that which a kernel
+    needs.
 
     The bitcode, most of it, is read when another kernel is compiled. Environments are what
     `_environment` takes, the kernel's own first: numba would import a dozen modules of its
@@ -195,7 +196,7 @@ def _linked(
     initialisers: Any,
     environments: list[tuple[str, list[Any], str]],
 ) -> Any:
-    """What `CompileResult._rebuild` makes of the same."""
+    """Inverse of `CompileResult._rebuild`."""
     for initialise in initialisers:
         initialise()
     codegen = target.codegen()
