@@ -1,1 +1,1 @@
-"""What speaks to a device: bytes and frames in, measurements out. Imports nothing of fusiond."""
+"""Drivers: bytes and frames in, measurements out. Imports nothing of fusiond."""

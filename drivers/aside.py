@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 async def aside(call: Callable[[], T], discard: Callable[[T], None]) -> T:
-    """What `call` returns or raises. `discard` gets what comes after this was cancelled."""
+    """Result of `call`. `discard` gets what comes after this was cancelled."""
     loop = asyncio.get_running_loop()
     outcome: asyncio.Future[T] = loop.create_future()
 

@@ -1,4 +1,4 @@
-"""What every driver is: a name, options, counters, a state, and one coroutine.
+"""Interface of a driver: a name, options, counters, a state, and one coroutine.
 
 A driver runs until it is cancelled. It opens its device, reopens it with backoff when it goes away,
 and hands over measurements and events by calling `emit`; it never raises for what a device does.
@@ -45,7 +45,7 @@ class DriverOptions(BaseModel):
 
 @dataclass(slots=True)
 class DriverStatus:
-    """What `health` says of a device: its state and why it is so, in one sentence.
+    """State of a device for `health`: its state and why it is so, in one sentence.
 
     `starting` not yet tried; `absent` the port or bus cannot be opened; `silent` open but nothing
     intelligible for the driver's time-out; `running`; `failed` permanently.

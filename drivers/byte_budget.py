@@ -1,4 +1,4 @@
-"""How many bytes of a line are parsed in a while: as many as a receiver sends, whoever sends them.
+"""Budget of bytes parsed of a line: as many as a receiver sends, whoever sends them.
 
     a bucket of BURST bytes, filled at the line's rate; each byte read takes one out of it
 

@@ -1,4 +1,4 @@
-"""Which messages make an epoch, and when its last one has come: no I/O, no clock.
+"""Epochs of messages, and their ends: no I/O, no clock.
 
 An epoch is closed by a message of another instant, by one that repeats, by its last one, or by
 silence. Which one is the last is learned: the same cycle seen twice in a row.
@@ -34,17 +34,17 @@ class Cycle:
 
     @property
     def open(self) -> bool:
-        """Whether an epoch has begun."""
+        """True if an epoch has begun."""
         return bool(self._names)
 
     def begins_anew(self, key: Hashable, name: Name) -> bool:
-        """Whether a message belongs to another epoch than the one that is open."""
+        """True if a message belongs to another epoch than the one that is open."""
         if not self._names:
             return False
         return key != self._key or name in self._names or len(self._names) >= MAX_CYCLE
 
     def late(self, key: Hashable, name: Name) -> bool:
-        """Whether a message is of the epoch that was closed just now: what was learned is too
+        """True if a message is of the epoch that was closed just now: what was learned is too
         short. One that this epoch had is none: the receiver repeats itself."""
         if self._names or not self._at_once or key != self._key or name in self._last:
             return False

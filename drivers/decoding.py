@@ -1,4 +1,4 @@
-"""What any decoder of a GNSS receiver may be told."""
+"""Options of any GNSS decoder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ BUILD_DATE = date(2026, 11, 20)
 
 
 class SolutionDecoding(DriverOptions):
-    """How a receiver's own solutions are taken."""
+    """Options for a receiver's own solutions."""
 
     heading_offset_deg: float = 0.0
     """Added to headings: from the antenna baseline to the vehicle's forward axis, clockwise."""

@@ -35,7 +35,7 @@ class Inputs:
         self.heard: Callable[[str, int, bytes | str | CanFrame | None], None] | None = None
 
     def on(self, kind: str, handler: Handler) -> None:
-        """Who handles the inputs of a kind."""
+        """Register the handler of a kind of input."""
         self._handlers[kind] = handler
 
     def now_ns(self) -> int:

@@ -191,8 +191,8 @@ class Heading:
 
 @immutable()
 class MagneticHeading:
-    """What a compass says: heading of the body's forward axis from magnetic north (rad, clockwise),
-    with whatever deviation the vehicle's own iron and currents make."""
+    """Magnetic heading of a compass: heading of the body's forward axis from magnetic north (rad,
+    clockwise), with whatever deviation the vehicle's own iron and currents make."""
 
     source: str
     t_seen_ns: int

@@ -39,7 +39,7 @@ _EXAMPLES = "tcp://HOST:PORT, udp://:PORT or gpsd://HOST:2947"
 
 
 def on_network(port: str) -> bool:
-    """Whether a `port` is no serial device but an address."""
+    """True if a `port` is no serial device but an address."""
     return "://" in port
 
 
@@ -102,7 +102,7 @@ def connect(host: str, number: int) -> socket.socket:
 
 
 class _SocketPort:
-    """What TCP and UDP have in common: no rate, and a name that stands for nothing else."""
+    """Common part of TCP and UDP: no rate, and a name that stands for nothing else."""
 
     def __init__(self, opened: socket.socket) -> None:
         opened.setblocking(False)

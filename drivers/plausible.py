@@ -1,4 +1,4 @@
-"""What no receiver on a vehicle can mean: ranges that a number of a device is held against.
+"""Plausible ranges of measurements on a vehicle: ranges that a number of a device is held against.
 
 A sentence or frame whose check is right can still hold any number: a receiver that restarts, a line
 that was edited, a decoder of somebody else's. What lies outside is refused by the counter's name.
@@ -21,5 +21,5 @@ LEAP_SECONDS = (10, 30)
 
 
 def within(value: float, limits: tuple[float, float]) -> bool:
-    """Whether `value` lies in the range; not a number lies in none."""
+    """True if `value` lies in the range; not a number lies in none."""
     return limits[0] <= value <= limits[1]

@@ -1,4 +1,4 @@
-"""What a line is read from and written to: an open port that never blocks, and the serial one."""
+"""Ports: an open port that never blocks, and the serial one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ READ_BYTES = 1024
 parsing, so that a device that floods leaves every other task its turn."""
 
 OPEN_ERRORS = (OSError, ValueError, OverflowError, termios.error)
-"""What opening raises for a port that is absent, locked, no terminal, or refuses the baud rate
+"""Exceptions of opening a port that is absent, locked, no terminal, or refuses the baud rate
 (SerialException is an OSError), and for a host that cannot be reached."""
 
 
@@ -26,23 +26,23 @@ class Port(Protocol):
     it is broken."""
 
     at_end: str
-    """What it means that `read` gave no bytes, in words."""
+    """Meaning of a read without bytes, in words."""
 
     @property
     def writable(self) -> bool:
-        """Whether there is anybody to write to."""
+        """True if there is anybody to write to."""
 
     def fileno(self) -> int:
         """The descriptor that a loop waits for."""
 
     def read(self) -> bytes:
-        """What is waiting; no bytes at the end of the stream."""
+        """Waiting bytes; no bytes at the end of the stream."""
 
     def write(self, data: bytes | bytearray) -> int:
-        """How many bytes were taken."""
+        """Number of bytes taken."""
 
     def changed(self) -> str:
-        """Why this is no longer what its name stands for; empty while it is."""
+        """Reason why this is no longer what its name stands for; empty while it is."""
 
     def set_baud(self, baud: int) -> None:
         """Change the rate, where there is one."""

@@ -1,4 +1,4 @@
-"""What the drivers of GNSS receivers and compasses share: one on one line, read and judged.
+"""Common part of receiver and compass drivers: one on one line, read and judged.
 
 A decoder makes measurements of bytes; this hands them over, ends an epoch when the line falls
 silent, and says in `status` whether the device is there and intelligible.
@@ -38,7 +38,7 @@ class ReceiverDecoder(Protocol):
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
+        """True if `silence` would close an epoch."""
 
     def feed(self, data: bytes, t_seen_ns: int) -> Sequence[Measurement | RawEvent]: ...
 
@@ -48,7 +48,7 @@ class ReceiverDecoder(Protocol):
 
 
 class ReceiverOptions(DriverOptions):
-    """Where the receiver is, and what is written to it."""
+    """Port of the receiver, and what is written to it."""
 
     port: PortName
     """A serial device, or an address of a network: see `docs/network.md`."""
@@ -101,22 +101,22 @@ class ReceiverDriver:
             )
         self._silence: asyncio.TimerHandle | None = None
         self._alive_ns = now_ns()
-        """When the line opened or something on it last verified."""
+        """Instant when the line opened or something on it last verified."""
         self._window: dict[str, int] = {}
         """Counters at that instant: what came since and was not understood."""
         self._useful_ns = self._alive_ns
-        """When the line opened or a measurement was last handed over."""
+        """Instant when the line opened or a measurement was last handed over."""
 
     def _make_decoder(self) -> ReceiverDecoder:
         """The decoder, which counts in `self.counters`."""
         raise NotImplementedError
 
     def _useless_detail(self) -> str:
-        """Why what arrives has brought no measurement for the time-out."""
+        """Reason why what arrives has brought no measurement for the time-out."""
         raise NotImplementedError
 
     def _unintelligible_detail(self) -> str:
-        """Why the bytes that arrive are not what this driver reads."""
+        """Reason why the bytes that arrive are not what this driver reads."""
         raise NotImplementedError
 
     def _where_to_look(self) -> str:
@@ -216,7 +216,7 @@ class ReceiverDriver:
             self._emit(state_event(self.name, self._now_ns(), self._port, self.status))
 
     def _since_alive(self, name: str) -> int:
-        """What a counter of bytes, sentences or frames grew by since the device last made sense."""
+        """Growth of a counter of bytes, sentences or frames since the device last made sense."""
         return self.counters[name] - self._window.get(name, 0)
 
     def _running_detail(self) -> str:

@@ -1,4 +1,4 @@
-r"""What is known of a quantity that a device has rounded to its steps.
+r"""Distribution of a quantity that a device has rounded to its steps.
 
     to the nearest   x in value + q [-1/2, 1/2]    mean value             sd q / sqrt(12)
     downwards        x in value + q [0, 1]         mean value + q / 2     sd q / sqrt(12)

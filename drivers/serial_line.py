@@ -21,7 +21,7 @@ __all__ = ["PENDING_WRITE_BYTES", "READ_BYTES", "SerialLine"]
 PENDING_WRITE_BYTES = 4096
 """Most bytes that may wait for a slow line: 2 s of 19200 baud, the slowest terminal."""
 PATH_CHECK_S = 1.0
-"""How often the path is compared with the open device, for replugs the descriptor cannot see."""
+"""Interval of comparing the path with the open device, for replugs the descriptor cannot see."""
 
 
 class SerialLine:
@@ -52,7 +52,7 @@ class SerialLine:
         self._pending = bytearray()
         self._budget = ByteBudget(baud)
         self._unread: tuple[bytes, int] = b"", 0
-        """What is left of a read, and when it was found."""
+        """Rest of a read, and when it was found."""
         self._resume: asyncio.Handle | None = None
 
     @property

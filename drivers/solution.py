@@ -76,7 +76,7 @@ def day_of(utc_ns: int) -> date:
 
 
 class SolutionJudge:
-    """What solutions come to, in their order.
+    """Judge of solutions, in their order.
 
     Counts `epochs`, `fixes`, the names of `REFUSALS`, and within a fix `sigma_too_small`,
     `height_not_measured`, `velocity_not_finite`; of headings `headings`, `heading_implausible`.
@@ -85,7 +85,7 @@ class SolutionJudge:
     def __init__(self, source: str, decoding: SolutionDecoding, counters: Counter[str]) -> None:
         self.counters = counters
         self.refusal = ""
-        """Why the last epoch was refused, by counter name; empty when it was not."""
+        """Reason why the last epoch was refused, by counter name; empty when it was not."""
         self.gga = b""
         """The last fix as a GGA, for a caster that asks where the receiver is; empty before one."""
         self._source = source

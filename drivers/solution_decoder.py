@@ -1,4 +1,4 @@
-"""What the decoders `ubx`, `bestpos` and `sbf` share: messages of bytes, epochs of messages.
+"""Common part of the decoders `ubx`, `bestpos` and `sbf`: messages of bytes, epochs of messages.
 
 An epoch is closed as `drivers.cycle` finds, and judged by `drivers.solution`. No I/O, no clock.
 """
@@ -43,7 +43,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @property
     def refusal(self) -> str:
-        """Why the last epoch gave no fix, by counter name."""
+        """Reason why the last epoch gave no fix, by counter name."""
         return self._judge.refusal
 
     @property
@@ -53,7 +53,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
+        """True if `silence` would close an epoch."""
         return self._epoch is not None
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
@@ -84,7 +84,7 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @abstractmethod
     def _make_splitter(self) -> Splitter[Message]:
-        """What finds messages; it counts in `self.counters`."""
+        """Splitter; it counts in `self.counters`."""
 
     @abstractmethod
     def _take(self, message: Message, found: list[Measurement]) -> None:
@@ -92,12 +92,12 @@ class SolutionDecoder(ABC, Generic[Message, Epoch]):
 
     @abstractmethod
     def _solution(self, epoch: Epoch) -> Solution | None:
-        """What a closed epoch says; None where it has no position to judge."""
+        """Solution of a closed epoch; None where it has no position to judge."""
 
     # ----------------------------------------------------------------- epochs
 
     def _belongs(self, key: Hashable, name: Name, found: list[Measurement]) -> bool:
-        """Whether a message of instant `key` goes into the epoch that is open, or a new one; what
+        """True if a message of instant `key` goes into the epoch that is open, or a new one; what
         it closes is `found`."""
         if self._cycle.begins_anew(key, name):
             self._close(found, learn=True)

@@ -1,4 +1,5 @@
-"""What the drivers `ubx`, `bestpos` and `sbf` share: a receiver whose own solutions are read."""
+"""Common part of the drivers `ubx`, `bestpos` and `sbf`: a receiver whose own solutions are
+read."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from drivers.receiver import ReceiverDriver, ReceiverOptions
 from drivers.solution import REFUSALS
 
 KEPT_BYTES = 4096
-"""What is looked at for its protocol: an epoch or two of anything."""
+"""Bytes searched for the protocol: an epoch or two of anything."""
 
 
 class SolutionOptions(ReceiverOptions, SolutionDecoding):
@@ -29,9 +30,9 @@ class SolutionDriver(ReceiverDriver):
     kind: ClassVar[str]
     """The driver's name."""
     wanted: ClassVar[str]
-    """What verifies, as in "bytes arrive, but no ... verifies"."""
+    """Name of what verifies, as in "bytes arrive, but no ... verifies"."""
     switch_on: ClassVar[str]
-    """What to do where nothing that arrives has a position."""
+    """Advice where nothing that arrives has a position."""
 
     def __init__(
         self, name: str, options: SolutionOptions, emit: Emit, now_ns: Now = monotonic_ns
@@ -54,7 +55,8 @@ class SolutionDriver(ReceiverDriver):
 
     @property
     def cause(self) -> str:
-        """What the line carries instead, as a sentence; "" where nothing that arrives tells."""
+        """Text on another protocol on the line, as a sentence; "" where nothing that arrives
+        tells."""
         if not self._foreign:
             return ""
         counters = Counter[str]()

@@ -1,4 +1,4 @@
-"""What splitters of byte streams share: any pieces in, verified messages out, memory bounded."""
+"""Common part of byte stream splitters: any pieces in, verified messages out, memory bounded."""
 
 from __future__ import annotations
 

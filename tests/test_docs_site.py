@@ -43,3 +43,10 @@ def test_every_page_is_in_the_navigation_and_every_picture_is_drawn() -> None:
     drawn = {path.stem for path in (REPOSITORY / "docs" / "figures").glob("*.png")}
     shown = set(re.findall(r"figures/([\w-]+)\.png", (REPOSITORY / "docs/papers.md").read_text()))
     assert drawn == shown == set(RUNS)
+
+
+def test_every_page_opens_with_whom_it_is_for() -> None:
+    """The first paragraph below the title; index.md is a table of that."""
+    pages = [path for path in (REPOSITORY / "docs").glob("*.md") if path.name != "index.md"]
+    second = {path.name: path.read_text(encoding="utf-8").split("\n\n")[1] for path in pages}
+    assert [name for name, text in second.items() if not text.startswith("For ")] == []

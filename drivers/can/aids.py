@@ -24,7 +24,7 @@ NAN = math.nan
 
 
 class CanAidOptions(CanOptions):
-    """What the two have in common."""
+    """Common part of the two."""
 
     valid: str | Signals = ()
     """Flags: a measurement with 0 in one is counted as `not_valid` and goes no further."""
@@ -33,7 +33,7 @@ class CanAidOptions(CanOptions):
 
 
 class CanAttitudeOptions(CanAidOptions):
-    """Which signals are roll, pitch and yaw (NED to body, 3-2-1), and one sigma of each.
+    """Signals of roll, pitch and yaw (NED to body, 3-2-1), and one sigma of each.
 
     "" for an angle that the device does not measure, or whose sigma it does not say.
     """
@@ -43,7 +43,7 @@ class CanAttitudeOptions(CanAidOptions):
 
 
 class CanBearingOptions(CanAidOptions):
-    """Which signals are the direction to a point, and which number names the point.
+    """Signals of the direction to a point, and which number names the point.
 
     Azimuth runs from the sensor's x (nominally forward) to its y (right), elevation is positive
     upwards.

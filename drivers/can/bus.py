@@ -31,7 +31,7 @@ FRAMES_PER_WAKEUP = 64
 RING_FRAMES = 1024
 """Most frames a thread may hold for the loop: 1.7 s of an IMU of 600 frames/s."""
 CHECK_S = 1.0
-"""How often the kernel is asked how many frames it dropped for want of room in the socket."""
+"""Interval of reading the kernel's drop count for want of room in the socket."""
 LONGEST_WAIT_S = 1.0
 """Longest wait between attempts to open: trying costs three system calls, so try often."""
 

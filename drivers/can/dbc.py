@@ -130,7 +130,7 @@ class Stamp:
 
 @dataclass(slots=True)
 class Part:
-    """What one frame contributes: values by slot (IMU: 0..2 gyro, 3..5 accelerometer), stamps."""
+    """Values of one frame: values by slot (IMU: 0..2 gyro, 3..5 accelerometer), stamps."""
 
     values: list[tuple[int, float]]
     counter: int | None
@@ -139,7 +139,7 @@ class Part:
 
 @dataclass(slots=True)
 class MessagePlan:
-    """What is taken out of one message; `paired`: its frames wait for those of other messages."""
+    """Signals of one message; `paired`: its frames wait for those of other messages."""
 
     message: Message
     paired: bool = False

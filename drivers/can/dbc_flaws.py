@@ -1,4 +1,4 @@
-"""What can be read of a DBC file that as a whole cannot: messages one by one, the others by name.
+"""Readable part of a damaged DBC file: messages one by one, the others by name.
 
 Of public files one in six has a flaw somewhere: an identifier of 29 bits without the mark of one
 (bit 31), a name that begins with a digit, a comma for a decimal point, a comment without its
@@ -82,7 +82,7 @@ class _Unit:
     own: list[tuple[str | None, str]] = field(default_factory=list)
     """Statements, with the signal that each is of."""
     marked: bool = False
-    """Whether the mark of an extended frame was put to its identifier."""
+    """True if the mark of an extended frame was put to its identifier."""
 
     def mark(self, can_id: str) -> None:
         """Put the mark of an extended frame to it, where no standard frame can have it."""
@@ -113,7 +113,7 @@ class _Unit:
         return [name for name, mark in marks if len(mark) > 1]
 
     def _marks(self) -> list[tuple[str, str]]:
-        """What stands behind each name: M, m and a number, or nothing."""
+        """Suffix behind each name: M, m and a number, or nothing."""
         found = ((name, _SIGNAL.match(line)) for name, line in self.signals.items())
         return [(name, (m["mux"] or "") if m is not None else "") for name, m in found]
 
@@ -146,7 +146,7 @@ def sound_part(text: str) -> SoundPart:
 
 
 def unselected(text: str) -> bool:
-    """Whether a signal of the file shares its bits with others, and none selects one of them.
+    """True if a signal of the file shares its bits with others, and none selects one of them.
 
     cantools reads such a one as if it were there in every frame.
     """

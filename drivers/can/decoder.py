@@ -43,7 +43,7 @@ class Find(Protocol):
 
 
 class CanOptions(BusOptions):
-    """Which bus, which DBC, and what gives the time."""
+    """Bus, DBC and source of time."""
 
     dbc: str
     """Path of a DBC file, or the name of a shipped one such as "sbg_ellipse"."""
@@ -64,7 +64,7 @@ class CanOptions(BusOptions):
 O = TypeVar("O", bound=CanOptions)  # noqa: E741
 
 HELD_NS = 1_000_000_000
-"""How long a held value counts: gears and directions are sent at 1 Hz or faster, and in less than a
+"""Lifetime of a held value: gears and directions are sent at 1 Hz or faster, and in less than a
 second no vehicle stops and drives the other way."""
 
 
@@ -100,13 +100,13 @@ class CanDecoder(ABC, Generic[O]):
 
     @property
     def device_restarts(self) -> int:
-        """How often the device's clock began anew."""
+        """Number of restarts of the device's clock."""
         time = self._pairing.device_time
         return time.restarts if time is not None else 0
 
     @property
     def filters(self) -> list[CanFilter]:
-        """What the bus must let through."""
+        """Filters of the bus."""
         filters: list[CanFilter] = []
         for plan in self.plans:
             frame_id, extended = plan.message.frame_id, plan.message.is_extended_frame
@@ -214,7 +214,8 @@ class CanDecoder(ABC, Generic[O]):
     def _measurements(
         self, values: list[float], t_seen_ns: int, stamp: Stamp
     ) -> Sequence[Measurement]:
-        """What a complete set of values (by slot) says; none, counted, where it says nothing."""
+        """Measurements of a complete set of values (by slot); none, counted, where it says
+        nothing."""
 
 
 def names_of(signals: str | Signals | None) -> Signals:

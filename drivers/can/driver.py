@@ -1,4 +1,4 @@
-"""What every driver of a device on a CAN bus has: a bus, a codec, stamps, states, events.
+"""Base of CAN drivers: a bus, a codec, stamps, states, events.
 
 The codec of most is a `drivers.can.decoder.CanDecoder`, which a DBC file describes. Each driver
 opens the bus for itself, so several share one channel; the kernel gives each the frames it filters
@@ -52,7 +52,7 @@ CONTROLLER_EVENTS: dict[ControllerState, tuple[str, str]] = {
 
 
 class BusOptions(DriverOptions):
-    """Which bus, and what gives the time."""
+    """Bus and source of time."""
 
     interface: Interface = "socketcan"
     channel: str = "can0"
@@ -80,11 +80,11 @@ class Codec(Protocol):
 
     @property
     def filters(self) -> list[CanFilter]:
-        """What the bus must let through."""
+        """Filters of the bus."""
 
     @property
     def device_restarts(self) -> int:
-        """How often the device's clock began anew."""
+        """Number of restarts of the device's clock."""
 
     def take_missing(self) -> list[str]:
         """Wanted messages not received since this was asked last, such as "0x121 IMU_ACCEL"."""

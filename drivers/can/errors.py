@@ -1,4 +1,4 @@
-"""What error frames tell of a CAN controller: Linux `include/uapi/linux/can/error.h`."""
+"""Error frames of a CAN controller: Linux `include/uapi/linux/can/error.h`."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ Triple = tuple[str, str, str]
 
 
 class CanGnssOptions(CanOptions):
-    """Which signals are what. A signal is "Message.Signal"; all messages but those of `quality` and
+    """Signals of a receiver. A signal is "Message.Signal"; all messages but those of `quality` and
     `satellites` alone must come at the rate of the fixes."""
 
     lat: str
@@ -253,8 +253,8 @@ class CanGnssDecoder(CanDecoder[CanGnssOptions]):
         )
 
     def _position_sd(self, values: list[float]) -> Vector3 | None:
-        """What the receiver states; without a vertical sigma twice the horizontal one, as the
-        geometry of satellites above the horizon makes it (GPS SPS Performance Standard, 2020)."""
+        """Stated sigma; without a vertical sigma twice the horizontal one, as the geometry of
+        satellites above the horizon makes it (GPS SPS Performance Standard, 2020)."""
         level = self._value("horizontal_accuracy", values)
         if not level:
             return None

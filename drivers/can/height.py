@@ -24,7 +24,7 @@ _ACCURACY, _FLAGS = 1, 2
 
 
 class CanHeightOptions(CanOptions):
-    """Which signal is a height, or the pressure of the air around. A signal is "Message.Signal"."""
+    """Signal of a height, or the pressure of the air around. A signal is "Message.Signal"."""
 
     height: str | None = None
     """Metres or feet. Of a barometer's own, say `barometric`."""

@@ -16,7 +16,7 @@ Triad = tuple[AxisSource, AxisSource, AxisSource]
 
 
 class CanImuOptions(CanOptions):
-    """Which bus, which DBC, and which signals are the axes x, y, z of the sensor.
+    """Bus, DBC and signals of the axes x, y, z of the sensor.
 
     An axis is "Message.Signal", with a leading "-" to turn its sign, or a number for an axis that
     the device does not measure (rad/s or m/s^2).

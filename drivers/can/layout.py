@@ -1,4 +1,4 @@
-"""Where the signals of a message lie in its frames, worked out once: bits of one whole number.
+"""Layout of a message's signals in its frames, worked out once: bits of one whole number.
 
 A frame's data is one number N, little-endian for Intel's signals and big-endian for Motorola's. A
 signal of n bits is
@@ -87,8 +87,8 @@ class Layout:
         return numbers
 
     def _as_struct(self) -> struct.Struct | None:
-        """What takes the wanted signals out at once; None where they are not whole bytes of one
-        byte order, one after the other."""
+        """Reader of the wanted signals at once; None where they are not whole bytes of one byte
+        order, one after the other."""
         places = [self._place(bits) for bits in self._wanted]
         apart = all(before[1] <= after[0] for before, after in pairwise(places))
         whole = all(b.shift % 8 == 0 and b.mask.bit_length() in _CODES for b in self._wanted)

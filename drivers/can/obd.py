@@ -51,17 +51,17 @@ MOST_RATE_HZ = 20.0
 
 
 class ObdSpeedOptions(BusOptions):
-    """Which bus, which identifiers, and whether to ask."""
+    """Bus, identifiers, and whether to ask."""
 
     identifiers: Literal[11, 29] = 11
     """Bits of the identifiers, as the vehicle uses them."""
     unit: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Which unit's answer counts: the last digits of its identifier, 0xE8 for 7E8 or xx of
+    """Identifier of the unit that counts: the last digits of its identifier, 0xE8 for 7E8 or xx of
     18DAF1xx. Without it the first that answers, until it falls silent."""
     ask_hz: Annotated[float, Field(ge=0.0, le=MOST_RATE_HZ)] = 0.0
-    """How often to ask; 0 only listens to the answers that another tester gets."""
+    """Request interval; 0 only listens to the answers that another tester gets."""
     rounding: Rounding = "unknown"
-    """How the vehicle makes whole km/h: no standard says, and the data sheet seldom."""
+    """Rounding of the vehicle to whole km/h: no standard says, and the data sheet seldom."""
     accuracy_m_s: NonNegativeFloat = 0.0
     """One sigma of the speed beside the rounding, where known."""
     timeout_s: PositiveFloat = 3.0

@@ -62,7 +62,7 @@ class _Last:
 
 @dataclass(slots=True)
 class _Losses:
-    """What the last sample handed out leaves for counting losses."""
+    """State for counting losses."""
 
     at_ns: int | None = None
     counter: int | None = None

@@ -39,7 +39,7 @@ _STEERING, _DIRECTION, _ACCURACY, _FLAGS = 4, 5, 6, 7
 
 
 class CanWheelOptions(CanOptions):
-    """Which signals are the speeds of which wheels. A signal is "Message.Signal"."""
+    """Signals of wheel speeds. A signal is "Message.Signal"."""
 
     wheels: Signals = ()
     """Wheels that do not steer: their mean is the speed at the middle of their axle. Of an axle

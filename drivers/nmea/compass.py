@@ -27,12 +27,12 @@ FORMATTERS = ("HDG", "HDM", "HDT")
 
 
 class CompassDecoding(DriverOptions):
-    """What the decoder may be told."""
+    """Options of the decoder."""
 
     heading_offset_deg: float = Field(0.0, ge=-360.0, le=360.0)
     """Added to every heading: from the compass's lubber line to the forward axis, clockwise."""
     latency_s: NonNegativeFloat = 0.1
-    """How old a heading is when it comes: half of a damping of 0.2 s."""
+    """Latency of a heading: half of a damping of 0.2 s."""
 
 
 class CompassOptions(ReceiverOptions, CompassDecoding):

@@ -1,4 +1,4 @@
-"""Which sentences a receiver makes an epoch of, and where it pauses inside one: learned.
+"""Learned order of a receiver's sentences and pauses in an epoch.
 
 Two epochs in a row of the same sentences in the same order are a *cycle*: from then on its last
 sentence ends an epoch at once. A silence ends an epoch too, but where the receiver has gone on with
@@ -16,7 +16,7 @@ Formatters = tuple[str, ...]
 
 
 class Cycle:
-    """What the epochs of one receiver have shown."""
+    """Learned order of one receiver's epochs."""
 
     def __init__(self) -> None:
         self.last: Formatters = ()
@@ -26,11 +26,11 @@ class Cycle:
         self._pauses: set[Formatters] = set()
 
     def whole(self, so_far: Sequence[str]) -> bool:
-        """Whether an epoch of these sentences is one to which nothing comes."""
+        """True if an epoch of these sentences is one to which nothing comes."""
         return tuple(so_far) == self._whole
 
     def pauses(self, so_far: Sequence[str]) -> bool:
-        """Whether the receiver has paused here and then gone on with the same epoch."""
+        """True if the receiver has paused here and then gone on with the same epoch."""
         return tuple(so_far) in self._pauses
 
     def ended(self, sentences: Sequence[str], *, learn: bool) -> None:

@@ -66,7 +66,7 @@ Formatter = Literal["GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "ZDA", "HDT
 
 
 class NmeaDecoding(SolutionDecoding):
-    """What the decoder may be told."""
+    """Options of the decoder."""
 
     last_sentence: Formatter | None = None
     """The sentence that ends an epoch (one that is sent once an epoch); learned by default."""
@@ -92,7 +92,7 @@ class NmeaDecoder:
     ) -> None:
         self.counters: Counter[str] = Counter() if counters is None else counters
         self.refusal = ""
-        """Why the last epoch was refused, by counter name; empty when it was not."""
+        """Reason why the last epoch was refused, by counter name; empty when it was not."""
         self.gga = b""
         """The last GGA with a position, without its line end; empty before one."""
         self.heard = Heard()
@@ -109,7 +109,7 @@ class NmeaDecoder:
         self._closed: Epoch | None = None
         """The epoch before."""
         self._closed_by = ""
-        """What closed it: `last` sentence, `silence`, or what came then."""
+        """Closing event: `last` sentence, `silence`, or what came then."""
         self._without_gga = 0
         """Epochs with RMC or GLL in a row that had neither GGA nor GNS."""
 
@@ -120,14 +120,15 @@ class NmeaDecoder:
 
     @property
     def cause(self) -> str:
-        """Why there is no fix, as a sentence; "" where bytes say nothing of why none verifies."""
+        """Reason why there is no fix, as a sentence; "" where bytes say nothing of why none
+        verifies."""
         if not self.counters["sentences"]:
             return nothing_verified(self.counters, self._splitter.unread)
         return no_fix(self.counters, self.heard, self.refusal)
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
+        """True if `silence` would close an epoch."""
         return self._epoch is not None
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Measurement]:
@@ -231,14 +232,14 @@ class NmeaDecoder:
             self._close(found, learn=False, by="last")
 
     def _of_epoch(self, epoch: Epoch, time_ns: int, sentence: Sentence) -> bool:
-        """Whether a sentence with a time is of an epoch, by that alone."""
+        """True if a sentence with a time is of an epoch, by that alone."""
         if epoch.time_of_day_ns is None:
             return True
         step_ns = time_step_ns(sentence)
         return one_time(epoch.time_of_day_ns, epoch.time_step_ns, time_ns, step_ns)
 
     def _told_already(self, time_ns: int, sentence: Sentence) -> bool:
-        """Whether the place at this instant came by a sentence that says more: many a burst ends
+        """True if the place at this instant came by a sentence that says more: many a burst ends
         with GLL, behind all GSV, and the epoch would wait for it."""
         epoch = self._epoch if self._epoch is not None else self._closed
         if epoch is None or epoch.time_of_day_ns is None or FULLER.isdisjoint(epoch.cycle):
@@ -246,7 +247,7 @@ class NmeaDecoder:
         return self._of_epoch(epoch, time_ns, sentence)
 
     def _belongs_before(self, epoch: Epoch, t_seen_ns: int) -> bool:
-        """Whether what has no time of its own came sooner after the epoch that a silence closed
+        """True if what has no time of its own came sooner after the epoch that a silence closed
         than before the one that begins now."""
         closed = self._closed
         if closed is None or self._closed_by != "silence" or not _is_tail(epoch):
@@ -313,7 +314,7 @@ class NmeaDecoder:
             found.append(Heading(self._source, epoch.t_seen_ns, stamp, yaw))
 
     def _refusal(self, epoch: Epoch) -> str | None:
-        """Why this epoch gives no position; None when it does, or was never to give one."""
+        """Reason why this epoch gives no position; None when it does, or was never to give one."""
         if epoch.quality == 6 or "E" in epoch.modes:
             return "dead_reckoning_refused"
         if not self._decoding.allow_simulator:
@@ -404,5 +405,5 @@ class NmeaDecoder:
 
 
 def _is_tail(epoch: Epoch) -> bool:
-    """Whether it has nothing but sentences that have no time and belong to another epoch."""
+    """True if it has nothing but sentences that have no time and belong to another epoch."""
     return epoch.time_of_day_ns is None and _TIMELESS.issuperset(epoch.cycle)

@@ -37,7 +37,7 @@ class NmeaDriver(ReceiverDriver):
 
     @property
     def cause(self) -> str:
-        """Why there is no fix, as a sentence; "" where nothing that arrives tells."""
+        """Reason why there is no fix, as a sentence; "" where nothing that arrives tells."""
         return self._nmea.cause if self.counters["bytes_in"] else ""
 
     @property

@@ -80,13 +80,14 @@ class BadFieldError(ValueError):
 
 @dataclass(slots=True)
 class Epoch:
-    """What the sentences of one instant said; None where none did. Degrees as printed, SI else."""
+    """Contents of the sentences of one instant; None where none did. Degrees as printed, SI
+    else."""
 
     time_of_day_ns: int | None = None
     time_step_ns: int = 0
     """Of its last digit."""
     t_seen_ns: int = 0
-    """When the last sentence that counts came in."""
+    """Instant when the last sentence that counts came in."""
     cycle: list[str] = field(default_factory=list)
     """Formatters in the order they came."""
     addresses: set[str] = field(default_factory=set)
@@ -100,7 +101,7 @@ class Epoch:
     plain: Printed | None = None
     """The place in RMC or GLL, which say nothing of its quality but a mode."""
     by_plain: str = ""
-    """Whose place and quality are the epoch's where there is neither GGA nor GNS: RMC or GLL."""
+    """Source of place and quality where there is neither GGA nor GNS: RMC or GLL."""
     place: Printed | None = None
     altitude_m: float | None = None
     height_step_m: float = 0.0
@@ -116,7 +117,7 @@ class Epoch:
     hdop: float | None = None
     vdop: float | None = None
     nav_modes: set[int] = field(default_factory=set)
-    """What GSA says: 1 no fix, 2 two-dimensional, 3 three-dimensional."""
+    """Fix mode of GSA: 1 no fix, 2 two-dimensional, 3 three-dimensional."""
     sd_ned_m: Vector3 | None = None
     """As printed; `implausible` judges it."""
     speed_m_s: float | None = None
@@ -146,7 +147,7 @@ class Epoch:
 
     @property
     def plain_valid(self) -> bool | None:
-        """What RMC, or else GLL, says of place and time; None where neither does."""
+        """Place and time of RMC, or else GLL; None where neither does."""
         return self.gll_valid if self.rmc_valid is None else self.rmc_valid
 
     def take_plain(self) -> None:
@@ -161,7 +162,7 @@ class Epoch:
 
     @property
     def two_dimensional(self) -> bool:
-        """Whether the height is none that was measured: GSA says so, and may be right."""
+        """True if the height is none that was measured: GSA says so, and may be right."""
         if 2 not in self.nav_modes or 3 in self.nav_modes:
             return False
         return max(self.counted, len(self.listed)) < OVERDETERMINED or self.vdop is None

@@ -44,8 +44,8 @@ _START = re.compile(
     rb"|\xd3(?:\Z|[\x00-\x03](?:.{0,2}\Z|." + _RTCM_NUMBER + rb"))",
     re.DOTALL,
 )
-"""What a sentence or a frame may begin with, or what ends before that can be told. All else is
-passed over here, a stream of 0xD3 twelve times as fast as by a look at each byte."""
+"""Prefixes of a sentence or frame, or of what ends too early. All else is passed over here, a
+stream of 0xD3 twelve times as fast as by a look at each byte."""
 _NOT_BODY = re.compile(rb"[^\x20-\x23\x25-\x29\x2b-\x7e]")  # anything but text, and $ and *
 _WHOLE = re.compile(rb"\$([\x20-\x23\x25-\x29\x2b-\x7e]{1,252})\*([0-9A-Fa-f]{2})")
 _ADDRESS = re.compile(r"[A-Z][A-Z0-9]{2,9}\Z")
@@ -77,7 +77,7 @@ class Sentence:
 
 
 def is_rdss_sentence(sentence: Sentence) -> bool:
-    """Whether this belongs to a BeiDou RDSS terminal, not to a GNSS receiver.
+    """True if this belongs to a BeiDou RDSS terminal, not to a GNSS receiver.
 
     The one clash is BDZDA. The RDSS form has 11 fields, the first a mode of one digit; the NMEA
     form has 6, the first a time of at least 6.
@@ -239,14 +239,15 @@ class StreamSplitter(Splitter[Item]):
 
 
 class _WholeSentences:
-    """Where in a growing buffer whole sentences verify; what was searched is not searched again."""
+    """Positions of verified sentences in a growing buffer; what was searched is not searched
+    again."""
 
     def __init__(self) -> None:
         self._found: deque[tuple[int, int]] = deque()
         self._searched = 0
 
     def inside(self, buffer: bytearray, start: int, end: int) -> bool:
-        """Whether one stands in start..end, as far as that has come."""
+        """True if one stands in start..end, as far as that has come."""
         self._search(buffer)
         found = self._found
         while found and found[0][0] < start:
@@ -299,7 +300,7 @@ class NmeaSplitter:
 
 
 def _verifies(raw: bytes) -> bool:
-    """Whether `$`...`*hh` carries the XOR of what stands between `$` and `*`."""
+    """True if `$`...`*hh` carries the XOR of what stands between `$` and `*`."""
     return b"%02X" % reduce(xor, raw[1:-3], 0) == raw[-2:].upper()
 
 

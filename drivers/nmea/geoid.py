@@ -1,4 +1,4 @@
-"""How high the geoid is above the ellipsoid, where a receiver does not say it.
+"""Geoid height above the ellipsoid, where a receiver does not say it.
 
     h = H + N      h above the ellipsoid, H above the sea (GGA's altitude), N the geoid's height
 
@@ -22,7 +22,7 @@ EARTH_M = 6_371_000.0
 
 
 class Geoid:
-    """What one receiver has said of the geoid."""
+    """Geoid separation of one receiver."""
 
     def __init__(self) -> None:
         self._known: tuple[float, float, float] | None = None

@@ -1,4 +1,4 @@
-"""Which protocol bytes are of that are not NMEA, UBX or RTCM 3: named, not read.
+"""Detection of protocols other than NMEA, UBX or RTCM 3: named, not read.
 
 A name is given where two messages in it verify, by their checksum where it is cheap, else by what
 must stand at their end. Sources: u-blox, Septentrio (SBF reference guide), NovAtel OEM7 and Unicore
@@ -26,7 +26,8 @@ _BARE = re.compile(rb"(?:^|[\r\n])[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG),[^\r\n$]*[
 
 
 def _framed(sync: bytes, whole: Callable[[bytes, int], int]) -> Callable[[bytes], int]:
-    """How many messages behind `sync` verify: `whole(data, at)` is the length of one, 0 of none."""
+    """Number of messages behind `sync` that verify: `whole(data, at)` is the length of one, 0 of
+    none."""
 
     def count(data: bytes) -> int:
         at, found, tries = data.find(sync), 0, 0
@@ -142,7 +143,7 @@ _KNOWN: tuple[tuple[str, Callable[[bytes], int], str], ...] = (
 
 
 def named(data: bytes) -> str:
-    """What these bytes are and what would do, as a sentence; "" where nobody knows them."""
+    """Text on the protocol of these bytes, as a sentence; "" where nobody knows them."""
     for name, count, remedy in _KNOWN:
         if count(data) >= FEWEST:
             return f"{name} arrives, which is not read here: {remedy}"

@@ -1,4 +1,5 @@
-"""Why a receiver's bytes give no fix, or a poorer one than they could: one sentence each."""
+"""Reasons why a receiver's bytes give no fix, or a poorer one than they could: one sentence
+each."""
 
 from __future__ import annotations
 
@@ -46,7 +47,8 @@ OWN_SENTENCES = {
     "GPFPD": "inertial systems: their own solution",
     "GTIMU": "inertial systems",
 }
-"""Whose own sentences, by their beginning, in which receivers tell place or attitude."""
+"""Owners of proprietary sentences, by their beginning, in which receivers tell place or
+attitude."""
 MOST_NAMES = 8
 """Talkers and formatters that are remembered; the first ones are enough to name."""
 ROLLOVER = timedelta(weeks=1024)
@@ -64,7 +66,7 @@ CHECKSUMS = (
 
 @dataclass(slots=True)
 class Heard:
-    """What a decoder has heard that it does not use, beside its counters."""
+    """Received items that a decoder does not use, beside its counters."""
 
     talkers: Counter[str] = field(default_factory=Counter)
     """Of sentences with a position."""
@@ -84,7 +86,7 @@ def note(names: Counter[str], name: str) -> None:
 
 
 def wrong_checksums(counters: Counter[str]) -> str:
-    """Why no sentence verifies, where it is for their checksums; "" where it is not."""
+    """Reason why no sentence verifies, where it is for their checksums; "" where it is not."""
     if counters["checksum_missing"] >= MANY > counters["sentences"]:
         return f"NMEA {CHECKSUMS}"
     if counters["checksum_bad"] >= MANY > counters["sentences"]:
@@ -96,7 +98,7 @@ def wrong_checksums(counters: Counter[str]) -> str:
 
 
 def nothing_verified(counters: Counter[str], unread: bytes) -> str:
-    """Why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
+    """Reason why bytes arrive and no sentence verifies; "" where it may be the baud rate."""
     if wrong := wrong_checksums(counters):
         return wrong
     if counters["ubx_frames"]:
@@ -110,7 +112,8 @@ def nothing_verified(counters: Counter[str], unread: bytes) -> str:
 
 
 def no_fix(counters: Counter[str], heard: Heard, refusal: str) -> str:
-    """Why sentences arrive and no fix comes of them. `refusal`: why the last epoch was refused."""
+    """Reason why sentences arrive and no fix comes of them. `refusal`: why the last epoch was
+    refused."""
     if refusal:
         return REFUSALS.get(refusal, refusal)
     if heard.talkers and not POSITIONS & set(heard.used):

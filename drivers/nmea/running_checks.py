@@ -100,7 +100,7 @@ class RunningFletcher:
         """End of the last stretch refused."""
 
     def holds(self, buffer: bytearray, start: int, end: int) -> bool:
-        """Whether the last two bytes of start..end are the sums of the others."""
+        """True if the last two bytes of start..end are the sums of the others."""
         if start >= self._refused:
             self.taken += end - start
             covered = buffer[start : end - 2]
@@ -141,7 +141,7 @@ class RunningCrc24q:
         self._crc = [0]
 
     def holds(self, buffer: bytearray, start: int, end: int) -> bool:
-        """Whether start..end (LONGEST_RTCM bytes at most) ends with its CRC."""
+        """True if start..end (LONGEST_RTCM bytes at most) ends with its CRC."""
         known = len(self._crc) - 1
         if end > known:
             more = accumulate(buffer[known:end], _next_crc, initial=self._crc[-1])

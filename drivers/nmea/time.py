@@ -30,7 +30,7 @@ LATEST = date(2099, 12, 31)
 """No two-digit year of RMC can say more."""
 
 _TIME_AT = {**dict.fromkeys(("GSA", "VTG", "HDT", "THS"), -1), "GLL": 4}
-"""Which field is the time, where it is not the first; -1: none."""
+"""Field of the time, where it is not the first; -1: none."""
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d{1,9}))?\Z")
 _EPOCH_ORDINAL = date(1970, 1, 1).toordinal()
 
@@ -51,7 +51,7 @@ def parse_time_of_day(text: str) -> int | None:
 
 
 def one_time(a_ns: int, a_step_ns: int, b_ns: int, b_step_ns: int) -> bool:
-    """Whether two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
+    """True if two printed times are one: receivers cut the same to 0, 1, 2 or 3 decimals, or round
     it to two."""
     if a_step_ns == b_step_ns:
         return a_ns == b_ns
@@ -123,7 +123,7 @@ class EpochOrder:
         self._backward: list[int] = []
 
     def accept(self, day: date | None, time_of_day_ns: int) -> bool:
-        """Whether this epoch is later than every one before it."""
+        """True if this epoch is later than every one before it."""
         if self._last is not None:
             step = _step_ns(self._last, (day, time_of_day_ns))
             if step == 0:
@@ -167,7 +167,7 @@ class TimeTrust:
         self._even = 0
 
     def report(self, utc_ns: int, t_seen_ns: int, *, valid: bool) -> bool | None:
-        """Whether this time is to be trusted; None when it was reported already."""
+        """True if this time is to be trusted; None when it was reported already."""
         if self._last is not None:
             step, elapsed = utc_ns - self._last[0], t_seen_ns - self._last[1]
             if step == 0 and elapsed < STEP_TOLERANCE_NS:

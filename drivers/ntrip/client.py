@@ -98,7 +98,7 @@ def _reach(host: str, port: int, tls: bool) -> tuple[socket, ssl.SSLContext | No
 
 
 def _without_tls(error: ssl.SSLError) -> str:
-    """Why no connection with TLS came about, and what would do."""
+    """Reason why no connection with TLS came about, and what would do."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return (
             f"its certificate is not accepted: {error.verify_message} (an authority of your own: "
@@ -131,7 +131,7 @@ class NtripClient:
     ) -> None:
         self.state: NtripState = "starting"
         self.detail = ""
-        """Why there are no corrections; empty while they come."""
+        """Reason why there are no corrections; empty while they come."""
         self._options = options
         self._counters = counters
         self._write = write

@@ -22,7 +22,7 @@ class CasterRefusedError(Exception):
 
 
 def request(host: str, port: int, mountpoint: str, user: str, password: str) -> bytes:
-    """What asks for a mountpoint; a caster that knows 1.0 alone overlooks what it does not know."""
+    """Request for a mountpoint; a caster that knows 1.0 alone overlooks what it does not know."""
     lines = [
         f"GET /{mountpoint} HTTP/1.1",
         f"Host: {host}:{port}",
@@ -45,11 +45,11 @@ class CasterReply:
     def __init__(self) -> None:
         self.accepted = False
         self.over: EOFError | CasterRefusedError | None = None
-        """Why no more corrections follow on those that came: the caster ended them, or its chunks
-        make no sense."""
+        """Reason why no more corrections follow on those that came: the caster ended them, or its
+        chunks make no sense."""
         self._buffer = bytearray()
         self._sought = 0
-        """Where the end of the head may begin: not before."""
+        """Earliest end of the head: not before."""
         self._chunked = False
         self._left = 0
         """Bytes of the chunk that have not come, its closing CR LF included."""
@@ -109,13 +109,13 @@ class CasterReply:
 
 
 def _size(line: bytes) -> int | None:
-    """What a chunk's first line says; None where that is no size."""
+    """Size in a chunk's first line; None where that is no size."""
     digits = line.partition(b";")[0].strip()
     return int(digits, 16) if _HEXADECIMAL.fullmatch(digits) else None
 
 
 def _judge(first: str, head: bytes) -> None:
-    """Whether corrections follow on a head that begins with the line `first`."""
+    """True if corrections follow on a head that begins with the line `first`."""
     protocol, _, status = first.partition(" ")
     code = status.partition(" ")[0]
     if protocol != "ICY" and not protocol.startswith("HTTP/1."):

@@ -117,8 +117,8 @@ class Bcnav1Decoder:
         self._healthy: bool | None = None
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this subframe completes: an ephemeris as soon as both 2 and 3 have been heard, and
-        the ionosphere of 3. RefusedError by name."""
+        """Result of a subframe: an ephemeris as soon as both 2 and 3 have been heard, and the
+        ionosphere of 3. RefusedError by name."""
         number = SUBFRAMES.get(len(subframe.words))
         if number is None:
             raise RefusedError("subframe_short")
@@ -165,7 +165,7 @@ class Bcnav2Decoder:
         self._parts: dict[int, Bits] = {}
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this message completes. RefusedError by name, `ephemeris_mixed` among them."""
+        """Result of a message. RefusedError by name, `ephemeris_mixed` among them."""
         if len(subframe.words) < 9:
             raise RefusedError("subframe_short")
         bits = _checked(subframe.words[:9], _MESSAGE)

@@ -54,7 +54,7 @@ class D1Decoder:
         self._parts = Parts()
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this subframe completes. RefusedError by name, `ephemeris_mixed` among them."""
+        """Result of a subframe. RefusedError by name, `ephemeris_mixed` among them."""
         bits = information(subframe.words, WORDS)
         number = subframe_number(bits)
         if number not in (1, 2, 3):

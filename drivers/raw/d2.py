@@ -61,7 +61,7 @@ class D2Decoder:
         self._parts = Parts()
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this subframe completes. RefusedError by name, `ephemeris_mixed` among them."""
+        """Result of a subframe. RefusedError by name, `ephemeris_mixed` among them."""
         bits = information(subframe.words, PAGE_WORDS)
         if subframe_number(bits) != 1:
             return []

@@ -118,7 +118,7 @@ class RawDecoder:
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `flush_epoch` would end an epoch of MSM."""
+        """True if `flush_epoch` would end an epoch of MSM."""
         return self._rtcm is not None and self._rtcm.epoch_open
 
     def flush_epoch(self) -> list[RawEvent]:
@@ -130,7 +130,7 @@ class RawDecoder:
         self._weeks.note_utc(utc, self.leap_seconds)
 
     def take(self, frame: Frame, t_seen_ns: int) -> list[RawEvent]:
-        """What a frame that `StreamSplitter` verified completes."""
+        """Result of a frame that `StreamSplitter` verified."""
         if frame.kind == "rtcm":
             if self._rtcm is not None:
                 return self._rtcm.take(frame.raw, t_seen_ns)

@@ -87,7 +87,7 @@ class GnssDecoder:
 
     @property
     def refusal(self) -> str:
-        """Why the last epoch of NMEA, or else of UBX-NAV, gave no fix, by counter name."""
+        """Reason why the last epoch of NMEA, or else of UBX-NAV, gave no fix, by counter name."""
         return self._nmea.refusal or self._ubx.refusal
 
     @property
@@ -97,12 +97,12 @@ class GnssDecoder:
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch."""
+        """True if `silence` would close an epoch."""
         raw = self._raw is not None and self._raw.epoch_open
         return self._nmea.epoch_open or self._ubx.epoch_open or raw
 
     def feed(self, data: bytes, t_seen_ns: int) -> list[Found]:
-        """What `data`, seen at `t_seen_ns`, completes."""
+        """Result of `data`, seen at `t_seen_ns`."""
         self._t_seen_ns = t_seen_ns
         found: list[Found] = []
         for item in self._splitter.feed(data):
@@ -148,7 +148,7 @@ class GnssDecoder:
             found.append(measurement)
 
     def _own_fix(self, fix: PositionFix) -> bool:
-        """Whether a fix by NMEA is handed over."""
+        """True if a fix by NMEA is handed over."""
         if not self._use_nmea_fix:
             return False
         if self._ubx_fix_ns is not None and self._t_seen_ns - self._ubx_fix_ns < UBX_FIX_NS:
@@ -174,7 +174,7 @@ class GnssDecoder:
             found.append(measurement)
 
     def _already(self, fix: PositionFix) -> bool:
-        """Whether NMEA has told this very fix: the first one, where its sentences come first."""
+        """True if NMEA has told this very fix: the first one, where its sentences come first."""
         last, self._nmea_fix = self._nmea_fix, None
         if last is None or not isinstance(fix.stamp, UtcStamp):
             return False
@@ -208,7 +208,7 @@ class GnssDecoder:
             found.append(TimeReport(self._source, epoch.t_seen_ns, utc_ns, trusted))
 
     def _told_by_nmea(self, utc_ns: int) -> bool:
-        """Whether RMC or ZDA have told the time lately, or may yet."""
+        """True if RMC or ZDA have told the time lately, or may yet."""
         if self._nmea_told_ns is None:
             self._nmea_told_ns = utc_ns
         return abs(utc_ns - self._nmea_told_ns) < NMEA_TIME_NS
@@ -277,6 +277,7 @@ class GnssDriver(ReceiverDriver):
 
     @property
     def cause(self) -> str:
-        """Why nothing on the line verifies, as a sentence; "" where nothing that arrives tells."""
+        """Reason why nothing on the line verifies, as a sentence; "" where nothing that arrives
+        tells."""
         alive = any(self.counters[name] for name in self.alive_by)
         return "" if alive else wrong_checksums(self.counters)

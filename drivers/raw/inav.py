@@ -83,7 +83,7 @@ class InavDecoder:
         self._parts = Parts()
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this page completes. RefusedError by name, `ephemeris_mixed` among them."""
+        """Result of a page of I/NAV. RefusedError by name, `ephemeris_mixed` among them."""
         bits = data_word(subframe.words)
         kind = bits.unsigned(0, 6)
         parts = self._parts

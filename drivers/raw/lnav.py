@@ -102,7 +102,7 @@ class LnavDecoder:
         self._parts: dict[int, Bits] = {}
 
     def take(self, subframe: Subframe, weeks: WeekReference) -> Decoded:
-        """What this subframe completes. RefusedError by name, `ephemeris_mixed` among them."""
+        """Result of a subframe. RefusedError by name, `ephemeris_mixed` among them."""
         bits = subframe_bits(subframe.words)
         number = bits.unsigned(43, 3)
         if number == 4 and bits.unsigned(50, 6) == IONOSPHERE_PAGE:

@@ -1,4 +1,4 @@
-"""What a GNSS receiver's raw stream says: observations, broadcast ephemerides, ionosphere models.
+"""Raw messages of a GNSS receiver: observations, broadcast ephemerides, ionosphere models.
 
 Angles are rad, times s, lengths m; every field is in the unit that the orbit equations take, and
 semicircles, scale factors and week rollovers end in the decoders. Systems are the letters of
@@ -153,5 +153,5 @@ class Bdgim:
 
 
 NavigationMessage = Ephemeris | Klobuchar | Bdgim
-"""What satellites say of orbits, clocks and the ionosphere: valid at no one instant."""
+"""Navigation messages of orbits, clocks and the ionosphere: valid at no one instant."""
 RawEvent = RawGnssEpoch | NavigationMessage

@@ -60,7 +60,7 @@ _ORBIT = (
 
 
 class Broadcast(NamedTuple):
-    """What a satellite sent, and when (GPS time, s since 1980-01-06)."""
+    """Message of a satellite, and when (GPS time, s since 1980-01-06)."""
 
     gps_s: float
     message: NavigationMessage

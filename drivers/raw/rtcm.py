@@ -121,7 +121,7 @@ class RtcmDecoder:
 
     def __init__(self, source: str, weeks: WeekReference, counters: Counter[str]) -> None:
         self.leap_seconds: int | None = None
-        """What another message of the stream said."""
+        """Store another message of the stream."""
         self._source = source
         self._weeks = weeks
         self._counters = counters
@@ -133,11 +133,11 @@ class RtcmDecoder:
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `flush` would end an epoch."""
+        """True if `flush` would end an epoch."""
         return self._epoch is not None
 
     def take(self, frame: bytes, t_seen_ns: int) -> list[RawEvent]:
-        """What this frame completes."""
+        """Result of a frame."""
         bits = Bits.of_bytes(frame[3:-3])
         number = bits.unsigned(0, 12) if bits.length >= 12 else 0
         group, kind = divmod(number, 10)

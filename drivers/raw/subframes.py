@@ -15,8 +15,8 @@ from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, NavigationMessage,
 from drivers.raw.weeks import HALF_WEEK_S
 
 MAX_ECCENTRICITY = 0.5
-"""What the 32 bits of IS-GPS-200 table 20-III are said to hold at most (0.03); GPS and Galileo
-reserve the rest, Galileo's E14 and E18 have 0.17."""
+"""Largest eccentricity in the 32 bits of IS-GPS-200 table 20-III (0.03); GPS and Galileo reserve
+the rest, Galileo's E14 and E18 have 0.17."""
 SQRT_A_M = (4000.0, 7000.0)
 """Orbit radius 16,000 to 49,000 km: MEO is above 25,500 km, GEO and IGSO at 42,164 km."""
 
@@ -27,7 +27,7 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Subframe:
-    """What UBX-RXM-SFRBX carries: the words of one block of one signal of one satellite."""
+    """Contents of UBX-RXM-SFRBX: the words of one block of one signal of one satellite."""
 
     source: str
     t_seen_ns: int

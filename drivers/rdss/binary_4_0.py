@@ -130,7 +130,7 @@ def _text_kind(payload: bytes, code: bool) -> TextEncoding:
 
 
 def _odd_digits(bits: int, text: bytes, encoding: TextEncoding) -> bool:
-    """Whether a code ends with half a byte. FieldError where the length is not the text's."""
+    """True if a code ends with half a byte. FieldError where the length is not the text's."""
     if (bits + 7) // 8 != len(text):
         raise FieldError(f"{bits} bits of text in {len(text)} bytes")
     return encoding == "code" and 0 < bits % 8 <= 4

@@ -113,7 +113,7 @@ class MailReady:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """What an operator should know."""
+    """Notice for the operator."""
 
     code: str
     text: str
@@ -147,8 +147,8 @@ class TerminalOptions:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """What a feedback that refuses our request leads to. `notice` once, until a request is
-    accepted; after `retries` in a row the state is HOLDING."""
+    """Consequence of a rejected request. `notice` once, until a request is accepted; after
+    `retries` in a row the state is HOLDING."""
 
     counter: str
     state: State
@@ -198,6 +198,6 @@ DETAIL = {
     State.SUPPRESSED: "Suppressed by the RDSS centre; transmits again in {hold} s, or when lifted",
     State.SILENT: "Radio silence set at the terminal; lift it there",
 }
-"""What a state says of itself to an operator."""
+"""Texts of states for the operator."""
 READ_ONLY_DETAIL = "card {card}, {service} s: read only, no fix is requested; {beams}"
 """READY without the option `transmit`."""

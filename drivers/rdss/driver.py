@@ -86,7 +86,7 @@ class RdssOptions(DriverOptions):
     message_expiry_s: PositiveFloat = 3600.0
     """A message that could not be sent or confirmed for so long is given up."""
     message_carriage: Carriage = "binary"
-    """How reports, receipts and texts that ask for one are carried: `binary`, `ascii` where only
+    """Encoding of reports, receipts and texts that ask for one: `binary`, `ascii` where only
     printable characters pass, `bcd` where only digits do."""
     timeout_s: Annotated[float, Field(ge=20.0)] = 30.0
     """Nothing intelligible for this long: look again who is there. Reads go out every 10 s."""
@@ -170,7 +170,7 @@ class RdssDriver:
         self._terminal.height.hint(height_m, sd_m, t_ns, centre_sd_m)
 
     def pressure_hint(self, pressure_pa: float, t_ns: int) -> None:
-        """What the vehicle's own barometer measures."""
+        """Pressure of the vehicle's own barometer."""
         self._terminal.height.pressure(pressure_pa, t_ns)
 
     def request_now(self, t_ns: int) -> str:
@@ -201,7 +201,7 @@ class RdssDriver:
 
     @property
     def inbox(self) -> Inbox:
-        """What is remembered of the messages that came, for whoever keeps it."""
+        """Inbox of messages that came, for whoever keeps it."""
         return self._terminal.inbox
 
     @property
@@ -212,7 +212,7 @@ class RdssDriver:
 
     @property
     def beams(self) -> BeamPower | None:
-        """What the terminal said of its beams last."""
+        """Last beams of the terminal."""
         return self._terminal.beams
 
     def _posted(self, t_ns: int) -> None:

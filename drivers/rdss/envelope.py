@@ -1,4 +1,5 @@
-"""What fusiond says to fusiond in a short message: an envelope with kind, version and check.
+"""Envelope of short messages between vehicles with fusiond: an envelope with kind, version and
+check.
 
     0    1  0xF8 + kind
     1    n  body
@@ -61,7 +62,7 @@ class Envelope(NamedTuple):
 
 
 class Receipted(NamedTuple):
-    """What a receipt names: the sender's number of the message, and the message's CRC."""
+    """Contents of a receipt: the sender's number of the message, and the message's CRC."""
 
     number: int
     crc: int
@@ -98,7 +99,7 @@ def receipt_body(receipted: Receipted) -> bytes:
 
 
 def read_receipt(body: bytes) -> Receipted:
-    """What a receipt names."""
+    """Contents of a receipt."""
     return Receipted(int.from_bytes(body[:2], "big"), int.from_bytes(body[2:], "big"))
 
 

@@ -1,4 +1,4 @@
-"""What both wire families share: how frames are found in a stream, and their checksum.
+"""Framing of both wire families: how frames are found in a stream, and their checksum.
 
 A frame begins with `$`, which may also occur inside one, so every failure advances one byte and
 looks for the next `$`: a good frame is found whatever stands before it.
@@ -93,7 +93,7 @@ class FrameDecoder(ABC):
         return messages
 
     def _judge(self, read: Callable[[], Message | None] | None, unknown: Unknown) -> Message | None:
-        """What a frame with a good checksum says, counted; `unknown` where nobody reads it."""
+        """Message of a verified frame, counted; `unknown` where nobody reads it."""
         try:
             message = read() if read is not None else None
         except ValueError:

@@ -1,4 +1,4 @@
-"""Which height goes into a position request."""
+"""Choice of the height in a position request."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Inbox:
         )
 
     def place(self, fix: Fix, t_ns: int) -> MailReady | None:
-        """Where another card is by the centre; None for a fix that names no other."""
+        """Position of another card by the centre; None for a fix that names no other."""
         own = self._session.identity
         card = fix.queried or fix.user
         if fix.kind == "own" or own is None or card in (0, own.user):

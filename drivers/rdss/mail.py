@@ -1,4 +1,4 @@
-"""What an RDSS driver hands over of short messages: those that came, and how those sent fare.
+"""Mail of an RDSS driver: those that came, and how those sent fare.
 
 It stands by itself: a daemon without a terminal loads no more than this.
 """
@@ -41,9 +41,9 @@ ENDS: frozenset[Stage] = frozenset(
     }
 )
 Fault = Literal["", "crc", "cut", "damaged", "version", "other_card"]
-"""What is wrong with a message that came: the terminal says that its CRC failed; an envelope of
-fusiond's is cut, damaged or of a later version; it is for another card. It is handed on all the
-same, as bytes."""
+"""Fault of a received message: the terminal says that its CRC failed; an envelope of fusiond's
+is cut, damaged or of a later version; it is for another card. It is handed on all the same, as
+bytes."""
 
 
 @immutable()
@@ -71,7 +71,7 @@ class MessageReceived:
 
 @immutable()
 class MessageStage:
-    """Where one of our messages is: `key` is its sender's name for it, `why` in words."""
+    """Stage of one of our messages: `key` is its sender's name for it, `why` in words."""
 
     source: str
     t_seen_ns: int
@@ -87,7 +87,7 @@ class MessageStage:
 
     @property
     def over(self) -> bool:
-        """Whether this is its end."""
+        """True if this is its end."""
         return self.stage in ENDS or (self.stage == "sent" and not self.wants_receipt)
 
 

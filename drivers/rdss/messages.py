@@ -1,4 +1,4 @@
-"""What an RDSS user terminal and its host say to each other, whichever wire family they use.
+"""Messages between RDSS terminal and host, whichever wire family they use.
 
 Both codecs (`binary_4_0`, `text_2_1`) decode to these classes and encode from them, in both
 directions. `user` is the card number in the frame's address field, 0 where the frame has none or
@@ -33,7 +33,7 @@ class FieldError(ValueError):
 
 
 class HeightMode(IntEnum):
-    """How the centre gets the height (4.0 DWSQ bits 3-2, 2.1 CCDWA field 3)."""
+    """Source of the height (4.0 DWSQ bits 3-2, 2.1 CCDWA field 3)."""
 
     GIVEN = 0
     NONE = 1
@@ -231,7 +231,7 @@ class DeviceClock:
 
 
 class Outcome(StrEnum):
-    """What a feedback says."""
+    """Contents of a feedback."""
 
     OK = "ok"
     FAILED = "failed"

@@ -51,7 +51,7 @@ BLOCKED = frozenset(
         *(Outcome.SUPPRESSED, Outcome.SILENCE, Outcome.SILENCE_OR_LIFTED, Outcome.NO_CARD),
     }
 )
-"""What passes by itself, or by somebody: no attempt."""
+"""Temporary refusals: they pass by themselves or by somebody; they are no attempt."""
 
 
 @dataclass(slots=True)
@@ -187,11 +187,11 @@ class Outbox:
 
     @property
     def next_ns(self) -> int | None:
-        """When something is due here by itself: a message, a receipt that did not come, an end."""
+        """Next instant of work: a message, a receipt that did not come, an end."""
         return min((min(m.not_before_ns, self._end_ns(m)) for m in self.waiting), default=None)
 
     def wording(self, message: Outgoing) -> Wording | None:
-        """How it is sent from this card; None, and its end, if it cannot be."""
+        """Wording for this card; None, and its end, if it cannot be."""
         most = level_bits(self.comm_level or 0)
         for wording in message.wordings:
             if wording.bits <= most:
@@ -306,7 +306,7 @@ class Outbox:
 
 
 class Turns:
-    """Whose turn a transmission is, where fixes and messages both wait: messages have `share`.
+    """Order of fixes and messageswhere both wait: messages have `share`.
 
     Stride scheduling (Waldspurger and Weihl, MIT/LCS/TM-528, 1995): each turn costs its class the
     inverse of its share, and the class that has spent less goes next. Who does not want turns does
@@ -319,7 +319,7 @@ class Turns:
 
     @property
     def message_first(self) -> bool:
-        """Where both wait, at equal cost the fix goes first."""
+        """True if the message goes first; at equal cost the fix does."""
         return self._spent["message"] < self._spent["fix"]
 
     def took(self, message: bool, other_waits: bool) -> None:

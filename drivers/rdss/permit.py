@@ -1,4 +1,4 @@
-"""When the terminal may transmit: the card's spacing, suppression, radio silence.
+"""Permission to transmit: the card's spacing, suppression, radio silence.
 
 Suppression (by the system) and silence (by the operator) are never lifted from here; what lifts
 them is noticed here.
@@ -109,14 +109,14 @@ class Pace:
 
     @property
     def free_ns(self) -> int:
-        """When the next transmission may be written."""
+        """Instant of the next permitted transmission."""
         if self.written_ns is None:
             return self._not_before_ns
         return max(self._not_before_ns, self.written_ns + self.spacing_ns)
 
     @property
     def due_ns(self) -> int:
-        """When the next request for a fix may be written."""
+        """Instant of the next permitted request for a fix."""
         if self.requested_ns is None or self.asap:
             return self.free_ns
         return max(self.free_ns, self.requested_ns + self._interval_ns)

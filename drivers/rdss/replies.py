@@ -1,4 +1,4 @@
-"""What a message from the terminal changes in the request cycle.
+"""Replies: effect of a message on the request cycle.
 
 Refusals lead where the table `REFUSALS` says; suppression, silence, a low battery and a missing
 card count whenever they are told. A fix counts once, for the last request written.
@@ -185,7 +185,7 @@ class Replies:
             self._on_refusal(feedback, t_ns, actions)
 
     def _on_message(self, feedback: Feedback, t_ns: int, actions: list[Action]) -> bool:
-        """Whether a feedback is for a message of ours, and what it changes."""
+        """True if a feedback is for a message of ours, and what it changes."""
         session = self._session
         awaited = session.state is State.AWAIT_MESSAGE
         outcome = feedback.outcome

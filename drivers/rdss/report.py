@@ -39,7 +39,8 @@ FULL_SIGMAS, SHORT_SIGMAS = 255, 14
 
 
 class PositionReport(NamedTuple):
-    """Where a vehicle is by its own solution; degrees, metres, one sigma. None: not known.
+    """Position report of a vehicle by its own solution; degrees, metres, one sigma. None: not
+    known.
 
     `t_s` is POSIX; of a short report, which has no date, the second of its day (`dated` is False).
     `sd_ned_m` of a short report is one figure for north and east.

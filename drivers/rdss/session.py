@@ -1,4 +1,4 @@
-"""What the request cycle knows of the terminal on the line, and the moves between its states.
+"""State of the terminal in the request cycle, and the moves between its states.
 
 `replies` changes it by what the terminal says, `terminal` by what is due.
 """
@@ -69,7 +69,7 @@ class Session:
 
     @property
     def blocked_until_ns(self) -> int | None:
-        """When HOLDING or SUPPRESSED ends by itself; None in any other state."""
+        """End of HOLDING or SUPPRESSED; None in any other state."""
         match self.state:
             case State.HOLDING:
                 return self.hold_until_ns

@@ -188,17 +188,17 @@ class Terminal:
 
     @property
     def inbox(self) -> Inbox:
-        """What is remembered of those that came."""
+        """Inbox of those that came."""
         return self._replies.inbox
 
     @property
     def beams(self) -> BeamPower | None:
-        """What was last read of the beams, with their levels."""
+        """Last reading of the beams, with their levels."""
         return self._session.beams_said
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """When `tick` has something to do; None while the line is closed."""
+        """Instant of the next `tick`; None while the line is closed."""
         session = self._session
         due = session.deadline_ns
         if session.state is State.READY:
@@ -214,7 +214,7 @@ class Terminal:
 
     @property
     def state(self) -> State:
-        """Where in the cycle it is; CLOSED at first."""
+        """State in the cycle; CLOSED at first."""
         return self._session.state
 
     @property
@@ -244,7 +244,7 @@ class Terminal:
 
     @property
     def detail(self) -> str:
-        """What it is doing, in words."""
+        """Present activity, in words."""
         session = self._session
         waiting = len(session.outbox.waiting)
         words = DETAIL[session.state]
@@ -423,4 +423,4 @@ _DUE: dict[State, Callable[[Terminal, int, list[Action]], None]] = {
     State.SUPPRESSED: Terminal._due_blocked,
     State.SILENT: Terminal._due_blocked,
 }
-"""What each state does when its deadline comes. CLOSED has none."""
+"""Action of each state at its deadline. CLOSED has none."""

@@ -32,7 +32,7 @@ class Wording(NamedTuple):
 
     @property
     def bits(self) -> int:
-        """What it takes of a card's allowance."""
+        """Size in a card's allowance."""
         if self.encoding == "chinese":
             return 7 * len(self.payload)
         return 8 * len(self.payload) - 4 * self.odd
@@ -68,7 +68,7 @@ def digits(text: str) -> Wording:
 
 
 def plain_text(wording: Wording) -> str | None:
-    """What a person reads; None for bytes that are no text. Control characters are left out."""
+    """Readable text; None for bytes that are no text. Control characters are left out."""
     if wording.encoding == "code":
         text = wording.payload.hex().upper()
         return text[:-1] if wording.odd else text

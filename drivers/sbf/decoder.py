@@ -87,7 +87,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
 
     @property
     def epoch_open(self) -> bool:
-        """Whether `silence` would close an epoch, or a heading."""
+        """True if `silence` would close an epoch, or a heading."""
         return super().epoch_open or self._heading is not None
 
     def _end(self, found: list[Measurement], *, learn: bool) -> None:
@@ -122,7 +122,7 @@ class SbfDecoder(SolutionDecoder[Block, _Epoch]):
                 self._tell_heading(math.radians(math.sqrt(variance)) if good else None, found)
 
     def _group(self, block: Block, when: tuple[int, int], found: list[Measurement]) -> bool:
-        """Whether a block is taken into an epoch."""
+        """True if a block is taken into an epoch."""
         if not self._belongs(when, block.number, found):
             return False
         epoch = self._epoch or _Epoch()

@@ -46,7 +46,7 @@ class UbxDecoder(SolutionDecoder[Item, NavEpoch]):
         return StreamSplitter(self.counters)
 
     def take(self, raw: bytes, t_seen_ns: int) -> list[Measurement]:
-        """What a UBX frame that `StreamSplitter` verified completes."""
+        """Result of a UBX frame that `StreamSplitter` verified."""
         self._t_seen_ns = t_seen_ns
         found: list[Measurement] = []
         self._frame(raw, found)

@@ -34,7 +34,7 @@ NO_DOP = 99.0
 
 @dataclass(slots=True)
 class NavEpoch:
-    """What the messages of one iTOW said; None where none did.
+    """Messages of one iTOW; None where none did.
 
     `rank`: of what the position is (SOL 1, POSLLH 2, PVT 3, HPPOSLLH 4), `utc_rank` of what the
     time is: the higher takes the place of the lower.

@@ -1,4 +1,4 @@
-r"""What every aid is: an innovation that is linear in the error state.
+r"""Interface of an aiding measurement: an innovation that is linear in the error state.
 
     z = h(x^) - y = H dx + v,   v ~ N(0, diag(r))
 
@@ -29,8 +29,8 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_SMOOTH_N, VE, VN
 Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 Feedback = Literal["at_once", "hold", "release"]
-"""When the error estimate is fed back into the navigation state: right after the aid; not before an
-aid says so; or now, all that was held."""
+"""Choice of when the error estimate is fed back into the navigation state: right after the aid; not
+before an aid says so; or now, all that was held."""
 LENT_ROWS = 3
 """Aids of so many rows at most write their innovations to what a filter lends them: nearly all."""
 
@@ -55,8 +55,8 @@ class Innovation(NamedTuple):
 
 
 class State(NamedTuple):
-    """What an aid may look at: navigation state (10,), parameters (n,), last step (28,), model, and
-    the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth).
+    """View of the filter for a measurement: navigation state (10,), parameters (n,), last step
+    (28,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth).
     `lent` is what a filter lends aids to write their innovations to, by the number of rows: it
     holds until the next innovation is asked for."""
 
@@ -137,7 +137,8 @@ class Aid:
 
     @property
     def device(self) -> str:
-        """What measured it: a device may send positions and velocities under names of their own."""
+        """Device that measured it: a device may send positions and velocities under names of their
+        own."""
         return self.source
 
     @property
@@ -152,7 +153,7 @@ class Aid:
 
     @property
     def feedback(self) -> Feedback:
-        """When the estimate that it leads to is fed back."""
+        """Choice of when the estimate is fed back."""
         return "at_once"
 
     def at(self, nav: Array) -> Aid:
@@ -171,11 +172,11 @@ class Aid:
         raise NotImplementedError
 
     def judged(self, codes: Sequence[int], whitened: Sequence[float]) -> None:
-        """How it ended, for a receiver that keeps count of its rows (fusiond.estimators.screening);
-        called again when a rewind brings it again."""
+        """Receive the outcome, for a receiver that keeps count of its rows
+        (fusiond.estimators.screening); called again when a rewind brings it again."""
 
     def offers(self) -> Sequence[Offer]:
-        """What alignment may start with."""
+        """Candidates for the start of alignment."""
         return ()
 
     def series(self, whitened: Sequence[float], kept: NDArray[np.bool_]) -> Mapping[str, Array]:
@@ -188,7 +189,7 @@ class Aid:
 
 
 class Linearised(Protocol):
-    """What an estimator knows of an aid."""
+    """Interface of a measurement to an estimator."""
 
     @property
     def screened(self) -> bool: ...

@@ -1,4 +1,5 @@
-r"""What an aid takes from the IMU: an acceleration, with the force's own errors, and a turn.
+r"""Preintegrated IMU data of a measurement: an acceleration, with the force's own errors, and a
+ turn.
 
     a = C f + g,   d a = [f x] phi + C e,   e = db + ds f       (computed minus true, body axes)
 

@@ -1,4 +1,4 @@
-"""What an aid can give a filter that has not started: position, velocity, speed, heading, height.
+"""Initialisation candidates of measurements: position, velocity, speed, heading, height.
 
 Alignment starts with these (fusiond.navigator.alignment). `sd` are one sigma, `lever` (3,) the way
 from the IMU to the point that was measured, body axes, m. `bias`, `time` and `rest` name the blocks

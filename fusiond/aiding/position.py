@@ -69,8 +69,8 @@ _UNKNOWN = np.zeros((0, 0))
 
 
 def wander_of(axis: int, wander_m: float, sd: Vector3) -> float:
-    """How many metres of an error that lasts for seconds there are along an axis: down as many more
-    as the fix's own sigmas (m) say that its errors are larger there."""
+    """Metres of an error that lasts for seconds along an axis: down as many more as the fix's own
+    sigmas (m) say that its errors are larger there."""
     return wander_m if axis < 2 else 2.0 * wander_m * sd[2] / (sd[0] + sd[1])
 
 

@@ -169,7 +169,7 @@ class Rest:
         return creeps
 
     def _turns(self, state: State, p: Array) -> bool:
-        """Whether an axis has turned in the window, or in the run of windows, by more than bias and
+        """True if an axis has turned in the window, or in the run of windows, by more than bias and
         noise make."""
         w, free = self.window, self.rate_sd_rad_s**2 + self.noise_sd_rad_s**2
         errors = _rate_error(state, np.array((w.mean_rate, w.run_rate))).tolist()

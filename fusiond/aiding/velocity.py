@@ -42,7 +42,7 @@ from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, STEP_RATE_B, STEP_SMOO
 Array = NDArray[np.float64]
 
 SUFFIX = "_velocity"
-"""What the name of a receiver's velocity adds to that of the receiver."""
+"""Suffix that a receiver's velocity adds to its name."""
 AVERAGED = 0.5
 """One sigma of what an average leaves of a velocity that changes within it, as a share of what its
 lag makes: of a change at once it is between nothing and all. With 0.5 what steps of stamps and

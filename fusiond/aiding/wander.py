@@ -1,4 +1,4 @@
-r"""How much the error of a receiver's fixes wanders within half a minute, as its velocities show.
+r"""Size of the Gauss-Markov error of fixes within half a minute, as its velocities show.
 
 Beside what fixes share for half an hour (orbits, ionosphere) and noise of their own, a receiver in
 a street has errors that last for ten seconds or a minute (multipath, satellites that come and go):
@@ -45,10 +45,9 @@ LASTS_S = 30.0
 """Correlation time of the state. Fixes were simulated with 10 to 20 s; it is what their lag shows
 that counts."""
 LAG_S, STEP_S = 20.0, 2.0
-"""What is compared lies so far apart; and so often."""
+"""Spacing of the fixes compared, and of comparisons."""
 ASSUMED = 0.5
-"""What part of the stated variance it is before fixes have shown it: a choice, as of those by
-phase."""
+"""Share of the stated variance before fixes have shown it: a choice, as of those by phase."""
 GAP_S = 2.5
 """Fixes farther apart than this leave too much of the way between them to two velocities."""
 FORGETS_S = 600.0

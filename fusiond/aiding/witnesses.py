@@ -1,4 +1,4 @@
-r"""What speaks for or against rest beside a quiet sensor: measured speeds, and quiet at speed.
+r"""Evidence for or against rest beside a quiet sensor: measured speeds, and quiet at speed.
 
     m = sum(v_k) / n,   s = max(sd / sqrt(n), s_0),   contradicts rest if m^2 / s^2 > chi2(0.999)
 
@@ -44,10 +44,10 @@ SMOOTH_WINDOWS, SMOOTH_NS = 3, 300_000_000_000
 
 
 class Measured(NamedTuple):
-    """What the measured speeds of a span say: whether they contradict rest, and the sigma (m/s) of
+    """Result of the measured speeds of a span: whether they contradict rest, and the sigma (m/s) of
     the best of their means (infinite: none was measured); whether `surely`, beyond what they may
-    drift by. What is claimed of rest asks for the first, what is asked of the gyros for the last:
-    a wheel that has drifted is no reason to believe a gyro."""
+    drift by. What is claimed of rest asks for the first, what is asked of the gyros for the last: a
+    wheel that has drifted is no reason to believe a gyro."""
 
     contradicts: bool
     sd: float
@@ -103,8 +103,8 @@ class Witnesses:
         self._speeds: defaultdict[str, list[_Speed]] = defaultdict(list)
         self._at_speed: list[int] = []
         self._told: dict[tuple[int, int], Measured] = {}
-        """What `measured` has said of spans, asked for at every tick and again by each rewind: of
-        those that no speed has come into since."""
+        """Results of `measured` by span, asked for at every tick and again by each rewind: of those
+        that no speed has come into since."""
         self._told_ns = 0
         """The latest end of them."""
         self._sums: dict[tuple[str, int], _Sum] = {}
@@ -140,7 +140,7 @@ class Witnesses:
                     del speeds[: bisect_left(speeds, (speeds[-1][0] - KEEP_NS,))]
 
     def measured(self, begin_ns: int, end_ns: int) -> Measured:
-        """What was measured from `begin_ns` to `end_ns`, both included."""
+        """Speeds measured from `begin_ns` to `end_ns`, both included."""
         span = begin_ns, end_ns
         found = self._told.get(span)
         if found is None:
@@ -191,7 +191,7 @@ class Witnesses:
         return north, east, max(row.sd for row in found)
 
     def quiet_at_speed(self, t_ns: int, at_speed: bool) -> None:
-        """Whether the quiet window that ended at `t_ns` was at speed; a rewind may say otherwise
+        """True if the quiet window that ended at `t_ns` was at speed; a rewind may say otherwise
         than before."""
         row = bisect_left(self._at_speed, t_ns)
         known = row < len(self._at_speed) and self._at_speed[row] == t_ns
@@ -203,7 +203,7 @@ class Witnesses:
             del self._at_speed[row]
 
     def smooth_ride(self, t_ns: int) -> bool:
-        """Whether, before `t_ns`, the vehicle has been as quiet at speed as at rest: then quiet
+        """True if, before `t_ns`, the vehicle has been as quiet at speed as at rest: then quiet
         says nothing."""
         first = bisect_right(self._at_speed, t_ns - SMOOTH_NS)
         return bisect_left(self._at_speed, t_ns) - first >= SMOOTH_WINDOWS

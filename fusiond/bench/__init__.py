@@ -1,1 +1,1 @@
-"""What the numerics cost, as ratios to one numpy product."""
+"""Cost of the numerics, as ratios to one numpy product."""

@@ -23,8 +23,8 @@ from fusiond.simulation.scenarios import CAR_IMU, SCENARIOS
 RATE_HZ, AIDS_HZ = 200.0, 10.0
 LATE_S = 10.0
 AT_S, EVERY_S = 110.0, 1.0
-"""When the first fix comes late, well after the start, and how long the drive then goes on until
-the next does."""
+"""Delay of the first fix after the start, and how long the drive then goes on until the next
+does."""
 SAMPLES, TICK_SAMPLES = round(RATE_HZ / AIDS_HZ), round(RATE_HZ / 100.0)
 
 
@@ -98,7 +98,7 @@ class Drive:
         self._row = rows.stop
 
     def fix(self) -> None:
-        """What the receiver says at the epoch that comes next."""
+        """Next epoch of the receiver."""
         r, epoch = self._receiver, self._row // SAMPLES
         t_ns = round(float(r.t_s[epoch]) * 1e9)
         stamp = MonotonicStamp(t_ns)
@@ -109,7 +109,7 @@ class Drive:
         self._navigator.add(fix, t_ns)
 
     def _wheel(self) -> None:
-        """What the wheel says at that epoch."""
+        """Wheel measurement at that epoch."""
         r, epoch = self._receiver, self._row // SAMPLES
         t_ns = round(float(r.t_s[epoch]) * 1e9)
         n, e, _ = r.v_ned[epoch].tolist()

@@ -1,4 +1,4 @@
-"""What an epoch of raw GNSS data costs: 40 satellites, a range and a rate of each.
+"""Cost of an epoch of raw GNSS data: 40 satellites, a range and a rate of each.
 
 From the decoded epoch to the filter that has used it: signals chosen, satellites and corrections
 computed, 80 rows linearised, gated one by one, folded in and tested by their residuals, the

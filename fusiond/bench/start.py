@@ -1,4 +1,4 @@
-"""What `fusiond process` costs before its first row: a process of its own, kernels in the cache.
+"""Cost of `fusiond process` before its first row: a process of its own, kernels in the cache.
 
 From the start of the interpreter over imports, kernels linked, files read and a vehicle that stands
 until it is aligned, to the first rows; the few hundred rows of the file are a hundredth of that.

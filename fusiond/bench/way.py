@@ -27,7 +27,7 @@ class Way(NamedTuple):
 
     @property
     def functions(self) -> int:
-        """How many different ones."""
+        """Number of different ones."""
         return len(self.calls)
 
     @property

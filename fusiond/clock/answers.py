@@ -1,4 +1,4 @@
-"""What the clock answers with."""
+"""Results of the clock."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Instant(NamedTuple):
-    """When a measurement was true (monotonic ns), one sigma of that (s), and the rule used."""
+    """Instant of validity (monotonic ns), one sigma of that (s), and the rule used."""
 
     t_valid_ns: int
     sd_s: float
@@ -15,7 +15,7 @@ class Instant(NamedTuple):
 
 
 class TimeSample(NamedTuple):
-    """What CLOCK_REALTIME said when a report of the reference came in, and true UTC then (ns)."""
+    """Reading of CLOCK_REALTIME when a report of the reference came in, and true UTC then (ns)."""
 
     system_ns: int
     utc_ns: int
@@ -23,7 +23,7 @@ class TimeSample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ClockStatus:
-    """What `health` and `doctor` say of the clock.
+    """Status of the clock for `health` and `doctor`.
 
     `utc_source` is a source's name, `system`, or `none` while no plausible UTC is known.
     `system_error_s` is the system clock minus the receiver's UTC. `rdss_clock_error_s` is daemon

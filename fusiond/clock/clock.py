@@ -115,7 +115,7 @@ class Clock:
         return self._host.monotonic_ns()
 
     def system_state(self) -> dict[str, int | None]:
-        """What is known of the system clock, for a replay (`restore_system`)."""
+        """State of the system clock, for a replay (`restore_system`)."""
         return self._system.state()
 
     def restore_system(self, state: Mapping[str, int | None]) -> None:
@@ -372,7 +372,7 @@ class Clock:
 
     @property
     def sets_others(self) -> bool:
-        """Whether others may set a clock by `utc_ns`: a receiver has told UTC and there is no doubt
+        """True if others may set a clock by `utc_ns`: a receiver has told UTC and there is no doubt
         about it, or the system clock is configured to be what keeps it."""
         if self._options.utc == "system":
             return True

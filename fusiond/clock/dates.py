@@ -19,7 +19,7 @@ a rollover moved once too often, nor one beyond the service life of this code.""
 
 
 def plausible(utc_ns: int) -> bool:
-    """Whether a date can be today's."""
+    """True if a date can be today's."""
     return EARLIEST_UTC_NS <= utc_ns < LATEST_UTC_NS
 
 

@@ -134,7 +134,7 @@ class DeviceClock:
         return early_ns > _JITTER_NS or ticks_ns < last_ns - _JITTER_NS
 
     def _follow(self, ticks_ns: int, t_seen_ns: int) -> bool:
-        """Whether the counts held back, with this one, are the clock's new reading."""
+        """True if the counts held back, with this one, are the clock's new reading."""
         assert self._filter.offset_ns is not None
         self._counters["device_tick_odd"] += 1
         d = t_seen_ns - ticks_ns

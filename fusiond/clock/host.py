@@ -18,8 +18,7 @@ from typing import Literal, Protocol
 SECOND_NS = 1_000_000_000
 MILLISECOND_NS = 1_000_000
 KERNEL_FUTURE_NS = MILLISECOND_NS
-"""What the kernel stamps has happened: no stamp lies further ahead than the two clocks' readings
-are apart."""
+"""Bound on kernel stamps: no stamp lies further ahead than the two clocks' readings are apart."""
 
 _STEP_NS = MILLISECOND_NS
 """NTP slews at 500 ppm at most (adjtimex(2)); with 1000 ppm and 1 ms allowed the rest are steps."""
@@ -66,7 +65,7 @@ class SystemTime:
 
 
 class Readings:
-    """How far two clocks of the host are ahead of the monotonic one: `(t_ns, ahead_ns)` each.
+    """Lead of two clocks of the host over the monotonic one: `(t_ns, ahead_ns)` each.
 
     `heard(clock, t_ns, ahead_ns)` is told every reading, of clock `realtime` or `boottime`: with
     them, all that a `Clock` takes from the host can be recorded.
@@ -176,7 +175,7 @@ class SystemClock:
             setattr(self, name, state[name])
 
     def _sleep(self) -> int:
-        """What boottime has gained on monotonic since it was last asked, ns: 0 for no sleep."""
+        """Gain of boottime over monotonic since the last call, ns: 0 for no sleep."""
         boot_ns = self._readings.boottime()[1]
         slept = boot_ns - self._boot_ns
         if slept < _SLEPT_NS:

@@ -32,7 +32,8 @@ LEAP_NS = 200 * MILLISECOND_NS
 """A receiver's reports of UTC are at most so late on a healthy line (fusiond.clock.utc_envelope):
 of a smaller step they say nothing, and the envelope follows it."""
 ASKED_AGAIN_NS = 20 * SECOND_NS
-"""How long a bus whose controllers disagree is not asked once more whether its clock was set."""
+"""Time for which a bus whose controllers disagree is not asked once more whether its clock was
+set."""
 ORDINARY = 3
 """A pause of so many of the longest lately is one of a sparse bus."""
 FOLLOWING = 8
@@ -81,7 +82,7 @@ class RecorderClock:
         return sum(step.set_ns for step in self.steps)
 
     def is_odd(self, stamp_ns: int, of: Of) -> bool:
-        """Whether `take` has to look at what follows."""
+        """True if `take` has to look at what follows."""
         change = stamp_ns - self.stamp_ns
         if 0 <= change < LEAP_NS:
             return not self._begun
@@ -161,7 +162,7 @@ class RecorderClock:
         self._on(stamp_ns, passed, of)
 
     def _due_ns(self, of: Of) -> int:
-        """How long after the last frame the next of this channel and identifier is due."""
+        """Time from the last frame until the next of this channel and identifier is due."""
         times = [t_ns for each, t_ns in self._frames if each == of][-2:]
         spacing = median_low(self._spacings) if self._spacings else 0
         if len(times) < 2:

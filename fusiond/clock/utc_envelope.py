@@ -66,7 +66,7 @@ _UNKNOWN_S = 0.15
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, extra="forbid"))
 class UtcKnown:
-    """What is known of a source's UTC, for a process that runs later on the same monotonic clock.
+    """State of a source's UTC, for a process that runs later on the same monotonic clock.
 
     `offset_ns` and `t_seen_ns` as of `UtcEnvelope`, `utc_ns` the UTC of its last report, `reports`
     how many have told it. Raises pydantic's `ValidationError` for what no source can have told.
@@ -93,7 +93,7 @@ def whole_seconds_ns(late_ns: int, delay_ns: int = _WHOLE_HIGH_NS) -> int:
 
 
 def _after_leap(utc_ns: int) -> bool:
-    """Whether a month has just begun: leap seconds come before it (ITU-R TF.460-6, annex 1)."""
+    """True if a month has just begun: leap seconds come before it (ITU-R TF.460-6, annex 1)."""
     if utc_ns % _DAY_NS > _AFTER_LEAP_NS:
         return False
     return datetime.fromtimestamp(utc_ns // SECOND_NS, UTC).day == 1
@@ -127,7 +127,7 @@ class UtcEnvelope:
         self.plausible = True
 
     def known(self, source: str) -> UtcKnown | None:
-        """What another process may go on with; None while there is a doubt."""
+        """State for another process; None while there is a doubt."""
         if self._offset_ns is None or not (self.settled and self.plausible):
             return None
         return UtcKnown(source, self._offset_ns, self._utc_ns, self.t_seen_ns, self._reports)
@@ -187,13 +187,13 @@ class UtcEnvelope:
         return Stamped(utc_ns + self.offset_ns, hypot(self.sd_s, doubt_s))
 
     def _missed(self, utc_ns: int) -> bool:
-        """Whether reports are missing before `utc_ns`: a jump of UTC may hide there."""
+        """True if reports are missing before `utc_ns`: a jump of UTC may hide there."""
         if self._interval_ns is None:
             return True
         return 2 * (utc_ns - self._utc_ns) > 3 * self._interval_ns
 
     def _turns_back(self, utc_ns: int, t_seen_ns: int) -> bool:
-        """Whether UTC stands still or goes back with `utc_ns`, and not because it is read twice."""
+        """True if UTC stands still or goes back with `utc_ns`, and not because it is read twice."""
         return utc_ns <= self._utc_ns and t_seen_ns - utc_ns > self._delay_ns + _LATE_NS
 
     def untrusted(self, utc_ns: int, t_seen_ns: int) -> None:
@@ -266,7 +266,8 @@ class UtcEnvelope:
         self.t_seen_ns = max(t_seen_ns, self.t_seen_ns)
 
     def _hold(self, d: int, late: int, utc_ns: int, t_seen_ns: int) -> None:
-        """What no lateness explains: a wrong report, or a change of UTC once three agree."""
+        """Hold a report that no latency explains: a wrong report, or a change of UTC once three
+        agree."""
         self._counters["utc_report_odd"] += 1
         if self._odd and abs(d - self._odd[0]) > max(_AGREE_NS, round(self._spread_s * SECOND_NS)):
             self._odd.clear()

@@ -70,7 +70,7 @@ def row_errors() -> Iterator[None]:
 
 
 def counted(ended: Mapping[str, int]) -> str:
-    """How many rows ended in which way."""
+    """Count of rows by outcome."""
     return ", ".join(f"{count} {how}" for how, count in ended.items() if count) or "no rows"
 
 

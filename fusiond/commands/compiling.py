@@ -1,4 +1,4 @@
-"""What is told while kernels compile: once after an installation or an update, a minute and more.
+"""Notice while kernels compile: once after an installation or an update, a minute and more.
 
 with compiling():
     from fusiond.live.daemon import run

@@ -107,7 +107,7 @@ Kind = Literal["csv", "gpx", "kml", "geojson", "rosbag2"]
 
 @log.command("info")
 def info(logs: LogPaths, json_path: JsonPath = None) -> None:
-    """What is in a log, and what is wrong with it."""
+    """Print contents and damage of a log."""
     from fusiond.recording.info import info as of  # noqa: PLC0415
     from fusiond.recording.reader import Log  # noqa: PLC0415
 

@@ -132,8 +132,8 @@ def _runs(
     timeout_s: float | None,
     kept: KeptRuns | None,
 ) -> Iterator[Sequence[Lost]]:
-    """Where runs are made: here, if they are so few that workers would not be warm before their
-    end, and nobody asked for any."""
+    """Choice where the runs go: here, if they are so few that workers would not be warm before
+    their end, and nobody asked for any."""
     few = runs < FEWEST_RUNS and kept is None
     if few and workers is None and cluster is None and timeout_s is None:
         yield ()

@@ -1,4 +1,4 @@
-"""What the commands share: their arguments, their exit codes, what they write."""
+"""Shared arguments, exit codes and output of the commands."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def loaded() -> None:
 
 
 def draws(stream: TextIO) -> bool:
-    """Whether it is a terminal that can be drawn on."""
+    """True if it is a terminal that can be drawn on."""
     return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown")
 
 

@@ -36,7 +36,7 @@ _LOOK_EVERY_S = 0.05
 _MOST_BYTES = 65_536
 """`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
 _ASKED = ("status", "nav", "health")
-"""What a daemon that works has said within a second."""
+"""Topics of a working daemon within a second."""
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class Heard:
 
     @property
     def complete(self) -> bool:
-        """Whether there is nothing more to wait for; nothing is before the first tick."""
+        """True if there is nothing more to wait for; nothing is before the first tick."""
         compiling = self.topics.get("status", {}).get("ticks") == 0
         asked = ("status",) if compiling else _ASKED
         return self.online == "offline" or (self.live and all(t in self.topics for t in asked))
@@ -112,7 +112,7 @@ def status(
 async def ask(
     host: str, port: int, access: Mqtt | None, vehicle: str | None, wait_s: float
 ) -> dict[str, Heard]:
-    """What the broker has of each vehicle, or of `vehicle` alone, after `wait_s` at most.
+    """Retained messages of each vehicle, or of `vehicle` alone, after `wait_s` at most.
 
     `access`: user, password and TLS. Raises `UnansweredError` where no broker lets us in.
     """

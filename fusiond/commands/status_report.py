@@ -141,7 +141,7 @@ def _sources(
 
 
 def _left_out(source: dict[str, Any]) -> str:
-    """What is wrong with it; nothing where nothing is."""
+    """Fault or exclusion of a source; empty without one."""
     fault = source["diagnosis"]
     return str(source["isolated"] or "") if fault is None else str(fault["text"])
 

@@ -34,13 +34,13 @@ class Section(BaseModel):
 
     @classmethod
     def unsaid(cls) -> Self:
-        """Where the file has no such section: `cls()`, less the validator that pydantic would build
-        for each alone, beside that of the whole, and then find nothing to validate."""
+        """Default for a section that the file lacks: `cls()`, less the validator that pydantic
+        would build for each alone, beside that of the whole, and then find nothing to validate."""
         return cls.model_construct()
 
 
 class Aiding(Section):
-    """What every aid has: where it sits, how it is gated."""
+    """Common options of aiding sections: place, how it is gated."""
 
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """Body axes (forward, right, down), from the IMU to the aid's reference point."""
@@ -58,11 +58,11 @@ class GnssAiding(Aiding):
 
     kind: Literal["gnss"] = "gnss"
     use_velocity: bool = True
-    """Whether the receiver's velocity is an aid too."""
+    """True if the receiver's velocity is an aid too."""
     range_error_m: PositiveFloat = 3.0
     """Times DOP gives sigma where the receiver sends no GST; see `docs/gnss-nmea.md`."""
     velocity_sd_m_s: PositiveFloat = 0.1
-    """Where the receiver states none."""
+    """Value where the receiver states none."""
     min_position_sd_m: PositiveFloat | None = None
     """No smaller sigma is believed; without it by the fix's quality: 0.3 m by code (0.5 m of
     height), 0.05 m RTK float, 0.02 m RTK fixed."""
@@ -72,8 +72,8 @@ class GnssAiding(Aiding):
     """Age of the velocity at the fix's instant: half an epoch where the receiver averages over
     one."""
     time_offset_sd_s: NonNegativeFloat = 0.1
-    """How much later or earlier than their stamps fixes are valid, and velocities: one sigma of
-    offsets that the filter estimates. A serial line's latency is known to 0.1 s. 0: none is."""
+    """Offset of validity from the stamps, for fixes and velocities: one sigma of offsets that the
+    filter estimates. A serial line's latency is known to 0.1 s. 0: none is."""
     time_sd_s: NonNegativeFloat = 0.0
     """Timing error of a single fix against the IMU; times the speed it adds to sigma."""
     lever_arm_sd_m: NonNegativeFloat | None = None
@@ -127,7 +127,7 @@ class RdssAiding(Aiding):
 
     kind: Literal["rdss"] = "rdss"
     strategy: Literal["rewind", "optimal_prediction", "position_compensation", "none"] = "rewind"
-    """What becomes of the delay; see `docs/rdss-strategies.md`. `rewind` is exact."""
+    """Treatment of the delay; see `docs/rdss-strategies.md`. `rewind` is exact."""
     noise: Literal["geometry", "class"] = "geometry"
     """Covariance from the satellites' geometry with the terminal's class as its floor, or the class
     alone on both axes."""
@@ -221,7 +221,8 @@ class BarometerAiding(Aiding):
 
     kind: Literal["barometer"] = "barometer"
     sd_m: PositiveFloat = 5.0
-    """Where the device states none: gusts of 0.5 m that last for 5 s, told ten times a second."""
+    """Value where the device states none: gusts of 0.5 m that last for 5 s, told ten times a
+    second."""
     weather_sd_m: PositiveFloat = 100.0
     """One sigma of the offset at first: 10 hPa of weather (80 m) and the geoid (30 m)."""
     weather_walk_m_sqrt_s: PositiveFloat = 0.15
@@ -229,7 +230,7 @@ class BarometerAiding(Aiding):
     temperature_sd: PositiveFloat = 0.04
     """By what share its metres are too many: 4 % in air 10 K colder than the standard."""
     airflow_sd: PositiveFloat = 0.1
-    """What share of the dynamic pressure the sensor's place lacks: 2 m at 20 m/s."""
+    """Share of the dynamic pressure missing at the sensor's place: 2 m at 20 m/s."""
 
 
 class WheelAiding(Aiding):
@@ -237,11 +238,11 @@ class WheelAiding(Aiding):
 
     kind: Literal["wheel"] = "wheel"
     sd_m_s: PositiveFloat = 0.1
-    """Where the device states none."""
+    """Value where the device states none."""
     scale: PositiveFloat = 1.0
-    """What the device says over the true speed; `fusiond calibrate` finds it."""
+    """Ratio of the device's speed to the true speed; `fusiond calibrate` finds it."""
     latency_s: float = 0.0
-    """How old a speed is when it comes."""
+    """Latency of a speed."""
     drift_sd_m_s: NonNegativeFloat = 0.1
     """Of what lasts (slip, a wheel's load, rounding at a steady speed): one sigma of a state; 0:
     none."""

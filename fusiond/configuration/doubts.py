@@ -1,4 +1,4 @@
-"""What a configuration says that is valid and cannot work, or hardly what was meant.
+"""Doubts: valid configuration that cannot work, or is hardly meant.
 
 `fusiond check` prints these; the daemon runs all the same, since a part that is missing today may
 be there tomorrow. Mistakes, which keep it from running, are found by `load`.
@@ -161,7 +161,7 @@ def _lever_arms(config: Config) -> Iterator[str]:
 
 
 def _files(config: Config) -> Iterator[str]:
-    """What the daemon reads at start, as far as this user can see it."""
+    """Files that the daemon reads at start, as far as this user can see it."""
     m = config.mqtt
     if not m.enabled:
         return

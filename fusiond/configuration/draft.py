@@ -28,7 +28,7 @@ class DraftSource:
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """What is known of a vehicle that has no configuration yet."""
+    """Draft of a configuration for a new vehicle."""
 
     vehicle: str = "vehicle"
     vehicle_class: VehicleClass = "road"

@@ -28,15 +28,15 @@ class Federated(Section):
     """The federated filter, where `filter = "federated"`; see `docs/estimators.md`."""
 
     sources: tuple[str, ...] = ()
-    """Which `[aiding.NAME]` have a local filter; empty: all of them."""
+    """Sections `[aiding.NAME]` that have a local filter; empty: all of them."""
     mode: Literal["no_reset", "fusion_reset", "zero_reset", "rescale"] = "no_reset"
-    """What becomes of the local filters after a fusion; only `no_reset` keeps a fault in its own
+    """Reset of the local filters after a fusion; only `no_reset` keeps a fault in its own
     filter."""
     fusion: Literal["uncorrelated", "correlated"] = "uncorrelated"
     """How the estimates are put together: by sharing factors, as if they were uncorrelated, or by
     the covariances between them (paper 004), which only `no_reset` can."""
     sharing: Literal["fixed", "adaptive"] = "fixed"
-    """Whether the sharing factors stay or follow the local covariances."""
+    """True if the sharing factors stay or follow the local covariances."""
     shares: dict[str, PositiveFloat] = Field(default_factory=dict)
     """Relative factors by local filter, brought to a sum of 1; empty: all equal."""
     master_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
@@ -44,7 +44,7 @@ class Federated(Section):
     retained: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """Of its information, what an updated local filter keeps in `rescale`."""
     fault_detection: bool = True
-    """Whether a local filter that fails its tests is left out."""
+    """True if a local filter that fails its tests is left out."""
     false_alarm_probability: Probability = 1e-6
     """Of one innovation or difference test."""
     window: Annotated[int, Field(ge=2, le=100)] = 10
@@ -74,7 +74,7 @@ class Unscented(Section):
 
 class Estimator(Section):
     filter: Literal["kalman", "unscented", "federated", "multiscale"] = "kalman"
-    """Which estimator; see `docs/estimators.md`."""
+    """Kind of estimator; see `docs/estimators.md`."""
     model: Literal["ins15", "ins21", "ins17", "ins20", "ins23", "planar10", "planar15"] = "ins21"
     """Error state; see `docs/navigation.md`."""
     buffer_s: Annotated[float, Field(ge=10.0, le=600.0)] = 15.0

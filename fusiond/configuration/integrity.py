@@ -34,5 +34,5 @@ class Integrity(Section):
 
     @property
     def watched(self) -> bool:
-        """Whether there is a limit, and so a use for levels."""
+        """True if there is a limit, and so a use for levels."""
         return self.horizontal_alert_limit_m is not None or self.vertical_alert_limit_m is not None

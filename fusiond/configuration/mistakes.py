@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, in words: dotted key, value as written, what would do.
+"""Mistakes of a configuration, in words: dotted key, value as written, what would do.
 
 Works on pydantic models and the data that was read for them; reads no file. Besides what pydantic
 refuses it refuses what pydantic would convert (`"100"` or `true` for a number) and nan and inf.
@@ -102,7 +102,7 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
 
 
 def described(annotation: Any) -> str:
-    """What a value of this type looks like in the file."""
+    """Description of a value of this type in the file."""
     base, constraints = _unpacked(annotation)
     origin = get_origin(base)
     if origin in (Union, UnionType):
@@ -252,7 +252,7 @@ def _converted(model: type[BaseModel], data: Any, at: Location) -> Iterator[tupl
 
 
 def _is_converted(annotation: Any, value: Any) -> bool:
-    """Whether pydantic would turn a value of one basic type into another without a word."""
+    """True if pydantic would turn a value of one basic type into another without a word."""
     arms = _arms(annotation)
     if any(value in get_args(arm) for arm in arms if get_origin(arm) is Literal):
         return False

@@ -1,4 +1,4 @@
-r"""Whether the error state of a configuration holds the errors of its inertial sensor.
+r"""Fit of the model to the inertial sensor's errors.
 
 An error that no state models and no noise of the model covers makes the filter wrong and sure of
 itself. The measure is a minute without aids, t = 60 s, one sigma of the displacement:

@@ -14,7 +14,7 @@ Rate = Annotated[float, Field(ge=0.1, le=100.0)]
 
 
 class Served(Section):
-    """What every server of TCP clients has."""
+    """Common options of TCP servers."""
 
     host: str = "127.0.0.1"
     """Address to listen at; `0.0.0.0` lets the whole network in, unasked for a name."""
@@ -95,7 +95,7 @@ class Chrony(Section):
 
 
 class Outputs(Section):
-    """What several of them need, and a section each."""
+    """Shared options of outputs, and a section each."""
 
     geoid_separation_m: Annotated[float, Field(ge=-120.0, le=100.0)] | None = None
     """Height of the geoid above the ellipsoid where the vehicle drives; without it no height above

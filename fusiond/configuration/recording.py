@@ -14,7 +14,7 @@ class Recording(Section):
     """Logs of all that came in and what came of it, for `fusiond replay` and other tools."""
 
     directory: Path | None = None
-    """Where the logs go; without it only `fusiond run --record DIR` records."""
+    """Directory of the logs; without it only `fusiond run --record DIR` records."""
     when: Literal["always", "event", "command"] = "always"
     """`always` from the start on; `event`: when one of `events` comes, with the time before it;
     `command`: when `cmd/start_recording` says so, which works in any case."""

@@ -68,7 +68,7 @@ class SpareImu(Section):
 
     @property
     def mounted(self) -> dict[str, Any]:
-        """How it sits, by the keys of `[imu]`."""
+        """Orientation of the sensor, by the keys of `[imu]`."""
         return {"axes": self.axes, "mounting_deg": self.mounting_deg}
 
 
@@ -123,7 +123,7 @@ class Imu(Section):
     @model_validator(mode="before")
     @classmethod
     def _of_its_class(cls, data: Any) -> Any:
-        """What the class says stands where no key of its own does."""
+        """Values of the class for keys that are absent."""
         named = data.get("sensor_class") if isinstance(data, dict) else None
         known = CLASSES.get(named) if named is not None else None
         return {**known, **data} if known else data
@@ -147,7 +147,7 @@ class ZeroVelocity(Section):
     velocity_sd_m_s: PositiveFloat = 0.05
     """One sigma of the velocity at rest."""
     rate_sd_deg_s: PositiveFloat = 0.1
-    """What the standing vehicle may turn."""
+    """Largest rate of a standing vehicle."""
     interval_s: PositiveFloat = 0.5
 
 
@@ -181,7 +181,7 @@ class Constraints(Section):
 
 
 class Alignment(Section):
-    """How attitude and position are found before navigation starts.
+    """Alignment: sources of attitude and position before navigation starts.
 
     `heading` lists the allowed sources of the first heading in order of preference.
     """
@@ -241,7 +241,7 @@ class Scheduler(Section):
 
 
 class ClockOptions(Section):
-    """Where UTC comes from.
+    """Source of UTC.
 
     `gnss`: the receiver's time, as the lower envelope of arrival minus `serial_latency_s`, and the
     system clock until that is known. `system`: always CLOCK_REALTIME (NTP or PPS keeps it); a step
@@ -306,11 +306,11 @@ class Config(Section):
 
     vehicle: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")] = "vehicle"
     vehicle_class: VehicleClass = "road"
-    """What it is: height and speed of no measurement may exceed what its class can do."""
+    """Class of the vehicle: height and speed of no measurement may exceed what its class can do."""
     state_file: Path | None = None
-    """Where the last solution is kept for the next start; the unit's state directory by default."""
+    """Path of the last solution for the next start; the unit's state directory by default."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """What the daemon writes to its log: this and what matters more."""
+    """Least level of messages in the log."""
     imu: Imu = Field(default_factory=Imu.unsaid)
     sources: dict[str, Source] = Field(default_factory=dict)
     aiding: dict[str, AnyAiding] = Field(default_factory=dict)
@@ -328,7 +328,7 @@ class Config(Section):
 
     @property
     def plausibility(self) -> Plausibility:
-        """What a vehicle of this class can do."""
+        """Limits of a vehicle of this class."""
         return PLAUSIBILITY[self.vehicle_class]
 
     @model_validator(mode="before")

@@ -28,7 +28,7 @@ _LOG.setLevel(logging.ERROR)
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Where the broker is and how it lets us in."""
+    """Address of the broker and credentials."""
 
     host: str = "localhost"
     port: int = 1883

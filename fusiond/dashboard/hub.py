@@ -16,8 +16,8 @@ LARGEST_BYTES = 65536
 """`health` of twenty sources with a full sky has some 20 kB; what is larger is not ours."""
 MOST_VEHICLES = 32
 GIVES_WAY_S = 60.0
-"""When there are so many, one that was silent for so long gives way to one that speaks: a daemon
-says its status every second. Names of no vehicles that a broker has kept shut nobody out."""
+"""Age from which a silent vehicle gives way to a new one: a daemon sends its status every second.
+Names of no vehicles that a broker has kept shut nobody out."""
 MOST_NAME = 64
 """Letters of a vehicle's name, as the configuration has it."""
 
@@ -70,7 +70,7 @@ class Hub:
 
     @property
     def refused(self) -> dict[str, Any]:
-        """What the page says of refused messages: how many of each kind, and why the last was."""
+        """Summary of rejected messages: how many of each kind, and why the last was."""
         kinds = {kind: n for kind in REFUSALS if (n := self.counters[kind])}
         return {"count": sum(kinds.values()), "kinds": kinds, "last": self._refused_last}
 
@@ -113,7 +113,7 @@ class Hub:
         del self.vehicles[silent.name]
 
     def _read(self, topic: str, payload: bytes) -> Any:
-        """What it says, by the schema of its topic."""
+        """Message by the schema of its topic."""
         if topic == "online":
             if payload not in (b"online", b"offline"):
                 raise _NotTakenError("not_as_published", "neither online nor offline")
@@ -129,7 +129,7 @@ class Hub:
 
 
 class _NotTakenError(Exception):
-    """Why a message is not used; `kind` is its counter."""
+    """Rejection of a message; `kind` is its counter."""
 
     def __init__(self, kind: str, why: str) -> None:
         super().__init__(why)

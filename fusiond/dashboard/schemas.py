@@ -85,8 +85,8 @@ def _message(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
 
 
 def reader(schema: Mapping[str, Any], shared: Mapping[str, Read]) -> Read:
-    """What reads by a schema; `shared` are the readers of those it refers to. Raises ValueError for
-    a keyword that is not known."""
+    """Reader for a schema; `shared` are the readers of those it refers to. Raises ValueError for a
+    keyword that is not known."""
     unknown = schema.keys() - _WORDS
     if unknown:
         raise ValueError(f"keywords of JSON Schema that are not known here: {sorted(unknown)}")

@@ -17,7 +17,7 @@ from fusiond.dashboard.hub import Hub
 
 INSTALL = "the dashboard's packages are not installed: pip install 'fusiond[dashboard]'"
 PMTILES = b"PMTiles\x03"
-"""What a file of version 3 begins with."""
+"""Header of a file of version 3."""
 SEND_BUFFER = 128 * 1024
 """Bytes that the kernel holds for a browser: some frames, not minutes of them."""
 
@@ -32,8 +32,8 @@ class DashboardError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """Where to serve. `token`: whoever has it may send commands; None: nobody.
-    `base_map`: a PMTiles file to draw below the track."""
+    """Address of the server. `token`: whoever has it may send commands; None: nobody. `base_map`: a
+    PMTiles file to draw below the track."""
 
     host: str = "127.0.0.1"
     port: int = 8770
@@ -46,7 +46,7 @@ class Serving:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach `host`."""
+    """True if only this computer can reach `host`."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:

@@ -1,4 +1,4 @@
-"""What one vehicle has said: the latest of each topic, when it came, and ten minutes of history.
+"""State of one vehicle: the latest of each topic, when it came, and ten minutes of history.
 
 Everything that is kept has a number from one count that only grows. Whoever looks remembers the
 count and asks for what is newer: a slow one gets the newest and never a queue of what is old.
@@ -56,7 +56,7 @@ class Vehicle:
         self.name = name
         self.count = 0
         self.heard_s = float("-inf")
-        """When it last spoke; what the broker had kept is no sign of it."""
+        """Instant of its last message; what the broker had kept is no sign of it."""
         self._latest: dict[str, Heard] = {}
         self._rows = {kind: Ring(most, KINDS[kind]) for kind, most in MOST_ROWS.items()}
         self._innovations = Keyed(MOST_INNOVATIONS, "doodd")
@@ -127,7 +127,7 @@ class Vehicle:
         self._latest[topic] = heard
 
     def _other(self, said: Said, at_s: float | None) -> None:
-        """Where another vehicle is: a message of its own for each card."""
+        """Position of another vehicle: a message of its own for each card."""
         topic = f"fleet/{said.get('card')}"
         others = sum(name.startswith("fleet/") for name in self._latest)
         if topic in self._latest or others < MOST_CARDS:

@@ -97,7 +97,8 @@ class Viewer:
         return self._token is not None and self._hub.send_command is not None
 
     def _frame(self) -> dict[str, Any]:
-        """What is new. The first vehicle by name is shown until the browser names one."""
+        """New data for the browser. The first vehicle by name is shown until the browser names
+        one."""
         hub = self._hub
         names = sorted(hub.vehicles)
         name = self._vehicle if self._vehicle in hub.vehicles else next(iter(names), None)

@@ -79,7 +79,7 @@ def application(
 
 
 def of_our_page(headers: Mapping[str, str]) -> bool:
-    """Whether no browser asks, or one that shows our own page."""
+    """True if no browser asks, or one that shows our own page."""
     origin = headers.get("origin")
     return origin is None or urlsplit(origin).netloc == headers.get("host")
 

@@ -254,7 +254,7 @@ class _Run:
         }
 
     def _tell(self) -> None:
-        """What happened, on standard error: the last line of the output is the summary."""
+        """Report an event on standard error: the last line of the output is the summary."""
         t_s, error_m, sigma_m = self._score.horizontal(self._vehicle)
         start_s = self._vehicle.start_ns * 1e-9
         outages = [(begin - start_s, end - start_s) for begin, end in self._without_gnss]

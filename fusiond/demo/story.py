@@ -1,4 +1,4 @@
-"""What happened on the demo's drive: what was lost without GNSS, and what sigma knew of it."""
+"""Story of the demo's drive: what was lost without GNSS, and its share in sigma."""
 
 from __future__ import annotations
 

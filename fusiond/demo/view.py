@@ -1,4 +1,4 @@
-"""What the demo shows: the broker's messages beside the true errors, on a terminal or as lines."""
+"""Display of the demo: the broker's messages beside the true errors, on a terminal or as lines."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _MADE_INSIDE = "made by the filter or part of another source"
 
 
 class Live:
-    """What came out of the broker last, and what the simulation knows besides."""
+    """Latest messages of the broker, and what the simulation knows besides."""
 
     def __init__(self, duration_s: float, port: int, vehicle: str, page: str | None = None) -> None:
         self.duration_s = duration_s
@@ -102,7 +102,7 @@ class Live:
 
     @property
     def scene(self) -> str:
-        """What happens on the road."""
+        """Name of the scene on the road."""
         if self.outage_until is not None:
             left = max(0.0, self.outage_until - time.monotonic())
             return f"GNSS unplugged for {left:.0f} s more: RDSS and INS carry on"

@@ -32,7 +32,7 @@ from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.outputs import broker_access
 
 BURST_S = 0.1
-"""What comes within one read of a line, such as all ephemerides, has no rate."""
+"""Longest burst: arrivals within one read of a line, such as all ephemerides; it has no rate."""
 MAX_TILT_DEG = 30.0
 """No vehicle is parked on a steeper slope; a wrong axis is 90 or 180 degrees off."""
 GRAVITY_TOLERANCE = 0.05
@@ -105,7 +105,7 @@ class Heard:
 
 @dataclass(slots=True)
 class Report:
-    """What to print of one thing: its headline, facts, and findings."""
+    """Report of one device or service: its headline, facts, and findings."""
 
     title: str
     facts: list[str] = field(default_factory=list)
@@ -208,7 +208,7 @@ def _beams_line(beams: BeamPower) -> str:
 
 
 def _damage(counters: Counter[str], said: list[str]) -> list[str]:
-    """What arrived broken or not at all, where it is more than a sound line has and has not been
+    """Findings of damaged or missing data, where it is more than a sound line has and has not been
     `said`."""
     findings = []
     lost, samples = counters["lost_samples"], counters["samples"]

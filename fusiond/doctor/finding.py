@@ -1,4 +1,4 @@
-"""What is on the ports and buses of this computer: `fusiond config init`.
+"""Devices on ports and buses of this computer: `fusiond config init`.
 
 Listening only, but that an RDSS terminal says nothing unless it is asked who it is; the question
 does not make it transmit, and is put only where that is wanted. On a bus every device that is known
@@ -76,7 +76,7 @@ class Device:
 
 @dataclass(slots=True)
 class _Line:
-    """What came over a serial line."""
+    """Data received over a serial line."""
 
     splitter: StreamSplitter = field(default_factory=StreamSplitter)
     logs: LogSplitter = field(default_factory=lambda: LogSplitter(Counter()))
@@ -95,7 +95,7 @@ class _Line:
 
     @property
     def known(self) -> bool:
-        """Whether more would not change what it is: a receiver of two antennas tells its heading
+        """True if more would not change what it is: a receiver of two antennas tells its heading
         and its position in one epoch, a compass never any position."""
         return self.sound and ("position" in self.kinds or not self.kinds & _HEADINGS)
 

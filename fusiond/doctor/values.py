@@ -1,4 +1,4 @@
-"""What a device's measurements say, as mean and spread: scale and byte order show in them.
+"""Mean and spread of a device's measurements: scale and byte order show in them.
 
 A wrong scale is a |f| at rest that is not 9.8 m/s^2, a wrong byte order a spread of the order of
 the range, a slipped field a value that jumps.
@@ -33,7 +33,7 @@ _AXES = ("x", "y", "z")
 
 
 class Quantity(NamedTuple):
-    """What one measurement says of something: labels of its parts, their unit, digits to show."""
+    """Quantity of a measurement: labels of its parts, their unit, digits to show."""
 
     name: str
     parts: tuple[str, ...]
@@ -96,7 +96,7 @@ QUANTITIES: Mapping[type, tuple[Quantity, ...]] = {
 
 
 class Values:
-    """What came of one kind of measurement."""
+    """Values of one kind of measurement."""
 
     def __init__(self, kind: type) -> None:
         self._quantities = QUANTITIES.get(kind, ())

@@ -1,4 +1,4 @@
-r"""Where an antenna was, when an update turns a vehicle whose lever arm nobody has measured.
+r"""Position of an antenna, when an update turns a vehicle whose lever arm nobody has measured.
 
 A fix tells the place of the antenna, and nothing of the lever arm that leads there:
 

@@ -1,4 +1,4 @@
-r"""What every estimator is, and what all share: an error-state filter in a closed loop.
+r"""Interface and common state of estimators: an error-state filter in a closed loop.
 
 One navigation state is propagated through the IMU's samples. Beside it run the statistics of its
 error: one covariance and one error estimate for each filter that the estimator keeps (`covs`,
@@ -67,8 +67,8 @@ def gate_threshold(probability: float, degrees: int) -> float:
 
 
 class Outcome(NamedTuple):
-    """How an aid ended: its name, and the innovation that led to it (NIS, dimension, and L^-1 nu
-    with S = L L^T). `rows`: of a screened aid, what became of each row
+    """Outcome of a measurement: its name, and the innovation that led to it (NIS, dimension, and
+    L^-1 nu with S = L L^T). `rows`: of a screened aid, what became of each row
     (fusiond.estimators.screening); `whitened` is then 0 where a row was left out. `lasting`: of one
     that is out, the NIS if each of the faults for which it may be out lasts."""
 
@@ -103,7 +103,7 @@ class Screened(NamedTuple):
 
 
 class Estimator(Protocol):
-    """What timeline, navigator and studies know of an estimator: nothing of how it works.
+    """Interface of an estimator to timeline, navigator and studies.
 
     State at `t_ns` (ns) after samples of the buffer up to, not including, `sample` (absolute).
     """
@@ -115,10 +115,10 @@ class Estimator(Protocol):
     xi: Array
     step: Array
     passing: bool
-    """Whether it was brought where it is in passing: before an aid is folded in it has to be
+    """True if it was brought where it is in passing: before an aid is folded in it has to be
     propagated there otherwise."""
     published: Published
-    """What solutions are published by: at first the clock of the model's receiver."""
+    """Axes and clock of publication: at first the clock of the model's receiver."""
     turned: float
     """By how much (rad) the last update that was fused turned the axes in which P has the tilt."""
     wider: Array
@@ -128,7 +128,7 @@ class Estimator(Protocol):
 
     @property
     def state(self) -> State:
-        """What an aid may look at."""
+        """View of the filter for a measurement."""
 
     @property
     def covariance(self) -> Array:
@@ -140,7 +140,7 @@ class Estimator(Protocol):
 
     @property
     def isolates(self) -> bool:
-        """Whether it detects and leaves out faulty sources by itself."""
+        """True if it detects and leaves out faulty sources by itself."""
 
     @property
     def isolated(self) -> dict[str, str]:
@@ -164,8 +164,8 @@ class Estimator(Protocol):
         times (3,)."""
 
     def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
-        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in.
-        `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
+        """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded
+        in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
 
     def adopt(self, mean: Array, spread: Array) -> None:
         """Take a fault's effect out of the state: its mean (n,), and P grows by `spread` (n, n)."""
@@ -191,13 +191,13 @@ class Estimator(Protocol):
 
 
 class ErrorStateFilter:
-    """What the estimators share: the state, its propagation, feedback and snapshots.
+    """Common part of the estimators: the state, its propagation, feedback and snapshots.
 
     `shares` (k,): filter i gets its process noise and its initial covariance divided by shares[i].
     """
 
     carries_transition: ClassVar[bool] = False
-    """Whether `_phi` (width, width) is propagated, too."""
+    """True if `_phi` (width, width) is propagated, too."""
 
     def __init__(
         self,
@@ -242,7 +242,7 @@ class ErrorStateFilter:
 
     @property
     def isolates(self) -> bool:
-        """Whether it detects and leaves out faulty sources by itself."""
+        """True if it detects and leaves out faulty sources by itself."""
         return False
 
     @property
@@ -292,7 +292,7 @@ class ErrorStateFilter:
 
     @property
     def state(self) -> State:
-        """What an aid may look at."""
+        """View of the filter for a measurement."""
         return self._view
 
     @property
@@ -354,8 +354,8 @@ class ErrorStateFilter:
             renew = True
 
     def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
-        """What the innovation of an aid would be; the aid is `isolated`, nothing is folded in.
-        `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
+        """Innovation of a measurement that is not fused; the aid is `isolated`, nothing is folded
+        in. `lasting` (k, 3): what each of some faults adds to it, if it lasts."""
         rows = self._linearise(aid)
         if isinstance(rows, NotApplicable):
             return Outcome(rows.outcome)
@@ -417,7 +417,7 @@ class ErrorStateFilter:
         self._own_restore(extra)
 
     def _own_snapshot(self) -> object:
-        """What a kind of estimator keeps beside the shared state; never changed afterwards."""
+        """Own state of a kind of estimator beside the shared state; never changed afterwards."""
         return None
 
     def _own_restore(self, extra: object) -> None:

@@ -40,8 +40,8 @@ GRID_NS = 20_000_000
 
 SPAN, STEPS, DENSITIES = 0, 1, 1 + STEP_SMOOTH_N
 SUMS = DENSITIES + 6
-"""What is added up: seconds; the means of what a step leaves up to C_nb (18,), and of the noise of
-the samples (6,)."""
+"""Sums over an interval: seconds; the means of what a step leaves up to C_nb (18,), and of the
+noise of the samples (6,)."""
 
 # What the vehicle may do while the IMU is silent, one sigma of the mean rate (rad/s) and force
 # (m/s^2) against the sample that is held: a car that turns or brakes at a comfortable limit. Real

@@ -67,8 +67,8 @@ POSITION, POSITION_RAMP, VELOCITY, VELOCITY_RAMP, CARRIED, DELAY, SPEED, ROWS = 
 positions that grow as velocities say; a delay; a share of the speed; an offset of each of an aid's
 rows."""
 PLACES, MOVES, ROLLS, OTHER, NOTHING = range(5)
-"""What an aid's rows are: a position, a velocity, a speed, something of its own, nothing that can
-be at fault."""
+"""Kinds of a measurement's rows: a position, a velocity, a speed, something of its own, nothing
+that can be at fault."""
 
 # Columns of the table of kinds: signature, device, size p, slots of a step, class,
 # whether it is in its device's positions and in its velocities.
@@ -113,7 +113,7 @@ UNEXPLAINED_SIGMAS = 4.0
 DECIDED = 7.0
 """Log odds beyond which a hypothesis is likely: a thousand to one."""
 LEAST_WEIGHT = 1e-7
-"""What is as unlikely opens nothing: of a kilometre a third of a metre."""
+"""Probability below which a hypothesis counts for nothing: a third of a metre of a kilometre."""
 LASTS_S = 1.0
 """For so long it must have been: a receiver's errors of a second are one error."""
 
@@ -130,12 +130,12 @@ class FaultTable(NamedTuple):
 
     @property
     def threes(self) -> int:
-        """How many groups have three numbers."""
+        """Number of groups with three numbers."""
         return RESTARTS * int(np.count_nonzero(self.ints[:, SIZE] == 3))
 
     @property
     def groups(self) -> int:
-        """How many groups there are."""
+        """Number of groups."""
         return RESTARTS * len(self.ints)
 
 
@@ -198,7 +198,7 @@ def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
 
 @compiled("i8(f8[::1], i8)", forceinline=True)
 def group_at(bank: Array, number: int) -> int:
-    """Where a group's numbers begin."""
+    """Offset of a group's numbers."""
     threes = int(bank[THREES])
     tile, lane = number // LANES, number % LANES
     at: int = GROUPS + tile * OF_THREE + lane

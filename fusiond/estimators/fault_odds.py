@@ -312,7 +312,7 @@ def judge(
 
 @compiled("b1(f8[::1])", forceinline=True)
 def identified(found: Array) -> bool:
-    """Whether a group is so much likelier than all of other classes, as `judge` has `found`."""
+    """True if a group is so much likelier than all of other classes, as `judge` has `found`."""
     apart = found[BEST] >= 0.0 and found[AHEAD] > APART
     return bool(apart)
 

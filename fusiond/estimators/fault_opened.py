@@ -1,4 +1,4 @@
-r"""What the hypotheses of a bank are found to be, and leave open of what a filter publishes.
+r"""Sizes of a bank's hypotheses, and their share of the published covariance.
 
 Of the mixture of fusiond.estimators.fault_odds nine variances are published, with three products of
 the attitude's errors. With L + S^-1 = C D C^T of a group, C of unit diagonal,

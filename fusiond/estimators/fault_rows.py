@@ -89,7 +89,7 @@ def walk_path(bank: Array, nav: Array, now_s: float, step_s: float) -> None:
 
 @compiled("i8(f8[::1], f8)")
 def _past(bank: Array, t_s: float) -> int:
-    """How many points ago the path was last before `t_s`, or at it; -1 where it is not kept."""
+    """Points back to the path's last before `t_s`, or at it; -1 where it is not kept."""
     entries = int(bank[ENTRIES])
     first, end = 1, min(entries, RING)  # of two points the first is looked for
     while first < end:
@@ -116,7 +116,7 @@ def _at_past(bank: Array, back: int, t_s: float, component: int) -> float:
 
 @compiled("b1(i8[:, ::1], i8, i8, i8)", forceinline=True)
 def concerns(ints: Indices, kind: int, measures: int, device: int) -> bool:
-    """Whether a kind is one of rows, of a device, or of any and this one locates or moves."""
+    """True if a kind is one of rows, of a device, or of any and this one locates or moves."""
     if ints[kind, SIGNATURE] <= FOLLOWED:
         return False
     if measures == PLACES and not ints[kind, LOCATES]:

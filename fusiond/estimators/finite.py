@@ -1,4 +1,4 @@
-"""Whether a filter still has numbers: asked after every tick."""
+"""Check that a filter is finite: asked after every tick."""
 
 from __future__ import annotations
 

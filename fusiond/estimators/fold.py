@@ -142,8 +142,8 @@ def account_for(
     device: int,
     work: Array,
 ) -> None:
-    """What the bank makes of rows that were `fused` or not, as `whiten` has left y (m,) and g (m,
-    w): of a filter that keeps its estimate."""
+    """Update the bank by rows that were `fused` or not, as `whiten` has left y (m,) and g (m, w):
+    of a filter that keeps its estimate."""
     n = h.shape[1]
     restart_due(bank, ints, numbers, n, t_ns, nav, step)
     sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)

@@ -72,7 +72,7 @@ class Hypotheses:
         self.bank, self.table = bank, table
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
-        """What the last `judge` has found, as of fusiond.estimators.fault_odds."""
+        """Result of the last `judge`, as of fusiond.estimators.fault_odds."""
         self._mounting = np.full((2, 2), -1.0)
         """Slots of pitch and yaw of the mounting, and what of their squares is chance."""
         for k, slot in enumerate(model.slots_of(MOUNTING)[:2]):
@@ -90,7 +90,7 @@ class Hypotheses:
         self.of_source: dict[str, tuple[int, int]] = {}
 
     def of(self, aid: Linearised) -> tuple[int, int]:
-        """What an aid's rows are, as of fusiond.estimators.fault_bank, and the number of its
+        """Kinds of a measurement's rows, as of fusiond.estimators.fault_bank, and the number of its
         device; -1 where no kind is of it."""
         known = self.of_source.get(aid.source)
         if known is None:
@@ -101,7 +101,7 @@ class Hypotheses:
 
     @property
     def waits(self) -> bool:
-        """Whether V is still that of the last aid, as it is after a look in passing."""
+        """True if V is still that of the last aid, as it is after a look in passing."""
         return self.bank.item(WAITS) != 0.0
 
     def begin(self, t_ns: int, nav: Array, step: Array) -> None:
@@ -147,8 +147,8 @@ class Hypotheses:
         widen_by_faults(self.bank, self.table.lanes, self.n, step, self.work, wider)
 
     def opened(self) -> Array:
-        """What the weighed hypotheses leave open of attitude, velocity, position (9, 9); written
-        anew by the next call."""
+        """Covariance that the weighed hypotheses add to attitude, velocity, position (9, 9);
+        written anew by the next call."""
         self.conclude()
         mixture(self.bank, self.table.numbers, self.n, self._nine)
         return self._nine

@@ -105,7 +105,7 @@ LARGE_SD_RAD = 2.0 * PLAIN_SD_RAD
 
 
 class Turning(NamedTuple):
-    """What of velocity and position (3,) turns with the heading; and whether that is the speed, so
+    """Part of velocity and position that turns with the heading; and whether that is the speed, so
     that an error of the velocity changes it."""
 
     velocity: Array
@@ -114,7 +114,7 @@ class Turning(NamedTuple):
 
 
 class Sought(NamedTuple):
-    """Where an update leads: the error xi (n,), P_xi (n, n) after it, and how the innovation stands
+    """Result of an update: the error xi (n,), P_xi (n, n) after it, and how the innovation stands
     to its gate; of a screened aid what became of each row."""
 
     error: Array
@@ -127,11 +127,11 @@ class Sought(NamedTuple):
 
     @property
     def degrees(self) -> int:
-        """How many rows count."""
+        """Number of rows that count."""
         return self.rows.count(KEPT) if self.rows else len(self.whitened)
 
     def likelier(self, other: Sought) -> bool:
-        """Whether more rows fit, or as many and better."""
+        """True if more rows fit, or as many and better."""
         return (-self.degrees, self.nis) < (-other.degrees, other.nis)
 
 
@@ -149,7 +149,7 @@ class InvariantFilter(TiltAxesFilter):
         self._settles = settles
         self._mounts = model.indices[MOUNTING]
         self._bent = False
-        """Whether the bank has missed updates: of a heading so wide that no effect is linear."""
+        """True if the bank has missed updates: of a heading so wide that no effect is linear."""
         self.log_likelihood = 0.0
         """Of the innovation last looked at, but for a constant that is alike for all filters; one
         that fails its gate counts as one at the gate: it may be the measurement's fault."""
@@ -272,7 +272,7 @@ class InvariantFilter(TiltAxesFilter):
         return Outcome("fused", found.nis, found.degrees, found.whitened, found.rows)
 
     def _hypothesise(self, aid: Linearised, rows: Innovation, found: Sought, prior: float) -> None:
-        """What the bank makes of an update, which is to first order that of dx while the heading's
+        """Update the bank by an update, which is to first order that of dx while the heading's
         variance before it is not wide; else its hypotheses begin anew afterwards."""
         bank = self.hypotheses
         if bank is None or prior > WIDE_SD_RAD**2:

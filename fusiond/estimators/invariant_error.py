@@ -1,4 +1,4 @@
-"""What an error in the coordinates of fusiond.estimators.invariant makes of a state, as kernels.
+"""Kernels for a state with an error in invariant coordinates.
 
 `velocity` and `place` (3,) are what of a filter's velocity and position turns with the heading, and
 `speeds` whether that is the speed; `mounting` (0 or 2,): the slots of the IMU's pitch and yaw

@@ -93,7 +93,7 @@ class KalmanEstimator(ErrorStateFilter):
     def _account_for(
         self, aid: Linearised, rows: Innovation, kept: NDArray[np.bool_], fused: bool
     ) -> None:
-        """What the bank makes of rows of an aid that are about to be folded in, or have failed."""
+        """Update the bank by rows of an aid that are about to be folded in, or have failed."""
         bank, count = self.hypotheses, int(kept.sum())
         assert bank is not None
         z, h, r = (np.ascontiguousarray(part[kept]) for part in rows)

@@ -28,22 +28,22 @@ LINE_BYTES, LINE = 64, 8
 
 
 def line_after(doubles: int) -> int:
-    """Where the next line begins."""
+    """Offset of the next line."""
     return doubles + -doubles % LINE
 
 
 SIZE, ROOM, USED, RECORDED, TRANSITION, GAP, AHEAD, BANK = range(8)
-"""What the array begins with, a line of int64: states; covariances, and error estimates, that there
-is room for; how many covariances are propagated, from the first on; of which one sigmas are
-recorded; 1 if there is a transition matrix; ns beyond which no sample may stand; 1 if covariances
-are ahead of those that are held, by what has been added up; doubles of the bank of hypotheses."""
+"""Header of the array, a line of int64: states; covariances, and error estimates, that there is
+room for; how many covariances are propagated, from the first on; of which one sigmas are recorded;
+1 if there is a transition matrix; ns beyond which no sample may stand; 1 if covariances are ahead
+of those that are held, by what has been added up; doubles of the bank of hypotheses."""
 PUBLISHED_AT = LINE
 WIDER_AT = PUBLISHED_AT + len(Published._fields)
 NAV_AT = line_after(WIDER_AT + WIDER)
 STEP_AT, SUMS_AT = NAV_AT + NAV_SIZE, NAV_AT + NAV_SIZE + STEP_SIZE
 XI_AT = SUMS_AT + SUMS
-"""What lies where behind it, in doubles; then come parameters and error estimates, and on the next
-line covariances and the bank, with which ends what a snapshot copies, from `WIDER_AT` on."""
+"""Layout of the array behind it, in doubles; then come parameters and error estimates, and on the
+next line covariances and the bank, with which ends what a snapshot copies, from `WIDER_AT` on."""
 
 
 def scratch_size(width: int) -> int:

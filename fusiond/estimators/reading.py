@@ -60,9 +60,9 @@ ENTRIES, MOVING = 22, 12
 
 
 class Published(NamedTuple):
-    """What a filter's state is published by: the parameter that is the offset of the receiver's
-    clock, or -1 and one sigma (s) of the filter's own; and one sigma (rad) about each axis of what
-    the unit in use is turned by against that of which the attitude is published."""
+    """Axes and clock of publication: the parameter that is the offset of the receiver's clock, or
+    -1 and one sigma (s) of the filter's own; and one sigma (rad) about each axis of what the unit
+    in use is turned by against that of which the attitude is published."""
 
     time_slot: int
     clock_sd_s: float = 0.0

@@ -286,7 +286,7 @@ def screened_update(
 
 
 def jumped(codes: Codes, h: Array, offsets: Sequence[int]) -> bool:
-    """Whether the better half of the ranges fails; of the rows, `codes` (m,) and `h` (m, n), with
+    """True if the better half of the ranges fails; of the rows, `codes` (m,) and `h` (m, n), with
     the slots of the clock's offsets."""
     if np.count_nonzero(codes) < FEWEST_JUMPING:  # KEPT is 0
         return False

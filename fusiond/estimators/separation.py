@@ -82,8 +82,8 @@ class SeparatedEstimator(KalmanEstimator):
         return outcome
 
     def look(self, aid: Linearised, lasting: Array | None = None) -> Outcome:
-        """What the innovation of an aid would be; the aid is `isolated`, nothing that is published
-        changes. The subsets judge for themselves: there the aid may be the sound one."""
+        """Innovation of a measurement that is not fused; the aid is `isolated`, nothing that is
+        published changes. The subsets judge for themselves: there the aid may be the sound one."""
         outcome = super().look(aid, lasting)
         innovation = self._linearise(aid)
         if not isinstance(innovation, NotApplicable):
@@ -110,7 +110,7 @@ class SeparatedEstimator(KalmanEstimator):
             self._dxs -= self._dxs[0].copy()
 
     def _device(self, aid: Linearised) -> int | None:
-        """Which device an aid comes from; None where from none of them."""
+        """Device of a measurement; None where from none of them."""
         if aid.source not in self._device_of:
             self._device_of[aid.source] = local_of(aid.source, self.devices)
         return self._device_of[aid.source]

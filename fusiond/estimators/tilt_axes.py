@@ -142,7 +142,7 @@ def turn_rows(m: Array, before: Array, after: Array, slots: Indices, axes: Indic
 
 @compiled("b1(f8[:, :], i8[::1])")
 def may_part(p: Array, slots: Indices) -> bool:
-    """Whether an update may tell tilt and force biases, the `slots` (j,) of P (n, n), apart that
+    """True if an update may tell tilt and force biases, the `slots` (j,) of P (n, n), apart that
     nothing has told apart."""
     if slots.size == 0:
         return False
@@ -211,8 +211,8 @@ def keep_rows(
 
 @compiled("void(f8[::1], f8[::1], f8[::1], i8[:, ::1])")
 def keep_downward(before: Array, nav: Array, xi: Array, biases: Indices) -> None:
-    """What an update of an estimate `before` has told of xi's force `biases` downward, it has told
-    along the mean of the axes before and after: the vertical bias takes the difference."""
+    """Share of an update in xi's force `biases` downward, along the mean of the axes before and
+    after: the vertical bias takes the difference."""
     if biases.shape[1] == 0:
         return
     old, new = dcm_elements(before[Q0:NAV_SIZE]), dcm_elements(nav[Q0:])
@@ -281,7 +281,7 @@ class TiltAxesFilter(KalmanEstimator):
         self.turns = False
         """Whether the heading may be far off, and updates are another kind's."""
         self.undoubted = True
-        """Whether what gyros are wrong by is what they were wrong by when the filter started."""
+        """True if what gyros are wrong by is what they were wrong by when the filter started."""
         if known:
             self._options |= TURN_TILT
 

@@ -1,4 +1,4 @@
-"""What an interval does to the axes in which a covariance has the tilt, as compiled kernels.
+"""Effect of an interval on the tilt axes of a covariance: compiled kernels.
 
 The equations are in fusiond.estimators.tilt_axes. Covariances (width, width) are flat, and nothing
 of P21 comes into what else they hold: it is made of P12 (fusiond.estimators.covariance). What
@@ -100,7 +100,7 @@ def _vertical(sensor_slot: Indices, sensor_kind: Indices) -> int:
 def _left(
     rows: Array, at: int, stride: int, turn: Array, sensor_slot: Indices, sensor_kind: Indices
 ) -> float:
-    """What of the entries of the force biases, the first of all at `at`, the vertical one takes."""
+    """Share of the entries of the force biases, the first of all at `at`, for the vertical one."""
     left = 0.0
     for i in range(6, 12):
         if sensor_kind[i] == PLAIN:

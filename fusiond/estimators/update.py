@@ -134,7 +134,7 @@ def feed_back(nav: Array, xi: Array, d: Array) -> None:
 
 
 def work(rows: int, width: int) -> tuple[Array, Array]:
-    """What `fuse` needs beside a filter's own for so many rows: y (m,) and g (m, w)."""
+    """Workspace of `fuse` for so many rows: y (m,) and g (m, w)."""
     return np.empty(rows), np.empty((rows, width))
 
 

@@ -106,7 +106,7 @@ def counted(refused: Mapping[str, int]) -> list[Rejection]:
 
 
 def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
-    """How many rows were rejected for each reason."""
+    """Number of rows rejected, by reason."""
     found = Counter[str]()
     for each in rejected:
         found[each.reason] += each.times
@@ -114,7 +114,7 @@ def counts(rejected: Iterable[Rejection]) -> dict[str, int]:
 
 
 def file_report(rows: int, rejected: Sequence[Rejection], first: int = 5) -> dict[str, Any]:
-    """What a summary says of a file: rows used, rejected by reason, the first of them in words."""
+    """Summary of a file: rows used, rejected by reason, the first of them in words."""
     return {
         "rows": rows,
         "rejected": counts(rejected),

@@ -89,7 +89,7 @@ def _with_commas(data: Text) -> Text:
 
 
 def _decimal(data: bytes, between: bytes) -> bytes:
-    """What stands before a number's decimals: a comma or a point."""
+    """Decimal sign: a comma or a point."""
     points = commas = False
     for row in data.split(b"\n", _LOOKED_AT + 1)[1 : _LOOKED_AT + 1]:
         for cell in row.split(between):

@@ -28,7 +28,7 @@ _INF = int.from_bytes(b"inf", "little")
 _UNITS = np.array([10**k for k in range(19)], dtype=np.int64)
 _SCALES = np.array([10.0**k for k in range(MAX_DECIMALS + 1)])
 _FILL = np.array([10 ** (-k % 4) for k in range(MAX_DECIMALS + 1)], dtype=np.uint64)
-"""What makes of so many decimals a multiple of four."""
+"""Padding of so many decimals to a multiple of four."""
 _DIGITS = _ZERO + np.arange(10**4)[:, np.newaxis] // (1000, 100, 10, 1) % 10
 _FOURS = _DIGITS.astype(np.uint8).view("<u4").ravel().astype(np.uint32)
 """The digits of 0000 to 9999, the first in the lowest byte: one look instead of four divisions."""
@@ -166,7 +166,7 @@ def _newlines(words: NDArray[np.uint64]) -> int:
 
 
 def newlines(text: NDArray[np.uint8]) -> int:
-    """How many there are in a text (n,) that lies at the beginning of its memory."""
+    """Number of digits in a text (n,) that lies at the beginning of its memory."""
     whole = len(text) // 8 * 8
     words = _newlines(text[:whole].view(np.uint64))
     return words + int(np.count_nonzero(text[whole:] == _NEWLINE))

@@ -158,8 +158,9 @@ def klobuchar_gps(
 def pierced(
     ratio: float, lat_rad: float, sin_elevation: float, cos_azimuth: float
 ) -> tuple[float, float, float, float]:
-    """Where a ray pierces a layer: sine and cosine of the arc to there, sine of its latitude, and
-    the cosine of the ray's angle from the vertical. `ratio`: earth's radius over the layer's."""
+    """Pierce point of a ray in a layer: sine and cosine of the arc to there, sine of its
+    latitude, and the cosine of the ray's angle from the vertical. `ratio`: earth's radius over
+    the layer's."""
     se = max(sin_elevation, 0.0)
     ce = math.sqrt(1.0 - se * se)
     # The angle at the layer; the arc to its point is pi/2 less this and the elevation.

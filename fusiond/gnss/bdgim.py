@@ -39,7 +39,7 @@ SLOT_D = 2.0 / 24.0
 TECU_M = 40.28e16 / CARRIER_HZ["C", "1"] ** 2
 """Delay at B1C of 1e16 electrons a square metre."""
 FLOORS = ((35.0, 10.0), (20.0, 8.0), (12.0, 6.0), (-math.inf, 4.0))
-"""Where alpha_1 is above the first, VTEC is at least alpha_1 over the second."""
+"""Bounds; where alpha_1 is above the first, VTEC is at least alpha_1 over the second."""
 
 _HIGHEST, _ORDERS = 5, 4
 _BROADCAST = ((0, 0), (1, 0), (1, 1), (1, -1), (2, 0), (2, 1), (2, -1), (2, 2), (2, -2))
@@ -90,7 +90,7 @@ _PLACES = np.array([_place(n, m) for n, m in (*_BROADCAST, *_REST)])
 
 
 def bdgim_terms(model: Bdgim, week: int, tow_s: float) -> Array:
-    """What `bdgim` takes, (49,), for a GPS time; it holds for the two hours of BDT."""
+    """Coefficients of `bdgim`, (49,), for a GPS time; it holds for the two hours of BDT."""
     mjd = GPS_EPOCH_MJD + 7 * week + (tow_s - BDT_BEHIND_GPS_S) / 86_400.0
     middle = (math.floor(mjd / SLOT_D) + 0.5) * SLOT_D
     angles = 2.0 * math.pi / _PERIODS_D * middle

@@ -52,7 +52,7 @@ EPOCH_S = 2300.0 * WEEK_S
 """GPS time where the inertial axes coincide with the Earth's: 2024-02-04."""
 J2 = 1.082629821e-3
 UPDATE_S: dict[System, float] = {"G": 7200.0, "E": 600.0, "C": 3600.0}
-"""How often a new ephemeris is broadcast; toe lies on its multiples."""
+"""Interval of ephemeris broadcasts; toe lies on its multiples."""
 
 INCLINATION_RAD = math.radians(55.0)
 GEO_LONGITUDES_DEG = {59: 140.0, 60: 80.0, 61: 110.5}
@@ -148,7 +148,8 @@ def slots(systems: Sequence[System] = ("C", "G")) -> tuple[Slot, ...]:
 
 
 def ephemeris(slot: Slot, week: int, tow_s: float, epoch_s: float = EPOCH_S) -> Ephemeris:
-    """What the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest one.
+    """Ephemeris that the satellite broadcasts at GPS time `week`, `tow_s`: its toe is the nearest
+    one.
 
     At `epoch_s` (GPS time, s) the satellites stand where they do at `EPOCH_S` unless told.
     Unquantised: `fusiond.simulation.gnss.nav_fields.quantised` rounds to what a message can carry.

@@ -1,4 +1,4 @@
-r"""What a signal's hardware in the satellite adds to the clock that the ephemeris states.
+r"""Group delay of a signal in the satellite, against the clock of the ephemeris.
 
     pseudorange + c (dt - d) = range + ...        d in s, in terms of the broadcast group delays
 

@@ -69,7 +69,7 @@ CONSTANTS: dict[System, Constants] = {
 
 
 def is_beidou_geo(system: System, prn: int) -> bool:
-    """Whether the orbit is given in the tilted frame: C01 to C05 and C59 to C63."""
+    """True if the orbit is given in the tilted frame: C01 to C05 and C59 to C63."""
     return system == "C" and (prn <= 5 or 59 <= prn <= 63)
 
 

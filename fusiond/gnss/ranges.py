@@ -130,7 +130,7 @@ class _Of:
 
 @dataclass(slots=True, eq=False)
 class Rows:
-    """What serves of an epoch, n rows; ECEF is the frame of the instant of reception.
+    """Usable data of an epoch, n rows; ECEF is the frame of the instant of reception.
 
     `pseudorange_m` and `rate_m_s` (n,) corrected, so that range + clock offset of the receiver and
     its rate are left (NaN where no rate was measured); `position` and `velocity` (n, 3) of the
@@ -188,7 +188,7 @@ class Rows:
 
 
 class _Plan(NamedTuple):
-    """Which signals serve, as long as the same ones come and no ephemeris changes."""
+    """Usable signals, as long as the same ones come and no ephemeris changes."""
 
     keys: list[tuple[System, int, str]]
     version: int

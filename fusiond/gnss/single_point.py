@@ -78,7 +78,7 @@ class SinglePoint(NamedTuple):
 
     @property
     def consistent(self) -> bool:
-        """Whether the residual test passes; without redundancy there is nothing to test."""
+        """True if the residual test passes; without redundancy there is nothing to test."""
         return self.redundancy == 0 or self.statistic <= self.bound
 
 

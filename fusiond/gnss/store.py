@@ -38,7 +38,7 @@ _OTHERS: dict[System, tuple[str, ...]] = {
 
 
 class EphemerisStore:
-    """What has been received. `version` rises with every change."""
+    """Store of received navigation messages. `version` rises with every change."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[System, int, str], list[Ephemeris]] = {}

@@ -1,4 +1,4 @@
-r"""Whether a device that is out of service fits itself: its positions against its velocities.
+r"""Agreement of a device's positions with its velocities while it is out.
 
     |p_k - p_(k-1) - (v_k + v_(k-1)) h / 2| <= 4 sqrt(2 s_p^2 + s_v^2 h^2 / 2)        north and east
 

@@ -73,7 +73,7 @@ follow: half, as nothing says that either is more precious."""
 
 @immutable()
 class Requirement:
-    """What is allowed, as probabilities over the same exposure as the priors: an approach, an hour.
+    """Allowed risks, as probabilities over the same exposure as the priors: an approach, an hour.
     It holds so many independent `samples`. `tolerance_m` is that of a protection level."""
 
     vertical_risk: float
@@ -211,7 +211,7 @@ def _risk_of(terms: list[tuple[float, float, float]], level: float) -> float:
 
 
 def _level_of(term: tuple[float, float, float], risk: float) -> float:
-    """Where one term alone has `risk`; minus infinity where it never has as much."""
+    """Level at which one term alone has `risk`; minus infinity where it never has as much."""
     weight, offset, sigma = term
     return offset - gaussian_quantile(min(1.0, risk / weight)) * sigma
 
@@ -318,7 +318,7 @@ def _solve(design: Array, variance: Array, out: Mask) -> tuple[Array, Array] | N
 
 
 def detect(epoch: Epoch, protection: Protection, y: Array, requirement: Requirement) -> Detection:
-    """Whether the measurements y (n,), less what a linearisation point predicts, fit together.
+    """True if the measurements y (n,), less what a linearisation point predicts, fit together.
 
     The sum of squared residuals is a sanity check: a fault outside the modes shows there.
     """

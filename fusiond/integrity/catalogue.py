@@ -104,11 +104,11 @@ class Kind:
 
     @property
     def corrected(self) -> bool:
-        """Whether the filter goes on without it: it is one of its states."""
+        """True if the filter goes on without it: it is one of its states."""
         return self.signature in (STATES, TURNED, SHIFTED, FOLLOWED)
 
     def spoils(self, device: str, locates: bool, moves: bool) -> bool:
-        """Whether a series of such a device is no measurement any more."""
+        """True if a series of such a device is no measurement any more."""
         if self.corrected or self.device not in (TOGETHER, device):
             return False
         return self.of == OWN or (self.locates and locates) or (self.moves and moves)

@@ -71,7 +71,8 @@ _LAG = np.arange(1, LAGS + 1)
 
 @immutable()
 class ConsistencyOptions:
-    """How one source is judged; docs/consistency.md has the figures behind the defaults."""
+    """Options of the tests of one source; docs/consistency.md has the figures behind the
+    defaults."""
 
     window: int = 100
     """K, epochs. More see smaller faults, and later."""
@@ -96,7 +97,7 @@ class ConsistencyOptions:
 
 @immutable()
 class Consistency:
-    """What the tests found. Figures that need more epochs than there are, are NaN."""
+    """Results of the tests. Figures that need more epochs than there are, are NaN."""
 
     verdict: Verdict
     """Of the monitor: with hysteresis. Of `judge`: equal to `window_verdict`."""
@@ -132,7 +133,7 @@ class Consistency:
 
     @property
     def nis_inside(self) -> bool:
-        """Whether the average lies in its interval (not its limits)."""
+        """True if the average lies in its interval (not its limits)."""
         return self.nis_interval[0] <= self.nis_average <= self.nis_interval[1]
 
     @property
@@ -163,7 +164,7 @@ TOO_FEW = Consistency(
 
 
 class Limits(NamedTuple):
-    """What depends on K, m, alpha and gate only. `scale` of the average's gamma law."""
+    """Constants that depend on K, m, alpha and gate only. `scale` of the average's gamma law."""
 
     shape: float
     scale: float
@@ -196,7 +197,7 @@ def limits_of(k: int, dof: int, alpha: float, gate: float, whitened: bool) -> Li
 
 
 def _between(shape: float, scale: float, outside: float) -> Interval:
-    """What a gamma law leaves with this probability, half of it at either end."""
+    """Bounds of a gamma law with this probability inside, half of it at either end."""
     return (
         scale * gamma_quantile(shape, outside / 2.0),
         scale * gamma_quantile(shape, outside / 2.0, upper=True),
@@ -286,7 +287,7 @@ def judge(
 
 @compiled("i8(f8, f8, f8, f8, f8)")
 def verdict_index(average: float, q: float, low: float, high: float, most_q: float) -> int:
-    """Which of `WORDS`. The average goes first: a covariance that is too small is worse than
+    """Verdict, one of `WORDS`. The average goes first: a covariance that is too small is worse than
     colour."""
     if average > high:
         return 2

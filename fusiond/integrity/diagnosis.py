@@ -59,7 +59,7 @@ within a hundred metres."""
 
 
 class Correction(NamedTuple):
-    """What to take out of the error state, mean (n,), and its covariance (n, n)."""
+    """Correction of the error state, mean (n,), and its covariance (n, n)."""
 
     mean: Array
     spread: Array
@@ -87,7 +87,7 @@ class Diagnosis:
         self._lasting: Mapping[str, Lasting] = {}
         """By series, why it left service last; replaced, never changed."""
         self.findings: tuple[Finding, ...] = ()
-        """What has been identified since the start, the last of each kind and device."""
+        """Identified faults since the start, the last of each kind and device."""
 
     def snapshot(self) -> Memory:
         """A copy of everything."""
@@ -119,7 +119,7 @@ class Diagnosis:
 
     @property
     def positions_out(self) -> bool:
-        """Whether there are positions, and none is in service."""
+        """True if there are positions, and none is in service."""
         positions = [s for s in self._series.values() if s.locates]
         return bool(positions) and all(s.out for s in positions)
 
@@ -220,7 +220,7 @@ class Diagnosis:
         return correction
 
     def _decide(self, t_ns: int, bank: Hypotheses, found: Array) -> Correction:
-        """What is identified."""
+        """Faults that are identified."""
         best, odds = found.item(BEST), found.item(BEST_ODDS)
         taken = self._alike(bank, self._kinds[int(best) // RESTARTS], odds)
         fits = np.array([each.log_likelihood for each in taken])
@@ -246,9 +246,9 @@ class Diagnosis:
         return Finding(kind, t_ns, told.onset_s, size, sd, told.log_odds)
 
     def _leave_out(self, finding: Finding, bank: Hypotheses, fit: float) -> None:
-        """What a fault spoils leaves service, and what those of its device spoil that fit as well:
-        nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a straight
-        may be off, or late, and the velocity with it."""
+        """Series that a fault removes from service, and those of faults of its device that fit as
+        well: nothing of that is to be trusted before it is told apart. A fix of 60 m behind on a
+        straight may be off, or late, and the velocity with it."""
         fits = bank.explains & (bank.log_odds > max(0.0, finding.log_odds - DECIDED))
         fits &= bank.log_likelihood >= fit - APART
         found = []
@@ -278,7 +278,7 @@ class Diagnosis:
             self._lasting = {name: lasting.without(over) for name, lasting in known}
 
     def lasting(self, aid: Aid, one: Series, estimator: Estimator) -> Array | None:
-        """What each fault for which a series may be out adds to its innovation (k, 3), if it lasts;
+        """Terms of each fault in an innovation of a series that may be out (k, 3), if it lasts;
         None where none is known."""
         bank, added = estimator.hypotheses, []
         if bank is None:
@@ -300,7 +300,7 @@ class Diagnosis:
         ]
 
     def _exclude(self, t_ns: int, reason: str, spoiled: Callable[[Series], bool]) -> None:
-        """What is spoiled leaves service."""
+        """Exclude the series that faults affect."""
         for name in [n for n, s in self._series.items() if not s.out and spoiled(s)]:
             if name in self._shared:
                 self._shared.discard(name)
@@ -308,7 +308,7 @@ class Diagnosis:
             self._series[name].exclude(t_ns, reason)
 
     def _goes_its_own_way(self, one: Series) -> bool:
-        """Whether a position whose fault is over has gone the way that the velocity of its device
+        """True if a position whose fault is over has gone the way that the velocity of its device
         says, which is in service, for a minute: it is the filter that is somewhere else."""
         if not (one.out and one.locates and one.reason == STILL):
             return False

@@ -23,7 +23,7 @@ class Finding(NamedTuple):
 
     @property
     def largest(self) -> int:
-        """Which number is most."""
+        """Index of the largest number."""
         return max(range(len(self.size)), key=lambda i: abs(self.size[i]))
 
     @property

@@ -41,7 +41,7 @@ LAGS = 8
 COUNT = 600.0
 """Innovations that are averaged: two minutes of 5 Hz."""
 PRIOR_COUNT = 60.0
-"""What is stated weighs as much as so many: the estimate scatters by half of itself then."""
+"""Weight of the stated variance: the estimate scatters by half of itself then."""
 WAITS_NS = 15_000_000_000
 """A drift of 0.1 m/s is found within twice this; longer ones hide nothing."""
 MOST = 100.0
@@ -117,7 +117,7 @@ def learn(packed: Array, t_s: float, y0: float, y1: float, y2: float, rows: int)
 
 @compiled("void(f8[::1])")
 def forget_lately(packed: Array) -> None:
-    """What waits was of a fault."""
+    """Discard the rows that wait: they are of a fault."""
     for j in range(_LAGS):
         packed[_WAITS + j] = packed[_NEW + j] = 0.0
     packed[_WAITING] = packed[_NEW_COUNT] = packed[_HELD] = 0.0

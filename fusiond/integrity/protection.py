@@ -53,8 +53,8 @@ AXIS_SHARE = (0.25, 0.25, 0.5)
 
 @immutable()
 class IntegrityRisk:
-    """What is allowed, and how likely faults are: `risk` of an error beyond the level and
-    `false_alarm` of a separation beyond its threshold, each an hour; `priors` (devices,)."""
+    """Allowed risk and fault priors: `risk` of an error beyond the level and `false_alarm` of a
+    separation beyond its threshold, each an hour; `priors` (devices,)."""
 
     risk: float
     false_alarm: float

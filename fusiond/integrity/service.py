@@ -1,4 +1,4 @@
-r"""Which series of measurements are in service: one table of states, with named transitions.
+r"""Service of measurement series: one table of states, with named transitions.
 
 A series is what one source says of one thing (`gnss`, `gnss_velocity`).
 
@@ -82,7 +82,7 @@ class Series:
     failed: int = 0
     passed: int = 0
     out_ns: int = 0
-    """When (ns) it left service last."""
+    """Instant (ns) of its last exclusion."""
     proven_ns: int = 0
     """Until when (ns) it is on probation: for as long as it was out."""
     over: float = 0.0
@@ -90,7 +90,7 @@ class Series:
     value: object = None
     repeats: int = 0
     unchanged: bool = False
-    """Whether the last value was that before it, to the bit."""
+    """True if the last value was that before it, to the bit."""
     noise: Array = field(default_factory=unlearned)
     repeating: float = 1.0
     """Probability that a value repeats the one before it, as shown so far in motion."""
@@ -168,7 +168,7 @@ class Series:
         self.failed = self.passed = 0
 
     def repeats_itself(self, value: object, moving: bool) -> bool:
-        """Whether a new value makes so many alike to the bit, of a vehicle that is `moving`, that
+        """True if a new value makes so many alike to the bit, of a vehicle that is `moving`, that
         it is no measurement. What stands may repeat."""
         self.unchanged = value == self.value
         same = moving and self.unchanged
@@ -187,7 +187,7 @@ _EACH = attrgetter(*(each.name for each in fields(Series)))
 
 
 def value_of(offers: Sequence[Offer]) -> tuple[float, ...] | None:
-    """What a sensor that hangs repeats to the bit."""
+    """Values that a frozen sensor repeats to the bit."""
     for offer in offers:
         if isinstance(offer, PositionOffer):
             return offer.lat_rad, offer.lon_rad

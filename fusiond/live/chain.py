@@ -55,7 +55,7 @@ class Chain:
         self.operator = Operator(self.navigator, self.sources, self.injection, self.messaging)
         self.solution: Solution | None = None
         self.changed = False
-        """Whether the last tick brought another mode."""
+        """True if the last tick brought another mode."""
         self._second = Every(SECOND_NS)
 
     def _report(self, source: str, code: str, text: str) -> None:

@@ -253,7 +253,7 @@ class Daemon:
         return self._when_kept(text) if isinstance(command, SendMessage) else text
 
     async def _when_kept(self, text: str) -> str:
-        """What is said of a message that was queued, once it is on disk."""
+        """Reply for a queued message, once it is on disk."""
         messaging = self._chain.messaging
         missing = await self._messages.kept(messaging.revision, messaging)
         return f"{text}; {missing}" if missing else text

@@ -46,7 +46,7 @@ _VALUES = {
     Height: ("height_m",),
     WheelSpeed: ("speed_m_s",),
 }
-"""What a measurement says; all else of it is its stamp or how good it claims to be."""
+"""Fields that a fault may alter; all else of it is its stamp or how good it claims to be."""
 
 
 class Injection:
@@ -70,7 +70,7 @@ class Injection:
         return tuple(f"{n}: {_told(f.command)}" for n, f in self.faults.items() if not f.over)
 
     def pass_on(self, item: Emitted) -> Iterator[Emitted]:
-        """What a fault leaves of an item."""
+        """Items that remain after a fault."""
         fault = self.faults.get(item.source)
         if fault is None or fault.over or isinstance(item, DeviceEvent | Mail):
             yield item
@@ -78,7 +78,7 @@ class Injection:
             yield from fault.pass_on(item)
 
     def tick(self, t_ns: int) -> Iterator[Emitted]:
-        """What was held back and is due at `t_ns`; faults whose time is over end."""
+        """Items held back that are due at `t_ns`; faults whose time is over end."""
         for source, fault in tuple(self.faults.items()):
             yield from fault.due(t_ns)
             if not fault.over and t_ns >= fault.end_ns:

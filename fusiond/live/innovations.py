@@ -1,4 +1,4 @@
-"""How aids ended since it was last asked: what `innovations` says."""
+"""Outcomes of measurements since the last call, for `innovations`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is logged, with level, source and code as fields of the journal, and how much of it.
+"""Journal entries, with level, source and code as fields of the journal, and their limit.
 
     journalctl -u fusiond -p warning
     journalctl -u fusiond FUSIOND_SOURCE=gnss FUSIOND_CODE=device_absent

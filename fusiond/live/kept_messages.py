@@ -102,7 +102,7 @@ def _kept(m: Outgoing, t_ns: int) -> KeptMessage:
 
 
 def _outgoing(kept: KeptMessage, t_ns: int) -> Outgoing:
-    """What awaited its receipt goes on waiting, at the most as long as the first time again."""
+    """Restore the wait for receipts, at the most as long as the first time again."""
     wordings = tuple(Wording(bytes.fromhex(w.payload), w.encoding, w.odd) for w in kept.wordings)
     return Outgoing(
         kept.key,

@@ -1,4 +1,4 @@
-"""What a start has loaded of runs before it: a replay starts from the same."""
+"""Data loaded from earlier runs: a replay starts from the same."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class LogLimit(logging.Filter):
         self.left_out = 0
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is to be written; one that is written after others were left out says
+        """True if the record is to be written; one that is written after others were left out says
         so. Whoever asks for less than `info` wants all of it."""
         if record.levelno < logging.INFO:
             return True

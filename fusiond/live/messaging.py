@@ -143,7 +143,7 @@ class Messaging:
     # ------------------------------------------------------------------ in
 
     def take(self, mail: Mail) -> None:
-        """What a driver hands over."""
+        """Receive mail of a driver."""
         utc_ns = self._clock.utc_ns(mail.t_seen_ns)
         match mail:
             case MessageStage():
@@ -189,7 +189,7 @@ class Messaging:
     # ------------------------------------------------------------------ told and kept
 
     def take_waiting(self) -> Iterator[tuple[Topic, Message]]:
-        """What is to be published, since the last call."""
+        """Messages to publish, since the last call."""
         while self._waiting:
             yield self._waiting.popleft()
 
@@ -235,7 +235,7 @@ def _known(value: float) -> float | None:
 
 
 def _utc_of(report: PositionReport, seen_utc_ns: int | None) -> int | None:
-    """When a report's place was true; one without a date is of the last day."""
+    """Instant when a report's place was true; one without a date is of the last day."""
     if report.dated:
         return round(report.t_s * SECOND_NS)
     if seen_utc_ns is None:

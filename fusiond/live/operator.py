@@ -1,4 +1,4 @@
-"""What an operator may ask of the daemon, and how it is carried out."""
+"""Commands of the operator, and how they are carried out."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ class Operator:
         self._injection = injection
 
     def carry_out(self, command: Command, t_ns: int) -> str:
-        """What was done at `t_ns`. Raises `CommandRefusedError` for what cannot be done now."""
+        """Result of a command at `t_ns`. Raises `CommandRefusedError` for what cannot be done
+        now."""
         match command:
             case Inject():
                 if command.source not in self._sources.all:

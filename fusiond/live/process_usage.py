@@ -1,4 +1,4 @@
-"""What this process consumes, and what it need not hold."""
+"""Resources of this process, and memory that it can release."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is published when: the solution, the status, health and the verdicts, each at its rate."""
+"""Schedule of publishing: the solution, the status, health and the verdicts, each at its rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a running daemon takes from a configuration that was read again, and what needs a restart.
+"""Reload of a configuration; what needs a restart.
 
 Taken are the outputs (`mqtt`, `outputs`), the gates (`gate_probability` of every aid) and
 `log_level`: what can change without the solution losing what it knows. All else goes into the

@@ -32,7 +32,7 @@ class Every:
         self._next_ns = 0
 
     def due(self, t_ns: int) -> bool:
-        """Whether a period has passed; those missed altogether are not made up for."""
+        """True if a period has passed; those missed altogether are not made up for."""
         behind_ns = t_ns - self._next_ns
         if behind_ns < 0:
             return False

@@ -147,12 +147,12 @@ class Sources:
 
     @property
     def all_running(self) -> bool:
-        """Whether every device sends."""
+        """True if every device sends."""
         return all(s.driver.status.state == "running" for s in self.all.values())
 
     @property
     def inputs(self) -> dict[str, Inputs]:
-        """What moves each driver from outside; not of those that have no such door."""
+        """Inputs that move each driver from outside; not of those that have no such door."""
         doors = {name: getattr(s.driver, "inputs", None) for name, s in self.all.items()}
         return {name: door for name, door in doors.items() if door is not None}
 
@@ -190,7 +190,7 @@ class Sources:
         )
 
     def _diagnosed(self, now_ns: int) -> Callable[[str], dict[str, Any]]:
-        """What `health` of a source says of its service and of its latest fault."""
+        """Service and latest fault of a source for `health`."""
         service = self._navigator.service
         told = list(zip(service.faults(now_ns), self.faults(now_ns), strict=True))
 

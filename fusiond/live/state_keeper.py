@@ -124,7 +124,7 @@ def _speed_m_s(solution: Solution) -> float:
 
 
 def state_file(config: Config, environ: Mapping[str, str]) -> Path | None:
-    """Where a vehicle's state is kept; None where it is not."""
+    """Path of a vehicle's saved state; None where it is not."""
     if config.state_file is not None:
         return config.state_file
     directory = environ.get("STATE_DIRECTORY")

@@ -1,4 +1,4 @@
-"""What a fault of one part costs: that part, for a while, never the daemon."""
+"""Supervision: a fault of one part costs that part, for a while, never the daemon."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, extra="forbid"))
 class KeptState:
-    """What outlives the process: the filter's state, and UTC on the monotonic clock."""
+    """State that outlives the process: the filter's state, and UTC on the monotonic clock."""
 
     navigation: WarmState
     utc: tuple[UtcKnown, ...] = ()
@@ -83,7 +83,7 @@ class WarmKeeper:
         self._working: asyncio.Task[None] | None = None
         self._failing = False
         self.loaded: KeptState | None = None
-        """What was offered to the navigator."""
+        """State offered to the navigator."""
 
     def offer(self, navigator: Navigator) -> None:
         """Let clock and navigator go on from the state of the last run, if it is one of this
@@ -160,7 +160,7 @@ class WarmKeeper:
 
 
 def _boot_id() -> str:
-    """Which boot of this computer it is; empty where the kernel does not say."""
+    """Identifier of this boot; empty where the kernel does not say."""
     try:
         return BOOT_ID.read_text().strip()
     except OSError:
@@ -168,7 +168,7 @@ def _boot_id() -> str:
 
 
 def _asleep_ns() -> int:
-    """How long this boot has been suspended, ns: a monotonic clock that stood still."""
+    """Time that this boot has been suspended, ns: a monotonic clock that stood still."""
     asleep = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(
         time.CLOCK_MONOTONIC
     )

@@ -157,7 +157,7 @@ class Model:
 
     @cached_property
     def unstated(self) -> tuple[int, ...]:
-        """Where `stated` is not."""
+        """Value where `stated` is not given."""
         return tuple(np.flatnonzero(~self.stated).tolist())
 
     @cached_property
@@ -175,7 +175,7 @@ class Model:
 
     @cached_property
     def sensor_errors(self) -> bool:
-        """Whether it has states for what each gyro and each accelerometer errs by."""
+        """True if it has states for what each gyro and each accelerometer errs by."""
         return all(self.parameters(axis) for axis in range(RATE_ERROR, FORCE_ERROR + 3))
 
     def parameters(self, column: int) -> list[int]:

@@ -40,7 +40,7 @@ def mounting(sd_rad: float) -> Block:
 
 
 def axle_lever(sd_m: float) -> Block:
-    """How much further forward (m) than configured the point lies that does not slide sideways."""
+    """Forward offset (m) of the point that does not slide sideways, from the configured one."""
     return _constant(AXLE_LEVER, "m", ("x",), sd_m)
 
 
@@ -62,8 +62,7 @@ def wheel_rounding(name: str, sd: float) -> Block:
 
 
 def time_offset(name: str, sd_s: float, skew: str = "") -> Block:
-    """How much later (s) than its stamp a measurement is valid; `skew` names the block of what that
-    grows by."""
+    """Delay (s) of validity after its stamp; `skew` names the block of what that grows by."""
     walk = TIME_WALK_S_SQRT_S**2
     return Block(name, "s", ("t",), (-1,), initial=sd_s, white=walk, rate=skew)
 
@@ -81,13 +80,13 @@ def fix_wander(name: str, lasts_s: float) -> Block:
 
 
 def antenna_lever(name: str, sd_m: float) -> Block:
-    """What is left of the lever arm (m) from the IMU to an antenna, body axes."""
+    """Residual of the lever arm (m) from the IMU to an antenna, body axes."""
     return _constant(name, "m", ("x", "y", "z"), sd_m)
 
 
 def barometer_offset(name: str, sd_m: float, walk_m_sqrt_s: float) -> Block:
-    """How much too high (m) a barometer's height is, at the sea and at rest: the weather, and the
-    geoid above the ellipsoid."""
+    """Offset (m) of a barometer's height, at the sea and at rest: the weather, and the geoid above
+    the ellipsoid."""
     return Block(name, "m", ("m",), (-1,), initial=sd_m, white=walk_m_sqrt_s**2)
 
 
@@ -98,7 +97,7 @@ def barometer_scale(name: str, sd: float) -> Block:
 
 
 def barometer_airflow(name: str, sd: float) -> Block:
-    """What share of the dynamic pressure a barometer on a vehicle that drives lacks."""
+    """Share of the dynamic pressure missing at a barometer on a moving vehicle."""
     return _constant(name, "1", ("share",), sd)
 
 

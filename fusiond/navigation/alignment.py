@@ -80,7 +80,7 @@ def judge_felt(
     left: Array,
     rows: Array,
 ) -> None:
-    """What a guess leaves of k velocities, in sigmas (k, 3), and the slopes (k, 3, 13) of what it
+    """Residuals of a guess for k velocities, in sigmas (k, 3), and the slopes (k, 3, 13) of what it
     says by phi, biases (6,) of force and rate, offset in time and first velocity
     (`fusiond.navigator.alignment.motion_fit`).
 

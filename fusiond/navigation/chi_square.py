@@ -34,7 +34,8 @@ _STEPS = 40
 
 @lru_cache(maxsize=1024)
 def quantile(degrees: int, tail: float) -> float:
-    """What a chi-square variable of `degrees` degrees of freedom exceeds with probability `tail`.
+    """Quantileof a chi-square variable of `degrees` degrees of freedom exceeded with probability
+    `tail`.
 
     Infinite for none, which is what is left of one less 1e-17. Raises ValueError for degrees below
     one or a tail that is no probability below 1.

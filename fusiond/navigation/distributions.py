@@ -44,8 +44,8 @@ _STANDARD = NormalDist()
 
 
 def gaussian_quantile(p: float) -> float:
-    """What a Gaussian variable of variance one stays below with probability `p`; infinite at 0
-    and 1, NaN for what is no probability."""
+    """Quantile of a Gaussian variable of variance one below which it stays with probability `p`;
+    infinite at 0 and 1, NaN for what is no probability."""
     if 0.0 < p < 1.0:
         return _STANDARD.inv_cdf(p)
     return {0.0: -math.inf, 1.0: math.inf}.get(p, math.nan)
@@ -74,7 +74,7 @@ def gamma_tails(shape: float, x: float) -> tuple[float, float]:
 
 
 def gamma_quantile(shape: float, p: float, upper: bool = False) -> float:
-    """Where the gamma law has `p` below, or above if `upper`."""
+    """Quantile where the gamma law has `p` below, or above if `upper`."""
     if not 0.0 < p < 1.0:
         return 0.0 if upper == (p >= 1.0) else math.inf
 
@@ -99,7 +99,7 @@ def f_tail(d: float, n: float, x: float) -> float:
 
 
 def f_quantile(d: float, n: float, upper: float) -> float:
-    """What the F law of `d` and `n` degrees of freedom exceeds with probability `upper`."""
+    """Quantile of the F law of `d` and `n` degrees of freedom exceeded with probability `upper`."""
     return _quantile(lambda x: _f_tails(d, n, x), upper, True, 1.0)
 
 
@@ -208,7 +208,8 @@ def _noncentral(x: float, degrees: int, shift: float) -> tuple[float, float]:
 def _quantile(
     tails: Callable[[float], tuple[float, float, float]], p: float, upper: bool, x: float
 ) -> float:
-    """Where `tails` (below, above, density) has `p` below, or above if `upper`; begun at `x`."""
+    """Quantile where `tails` (below, above, density) has `p` below, or above if `upper`; begun at
+    `x`."""
     # The smaller one of the two tails is known to its last digit.
     which = int(upper != (p > 0.5))
     sign, tail = (-1.0 if which else 1.0), (1.0 - p if p > 0.5 else p)

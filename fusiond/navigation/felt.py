@@ -1,4 +1,5 @@
-r"""What gyros and accelerometers have felt since the first of some instants, as a compiled kernel.
+r"""Preintegrated gyro and accelerometer data since the first of some instants, as a compiled
+ kernel.
 
 With C' = C [w - b_w]x the attitude's error, a rotation vector in the axes of the begin, is D db_w
 with D' = -C, and that of the velocity gained v = int C f dt is

@@ -40,7 +40,7 @@ MARGIN = 3
 
 
 def sound(samples: Array) -> NDArray[np.bool_]:
-    """Which of samples (m, 6) are finite and within what any sensor can say."""
+    """Mask of samples (m, 6) that are finite and within what any sensor can say."""
     found: NDArray[np.bool_] = np.abs(samples[:, :3]).max(axis=1, initial=0.0) <= MAX_RATE_RAD_S
     found &= np.abs(samples[:, 3:]).max(axis=1, initial=0.0) <= MAX_FORCE_M_S2
     return found
@@ -48,7 +48,7 @@ def sound(samples: Array) -> NDArray[np.bool_]:
 
 @compiled("b1(f8[:, :])")
 def all_sound(samples: Array) -> bool:
-    """Whether `sound` holds for each of samples (m, 6): what a tick asks, of a sample or two."""
+    """True if `sound` holds for each of samples (m, 6): what a tick asks, of a sample or two."""
     for i in range(samples.shape[0]):
         for j in range(6):
             most = MAX_RATE_RAD_S if j < 3 else MAX_FORCE_M_S2

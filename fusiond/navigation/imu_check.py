@@ -1,4 +1,4 @@
-r"""Whether an inertial sample can be a measurement: judged in order, each by those before it.
+r"""Screening of inertial samples: judged in order, each by those before it.
 
     |x_k - x_g| <= n L_j,    L_j = 30 max(a_j, floor_j)       a leap is a `spike`
     r >= ln(1e-9) / ln(p)                                      a value that comes too often
@@ -42,7 +42,7 @@ OUTCOMES = (
     "stamp_ahead",
     "axis_dead",
 )
-"""What a sample's code means. `stamp_ahead`: stamped later than one that came after it."""
+"""Outcome of a sample, by code. `stamp_ahead`: stamped later than one that came after it."""
 TAKEN, SATURATED, REPEATED, NO_GRAVITY, SPIKE, STAMP_AHEAD, AXIS_DEAD = range(7)
 
 # Twice the largest leap of a car, and more than that of a walker.
@@ -175,7 +175,7 @@ def _judged(memory: Array, samples: Array, i: int, since_s: float, limits: Array
 
 @compiled("b1(f8[::1], f8[:, ::1], i8)", forceinline=True)
 def _leaps(memory: Array, samples: Array, i: int) -> bool:
-    """Whether sample i may be a spike, if the next one is back."""
+    """True if sample i may be a spike, if the next one is back."""
     for j in range(6):
         least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
         if abs(samples[i, j] - memory[_GOOD + j]) > LEAP * max(least, memory[_LEAP + j]):
@@ -185,7 +185,7 @@ def _leaps(memory: Array, samples: Array, i: int) -> bool:
 
 @compiled("b1(f8[::1], f8[:, ::1], i8, i8)")
 def _comes_back(memory: Array, samples: Array, i: int, k: int) -> bool:
-    """Whether a leap of sample i is taken back by sample k, the next."""
+    """True if a leap of sample i is taken back by sample k, the next."""
     for j in range(6):
         least = LEAST_RATE_RAD_S if j < 3 else LEAST_FORCE_M_S2
         leap = abs(samples[i, j] - memory[_GOOD + j])
@@ -288,7 +288,7 @@ class ImuCheck:
         self._last_ns = _NEVER_NS
         self._waiting: tuple[Stamps, Array] | None = None
         self.refused = 0
-        """How many of the samples last judged are not to be taken."""
+        """Number of rejected samples among those last judged."""
 
     def restart(self) -> None:
         """Forget all: the next sample may have any stamp."""

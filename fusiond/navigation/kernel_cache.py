@@ -99,7 +99,7 @@ def shipped_in(folder: Path) -> Shipped | None:
 
 
 class KernelCache(NullCache):
-    """What a numba dispatcher asks for its one signature; `name` is the kernel's alone.
+    """Interface to numba's dispatcher for its one signature; `name` is the kernel's alone.
 
     `shipped` is the file of the package's own that has it, None where none has.
     """
@@ -122,8 +122,8 @@ class KernelCache(NullCache):
         return str(self._folder)
 
     def load_overload(self, _signature: object, target: Any) -> Any:
-        """What was compiled for this processor, else what was shipped for its level; None where
-        there is nothing sound."""
+        """Code compiled for this processor, else that shipped for its level; None where there is
+        nothing sound."""
         _name_runtime()
         path = self._folder / self.file_name
         kept = _sound(path, _discard)
@@ -191,7 +191,8 @@ def _processor(codegen: Any) -> tuple[str, str, str]:
 
 
 def _kept(made: Any) -> tuple[Any, ...]:
-    """What a file holds, the arguments of `_linked`: of what numba keeps that which a kernel needs.
+    """Contents of a file, the arguments of `_linked`: of what numba keeps that which a kernel
+    needs.
 
     The bitcode, most of it, is read when another kernel is compiled. Environments are what
     `_environment` takes, the kernel's own first: numba would import a dozen modules of its
@@ -248,7 +249,7 @@ def _linked(
     initialisers: Any,
     environments: list[tuple[str, list[Any], str]],
 ) -> Any:
-    """What `CompileResult._rebuild` makes of the same."""
+    """Inverse of `CompileResult._rebuild`."""
     for initialise in initialisers:
         initialise()
     codegen = target.codegen()

@@ -175,7 +175,7 @@ def least_squares(rows: Array, z: Array, step: Array) -> bool:
 
 @compiled("b1(f8[::1], f8[::1], f8)")
 def _bent(biases: Array, felt: Array, seconds: float) -> bool:
-    """Whether integrals over so long, with biases (6,) of theirs, must be made anew for others."""
+    """True if integrals over so long, with biases (6,) of theirs, must be made anew for others."""
     force, rate = 0.0, 0.0
     for j in range(3):
         force = max(force, abs(biases[j] - felt[j]))

@@ -20,7 +20,7 @@ _UNKNOWN: Vector3 = (nan, nan, nan)
 
 
 class Mode(StrEnum):
-    """What the solution is worth.
+    """Mode of the solution.
 
     WAITING: no IMU data yet. ALIGNING: levelling, or heading or position not known yet.
     NAVIGATING: aided within the last `coast_after_s`. COASTING: inertial alone for longer than
@@ -36,8 +36,8 @@ class Mode(StrEnum):
 
 
 class BoundState(StrEnum):
-    """What the protection levels are worth. OFF: no alert limit is configured. UNKNOWN: no solution
-    to bound. WITHIN, BEYOND: against the alert limits."""
+    """Status of the protection levels. OFF: no alert limit is configured. UNKNOWN: no solution to
+    bound. WITHIN, BEYOND: against the alert limits."""
 
     OFF = "off"
     UNKNOWN = "unknown"

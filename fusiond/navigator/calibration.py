@@ -1,4 +1,5 @@
-"""What is calibrated: mounting, lever arms, offsets in time, scales, as the filter knows them now.
+"""Calibration parameters: mounting, lever arms, offsets in time, scales, as the filter knows them
+now.
 
 A parameter is told in the units that the configuration takes (deg, m, s, a ratio), as what lies
 beyond the value configured there, with one sigma and one of three states:
@@ -87,7 +88,7 @@ FIRM_RAD = math.radians(0.2)
 
 
 class CalibrationState(StrEnum):
-    """How well a parameter is known."""
+    """Quality of a parameter."""
 
     NOT_OBSERVED = "not_observed"
     OBSERVED = "observed"
@@ -96,7 +97,7 @@ class CalibrationState(StrEnum):
 
 @immutable()
 class Slot:
-    """Where a parameter lives: its published name, the block's kind (of `CALIBRATED`) and name, its
+    """Location of a parameter: its published name, the block's kind (of `CALIBRATED`) and name, its
     slot in the model, published units per SI unit, prior sigma (published units) and random walk
     (published units per root second)."""
 
@@ -124,7 +125,7 @@ class Parameter:
 
 
 def kind_of(block: str) -> str | None:
-    """Which calibration a block is, None for one that is none."""
+    """Calibration kind of a block, None for one that is none."""
     for kind in CALIBRATED:
         if block == kind or block.startswith(f"{kind}_"):
             return kind
@@ -205,7 +206,7 @@ class CalibrationWatch:
 
     @property
     def settled(self) -> bool:
-        """Whether all that is estimated has settled."""
+        """True if all that is estimated has settled."""
         return bool(self.parameters) and all(
             p.state is CalibrationState.SETTLED for p in self.parameters
         )
@@ -237,7 +238,7 @@ class CalibrationWatch:
         return True
 
     def _compare(self, t_ns: int, now: Array, variance: Array) -> None:
-        """Whether the mounting's yaw has moved by more than what was learned of it since a look."""
+        """True if the mounting's yaw has moved by more than what was learned of it since a look."""
         if not self._yaws:
             return
         yaws = list(self._yaws)

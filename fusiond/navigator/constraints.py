@@ -1,4 +1,4 @@
-"""What the IMU's samples say by themselves: the vehicle stands, or at least does not slide."""
+"""Measurements from the IMU alone: the vehicle stands, or at least does not slide."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Felt(NamedTuple):
 
 
 def vehicle_blocks(options: NonHolonomic) -> list[Block]:
-    """What a vehicle that does not slide shows of itself: mounting of the IMU, axle, side drift."""
+    """Parameters of a vehicle that does not slide: mounting of the IMU, axle, side drift."""
     if not options.enabled:
         return []
     found = []

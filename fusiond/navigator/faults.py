@@ -59,7 +59,7 @@ class SourceService:
         return {name: s.state for name, s in series.items() if source in (name, s.device)}
 
     def reason(self, source: str) -> str | None:
-        """Why a source of aids is left out; None if it is not."""
+        """Reason why a source of aids is left out; None if it is not."""
         if (reason := self._timeline.diagnosis.excluded.get(source)) is not None:
             return reason
         local = self._local(source)
@@ -76,7 +76,7 @@ def worst(states: Iterable[Service]) -> Service | None:
 
 
 def _suffers(finding: Finding, one: Series) -> bool:
-    """Whether a series is out or on probation, and was out when that was found."""
+    """True if a series is out or on probation, and was out when that was found."""
     if one.state not in (Service.OUT, Service.PROBATION):
         return False
     spoils = finding.kind.spoils(one.device, one.locates, one.moves)

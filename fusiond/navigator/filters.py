@@ -54,24 +54,24 @@ def model_of(config: Config, *extra: Block) -> Model:
 
 
 def _skews(_: Config, block: Block) -> bool:
-    """Whether a block is what two clocks part by."""
+    """True if a block is what two clocks part by."""
     return block.name.startswith(CLOCK_SKEW)
 
 
 def _wanders(_: Config, block: Block) -> bool:
-    """Whether a block is that of an error which fixes share for seconds."""
+    """True if a block is that of an error which fixes share for seconds."""
     return block.name.startswith(FIX_WANDER)
 
 
 def _unasked(config: Config, block: Block) -> bool:
-    """Whether a block is that of a lever arm of which the configuration says nothing."""
+    """True if a block is that of a lever arm of which the configuration says nothing."""
     receivers = [each for each in config.aiding.values() if isinstance(each, GnssAiding)]
     silent = all(each.lever_arm_sd_m is None for each in receivers)
     return silent and block.name.startswith(ANTENNA_LEVER)
 
 
 def kinds_of_config(config: Config, model: Model) -> list[Kind]:
-    """What may be wrong of a vehicle's sensors."""
+    """Fault kinds of a vehicle's sensors."""
     aiding = {name: section.kind for name, section in config.aiding.items()}
     return kinds_of(model, aiding or {"gnss": "gnss"}, config.constraints.non_holonomic.enabled)
 

@@ -1,4 +1,4 @@
-"""What goes wrong without anybody having thought of it: an aid that raises, a filter of no numbers.
+"""Unexpected failures: an aid that raises, a filter of no numbers.
 
 An exception costs the aid that raised it, never the tick. A filter that has lost its numbers never
 gets them back: it is started anew.
@@ -13,11 +13,11 @@ from fusiond.estimators.finite import first_not_finite
 
 _STATE = "the navigation state is", "the estimated parameters are", "the covariance is"
 RAISED_BY_NUMBERS = (ArithmeticError, ValueError)
-"""What numerics raise: division by zero and overflow; domain errors and numpy's LinAlgError."""
+"""Exceptions of numerics: division by zero and overflow; domain errors and numpy's LinAlgError."""
 
 
 def broken(estimator: Estimator) -> str:
-    """What of the filter's state is not finite, in words, where `first_not_finite` finds it.
+    """Part of the filter's state that is not finite, in words, where `first_not_finite` finds it.
 
     An update carries a covariance that is none to its diagonal.
     """

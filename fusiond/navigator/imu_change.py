@@ -15,16 +15,16 @@ from fusiond.navigator.timeline import Timeline
 
 
 def publish_by_axes(estimator: Estimator, imu: Imu, spare: bool = False) -> None:
-    """What is published is the attitude of the axes that the first unit has by its data sheet:
-    whoever has mounted something by them has not moved it. The gyros tell their own, which sit
-    askew; those of a spare as well, and it elsewhere."""
+    """Axes of publication: those that the first unit has by its data sheet: whoever has mounted
+    something by them has not moved it. The gyros tell their own, which sit askew; those of a spare
+    as well, and it elsewhere."""
     mounting_deg = imu.spare.mounting_sd_deg if spare and imu.spare is not None else 0.0
     sd_rad = math.hypot(imu.misalignment_deg, mounting_deg) * DEG
     estimator.publish_by(estimator.published._replace(axes_sd_rad=sd_rad))
 
 
 def published_of_spare(estimator: Estimator, imu: Imu) -> bool:
-    """Whether what is published is known no better than the spare sits."""
+    """True if what is published is known no better than the spare sits."""
     return estimator.published.axes_sd_rad > imu.misalignment_deg * DEG
 
 

@@ -1,4 +1,4 @@
-"""Which inertial unit is used: the first, or the spare that takes over.
+"""Choice of the inertial unit: the first, or the spare that takes over.
 
 The rule is that of gaps: once `gap_s` long no sample of the unit in use has been taken, whether it
 is silent, or says what cannot be true (stuck, saturated, dead: fusiond.navigator.imu_door), and the
@@ -73,7 +73,7 @@ class ImuChoice:
         return tuple(both.ravel().tolist())
 
     def changes(self, t_ns: int, taken_ns: int | None) -> bool:
-        """Whether the spare takes over in the tick at `t_ns`; `taken_ns` is the instant of the
+        """True if the spare takes over in the tick at `t_ns`; `taken_ns` is the instant of the
         newest sample that the navigator has taken, None while it has none.
 
         Two ticks in a row must say so: after a stall of the host the first may come before the

@@ -78,7 +78,7 @@ class ImuDoor:
         self._troubles: dict[str, _Trouble] = {}
 
     def silence(self, silent_s: float | None) -> str:
-        """What to say of an IMU that has given nothing for so long; None: nothing that counts."""
+        """Text on a silent IMU; None: nothing that counts."""
         last = max(self._troubles.items(), key=lambda t: t[1].last_ns, default=None)
         why = "" if last is None else f": {TEXTS[last[0]]}"
         if silent_s is None:
@@ -86,7 +86,7 @@ class ImuDoor:
         return reason("imu_silent", seconds=silent_s) + why
 
     def restarts(self, imu: ImuBuffer) -> bool:
-        """Whether stamps went back for good; then the next may have any."""
+        """True if stamps went back for good; then the next may have any."""
         stuck_s = imu.backward_in_a_row / self._config.rate_hz
         if stuck_s <= self._config.gap_s:
             return False
@@ -98,14 +98,14 @@ class ImuDoor:
         return True
 
     def change(self) -> None:
-        """What comes is of another unit: what was seen of the first says nothing of it."""
+        """Reset for another unit: what was seen of the first says nothing of it."""
         self._check.restart()
         self._troubles.clear()
 
     def admit(
         self, times: Stamps, samples: Array, imu: ImuBuffer, navigating: bool
     ) -> Iterator[Run]:
-        """What is to be appended to `imu`, in runs between gaps that cannot be borne.
+        """Samples to append to `imu`, in runs between gaps that cannot be borne.
 
         Refusals are counted in `imu.counters`. Before navigation nothing is known of what the
         vehicle did in a gap: any beyond `gap_s` ends what the alignment has collected.
@@ -189,7 +189,7 @@ class ImuDoor:
 
 
 def _unit(samples: Array) -> str:
-    """What else the forces of refused samples (m, 6) say by their magnitude."""
+    """Unit of rejected samples (m, 6) by their magnitude."""
     magnitude = median(np.linalg.norm(samples[:, 3:], axis=1))
     unit = other_unit(magnitude)
     if unit is None:

@@ -1,4 +1,4 @@
-r"""Whether an IMU speaks in the units that it is configured for, of a file as of a running vehicle.
+r"""Check of the IMU's units, of a file as of a running vehicle.
 
 Specific force. Its magnitude is that of gravity in the median, whatever the vehicle does; another
 unit shows as its factor. Rates are held against the course of the fixes: between two fixes of a
@@ -53,7 +53,7 @@ SHEET_SIGMAS = 4.0
 
 
 def force_unit(magnitude: float) -> str | None:
-    """What to say of forces of this magnitude in the median; None where they can be m/s^2."""
+    """Text on forces of this magnitude in the median; None where they can be m/s^2."""
     if FORCE_RANGE[0] <= magnitude / STANDARD_GRAVITY_M_S2 <= FORCE_RANGE[1]:
         return None
     unit = other_unit(magnitude)
@@ -72,7 +72,7 @@ def other_unit(magnitude: float) -> tuple[str, float] | None:
 
 
 def rms_unit(rms_rad_s: float) -> str | None:
-    """What to say of rates of this RMS; None where a vehicle can turn with them."""
+    """Text on rates of this RMS; None where a vehicle can turn with them."""
     if rms_rad_s <= MOST_RATE_RAD_S:
         return None
     return reason("rate_size", size=rms_rad_s)
@@ -110,12 +110,12 @@ class CourseTurns:
 
     @property
     def decided(self) -> bool:
-        """Whether the course has turned enough to tell."""
+        """True if the course has turned enough to tell."""
         return self._turn >= LEAST_TURN_RAD
 
     @property
     def fits(self) -> bool:
-        """Whether the rates are known to be in rad/s."""
+        """True if the rates are known to be in rad/s."""
         return self.decided and FITS_RANGE[0] <= self._factor <= FITS_RANGE[1]
 
     @property
@@ -123,7 +123,7 @@ class CourseTurns:
         return abs(self._product / self._square)
 
     def said(self) -> str | None:
-        """What to say of the rates; None where they fit, or nobody can tell."""
+        """Text on the rates; None where they fit, or nobody can tell."""
         if not self.decided or not DEGREES_RANGE[0] <= (factor := self._factor) <= DEGREES_RANGE[1]:
             return None
         return reason("rate_turns", factor=factor)
@@ -157,8 +157,8 @@ class RateUnits:
         self._squares, self._count, self._since_ns = 0.0, 0, 0
 
     def unproven(self, estimator: Estimator) -> str | None:
-        """Why a solution with these biases is not vouched for before the course has turned: one
-        that the data sheet does not allow; None where they are like it."""
+        """Reason why a solution with these biases is not vouched for before the course has turned:
+        one that the data sheet does not allow; None where they are like it."""
         if self._fit:
             return None
         model = estimator.model

@@ -1,4 +1,4 @@
-r"""Whether rates are in rad/s, by positions alone: the way between fixes against the gyro's turns.
+r"""Check of rates in rad/s by positions: the way between fixes against the gyro's turns.
 
 A vehicle that drives forward goes from fix to fix in a direction of those that it has faced in
 between. Of chord i, between two fixes that are far enough apart, with the gyro's heading G since

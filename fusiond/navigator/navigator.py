@@ -118,7 +118,7 @@ class Navigator:
         self.warm: WarmStart | None = None
         """A start to be tried before any alignment, and its trial."""
         self.calibration: SavedCalibration | None = None
-        """What an earlier drive has shown, taken up by each alignment until it is refuted."""
+        """Calibration of an earlier drive, taken up by each alignment until it is refuted."""
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
         self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
         self._status = NavigationStatus(config, self.estimator, self.imu, self._door, self._units)
@@ -179,7 +179,7 @@ class Navigator:
             self.timeline.insert(aid)
 
     def learn(self, message: NavigationMessage) -> None:
-        """What a satellite broadcasts, for the raw epochs of the same source."""
+        """Store a broadcast message, for the raw epochs of the same source."""
         if message.source in self.raw:
             self.raw[message.source].learn(message)
 
@@ -292,7 +292,7 @@ class Navigator:
             self.reset(reason("calibration_wrong", what=wrong))
 
     def _refuted(self) -> bool:
-        """Whether the start has shown to be a wrong one; alignment then begins anew."""
+        """True if the start has shown to be a wrong one; alignment then begins anew."""
         e, start = self.estimator, self._afterwards
         if start is None:
             return False
@@ -306,7 +306,7 @@ class Navigator:
         return True
 
     def _late(self) -> bool:
-        """Whether a receiver is found to be late; alignment then begins anew, by its last fixes at
+        """True if a receiver is found to be late; alignment then begins anew, by its last fixes at
         the instants at which they were true."""
         found = self._lateness.look(self.imu)
         if found is None:
@@ -334,7 +334,7 @@ class Navigator:
 
     @property
     def unconfirmed(self) -> str:
-        """What the heading hangs on and nothing has shown, in words; empty where it does not."""
+        """Condition of the heading that nothing has shown, in words; empty where it does not."""
         if self.warm is not None and self.warm.on_trial:
             return reason("not_confirmed_by_fix")
         return self._afterwards.unconfirmed if self._afterwards else ""
@@ -365,7 +365,7 @@ class Navigator:
         return solution_of(self.estimator, self.imu, t_ns, gap_ns, mode, reason, bound)
 
     def mode(self, t_ns: int) -> tuple[Mode, str]:
-        """What the solution is worth at `t_ns`, and why."""
+        """Mode at `t_ns`, and why."""
         begun = None
         if self.started is not None:
             begun = Begun(self.started.how, self.unconfirmed, self._last_position_ns)

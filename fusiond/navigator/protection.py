@@ -1,4 +1,4 @@
-"""What an operator hears when protection levels of the solution pass the alert limits.
+"""Events of protection levels that pass the alert limits.
 
 What computes the levels (fusiond.navigator.levels) is imported where a limit is configured.
 """
@@ -92,7 +92,7 @@ class ProtectionWatch:
             self._event("protection_restored", f"horizontal {found.hpl_m:.1f} m")
 
     def _passed(self, found: Level) -> list[str]:
-        """Which levels are beyond their limits, in words; a level that is not a number is."""
+        """Levels beyond their limits, in words; a level that is not a number is."""
         levels = zip(("horizontal", "vertical"), (found.hpl_m, found.vpl_m), strict=True)
         return [
             f"{name} {level:.1f} m, limit {limit:g} m"

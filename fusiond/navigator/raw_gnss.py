@@ -33,11 +33,11 @@ from fusiond.gnss.store import EphemerisStore
 Array = NDArray[np.float64]
 
 REASONS = {KEPT: "used", RESIDUAL: "residual"}
-"""What screening calls a row in `health`; everything else is `gated`."""
+"""Names of screened rows in `health`; everything else is `gated`."""
 
 
 class Seen(NamedTuple):
-    """Where a satellite stands (rad; None for one that was refused before that was looked at) and
+    """Direction of a satellite (rad; None for one that was refused before that was looked at) and
     its strongest signal (dB-Hz; None where the receiver does not say)."""
 
     azimuth_rad: float | None
@@ -68,7 +68,7 @@ class _Corrected(NamedTuple):
 
 @dataclass(slots=True)
 class _Memory:
-    """What an epoch came to last, and whether its refused satellites have been counted."""
+    """Result of the last epoch, and whether its refused satellites have been counted."""
 
     corrected: _Corrected | None = None
     counted: bool = False
@@ -214,7 +214,7 @@ class RawGnss:
                 self.refused[f"{satellite[0]}_{reason}"] += 1
 
     def sky(self) -> Sky:
-        """What the last epoch came to."""
+        """Result of the last epoch."""
         if self._judged is None:
             return Sky(refused=dict(self._left_out))
         epoch_aid, corrected, codes, whitened = self._judged

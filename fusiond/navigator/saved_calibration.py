@@ -102,9 +102,9 @@ class SavedCalibration:
         return replace(start, xi=xi, covariance=p)
 
     def refuted(self, parameters: Iterable[Parameter]) -> str | None:
-        """What speaks against it once it was taken up: a value that has left it by four sigma of
-        what may have changed, one time in 16,000 by chance. An offset in time may wander anywhere
-        on a long drive. None where nothing does."""
+        """Contradiction of a saved calibration once it was taken up: a value that has left it by
+        four sigma of what may have changed, one time in 16,000 by chance. An offset in time may
+        wander anywhere on a long drive. None where nothing does."""
         for p in parameters:
             if p.name in self.values and p.kind not in WANDERING:
                 value, sd = self.values[p.name]
@@ -138,7 +138,7 @@ def mounting_digest(config: Config) -> str:
 
 
 def saved_calibration(parameters: Iterable[Parameter], digest: str) -> SavedCalibration | None:
-    """What is worth keeping of a calibration: all that has been observed; None for nothing."""
+    """Part of a calibration to save: all that has been observed; None for nothing."""
     values = {
         p.name: (p.value, p.sd) for p in parameters if p.state is not CalibrationState.NOT_OBSERVED
     }

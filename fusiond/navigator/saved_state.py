@@ -42,7 +42,7 @@ class SavedState:
     yaw_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)]
     sd_yaw_rad: Annotated[float, Field(gt=0.0, le=2.0 * math.pi)]
     confirmed: bool = True
-    """Whether anything has shown the heading but the claim that it was configured with."""
+    """True if anything has shown the heading but the claim that it was configured with."""
     version: Literal[1] = 1
     """Of this layout; files of before it was written have none and are the same."""
 

@@ -31,7 +31,7 @@ CHECK_BEGINS, CHECK_SIZE = b'{"crc32":', len(CHECK % 0)
 
 
 class DamagedStateError(Exception):
-    """What lies at the path is no state: the text says why."""
+    """File at the path is not a state: the text says why."""
 
 
 class RefusedStateError(Exception):

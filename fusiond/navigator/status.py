@@ -21,7 +21,7 @@ from fusiond.navigator.reasons import joined, reason
 
 
 class Begun(NamedTuple):
-    """How the navigation began: `how` its heading came about; `unconfirmed`: what the heading hangs
+    """Start of the navigation: `how` its heading came about; `unconfirmed`: what the heading hangs
     on and nothing has shown, empty where it does not; `position_ns`: of the last position fused."""
 
     how: str
@@ -74,7 +74,7 @@ class NavigationStatus:
         return Mode.NAVIGATING, heading
 
     def failure(self, diagnosis: Diagnosis) -> str | None:
-        """Why navigation must begin anew; None while it need not."""
+        """Reason why navigation must begin anew; None while it need not."""
         e = self._estimator
         speed = math.hypot(e.nav.item(VN), e.nav.item(VE))
         if speed > self._max_speed_m_s:

@@ -86,7 +86,7 @@ class Timeline:
         self.imu = imu
         self.counters = Counters()
         self.keeps_raw = False
-        """Whether entries are to have their raw innovation: a log wants it, at 10 us an aid."""
+        """True if entries are to have their raw innovation: a log wants it, at 10 us an aid."""
         self._keep_ns = round(keep_s * 1e9)
         self._checkpoint_ns = round(checkpoint_s * 1e9)
         self._on_outcome = on_outcome
@@ -309,7 +309,7 @@ class Timeline:
 
 
 def _same(one: Offer, other: Offer) -> bool:
-    """Whether two offers are alike; vectors may be arrays, as a caller from Python gives them."""
+    """True if two offers are alike; vectors may be arrays, as a caller from Python gives them."""
     return type(one) is type(other) and all(
         a is b or np.array_equal(np.asarray(a), np.asarray(b))
         for a, b in zip(one, other, strict=True)

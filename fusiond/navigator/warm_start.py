@@ -153,8 +153,8 @@ def warm_state(
     *,
     confirmed: bool,
 ) -> WarmState:
-    """What the estimator holds and what the IMU felt last. Raises pydantic's `ValidationError` if
-    no vehicle can have that."""
+    """State of the estimator and last IMU data. Raises pydantic's `ValidationError` if no vehicle
+    can have that."""
     turn, push = _manoeuvre(estimator, imu)
     nav = estimator.nav.tolist()
     longitude = (nav[1] + math.pi) % (2.0 * math.pi) - math.pi

@@ -97,9 +97,9 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a drive has shown: findings by published name, seconds of what it was shown by, noise
-    seen (deg/sqrt(h), m/s/sqrt(h)) while driving and at rest, the configuration that comes of it,
-    and the TOML text. `result` is what `process` said of the last pass."""
+    """Result of a drive: findings by published name, seconds of what it was shown by, noise seen
+    (deg/sqrt(h), m/s/sqrt(h)) while driving and at rest, the configuration that comes of it, and
+    the TOML text. `result` is what `process` said of the last pass."""
 
     findings: dict[str, Finding]
     shown_s: dict[str, float]
@@ -166,7 +166,7 @@ def _finding(name: str, p: Parameter, key: str, value: float, drive: _Drive) -> 
 
 
 def _why(p: Parameter, drive: _Drive) -> str:
-    """What there is to say of a parameter's state."""
+    """Text on a parameter's state."""
     if p.name == ROLL:
         how = "the mean of driving straight on; roads lean by as much"
         return how if _seen(p) else f"left as it is: {p.value:+.2g} is less than its sigma; {how}"
@@ -237,7 +237,7 @@ class _Drive:
         return speed, np.gradient(np.unwrap(rows[:, 3]), t), np.gradient(speed, t), rows
 
     def shown_s(self) -> dict[str, float]:
-        """How long (s) the vehicle did what a parameter is shown by."""
+        """Duration (s) of the motion that shows a parameter."""
         speed, turn, change, _ = self._table()
         driving = speed > DRIVING_M_S
         step_s = STEP_NS * 1e-9
@@ -248,7 +248,7 @@ class _Drive:
         }
 
     def missing(self, p: Parameter) -> str:
-        """Why a parameter was not observed."""
+        """Reason why a parameter was not observed."""
         shown = self.shown_s()
         lacking = [what for what in SHOWN_BY[p.kind] if shown[what] < LEAST_S[what]]
         if lacking:
@@ -260,7 +260,7 @@ class _Drive:
         return f"what was fused narrows its sigma by less than {share:.0f} %"
 
     def more(self, p: Parameter) -> str:
-        """What would show more of it."""
+        """Motion that would show more of it."""
         shown = self.shown_s()
         said = ", ".join(f"{shown[what]:.0f} s of {what}" for what in SHOWN_BY[p.kind])
         return f"the drive has {said}: more is needed"

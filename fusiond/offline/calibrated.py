@@ -1,4 +1,4 @@
-"""What a calibration means as configuration: which keys change, and the lines of TOML for them.
+"""Configuration of a calibration: which keys change, and the lines of TOML for them.
 
 With C_vb the matrix of `imu.mounting_deg`, m the rest of the mounting that was found, rho the roll,
 and tau by how much fixes are later valid than their stamps say:
@@ -191,7 +191,7 @@ def _rpy_deg(dcm: Array) -> tuple[float, float, float]:
 def _of_section(
     section: Aiding, mine: list[Parameter], turn: Array, tau_s: float
 ) -> dict[str, Any]:
-    """What changes in a source's section."""
+    """Changed keys in a source's section."""
     by_kind = {p.kind: p.value for p in mine}
     if isinstance(section, GnssAiding):
         delay_s = section.velocity_delay_s

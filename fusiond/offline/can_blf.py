@@ -34,13 +34,14 @@ _LEAST = {
 }
 """Bytes behind the header that an object of a frame has at least, by its type."""
 _LONGEST_OBJECT = 1 << 20
-"""What a frame, a comment or an Ethernet packet takes is far less; a larger size is damage."""
+"""Largest size of an object: a frame, a comment or an Ethernet packet takes far less; a larger size
+is damage."""
 _LONGEST_CONTAINER = 1 << 26
 """Containers have some 128 kB (`BLFWriter.max_container_size`), unzipped."""
 _PADDING = 7
 """At most so many bytes pad an object."""
 _TIME_AT = 24
-"""Where in an object its stamp is."""
+"""Offset of the stamp in an object."""
 DAY_S = 86_400
 """By which stamps are moved: what a trigger keeps of before it are seconds to minutes."""
 _DAY_TICKS = {True: DAY_S * 10**5, False: DAY_S * 10**9}
@@ -63,7 +64,7 @@ class Containers:
         self._rest = b""
         self._header = True
         self.damage: Exception | None = None
-        """What ended the file before its end."""
+        """Cause of a premature end of the file."""
 
     def close(self) -> None:
         """For the reader, which closes what it has read: whoever opened it does."""

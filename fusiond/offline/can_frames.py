@@ -51,7 +51,7 @@ _DATED_LOG = "the dates of candump -t A have no zone: taken as local time of thi
 
 
 class Refusals:
-    """What of a log is not read: the first of it with line and text, of the rest the number."""
+    """Unread lines of a log: the first of it with line and text, of the rest the number."""
 
     def __init__(self) -> None:
         self._told: list[Rejection] = []
@@ -65,7 +65,7 @@ class Refusals:
             self._more[reason] += 1
 
     def count(self, refused: Counter[str]) -> None:
-        """What is counted by its reason alone."""
+        """Reasons that are only counted."""
         self._more.update(refused)
 
     @property

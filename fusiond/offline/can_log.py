@@ -78,7 +78,7 @@ REFUSALS = {
 
 
 class CanLog(NamedTuple):
-    """What a log holds: IMU samples with what was refused of them, aids with their arrivals,
+    """Contents of a log: IMU samples with what was refused of them, aids with their arrivals,
     refusals of frames (`can`) and by source of an aid; `events` (code, text); how many `frames`.
 
     `units` are the samples of all units with their instants (ns), in the order in which they came,
@@ -182,7 +182,7 @@ class _Replay:
         return CanLog(imu, self._arrivals, rejected, self._events, frames.number, units)
 
     def _buses(self) -> dict[Any, list[CanDriver[Any]]]:
-        """Whose frames those of each channel of the log are.
+        """Owners of the frames of each channel of the log.
 
         A log of one channel is everybody's bus. In one of several each source has the channel of
         its name, or `canN` of number N.
@@ -221,8 +221,8 @@ class _Replay:
             self._told("recorder_paused", text)
 
     def _tell_error(self) -> None:
-        """How far a recorder that knows the date is from a receiver's UTC at the end: a wrong zone
-        shows so."""
+        """Offset of a recorder that knows the date against a receiver's UTC at the end: a wrong
+        zone shows so."""
         status = self._clock.status()
         off_s = status.system_error_s or 0.0
         if abs(off_s) >= OFF_S and dates.plausible(self._host.stamp_ns):

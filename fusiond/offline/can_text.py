@@ -53,7 +53,7 @@ class TextLines:
         self.number = 0
         """Of the line that was pulled last, from 1."""
         self.damage: Exception | None = None
-        """What ended the file before its end: a zipped one that is cut."""
+        """Cause of a premature end: a zipped one that is cut."""
 
     def __iter__(self) -> Iterator[str]:
         return self
@@ -151,7 +151,7 @@ class Candump:
         self._differences = bool(stamps) and stamps[0] < _BEGINS and _fall_or_stand(stamps)
         self._sum_s = 0.0
         self.unstamped = False
-        """Whether there was a frame without its time."""
+        """True if there was a frame without its time."""
 
     def plain(self, line: str) -> str:
         """The line in the form of a log."""
@@ -205,7 +205,7 @@ def stamp_s(text: str) -> float | None:
 
 
 def dated(stamp: str) -> bool:
-    """Whether a stamp in brackets is a date."""
+    """True if a stamp in brackets is a date."""
     return "-" in stamp.strip()[1:] and stamp_s(stamp) is not None
 
 
@@ -224,7 +224,7 @@ def candump_of(stamps: list[str]) -> Candump:
 
 
 def _fall_or_stand(stamps: list[float]) -> bool:
-    """Whether the stamps are differences: they fall, or are all alike from the second on."""
+    """True if the stamps are differences: they fall, or are all alike from the second on."""
     falls = any(after < before for before, after in pairwise(stamps))
     return falls or (len(stamps) > 3 and stamps[1] > 0.0 and len(set(stamps[1:])) == 1)
 
@@ -247,7 +247,7 @@ class Asc:
 
     def __init__(self) -> None:
         self.in_frames = False
-        """Whether the header is over: stamped lines have come."""
+        """True if the header is over: stamped lines have come."""
         self.before_trigger_s = 0.0
         """By how much the last line lies before the beginning of the measurement."""
         self._relative = False

@@ -128,7 +128,7 @@ def report_of(errors: Errors) -> Report:
 
 
 class _Epochs:
-    """Where the truth's epochs lie between the solution's usable rows."""
+    """Places of the truth's epochs between the solution's usable rows."""
 
     def __init__(self, t: Floats, usable: Flags, wanted: Floats) -> None:
         self._rows = np.flatnonzero(usable)

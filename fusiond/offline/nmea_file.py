@@ -49,7 +49,7 @@ _LEFT_OUT = ("_refused", "_implausible", "no_fix", "checksum_bad", "bad_field")
 
 
 class Receiver(NamedTuple):
-    """Whose the sentences are, by the configuration: source and options of the receiver, and of the
+    """Owner of the sentences, by the configuration: source and options of the receiver, and of the
     compass where there is one."""
 
     source: str
@@ -136,12 +136,12 @@ def read_nmea(
 
 
 def _fed(decoder: NmeaDecoder | CompassDecoder, lines: Iterable[tuple[int, bytes]]) -> list[Any]:
-    """What the decoder makes of the lines; a measurement's arrival is the number of its line."""
+    """Measurements of the lines; a measurement's arrival is the number of its line."""
     return [m for number, line in lines for m in decoder.feed(line, number)]
 
 
 class _Epochs:
-    """Where in a file its epochs begin, by line, and their instants (UTC, ns)."""
+    """Lines at which epochs begin, and their instants (UTC, ns)."""
 
     def __init__(self, lines: list[bytes], measurements: Iterable[Any]) -> None:
         begins = _begins(lines)
@@ -155,7 +155,8 @@ class _Epochs:
         self.times = [places[line] for line in self._lines]
 
     def spread(self, untimed: list[Any]) -> list[tuple[int, Any]]:
-        """What has no time of its own with its instants, less the latency that is stated of it."""
+        """Stamp measurements without time with its instants, less the latency that is stated of
+        it."""
         if not self.times:
             return []
         found: list[tuple[int, Any]] = []

@@ -10,7 +10,7 @@ Outage: TypeAlias = tuple[float, float] | tuple[float, float, tuple[str, ...]]
 
 
 def withheld(source: str, t_s: float, outages: Sequence[Outage]) -> bool:
-    """Whether what the source measured at `t_s` lies in a window of its own or of all."""
+    """True if what the source measured at `t_s` lies in a window of its own or of all."""
     return any(
         start <= t_s < start + length and (not names or source in names[0])
         for start, length, *names in outages

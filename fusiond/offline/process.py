@@ -158,7 +158,7 @@ def _smoothed(navigator: Navigator, writer: RowsWriter) -> SmoothedRows:
 
 
 def refusals_of(navigator: Navigator) -> dict[str, Counter[str]]:
-    """What was refused by source and name, satellites of raw epochs among it."""
+    """Rejections by source and name, satellites of raw epochs among it."""
     found = {source: Counter(refused) for source, refused in navigator.refused.items()}
     for source, receiver in navigator.raw.items():
         if receiver.refused:

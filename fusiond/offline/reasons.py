@@ -1,4 +1,4 @@
-"""Why a run over files cannot be good, in one sentence that names what to mend."""
+"""Reasons why a run over files failed, in one sentence."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ _USED = frozenset(
 )
 """Counters of what was taken, or is no fix at all; all others are refusals."""
 _COMPRESSED = (b"\x1f\x9d", b"PK", b"BZ")
-"""What a RINEX file may be packed by but gzip: compress, zip, bzip2."""
+"""Packings of RINEX files but gzip: compress, zip, bzip2."""
 
 
 def content(path: Path) -> bytes:
@@ -122,7 +122,7 @@ def read_solutions(
 
 
 def is_of_week(imu: ImuTable) -> bool:
-    """Whether the IMU's times are seconds of a week."""
+    """True if the IMU's times are seconds of a week."""
     return bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
 
 

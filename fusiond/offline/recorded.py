@@ -1,4 +1,4 @@
-"""What a run was given: samples and aids of files or of a recorded bus, in order of arrival."""
+"""Input of a run: samples and aids of files or of a recorded bus, in order of arrival."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fusiond.offline.reasons import FileRead
 
 @dataclass(slots=True)
 class Recorded:
-    """What has been read, and of which files; `withheld` measurements by source."""
+    """Input read, and its files; `withheld` measurements by source."""
 
     config: Config
     imu: ImuTable
@@ -99,7 +99,7 @@ def _read_aid(
 
 
 BROADCAST = Ephemeris, Klobuchar, Bdgim
-"""What a satellite sends is valid at no instant. (A union would be made anew at each question.)"""
+"""Navigation messages are valid at no instant. (A union would be made anew at each question.)"""
 
 
 def valid_ns(m: Measurement | RawGnssEpoch) -> int:

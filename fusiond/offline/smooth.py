@@ -152,7 +152,7 @@ class SmoothedRows:
         self._writer.write(rows)
 
     def counts(self) -> dict[str, int]:
-        """What was smoothed: rows, starts of the filter, nodes."""
+        """Result of smoothing: rows, starts of the filter, nodes."""
         return {"rows": self.rows, "starts": self.starts, "nodes": self.nodes}
 
     def close(self) -> None:

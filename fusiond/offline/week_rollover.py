@@ -18,7 +18,7 @@ ROLLOVER_NS = ROLLOVER.days * 86_400 * 1_000_000_000
 
 
 class Rollover(NamedTuple):
-    """What is to be added to instants (ns), and what is to be said, by a name."""
+    """Correction of instants (ns), and text, by a name."""
 
     add_ns: int = 0
     said: tuple[tuple[str, str], ...] = ()

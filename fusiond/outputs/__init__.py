@@ -1,1 +1,1 @@
-"""What leaves the daemon."""
+"""Outputs of the daemon."""

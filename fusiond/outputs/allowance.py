@@ -1,4 +1,4 @@
-"""What one guest may cost: bytes, messages and microseconds, each a bucket that fills by itself.
+"""Allowance of one guest: bytes, messages and microseconds, each a bucket that fills by itself.
 
     left(t) = min(burst, left(t0) + rate (t - t0))
 
@@ -32,7 +32,7 @@ MICROSECONDS = Rate(20_000.0, 20_000.0)
 
 
 class Bucket:
-    """What is left of a rate."""
+    """Bucket of a rate."""
 
     __slots__ = ("_at_ns", "_left", "_rate")
 
@@ -46,7 +46,7 @@ class Bucket:
         self._left -= amount
 
     def empty(self, now_ns: int) -> bool:
-        """Whether more was spent than there was."""
+        """True if more was spent than there was."""
         self._fill(now_ns)
         return self._left < 0.0
 
@@ -67,5 +67,5 @@ class Allowance:
         self.microseconds = Bucket(MICROSECONDS, now_ns)
 
     def must_wait(self, now_ns: int) -> bool:
-        """Whether nothing more is to be read of it for now."""
+        """True if nothing more is to be read of it for now."""
         return self.bytes.empty(now_ns) or self.microseconds.empty(now_ns)

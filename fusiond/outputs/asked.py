@@ -1,4 +1,4 @@
-"""What a guest says as JSON, or one refusal for all that is none.
+"""Parser of a guest's JSON, or one refusal for all that is none.
 
 Refused beside what is no JSON: what is nested deeper than any request is, half a surrogate pair
 (no text that can be written out again), NaN and infinities.

@@ -1,4 +1,5 @@
-"""What every output is: it takes the vehicle's messages in the tick and sends them in its task."""
+"""Interface of an output: it takes the vehicle's messages in the tick and sends them in its
+task."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ class Output(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What an output may know of the rest: `on_event(code, text)` hears what it reports."""
+    """Context of an output: `on_event(code, text)` hears what it reports."""
 
     vehicle: str
     on_event: Callable[[str, str], None]

@@ -1,4 +1,4 @@
-"""How the broker lets us in: password and TLS, from the environment and from files only."""
+"""Access to the broker: password and TLS, from the environment and from files only."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def tls_context(options: Mqtt) -> ssl.SSLContext | None:
 
 
 def advice(error: aiomqtt.MqttError, host: str, port: int) -> str:
-    """Why the broker did not let us in, and what would do."""
+    """Reason why the broker refused, and what would do."""
     why = str(error) or "no answer"
     where = f"{host}:{port}"
     if isinstance(error, aiomqtt.MqttCodeError):

@@ -82,7 +82,7 @@ class ChronySocket:
 
 
 def _ahead_ns(sample: TimeSample) -> int:
-    """How far true UTC is ahead of the system clock by a sample; a late one says less."""
+    """Lead of true UTC over the system clock by a sample; a late one says less."""
     return sample.utc_ns - sample.system_ns
 
 

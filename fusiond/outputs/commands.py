@@ -20,7 +20,7 @@ class Command(BaseModel):
 
 
 class SetPosition(Command):
-    """Where the vehicle is: WGS 84, height above the ellipsoid; one sigma per horizontal axis.
+    """Position of the vehicle: WGS 84, height above the ellipsoid; one sigma per horizontal axis.
 
     It is fused like any fix, and gated like one; with `force` the filter is reset and aligns anew
     from it.
@@ -105,9 +105,9 @@ COMMANDS: dict[str, type[Command]] = {
     "stop_recording": StopRecording,
     "inject": Inject,
 }
-"""What may be asked from outside."""
+"""Commands from outside."""
 CARRIED_OUT: dict[str, type[Command]] = {**COMMANDS, "set_gates": SetGates}
-"""What a recording holds, and a replay carries out again."""
+"""Commands that a recording holds, and a replay carries out again."""
 NAMES = {command: name for name, command in CARRIED_OUT.items()}
 
 Handler = Callable[[Command], str | Awaitable[str]]

@@ -1,4 +1,4 @@
-"""What clients are told of a solution beyond its own figures: speed, course and 95 % errors.
+"""Derived figures for clients: speed, course and 95 % errors.
 
     speed  = hypot(v_n, v_e)
     course = atan2(v_e, v_n)
@@ -31,7 +31,7 @@ class Motion(NamedTuple):
 
 
 def usable(nav: NavMessage) -> bool:
-    """Whether position and velocity may be used."""
+    """True if position and velocity may be used."""
     return nav.mode in (Mode.NAVIGATING, Mode.COASTING)
 
 

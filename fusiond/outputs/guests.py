@@ -75,7 +75,7 @@ class Guests:
 
     @property
     def full(self) -> bool:
-        """Whether one more would take a descriptor of the daemon's own."""
+        """True if one more would take a descriptor of the daemon's own."""
         return len(self._open) >= self.most
 
     def places(self, wanted: int) -> int:

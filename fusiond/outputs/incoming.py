@@ -1,4 +1,4 @@
-"""What others publish to us, counted before anything is made of it.
+"""Publications of others, counted before anything is made of it.
 
 A broker hands on whatever anybody publishes, as fast as it comes, on the connection that our own
 messages are confirmed on: behind a hundred thousand commands a confirmation comes seconds late, and
@@ -73,5 +73,5 @@ class Incoming:
 
 
 def quiet() -> Backoff:
-    """How long to listen to nobody, flood by flood."""
+    """Pauses after floods."""
     return Backoff(first_s=QUIET_S, longest_s=LONGEST_QUIET_S)

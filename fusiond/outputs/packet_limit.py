@@ -14,7 +14,7 @@ import socket
 import aiomqtt
 
 LONGEST_TOPIC = 65_535 + 8
-"""What stands before the payload: topic, its length, packet identifier."""
+"""Length of the header before the payload: topic, its length, packet identifier."""
 PIECE = 4096
 """Bytes of a read; paho makes a hundred in one turn of the loop."""
 HELD_BYTES = 131_072

@@ -1,4 +1,4 @@
-"""Who gives way when all places of a server are taken and one more comes.
+"""Places of a server: who gives way when all are taken and one more comes.
 
 First who owes something: a request that has not come, an answer that it does not take. Then, where
 one host has more connections than the newcomer's would have, the last of that host's: so one host
@@ -22,7 +22,7 @@ class Placed(Protocol):
     host: str
 
     def owes(self, now_ns: int) -> bool:
-        """Whether something of it has been waited for long enough."""
+        """True if something of it has been waited for long enough."""
 
 
 T = TypeVar("T", bound=Placed)
@@ -43,7 +43,8 @@ def host_of(address: Any) -> str:
 
 
 def gives_way(taken: Collection[T], host: str, now_ns: int) -> T | None:
-    """Who makes room for one of `host`, if anybody does; `taken` in the order they came in."""
+    """Client that gives way to one of `host`, if anybody does; `taken` in the order they came
+    in."""
     for placed in taken:
         if placed.owes(now_ns):
             return placed

@@ -1,4 +1,4 @@
-"""Where a server listens: tried again while it cannot be had, and how it stands."""
+"""Listening port of a server: tried again while it cannot be had, and how it stands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.base import Backoff, DriverStatus
 
 
 class Listening(Protocol):
-    """What listens."""
+    """Listening server."""
 
     @property
     def sockets(self) -> Iterable[socket.socket]: ...
@@ -33,7 +33,7 @@ class Port:
         self.status = DriverStatus()
 
     async def open(self, listen: Callable[[str, int], Awaitable[S]]) -> S:
-        """What `listen(host, port)` gives; waits while it raises `OSError`."""
+        """Server by `listen(host, port)`; waits while it raises `OSError`."""
         backoff = Backoff()
         while True:
             try:

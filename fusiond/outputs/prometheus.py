@@ -35,7 +35,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 MOST_SCRAPERS = 32
 """At once; Prometheus opens one, and keeps none."""
 _KEPT_S = 1.0
-"""How long a text is given again: `health` comes once a second."""
+"""Time for which a text is reused: `health` comes once a second."""
 _MOST_HEAD_BYTES = 8192
 """Of a request's line and headers, as HTTP servers have it."""
 
@@ -108,7 +108,7 @@ class PrometheusEndpoint:
     # ------------------------------------------------------------------ metrics
 
     def families(self) -> list[Family]:
-        """What is known now."""
+        """Metrics of now."""
         found: list[Family] = []
         for message in self._latest.values():
             match message:

@@ -1,4 +1,4 @@
-"""When to try the broker again, and how to know that another client has our name.
+"""Reconnection to the broker, and how to know that another client has our name.
 
 A broker ends the older of two connections of one client identifier (MQTT 3.1.1, 3.1.4-2). In that
 version it does not say why; but a connection that it ends moments after it was made, again and
@@ -49,5 +49,5 @@ class Reconnecting:
         return True
 
     def wait_s(self) -> float:
-        """How long to wait before the next attempt, s."""
+        """Time before the next attempt, s."""
         return (self._contested if self.taken else self._ordinary).next()

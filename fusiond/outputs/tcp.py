@@ -38,8 +38,7 @@ REQUEST_S = 10.0
 """Longest wait for a request that a connection begins with: the scrape_timeout that Prometheus has
 by default."""
 HASTY_S = 1.0
-"""When all places are taken, who has asked nothing for so long gives way to one who comes; so does
-who takes nothing of an answer."""
+"""Idle time after which a client gives way to a new one; so does who takes nothing of an answer."""
 PAUSE_S = 1.0
 """Without a descriptor for a new connection; the kernel keeps those who come meanwhile."""
 SHORT_TOLD_S = 60.0
@@ -55,7 +54,7 @@ log = logging.getLogger("fusiond")
 
 
 class Session(Protocol):
-    """What a server knows of one client."""
+    """State of one client."""
 
     def receive(self, data: bytes) -> None:
         """Some bytes came; at most a KiB at once."""
@@ -92,7 +91,7 @@ class Client:
         self._allowance = Allowance(now_ns)
         self._moved_ns = now_ns
         self.request_due = False
-        """Whether it has yet to ask what its connection is for; it has `REQUEST_S` for that."""
+        """True if it has yet to ask what its connection is for; it has `REQUEST_S` for that."""
         self._flushing = self._slowed = self._finishing = self.closed = False
         self.session: Session | None = None
         self.on_room: Callable[[], None] | None = None
@@ -161,7 +160,7 @@ class Client:
             session.end()
 
     def owes(self, now_ns: int) -> bool:
-        """Whether a request, or the room for an answer that ends the connection, is overdue."""
+        """True if a request, or the room for an answer that ends the connection, is overdue."""
         since_ns = self.since_ns if self.request_due else self._moved_ns
         due = self.request_due or self._finishing
         return due and now_ns - since_ns > HASTY_S * _SECOND_NS
@@ -366,7 +365,7 @@ class TcpServer:
         return self.guests.places(self._most)
 
     def _make_room(self, host: str) -> None:
-        """Where all places are taken, for one who comes from `host`."""
+        """Handle a full server, for one who comes from `host`."""
         if len(self.clients) < self._places:
             return
         client = gives_way(self.clients, host, time.perf_counter_ns())

@@ -41,7 +41,7 @@ class Topic:
         return f"{self.name}/{self.below}" if self.below else self.name
 
     def address(self, base: str) -> str:
-        """Where it stands at the broker; an `absolute` one stands outside `base`."""
+        """Address at the broker; an `absolute` one stands outside `base`."""
         return self.path if self.absolute else f"{base}/{self.path}"
 
 
@@ -65,7 +65,7 @@ TOPICS = (
 
 
 def fleet(card: int) -> Topic:
-    """Where another vehicle is, by the number of its card."""
+    """Topic of another vehicle, by the number of its card."""
     return replace(FLEET, below=str(card))
 
 

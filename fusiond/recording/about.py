@@ -1,4 +1,4 @@
-"""What every log says of the daemon, the vehicle and the computer that made it."""
+"""Metadata of a log: the daemon, the vehicle and the computer that made it."""
 
 from __future__ import annotations
 

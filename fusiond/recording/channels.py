@@ -30,7 +30,7 @@ INPUT_ENCODING = "fusiond.records"
 
 @dataclass(frozen=True, slots=True)
 class InnovationMessage:
-    """How an aid ended when the filter met it, again after a rewind."""
+    """Outcome of a measurement when the filter met it, again after a rewind."""
 
     t_ns: int
     """Of validity, CLOCK_MONOTONIC."""

@@ -23,7 +23,8 @@ _TYPES = {".json": "application/json"}
 
 @dataclass(frozen=True, slots=True)
 class Edited:
-    """What was written: the file, its messages, and what was wrong with the logs it was made of."""
+    """Result of an edit: the file, its messages, and what was wrong with the logs it was made
+    of."""
 
     path: Path
     messages: int
@@ -39,7 +40,7 @@ def merge(paths: Sequence[Path], out: Path) -> Edited:
 
 
 def recover(path: Path, out: Path) -> Edited:
-    """What can be read of a log that was cut off or damaged. Raises `LogError`, OSError."""
+    """Readable part of a log that was cut off or damaged. Raises `LogError`, OSError."""
     return merge([path], out)
 
 

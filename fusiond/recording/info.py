@@ -1,4 +1,4 @@
-"""What is in a log: `fusiond log info`."""
+"""Contents of a log: `fusiond log info`."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What describes a log. `metadata` is told in docs/recording.md."""
+    """Metadata of a log. `metadata` is told in docs/recording.md."""
 
     metadata: Mapping[str, str]
     attachments: tuple[Attachment, ...] = ()

@@ -35,7 +35,8 @@ RATIO_LIMIT, RATIO_FREE = 100, 1 << 18
 """A chunk may become so many times as long, and two chunks of ours more: those of a drive are 4 to
 5 times as long, one of nothing but 0xD3 from a line 188. A small file is no large recording."""
 WINDOW_LIMIT = 1 << 23
-"""What a decompressor of zstd must be ready to hold of the past (RFC 8878, section 3.1.1.1.2)."""
+"""Window that a decompressor of zstd must be ready to hold of the past (RFC 8878, section
+3.1.1.1.2)."""
 LATEST_NS = 253_402_300_800 * 1_000_000_000
 """The end of 9999, POSIX: what is told of a log has four digits for a year."""
 MOST_PROBLEMS = 100
@@ -64,7 +65,7 @@ class LogMessage(NamedTuple):
     sequence: int
 
     def json(self) -> Any:
-        """What it says, of a channel other than the input. Raises ValueError."""
+        """Message, of a channel other than the input. Raises ValueError."""
         try:
             return json.loads(self.data)
         except RecursionError:
@@ -73,14 +74,14 @@ class LogMessage(NamedTuple):
 
 @dataclass
 class About:
-    """What a log says of itself."""
+    """Metadata of a log."""
 
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
 
     @property
     def epoch_ns(self) -> int:
-        """What the log's times are ahead of CLOCK_MONOTONIC."""
+        """Lead of the log's times over CLOCK_MONOTONIC."""
         return int(self.metadata["epoch_ns"])
 
     @property
@@ -151,12 +152,12 @@ class Log:
 
     @property
     def first_part(self) -> bool:
-        """Whether the recording's beginning is there."""
+        """True if the recording's beginning is there."""
         return self.about.metadata["part"] == "0"
 
 
 def described_by(path: Path) -> About:
-    """What the log at `path` says of itself. Raises `LogError`."""
+    """Metadata of the log at `path`. Raises `LogError`."""
     about = About()
     for record in _records(path, lambda text: None):
         if isinstance(record, Metadata) and record.name == METADATA:

@@ -49,7 +49,7 @@ from fusiond.recording.records import (
 MESSAGE_BYTES = 64 * 1024
 """Inputs that come without a tick (it is late, or none is left) make a message of their own."""
 STATE_EVERY_NS = 10 * SECOND_NS
-"""How much earlier than asked for a cut may begin; a state has 6 kB."""
+"""Largest early begin of a cut; a state has 6 kB."""
 
 
 class RecordingRefusedError(Exception):
@@ -173,7 +173,7 @@ class Recorder:
 
     @property
     def active(self) -> bool:
-        """Whether anything is to be told to it."""
+        """True if anything is to be told to it."""
         return self.state in ("recording", "waiting")
 
     @property
@@ -250,13 +250,13 @@ class Recorder:
             self.end(f"{self._options.after_s:.0f} s after the last event")
 
     def innovation(self, entry: Entry) -> None:
-        """How an aid ended."""
+        """Record the outcome of a measurement."""
         if self.active and entry.outcome is not None:
             t_log_ns = self._clock.now_ns() + self._epoch_ns
             self._put(Item(INNOVATION, t_log_ns, innovation(entry, entry.outcome)))
 
     def state_due(self, t_ns: int) -> bool:
-        """Whether `keep_state` should be called: now and then, and first of all in each file."""
+        """True if `keep_state` should be called: now and then, and first of all in each file."""
         old = self._state_ns is None or t_ns - self._state_ns >= STATE_EVERY_NS
         parts = 0 if self._writer is None else self._writer.parts
         return self.active and (old or parts != self._state_part)

@@ -1,4 +1,4 @@
-"""What moves the daemon from outside, as bytes: the records of the channel `/fusiond/input`.
+"""Input records, as bytes: the records of the channel `/fusiond/input`.
 
     record  = kind u8 | source u8 | readings u16 | length u32 | t_ns i64 | payload | reading ...
     reading = clock u8 | t_ns i64 | ahead_ns i64
@@ -49,7 +49,7 @@ Reading = tuple[int, int, int]
 
 
 class Kind(IntEnum):
-    """What a record is of."""
+    """Kind of a record."""
 
     START = 0
     TICK = 1

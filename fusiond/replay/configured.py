@@ -1,4 +1,4 @@
-"""Which configuration a replay runs with: the log's own, another file, single values changed."""
+"""Configuration of a replay: the log's own, another file, single values changed."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class RecordedTime:
 
 
 class RecordedReadings(Readings):
-    """What the daemon read of its host's clocks, in the same order.
+    """Clock readings of the daemon, in the same order.
 
     A filter that reports other events asks another number of times: what a record does not hold is
     answered with what was read last, and what is left over waits for nobody (`pending`).

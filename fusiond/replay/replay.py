@@ -44,7 +44,7 @@ Arrival = Callable[[Measurement | RawGnssEpoch, Instant], None]
 
 
 class Divergence(NamedTuple):
-    """Where a replay first went another way than the daemon did."""
+    """First difference of a replay from the recording."""
 
     tick: int
     t_ns: int
@@ -53,7 +53,7 @@ class Divergence(NamedTuple):
 
 @dataclass
 class Comparison:
-    """How ticks and requests of a replay compare with the recorded ones."""
+    """Comparison of a replay's ticks and requests with the recorded ones."""
 
     ticks: int = 0
     compared: int = 0
@@ -98,7 +98,7 @@ class Replay:
         self._inputs = 0
         self.exact = False
         self.began = "nothing in the log"
-        """What the replay started from, in words."""
+        """Starting state of the replay, in words."""
         self.comparison = Comparison()
         self.chain: Chain | None = None
 
@@ -255,7 +255,7 @@ class Replay:
 
 
 def _system_clock(record: Record, recording: Log) -> dict[str, int | None]:
-    """Where the log does not say it: the system clock as the log's own dates have it."""
+    """Fallback where the log is silent: the system clock as the log's own dates have it."""
     t_ns, ahead_ns = record.t_ns, recording.about.epoch_ns
     return {
         **dict.fromkeys(("_sampled_ns", "_queued_ns", "_stepped_ns"), t_ns),

@@ -38,8 +38,8 @@ FAREWELL_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What is asked of a replay: another configuration, single settings, files, the speed at which
-    it is published (None: not at all, as fast as it goes)."""
+    """Options of a replay: another configuration, single settings, files, the speed at which it is
+    published (None: not at all, as fast as it goes)."""
 
     config: Path | None = None
     settings: tuple[str, ...] = ()

@@ -1,1 +1,1 @@
-"""What happened on a drive, as one page: from logs and solution files, never from the daemon."""
+"""Report of a drive on one page: from logs and solution files, never from the daemon."""

@@ -1,4 +1,4 @@
-"""What the channels of a log say, as arrays. Values that are no numbers become NaN."""
+"""Channels of a log, as arrays. Values that are no numbers become NaN."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def report_drives(path: Path, out: Path) -> int:
 
 
 def document(title: str, rows: Sequence[Row]) -> dict[str, Any]:
-    """What the page draws."""
+    """Data of the page."""
     groups = groups_of(rows)
     failed = [row for row in rows if row["ended"] != "done"]
     problems = []

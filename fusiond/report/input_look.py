@@ -1,5 +1,5 @@
-"""What a log's input shows of the host and the inertial unit: lateness of ticks, regularity of the
-samples, their spectrum.
+"""Look at a log's input, host and inertial unit: lateness of ticks, regularity of the samples,
+their spectrum.
 
 The samples are decoded by the driver that decoded them live: those of the first minute, and of ten
 seconds in each minute after it.

@@ -1,5 +1,5 @@
-"""What a page is made of: plots, tables, the track, sentences. `as_json(zero_s)` is what the page
-reads, with times counted from there."""
+"""Items of a page: plots, tables, the track, sentences. `as_json(zero_s)` is what the page reads,
+with times counted from there."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fusiond.files.csv_tables import Floats
 from fusiond.report.arrays import packed, thinned
 
 Role = Literal["line", "points", "refused", "bound", "steps", "bars"]
-"""How a series is drawn. `bound`: thin and dashed, such as two sigma around zero; `refused`: the
+"""Style of a series. `bound`: thin and dashed, such as two sigma around zero; `refused`: the
 measurements that were not used."""
 
 
@@ -25,7 +25,7 @@ class Series:
     values: Floats
     role: Role = "line"
     like: int | None = None
-    """Which series of the plot it shares its colour with."""
+    """Series with the same colour."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """What is not there, and why."""
+    """Missing item, and why."""
 
     text: str
 

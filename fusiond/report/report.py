@@ -38,7 +38,7 @@ def _read(paths: Sequence[Path]) -> Run:
 
 
 def document(title: str, runs: Sequence[Run], truth: TrajectoryTable | None) -> dict[str, Any]:
-    """What the page draws."""
+    """Data of the page."""
     zeros = _zeros(runs)
     same_time = len(set(zeros)) == 1
     spans = [
@@ -66,7 +66,7 @@ def document(title: str, runs: Sequence[Run], truth: TrajectoryTable | None) -> 
 
 
 def _zeros(runs: Sequence[Run]) -> list[float]:
-    """What each run's times are counted from: the earliest instant of all where they overlap."""
+    """Zero of each run's times: the earliest instant of all where they overlap."""
     spans = [run.span_s for run in runs]
     first = min(a for a, _ in spans)
     if max(a for a, _ in spans) <= min(b for _, b in spans):

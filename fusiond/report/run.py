@@ -100,7 +100,7 @@ class Sky:
 
 @dataclass(frozen=True, slots=True)
 class ImuLook:
-    """What the inertial samples look like before the filter, in the stretches looked at.
+    """Statistics of inertial samples before the filter, in the stretches looked at.
 
     Intervals (ms) between samples by their own stamps and by their arrival; the amplitude spectrum
     of the three axes of rate (deg/s per root Hz) and specific force (m/s^2 per root Hz), (n, 3).
@@ -136,7 +136,7 @@ class Fault:
 
 @dataclass(slots=True)
 class LogParts:
-    """What a log holds beyond the solution; empty where it does not."""
+    """Data of a log beyond the solution; empty where it does not."""
 
     outcomes: dict[str, dict[str, int]] = field(default_factory=dict)
     counters: dict[str, dict[str, int]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What of a log's configuration differs from the defaults of this version."""
+"""Configuration that differs from the defaults of this version."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def _coverage(found: Errors) -> Item:
 
 
 def apart(first: Run, second: Run) -> Section | None:
-    """Where two runs of the same time part; None where they have no time in common."""
+    """Instants at which two runs differ; None where they have no time in common."""
     try:
         found = errors_of(second.solution, first.solution)
     except NothingToCompareError:

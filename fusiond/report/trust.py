@@ -44,7 +44,7 @@ def innovations(run: Run) -> Section | None:
 
 
 def _is_judged(log: LogParts, source: str) -> bool:
-    """Whether there is a verdict on it, or on a part of it: there is none on a constraint."""
+    """True if there is a verdict on it, or on a part of it: there is none on a constraint."""
     return not log.verdicts or any(f"{name}_".startswith(f"{source}_") for name in log.verdicts)
 
 
@@ -95,7 +95,7 @@ def _raw(source: str, found: Innovations) -> list[tuple[str, Item]]:
 
 
 def _by_row(values: Floats, fused: np.ndarray[Any, Any], names: Sequence[str]) -> list[Series]:
-    """What was accepted, and what was refused in the same colour."""
+    """Accepted and rejected measurements, in the same colour."""
     series: list[Series] = []
     for k, name in enumerate(names):
         series.append(Series(name, np.where(fused, values[:, k], np.nan), "points"))
@@ -206,7 +206,7 @@ def _histogram(source: str, delay_s: Floats) -> Plot:
 
 
 def _cycle(source: str, counters: dict[str, int]) -> Table:
-    """What became of the requests, as the driver counts them."""
+    """Outcomes of the requests, as the driver counts them."""
     head = ("counter", "count")
     rows = [[name, str(count)] for name, count in counters.items()]
     good = "Good: as many `fixes` as `requested`."

@@ -51,7 +51,7 @@ _TRUTH = (_TIME, *_PLACE, *_V, *((f"{angle}_deg", 7) for angle in ("roll", "pitc
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """What was written: the files, and their rows without the header (epochs of a raw stream)."""
+    """Result of writing: the files, and their rows without the header (epochs of a raw stream)."""
 
     scenario: str
     seed: int

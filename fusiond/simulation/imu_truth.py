@@ -1,4 +1,4 @@
-r"""What an ideal IMU on a trajectory would say, and where the vehicle is at any instant.
+r"""Samples of an ideal IMU on a trajectory, and where the vehicle is at any instant.
 
     w_ib^b = w_nb^b(rpy, rpy') + C_bn (w_ie^n + w_en^n)
     f^b    = C_bn (v' + (2 w_ie + w_en) x v - g)

@@ -57,7 +57,7 @@ class PtyLine:
         return self._master is not None and not self._hangup.poll(0)
 
     def read(self) -> bytes:
-        """What the host has written, b"" for nothing."""
+        """Bytes of the host, b"" for nothing."""
         if self._master is not None and self._open_by_host():
             with contextlib.suppress(OSError):
                 return os.read(self._master, _READ_BYTES)

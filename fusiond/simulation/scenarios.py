@@ -1,4 +1,4 @@
-"""What can be simulated: a motion, where it starts, and the sensors on board."""
+"""Scenarios of the simulation: a motion, where it starts, and the sensors on board."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Scenario:
         return Truth(path, origin, self.imu.rate_hz, length)
 
     def imu_output(self, truth: Truth, rng: np.random.Generator) -> ImuOutput:
-        """What this scenario's IMU says on that trajectory."""
+        """IMU samples of this scenario on that trajectory."""
         return imu_output(self.imu, truth.gyro, truth.accel, rng, vibration=self.vibration)
 
     def fitted(self, config: Config) -> Scenario:

@@ -48,7 +48,7 @@ from fusiond.simulation.trajectories import drive
 Device = Literal["imu", "gnss", "rdss", "star_tracker", "sar"]
 
 SERIAL_POLL_S = 0.01
-"""How often the terminal's line is read: far below the 50 ms that its answers take."""
+"""Interval of reads of the terminal's line: far below the 50 ms that its answers take."""
 
 
 class SimulatedVehicle:
@@ -163,7 +163,7 @@ class SimulatedVehicle:
         return (time.monotonic_ns() - self.start_ns) * 1e-9
 
     def _next_s(self, t_s: float) -> float:
-        """When there is something to do again."""
+        """Next instant of work."""
         due = [self.truth.duration_s, t_s + SERIAL_POLL_S, *(a.next_s for a in self.aids.values())]
         if self._next_imu < len(self.imu.gyro):
             due.append(float(self.truth.t_s[self._next_imu + 1]))

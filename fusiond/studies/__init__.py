@@ -27,12 +27,12 @@ STUDIES = {
 
 
 class About(NamedTuple):
-    """What a study asks, and how many runs it makes where nobody says how many."""
+    """Study: question and default number of runs."""
 
     text: str
     runs: int
     rows: bool = True
-    """Whether a run can be a row: not where all are drawn at once."""
+    """True if a run can be a row: not where all are drawn at once."""
 
 
 ABOUT = {

@@ -1,4 +1,4 @@
-r"""How often the consistency verdict is wrong, and how soon it notices a fault.
+r"""Error rate of the consistency verdict, and how soon it notices a fault.
 
 The filter is that of `level_axis` with the MEMS IMU of config/vehicle.toml (0.1 m/s/sqrt(h),
 0.3 deg/sqrt(h)), aided by GNSS, 1.5 m every 1 s, or by RDSS, 20 m every 1.5 s. Faults set in while

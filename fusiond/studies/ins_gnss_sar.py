@@ -141,7 +141,7 @@ def _satellites(seconds: float, all_in_view: bool) -> dict[str, float]:
 
 
 def _integration(of: Model, seconds: float) -> dict[str, float]:
-    """What the IMU's rate does to a flight without errors of the sensors."""
+    """Effect of the IMU's rate on a flight without errors of the sensors."""
     nav = flight.true_nav(flight.truth(seconds))
     true = State(nav[0], np.zeros(of.size), np.zeros(STEP_SIZE), of)
     errors, sd = [], []

@@ -109,7 +109,7 @@ def described(value: Any) -> str:
 
 
 def _part(work: Callable[[Any], Any]) -> str:
-    """What its arguments are called: texts, and what has a name."""
+    """Names of the arguments: texts, and what has a name."""
     args = work.args if isinstance(work, partial) else ()
     named = [arg if isinstance(arg, str) else getattr(arg, "name", "") for arg in args]
     return " ".join(str(name) for name in named if name)

@@ -37,7 +37,7 @@ class Aided:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """How the truth differs from what the filter assumes."""
+    """Difference of the truth from the filter's assumptions."""
 
     name: str
     q: float = 1.0

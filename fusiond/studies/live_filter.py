@@ -40,7 +40,7 @@ def drive_truth() -> Truth:
 
 
 def drive_samples(imu: Imu, rng: np.random.Generator) -> Array:
-    """What an IMU at `RATE_HZ` says on the drive (n, 6): rate (rad/s) and force (m/s^2)."""
+    """IMU samples at `RATE_HZ` on the drive (n, 6): rate (rad/s) and force (m/s^2)."""
     truth = drive_truth()
     output = imu_output(imu, truth.gyro, truth.accel, rng)
     return np.hstack([output.gyro, output.accel])

@@ -72,7 +72,7 @@ def runs_on(runner: Runner, kept: KeptRuns | None = None) -> Iterator[list[Lost]
 
 
 def step_counter(progress: Progress | None, total: int) -> Callable[[], None]:
-    """What to call after each of `total` steps."""
+    """Callback after each of `total` steps."""
     done = 0
 
     def step() -> None:
@@ -138,8 +138,8 @@ def _outcomes(given: _Given, work: Callable[[T], R], items: Sequence[T]) -> Iter
 
 
 def of_run(seed: int, number: int) -> np.random.SeedSequence:
-    """What run `number` of a study draws from: child `number` of the seed's sequence, without the
-    others having been made."""
+    """Random generator of run `number`: child `number` of the seed's sequence, without the others
+    having been made."""
     return np.random.SeedSequence(seed, spawn_key=(number,))
 
 

@@ -84,7 +84,7 @@ class Direction(NamedTuple):
 
 @dataclass(frozen=True)
 class Observability:
-    """What a trajectory's measurements tell of n states.
+    """Information of a trajectory on n states.
 
     `factor` (n, n) upper triangular with factor^T factor = O^T O; `scale` (n,) the D of the
     module's text; `theta` (n, n) the transition over the whole; `rows` of O.

@@ -66,7 +66,7 @@ EARTH_M = 6_378_137.0
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is wrong: a device, and how far its position is off to the north."""
+    """Fault: a device, and how far its position is off to the north."""
 
     name: str
     source: str = ""

@@ -1,4 +1,4 @@
-"""What became of one run, and what runs them."""
+"""Outcome of one run, and the interface of what runs them."""
 
 from __future__ import annotations
 

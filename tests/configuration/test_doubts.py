@@ -34,7 +34,7 @@ def found(folder: Path, text: str) -> list[str]:
 def test_examples_leave_no_doubt(path: Path) -> None:
     """But for those whose drives came as files."""
     said = doubts(load_config(path))
-    assert [doubt for doubt in said if not doubt.startswith("sources: there is none")] == []
+    assert [doubt for doubt in said if not doubt.startswith("sources: none")] == []
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_examples_leave_no_doubt(path: Path) -> None:
         ),
         (f"{SOUND}[mqtt]\ntls = true\nca_file = 'ca.pem'\n", "/ca.pem': No such file"),
         (f"[sources.imu]\n{IMU}", "sources: none gives a position"),
-        ("", "sources: there is none"),
+        ("", "sources: none"),
         (
             f"{SOUND}[estimator]\nmodel = 'planar10'\n",
             "'planar10' has no accelerometer bias, and [imu] has one of 10 mg, one sigma: "

@@ -53,7 +53,7 @@ LEAST_PART = 0.1
 
 
 class FederatedFilter(ErrorStateFilter):
-    """What the modes share; `names` are the local filters.
+    """Common part of the modes; `names` are the local filters.
 
     `_bank` (k, width, width) and `_bank_dxs` (k, n) are estimates to be fused, `_factors` (N,) the
     sharing factors of the local filters.
@@ -102,7 +102,7 @@ class FederatedFilter(ErrorStateFilter):
 
     @property
     def isolates(self) -> bool:
-        """Whether it detects and leaves out faulty sources by itself."""
+        """True if it detects and leaves out faulty sources by itself."""
         return self.options.fault_detection
 
     @property

@@ -1,4 +1,4 @@
-r"""Which local filters of a federated filter may be believed: two tests, isolation, return.
+r"""Isolation of local filters: two tests, isolation, return.
 
 Innovation test   sum over the last W innovations of min(nu^T S^-1 nu, gate), each a chi-square of
                   its dimension while filter and sensor agree, against the quantile 1 - p of the
@@ -44,7 +44,7 @@ INNOVATION, DIFFERENCE = "innovation test", "difference test"
 
 
 class Record(NamedTuple):
-    """What is known of one local filter; never changed, so that a snapshot may hold it.
+    """State of one local filter; never changed, so that a snapshot may hold it.
 
     `window`: (NIS, degrees) of the last innovations; `reason`: why it is isolated; `passes`: how
     many innovations in a row have passed since; `heard_ns`: its last fused aid.
@@ -71,7 +71,7 @@ class FaultDetection:
         self.records = [Record()] * len(self.records)
 
     def is_isolated(self, local: int) -> bool:
-        """Whether a local filter is kept out."""
+        """True if a local filter is kept out."""
         return bool(self.records[local].reason)
 
     def heard(self, local: int, t_ns: int) -> None:
@@ -93,7 +93,7 @@ class FaultDetection:
         return local if statistics[local] > gate_threshold(self._pass, degrees) else None
 
     def may_isolate(self, local: int, t_ns: int) -> bool:
-        """Whether another filter is believed and was heard lately."""
+        """True if another filter is believed and was heard lately."""
         return any(
             i != local and not r.reason and t_ns - r.heard_ns <= RECENT_NS
             for i, r in enumerate(self.records)

@@ -1,4 +1,4 @@
-"""How a federated filter is set up, and which aids belong to which of its local filters."""
+"""Options of a federated filter, and which aids belong to which of its local filters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Fusion = Literal["uncorrelated", "correlated"]
 
 @immutable()
 class FederatedOptions:
-    """How a federated filter shares, resets and isolates.
+    """Options for sharing, reset and isolation of a federated filter.
 
     `fusion`: by bounds that make estimates as good as uncorrelated, or by what they share
     (fusiond.estimators.federated.correlated), which is for `no_reset` and has no `shares`.
@@ -34,8 +34,8 @@ class FederatedOptions:
 
 
 def local_of(source: str, names: tuple[str, ...]) -> int | None:
-    """Which of the local filters `names` an aid's source belongs to: the filter of that name, else
-    the longest one that it begins with (`gnss_velocity` to `gnss`); None: common to all."""
+    """Local filter among `names` of a source: the filter of that name, else the longest one that it
+    begins with (`gnss_velocity` to `gnss`); None: common to all."""
     if source in names:
         return names.index(source)
     begun = [name for name in names if source.startswith(f"{name}_")]

@@ -97,7 +97,7 @@ class MultiscaleEstimator(ErrorStateFilter):
 
     @property
     def state(self) -> State:
-        """What an aid may look at."""
+        """View of the filter for a measurement."""
         return State(self.nav, self.xi, self.step, self.model, self.covariance)
 
     @property

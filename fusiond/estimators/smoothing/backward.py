@@ -79,7 +79,7 @@ class Smoothed(NamedTuple):
 
     @property
     def corrections(self) -> Corrections:
-        """What solutions between the nodes are corrected by."""
+        """Corrections of solutions between the nodes."""
         return Corrections(self.t_ns, self.before, self.after, self.variance)
 
 

@@ -1,4 +1,4 @@
-r"""What a filter leaves behind of an instant, so that a smoother can come back to it.
+r"""Node of a filter at an instant, so that a smoother can come back to it.
 
 A node is an instant t_j at which aids were fused, or one between them where they are far apart:
 

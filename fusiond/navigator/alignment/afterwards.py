@@ -1,4 +1,4 @@
-"""What the first motion says of a start: headings that were claimed, and how the IMU is mounted."""
+"""Checks of a start by the first motion: headings that were claimed, and how the IMU is mounted."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class Afterwards:
 
     @property
     def unconfirmed(self) -> str:
-        """What the heading hangs on and no motion has shown, in words; empty where there is no such
-        thing. A configured heading is a hypothesis until the first motion, and so is one that
-        was saved without it; another that was saved was measured, before the vehicle was parked.
-        And what looks like driving backward is driving
-        forward with an IMU that is mounted the other way, until it goes forward as well."""
+        """Condition of the heading that nothing has shown, in words; empty where there is no such
+        thing. A configured heading is a hypothesis until the first motion, and so is one that was
+        saved without it; another that was saved was measured, before the vehicle was parked. And
+        what looks like driving backward is driving forward with an IMU that is mounted the other
+        way, until it goes forward as well."""
         if self._backward:
             return reason("backward_or_mounted")
         return reason("not_confirmed_by_motion") if self._unproven else ""

@@ -66,7 +66,7 @@ class Aligner:
         self._track = Track(options, model)
         self._journal = Journal(on_event)
         self._news, self._said = True, -1
-        """Whether anything has come since the reason was said, and when (`SAID_NS`) that was."""
+        """True if anything has come since the reason was said, and when (`SAID_NS`) that was."""
         self._basis = Basis(options, noise, model, saved, self.known, self._track)
 
     def aids(self, aids: Sequence[Aid]) -> None:
@@ -83,7 +83,7 @@ class Aligner:
         self._track.hear(aids)
 
     def waits(self, start: Start, lateness: Lateness) -> bool:
-        """Whether a start that was found must wait: while it is looked whether the fixes that it is
+        """True if a start that was found must wait: while it is looked whether the fixes that it is
         made of are late, and longer where one is suspected, until others come."""
         self._found = start if lateness.looking else None
         if lateness.suspects:

@@ -1,4 +1,4 @@
-"""What every heading source may look at."""
+"""Data that heading sources share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an alignment has to go by: rest seen by the IMU, and what the aids offered."""
+"""Data of an alignment: rest seen by the IMU, and what the aids offered."""
 
 from __future__ import annotations
 
@@ -96,9 +96,9 @@ class Collected:
         self._options, self._noise, self._saved = options, noise, saved
         self._event = on_event
         self.why = ""
-        """What the start waits for, beyond what the aligner sees itself."""
+        """Reason to wait, beyond what the aligner sees itself."""
         self.poor_claims: dict[str, str] = {}
-        """Why a claimed heading, by its origin, is no start."""
+        """Reason why a claimed heading, by its origin, is no start."""
         self.told: set[str] = set()
         """Events that the operator has heard."""
         self.upside_down = False
@@ -198,7 +198,7 @@ class Collected:
 
     @property
     def resting(self) -> bool:
-        """Whether the last windows were quiet."""
+        """True if the last windows were quiet."""
         return self._at_rest
 
     def levelled(self) -> Standing | None:
@@ -209,7 +209,7 @@ class Collected:
         return s if self.rested(s, ANY_TIME_NS) else None
 
     def rested(self, s: Standing, until_ns: int = 0) -> bool:
-        """Whether no measured speed contradicts a standstill, up to its end or later; nor the way
+        """True if no measured speed contradicts a standstill, up to its end or later; nor the way
         between positions, where no speed was measured."""
         end_ns = max(s.end_ns, until_ns)
         seen = self.witnesses.measured(s.start_ns, end_ns)
@@ -219,7 +219,7 @@ class Collected:
         return slope <= max(self._options.rest_speed_m_s, CONTRADICTION_SIGMAS * sd)
 
     def confirmed_rest(self, s: Standing) -> bool:
-        """Whether a standstill that nothing contradicts was measured to be one."""
+        """True if a standstill that nothing contradicts was measured to be one."""
         if self.seen_at_rest(s):
             return True
         return CONTRADICTION_SIGMAS * self._way(s.start_ns, s.end_ns)[1] < SLOWEST_M_S
@@ -237,12 +237,12 @@ class Collected:
         return trend.slope
 
     def seen_at_rest(self, s: Standing) -> bool:
-        """Whether speeds were measured in a standstill, and were zero."""
+        """True if speeds were measured in a standstill, and were zero."""
         seen = self.witnesses.measured(s.start_ns, s.end_ns)
         return math.isfinite(seen.sd) and not seen.contradicts
 
     def doubted(self, why: str) -> str:
-        """Why there is no start yet; `why` back."""
+        """Set the reason why there is no start yet; `why` back."""
         self.why = why
         return why
 
@@ -254,8 +254,8 @@ class Collected:
         return self.doubted(text)
 
     def position_confirms(self, latest: Fix) -> bool:
-        """Whether the positions have moved as the velocities say, so far that the opposite would
-        be seen, and do not run away from them."""
+        """True if the positions have moved as the velocities say, so far that the opposite would be
+        seen, and do not run away from them."""
         way, before, trend = np.zeros(2), self.fixes[0], NO_TREND
         first = before.position
         if before is latest:
@@ -305,7 +305,7 @@ class Collected:
             self.tell("imu_upside_down", reason("imu_upside_down"))
 
     def _turns(self, w: Window) -> bool:
-        """Whether the rate of quiet windows can be no bias that the data sheet allows."""
+        """True if the rate of quiet windows can be no bias that the data sheet allows."""
         n = self._noise
         prior = n.rate_bias_initial**2 + n.rate_bias_instability**2
         free = n.rate_noise**2 / self._options.window_s + self._options.rate_sd_rad_s**2
@@ -339,8 +339,7 @@ class Collected:
         return Place(p, where, max(p.sd[:2]), sd_height)
 
     def _told(self) -> tuple[tuple[float, float, float | None], float] | None:
-        """Where (rad, rad, m) the configuration or the saved state says that the vehicle is, and
-        one sigma (m)."""
+        """Position (rad, rad, m) by the configuration or the saved state , and one sigma (m)."""
         if self._options.position is not None:
             return self._options.position, self._options.position_sd_m
         if self._saved is not None:

@@ -202,7 +202,7 @@ def _felt_sd(by: Basis, g: float, seconds: float, turned: float, speed: float) -
 def _along(
     options: AlignmentOptions, velocity: VelocityOffer, rate: Array, backward: bool
 ) -> Along:
-    """Where the antenna moves in a body that turns and does not slide."""
+    """Direction of the antenna's motion, in a body that turns and does not slide."""
     no_slip = options.no_slip_m
     known = no_slip is not None
     arm = np.array(velocity.lever) - np.array(no_slip if no_slip is not None else (0.0, 0.0, 0.0))
@@ -215,7 +215,7 @@ def _along(
 
 
 def _reversing(by: Basis, velocity: VelocityOffer) -> str:
-    """Why a start backward must wait; empty if it need not.
+    """Reason why a start backward must wait; empty if it need not.
 
     An IMU mounted backwards feels a vehicle that drives off forward just as one that reverses; the
     speed tells, once it has settled or is one that nobody reverses at. From then on no start is

@@ -70,8 +70,8 @@ def _at_standstill(
 
 
 def from_saved(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """What the vehicle knew when it was parked, while it has not moved since: neither by itself nor
-    on a ferry, which the first fix tells."""
+    """Start by the saved heading of a parked vehicle, while it has not moved since: neither by
+    itself nor on a ferry, which the first fix tells."""
     if by.saved is None or by.known.ever_moved:
         return None
     fix, where, sd, _ = place
@@ -99,7 +99,7 @@ def from_config(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """What an aid said last, while it is fresh."""
+    """Latest heading candidate, while it is fresh."""
     if by.known.heading is None or imu.latest_ns - by.known.heading.t_ns > HEADING_AGE_NS:
         return None
     return _at_standstill(
@@ -108,7 +108,7 @@ def from_dual_antenna(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
 
 
 def from_compass(by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
-    """What a compass said last, while it is fresh, until the vehicle has shown it to be wrong."""
+    """Compass candidate, while it is fresh, until the vehicle has shown it to be wrong."""
     offer = by.known.compass
     if offer is None or imu.latest_ns - offer.t_ns > HEADING_AGE_NS:
         return None

@@ -1,4 +1,4 @@
-r"""How much later than its stamps a receiver's fixes are valid, told by the IMU alone.
+r"""Delay of a receiver's fixes, told by the IMU alone.
 
 The velocities of the last seconds are compared with what the IMU has felt
 (fusiond.navigator.alignment.motion_fit), as if each had been true by tau before its stamp.
@@ -101,13 +101,13 @@ Fitting = Generator[None, None, tuple[float, int]]
 
 
 class Late(NamedTuple):
-    """How much later than stamped (s), and one sigma."""
+    """Delay against the stamps (s), and one sigma."""
 
     seconds: float
     sd: float
 
     def agrees(self, other: Late) -> bool:
-        """Whether both may be the same."""
+        """True if both may be the same."""
         return abs(self.seconds - other.seconds) <= AGREED * math.hypot(self.sd, other.sd)
 
 
@@ -148,7 +148,7 @@ class _Receiver:
     seen: int = 0
 
     def suspect(self, late: Late, t_ns: int) -> None:
-        """What the fixes until `t_ns` say; what looks agree upon counts, the best known of it."""
+        """Delay by the fixes until `t_ns`; what looks agree upon counts, the best known of it."""
         before = self.suspected
         if before is None or not late.agrees(before):
             self.suspected, self.since_ns, self.seen = late, t_ns, 1
@@ -158,7 +158,7 @@ class _Receiver:
             self.suspected = late
 
     def settled(self, t_ns: int) -> Late | None:
-        """How late it is, once that is known; a suspicion that has not lasted ends."""
+        """Delay, once that is known; a suspicion that has not lasted ends."""
         late = self.suspected
         if late is None:
             return None
@@ -211,12 +211,12 @@ class Lateness:
         ]
 
     def due(self, t_ns: int) -> bool:
-        """Whether it is time to look again, or to go on with it."""
+        """True if it is time to look again, or to go on with it."""
         return self._looking is not None or not 0 < self._due_ns - t_ns <= SEARCHED_NS
 
     @property
     def looking(self) -> bool:
-        """Whether a look has begun and not ended."""
+        """True if a look has begun and not ended."""
         return self._looking is not None
 
     def stop(self) -> None:
@@ -225,8 +225,7 @@ class Lateness:
 
     @property
     def suspects(self) -> str:
-        """Which receiver is late by as much as is not known yet, or may be, in words; empty where
-        none is."""
+        """Text on a receiver whose delay is suspected, in words; empty where none is."""
         for source, receiver in self._receivers.items():
             if receiver.suspected is not None:
                 late = receiver.suspected
@@ -285,8 +284,7 @@ class Lateness:
     def _weigh(
         self, receiver: _Receiver, past: motion.Past, first_ns: int, t_ns: int
     ) -> Generator[None, None, None]:
-        """What the fixes of a span say of a receiver's lateness; the best that they have said
-        counts."""
+        """Weigh the delay by the fixes of a span; the best that they have said counts."""
         of_each = (epoch for heard in receiver.heard for epoch in heard.epochs())
         epochs = sorted(of_each, key=lambda epoch: epoch.velocity.t_ns)
         looked = [e for e in epochs if first_ns <= e.velocity.t_ns <= t_ns]

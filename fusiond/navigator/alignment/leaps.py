@@ -1,4 +1,4 @@
-r"""Where a receiver's positions leap against its own velocities.
+r"""Position jumps of a receiver against its own velocities.
 
     r_k = p_k - p_k-1 - (v_k + v_k-1) / 2 (t_k - t_k-1)
 
@@ -67,7 +67,7 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
 
 
 def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool:
-    """Whether a receiver cannot have become later by `by_s` within what a look goes by, nor have
+    """True if a receiver cannot have become later by `by_s` within what a look goes by, nor have
     been so before: its positions have followed its velocities all the way, and before that these
     had changed by as much as shows a lateness. What follows `doubted_ns`, when something did not
     fit, shows none as long: what is begun anew by late fixes agrees with them for a while."""
@@ -87,7 +87,7 @@ def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool
 
 
 def velocities_alone(epochs: Sequence[Epoch], by_s: float) -> bool:
-    """Whether of fixes whose velocities are later by `by_s` than they were (earlier, below 0) the
+    """True if of fixes whose velocities are later by `by_s` than they were (earlier, below 0) the
     positions are nearer to have stayed."""
     steps = _steps(epochs)
     if steps is None or (steps.dt_s > LONGEST_S).any():

@@ -1,4 +1,4 @@
-r"""What a moving vehicle has felt and what was measured of it, since the first of some fixes.
+r"""Preintegrated motion and measurements, since the first of some fixes.
 
 Integrals of the gyros and accelerometers in the axes of the first fix, with their slopes by the
 sensors' biases, for fusiond.navigator.alignment.motion_fit.
@@ -66,9 +66,9 @@ class Measured(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """What the IMU sensed from the first of k fixes to the last: times (m + 1,) ns, of the first
-    fix and of samples (m, 6), how many of them (k,) there are until each fix, seconds (k,) from the
-    first to each, and means (k, 6) of the samples around each."""
+    """IMU data from the first of k fixes to the last: times (m + 1,) ns, of the first fix and of
+    samples (m, 6), how many of them (k,) there are until each fix, seconds (k,) from the first to
+    each, and means (k, 6) of the samples around each."""
 
     times: NDArray[np.int64]
     samples: Array
@@ -116,7 +116,8 @@ def span_since(imu: ImuBuffer, t_ns: int) -> Span:
 
 
 def measured(fixes: Sequence[VelocityOffer], most: int) -> Measured:
-    """What some fixes say; `most` of them, evenly, where they are more, the last among them."""
+    """Measurements of some fixes; `most` of them, evenly, where they are more, the last among
+    them."""
     every = math.ceil(len(fixes) / most)
     fixes = fixes[::-1][::every][::-1]
     found = [velocity_of(x) for x in fixes]
@@ -151,7 +152,7 @@ def samples_at(past: Past, t_ns: int) -> Array:
 
 
 def stretch(past: Past, instants: NDArray[np.int64]) -> Stretch:
-    """What was sensed from the first of instants (k,) to the last."""
+    """Sensed motion from the first of instants (k,) to the last."""
     first, end = past.index_after(int(instants[0])), past.index_after(int(instants[-1]))
     times = np.concatenate((instants[:1], past.times[first:end]))
     counts = np.searchsorted(times[1:], instants, side="right")
@@ -160,7 +161,7 @@ def stretch(past: Past, instants: NDArray[np.int64]) -> Stretch:
 
 
 def felt(past: Past, instants: NDArray[np.int64], rate: Array) -> Felt:
-    """What the IMU felt from the first of instants (k,) to each, less a rate bias (3,)."""
+    """Sensed motion from the first of instants (k,) to each, less a rate bias (3,)."""
     return stretch(past, instants).felt(np.concatenate((np.zeros(3), rate)))
 
 

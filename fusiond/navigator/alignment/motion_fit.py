@@ -1,4 +1,4 @@
-r"""Which way a moving vehicle faces: felt against measured changes of velocity, by least squares.
+r"""Direction of travel of a vehicle: felt against measured changes of velocity, by least squares.
 
     v(t_k) = v_0 + C_0 a_k + g t_k + C_k (w_k x l) + (C_k (f_k - b_f) + g) tau
     a_k = int C(0, t) (f - b_f) dt
@@ -123,8 +123,8 @@ class Asked(NamedTuple):
 
 
 class Descent(NamedTuple):
-    """Where Gauss-Newton has come to: the guess, its slopes (3 k + 10, 13) and what is left (3 k +
-    10,), in sigmas."""
+    """State of Gauss-Newton: the guess, its slopes (3 k + 10, 13) and what is left (3 k + 10,), in
+    sigmas."""
 
     here: Guess
     rows: Array

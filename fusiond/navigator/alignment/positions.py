@@ -86,7 +86,7 @@ def bank_model(model: Model, options: AlignmentOptions) -> Model:
 
 
 class Track:
-    """What a vehicle without heading has been measured with, and the bank that it leads to."""
+    """Measurements of a vehicle without heading, and the bank that it leads to."""
 
     def __init__(self, options: AlignmentOptions, model: Model) -> None:
         self._options = options
@@ -115,7 +115,7 @@ class Track:
 
     @property
     def running(self) -> bool:
-        """Whether a bank seeks the heading."""
+        """True if a bank seeks the heading."""
         return self._bank is not None
 
     def start(self, by: Basis, imu: ImuBuffer, place: Place) -> Start | None:
@@ -246,8 +246,8 @@ class Track:
         return Cell(found, weight)
 
     def _place(self, where: Array, t_ns: int) -> tuple[Array, float]:
-        """Where (rad, rad, m) a moving vehicle is at an instant, and one sigma (m): where it was at
-        the fix before, as far as it may have driven since, or about `where` it is now."""
+        """Position (rad, rad, m) of a moving vehicle at an instant, and one sigma (m): where it was
+        at the fix before, as far as it may have driven since, or about `where` it is now."""
         fixes = [o for a in self._aids for o in a.offers() if isinstance(o, PositionOffer)]
         before = [o for o in fixes if o.t_ns <= t_ns]
         if not before:
@@ -257,7 +257,7 @@ class Track:
         return np.array([o.lat_rad, o.lon_rad, where[2]]), math.hypot(max(o.sd[:2]), way)
 
     def _with_slip(self, due: list[Aid], begin_ns: int, until_ns: int) -> list[Aid]:
-        """What is due, and that the vehicle does not slide, twice a second."""
+        """Measurements that are due, and that the vehicle does not slide, twice a second."""
         lever = self._options.no_slip_m or (0.0, 0.0, 0.0)
         first = (begin_ns // SLIP_NS + 1) * SLIP_NS
         own: list[Aid] = [
@@ -269,7 +269,7 @@ class Track:
         return sorted([*due, *own], key=lambda a: (a.t_ns, a.source))
 
     def _forget(self, imu: ImuBuffer, standing: Standing | None) -> None:
-        """What no bank can begin with any more."""
+        """Drop measurements that no bank can use."""
         since = imu.latest_ns - 2 * LATE_NS
         begin = since if standing is None else min(since, standing.start_ns)
         old = [a for a in self._aids if a.t_ns < since]

@@ -128,7 +128,7 @@ class Start:
 
     @property
     def backward(self) -> bool:
-        """Whether the vehicle was taken to drive backward."""
+        """True if the vehicle was taken to drive backward."""
         return self.origin.endswith(BACKWARD)
 
 

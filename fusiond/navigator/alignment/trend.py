@@ -41,8 +41,7 @@ class Trend(NamedTuple):
 
     @property
     def slope(self) -> tuple[float, float]:
-        """How fast they run away (m/s), and the sigma of one of its axes; infinite where nothing is
-        known."""
+        """Drift rate (m/s), and the sigma of one of its axes; infinite where nothing is known."""
         spread = self.tt - self.t * self.t / self.n if self.n else 0.0
         if spread <= 0.0:
             return 0.0, math.inf

@@ -1,4 +1,4 @@
-"""Why there is no start yet, in words that say what to do.
+"""Reasons why there is no start: what is missing, and what to do.
 
 One sentence: what is missing, then what each allowed source of a heading waits for. It goes out as
 `why`; a change of it is an event, `not_aligned`, once it has lasted for `SETTLED_NS`. Numbers that
@@ -38,7 +38,7 @@ class Journal:
         self._since_ns = 0
 
     def keep(self, reason: str, t_ns: int) -> None:
-        """What is said at `t_ns`."""
+        """Report the reason at `t_ns`."""
         if reason != self._reason:
             self._reason, kind = reason, _NUMBER.sub("#", reason)
             if kind != self._kind:
@@ -73,7 +73,7 @@ def why_not(by: Basis, imu: ImuBuffer, latitude: float | None) -> str:
 
 
 def _no_heading(by: Basis) -> str:
-    """What to do for a heading by the allowed sources, the quickest first."""
+    """Step towards a heading by the allowed sources, the quickest first."""
     allowed = by.options.heading
     if "gnss_course" in allowed:
         return reason("no_heading_course", speed=by.options.course_speed_m_s)
@@ -97,7 +97,7 @@ def _rate(by: Basis, imu: ImuBuffer) -> list[str]:
 
 
 def _rest(by: Basis, imu: ImuBuffer) -> list[str]:
-    """What a vehicle that must stand lacks to be level."""
+    """Missing conditions of a rest for levelling."""
     o, s = by.options, by.known.standing
     if s is not None:
         if s.seconds >= o.levelling_s:
@@ -144,7 +144,7 @@ def _of_source(source: str, by: Basis, imu: ImuBuffer, latitude: float) -> list[
 
 
 def _gyrocompass(by: Basis, latitude: float) -> list[str]:
-    """How long the vehicle has stood, or that standing does not help."""
+    """Duration of the rest for gyrocompassing, or that standing does not help."""
     o, n, s = by.options, by.noise, by.known.standing
     bias = math.hypot(n.rate_bias_initial, n.rate_bias_instability)
     sd = gyrocompass_sd(latitude, bias, n.rate_noise, o.gyrocompass_s)

@@ -91,7 +91,7 @@ class Intake:
         return "not_an_aid"
 
     def extra_blocks(self) -> list[Block]:
-        """What the aids need in the model beside its own blocks: errors that successive
+        """Blocks that the aids need in the model beside its own blocks: errors that successive
         measurements share. Of a block that two sources need, the first says the noise."""
         blocks: dict[str, Block] = {}
         for source, section in self._sections.aiding.items():

@@ -47,10 +47,10 @@ PHASE_SD_M = 0.1
 """Nor has code, whatever its corrections, a sigma this small: a tenth of the best chip's noise."""
 FIX_BIAS = "gnss_bias"
 PHASE_SHARE = 0.5
-"""What part of the stated variance of a fix by carrier phase the next ones share, beside what each
+"""Share of the stated variance of a fix by carrier phase that the next ones share, beside what each
 has of its own: multipath and what is left of the atmosphere last for minutes (115 s over baselines
-up to 10 km: Miller, O'Keefe, Gao, Time correlation in GNSS positioning over short baselines,
-J. Surv. Eng. 138, 2012). Receivers do not say how their sigma is divided. It is a part of the state
+up to 10 km: Miller, O'Keefe, Gao, Time correlation in GNSS positioning over short baselines, J.
+Surv. Eng. 138, 2012). Receivers do not say how their sigma is divided. It is a part of the state
 that fixes by code share, and so has that one's correlation time, `bias_correlation_s`: longer."""
 # Vertical over horizontal sigma of a velocity where the receiver states none: as of the DOPs above.
 VERTICAL_VELOCITY_FACTOR = ASSUMED_VDOP / ASSUMED_HDOP
@@ -61,9 +61,8 @@ Motion = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class _Receiver(NamedTuple):
-    """What the sections say of a receiver: its own, whether its raw data are the aid, what its
-    velocities are called, and the blocks of what its fixes share (`blocks`), empty where it is not
-    estimated."""
+    """Options of a receiver: its own, whether its raw data are the aid, what its velocities are
+    called, and the blocks of what its fixes share (`blocks`), empty where it is not estimated."""
 
     section: GnssAiding
     raw: bool
@@ -74,7 +73,7 @@ class _Receiver(NamedTuple):
     bias: tuple[str, ...]
     wander: str
     holds: bool
-    """Whether the model has states for what its fixes share: its section is configured."""
+    """True if the model has states for what its fixes share: its section is configured."""
 
 
 def _receiver(source: str, sections: Sections) -> _Receiver:
@@ -160,7 +159,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
 
 
 def _by_phase(m: PositionFix, sections: Sections) -> bool:
-    """Whether the fix is one by carrier phase: its quality says so, or it states a sigma that code
+    """True if the fix is one by carrier phase: its quality says so, or it states a sigma that code
     cannot have; but for a receiver that has stated one of code under the same quality, which would
     have changed with the ambiguities."""
     if m.quality in RTK:
@@ -195,7 +194,7 @@ def _velocity(m: PositionFix, v_ned: tuple[float, float, float | None], o: GnssA
 
 
 def _phase_share(sd: Vector3, o: GnssAiding) -> Vector3:
-    """How much of the error that fixes by code share there is in one by carrier phase."""
+    """Share of the code error in one by carrier phase."""
     if o.bias_sd_m == 0.0:
         return (1.0, 1.0, 1.0)
     (north, east, down), part = sd, math.sqrt(PHASE_SHARE)
@@ -230,7 +229,7 @@ def _wandering(
     sections: Sections,
     sd: Vector3,
 ) -> float:
-    """How many metres of that there are, as this receiver's fixes and velocities have shown."""
+    """Size (m) of that error, as this receiver's fixes and velocities have shown."""
     known = sections.wander.get(m.source)
     if known is None:
         offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
@@ -243,8 +242,8 @@ def _wandering(
 
 
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
-    """What a receiver's fixes share: their offset in time, that of its velocities, what both grow
-    by, what is left of the lever arm, an error north and east, and one down."""
+    """Blocks that a receiver's fixes share: their offset in time, that of its velocities, what both
+    grow by, what is left of the lever arm, an error north and east, and one down."""
     found = []
     if section.time_offset_sd_s:
         skew, sd_s = sections.own(CLOCK_SKEW, source, section), section.time_offset_sd_s
@@ -268,7 +267,7 @@ def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:
 
 
 def told_by_operator(t_ns: int, where: tuple[float, float, float], sd_m: float) -> PositionAid:
-    """Where (rad, rad, m) an operator says that the vehicle is, one sigma (m) of each axis."""
+    """Position (rad, rad, m) by an operator, one sigma (m) of each axis."""
     return PositionAid("operator", t_ns, OPERATOR_GATE, *where, (sd_m,) * 3, (0.0, 0.0, 0.0))
 
 

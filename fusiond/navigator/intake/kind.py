@@ -1,4 +1,4 @@
-"""What a kind of measurement brings to the door: its sections, its aids, its blocks."""
+"""Interface of a kind of measurement: its sections, its aids, its blocks."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ class Sections:
         return section
 
     def made(self, source: str, make: Callable[[str, Sections], T]) -> T:
-        """What the sections alone say of a source, made once for all that comes of it."""
+        """Options of a source, made once for all that comes of it."""
         found: T | None = self._made.get((source, make))
         if found is None:
             found = self._made[source, make] = make(source, self)
         return found
 
     def robust(self, source: str) -> bool:
-        """Whether the section that a measurement of the source was made with, as `of` found it,
+        """True if the section that a measurement of the source was made with, as `of` found it,
         wants large residuals to weigh less."""
         section: Aiding | None = self.aiding.get(source)
         if section is None:

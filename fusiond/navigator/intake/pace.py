@@ -1,4 +1,4 @@
-r"""How fast a source may speak: what comes faster than its kind can is not believed.
+r"""Rate limits of sources: what comes faster than its kind can is not believed.
 
 A bucket of tokens for a source and kind of measurement:
 

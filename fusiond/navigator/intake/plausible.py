@@ -1,4 +1,4 @@
-"""Whether a measurement can be true: every kind is looked at here, once, before it is an aid.
+"""Plausibility of measurements: every kind is looked at here, once, before it is an aid.
 
 Outcomes: `not_finite`; `position_implausible` (no place on the Earth, too near a pole for north and
 east to mean anything, or exactly 0 N 0 E), `height_implausible` and `speed_implausible` (outside

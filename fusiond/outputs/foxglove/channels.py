@@ -1,4 +1,4 @@
-"""What Foxglove may subscribe to: its own schemas for map, attitude and log, and every topic.
+"""Channels of Foxglove: its own schemas for map, attitude and log, and every topic.
 
 Position covariance is east-north-up (m^2), of the variances alone. The attitude turns the body,
 with x forward, y left, z up, into east-north-up: by roll, minus pitch and 90 deg minus yaw, 3-2-1.

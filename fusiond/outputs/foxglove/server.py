@@ -103,7 +103,7 @@ class FoxgloveServer:
 
     @cached_property
     def greeting(self) -> bytes:
-        """What every viewer is told first: the server, and the channels; the frames."""
+        """First messages to a viewer: the server, and the channels; the frames."""
         hello = {
             "op": "serverInfo",
             "name": f"fusiond {self._vehicle}",

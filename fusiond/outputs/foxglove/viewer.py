@@ -51,7 +51,7 @@ def text_frame(text: str) -> bytes:
 
 
 def loopback(origin: str) -> bool:
-    """Whether a page's origin is this computer."""
+    """True if a page's origin is this computer."""
     try:
         name = urlsplit(origin).hostname or ""
         return name == "localhost" or ip_address(name).is_loopback
@@ -106,7 +106,7 @@ class Viewer:
             self._socket.send_text(text.encode())
 
     def _pass_on(self) -> None:
-        """What the WebSocket has to send."""
+        """Frame to send over the WebSocket."""
         parts = self._socket.data_to_send()
         data = b"".join(parts)
         if data:

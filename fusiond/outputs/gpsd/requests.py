@@ -63,7 +63,7 @@ class RequestReader:
             yield Malformed("request too long")
 
     def _ends(self, byte: int) -> bool:
-        """Whether a request ends with this byte."""
+        """True if a request ends with this byte."""
         if self._quoted:
             if self._escaped:
                 self._escaped = False

@@ -27,7 +27,7 @@ from fusiond.outputs.topics import HEALTH, NAV, Topic
 
 @dataclass(slots=True)
 class Watch:
-    """What a client watches: the object of WATCH."""
+    """Options of WATCH for a client."""
 
     enable: bool = False
     json: bool = False
@@ -121,7 +121,7 @@ class GpsdServer:
             self.server.send(self._epoch.wanted)
 
     def wanted(self, client: Client) -> Watch:
-        """What a client watches."""
+        """Set the options of a client's WATCH."""
         return client.session.watch if isinstance(client.session, _Asking) else Watch()
 
     def reports(self, nav: NavMessage) -> dict[str, Report]:
@@ -192,8 +192,8 @@ def _poll(t_utc: str | None, made: dict[str, Report]) -> Report:
 
 
 class _Epoch:
-    """What one `nav` comes to, with the satellites of that time: made once for all clients, and
-    only if one wants it."""
+    """Reports of one `nav`, with the satellites of that time: made once for all clients, and only
+    if one wants it."""
 
     def __init__(self, nav: NavMessage, server: GpsdServer) -> None:
         self._nav, self._server = nav, server

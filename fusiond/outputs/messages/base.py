@@ -1,4 +1,4 @@
-"""What every message has: the instant that it speaks of, null while the daemon knows no UTC.
+"""Base of every message: the instant that it speaks of, null while the daemon knows no UTC.
 
 A quantity that is not known is `null` (NaN here). The bounds of quantities stand in the published
 schemas alone: the daemon makes its messages of what it has itself, and a NaN is within no bound.
@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 Number = float | None
 LARGEST_INTEGER = 2**53 - 1
-"""What every reader of JSON takes as it was written (RFC 8259, section 6)."""
+"""Numbers that every reader of JSON takes as they were written (RFC 8259, section 6)."""
 Count = Annotated[
     int,
     Field(ge=0),

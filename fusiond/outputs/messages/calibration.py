@@ -22,7 +22,7 @@ class CalibratedParameter(BaseModel):
 
 
 class CalibrationMessage(Message):
-    """What the filter has found of mounting, lever arms, offsets in time and scales."""
+    """Calibration by the filter: mounting, lever arms, offsets in time and scales."""
 
     settled: bool = Field(description="all that is estimated has settled")
     parameters: dict[str, CalibratedParameter]

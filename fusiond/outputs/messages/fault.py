@@ -28,7 +28,7 @@ class FaultReport(BaseModel):
 
 
 def fault_report(finding: Finding, source: str, t_ns: int) -> FaultReport:
-    """What of a finding people are told at `t_ns`; `source` names its device."""
+    """Text and figures of a finding at `t_ns`; `source` names its device."""
     kind, row = finding.kind, finding.largest
     return FaultReport(
         source=source,

@@ -46,7 +46,7 @@ class SkyHealth(BaseModel):
 
 
 class BeamHealth(BaseModel):
-    """What an RDSS terminal said of its beams last; they are numbered from 1."""
+    """Beams of an RDSS terminal; they are numbered from 1."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

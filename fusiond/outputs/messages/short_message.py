@@ -16,7 +16,7 @@ Card = Annotated[
 
 
 class ShortMessage(Message):
-    """Where one message is: each change of one of ours, and each that comes, once.
+    """Stage of one message: each change of one of ours, and each that comes, once.
 
     Its time is that of the change. What a daemon that was killed could not tell any more it tells
     when it is back: the same `serial` again is the same message.

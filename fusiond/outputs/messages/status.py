@@ -18,7 +18,7 @@ RecordingState = Literal["off", "waiting", "recording", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class RecordingStatus:
-    """How a recording is."""
+    """State of a recording."""
 
     state: RecordingState = "off"
     file: str | None = None
@@ -27,7 +27,7 @@ class RecordingStatus:
 
 
 class StatusMessage(Message):
-    """What the solution is worth, why, and since when; counters since the daemon started."""
+    """Mode, reason and counters since the daemon started."""
 
     mode: Mode
     why: str

@@ -90,7 +90,7 @@ class CanAid:
 
     @property
     def next_s(self) -> float:
-        """When it speaks again, s of the trajectory."""
+        """Next instant of a measurement, s of the trajectory."""
         arrivals = self.sensor.t_arrival_s
         return float(arrivals[self._next]) if self._next < len(arrivals) else float("inf")
 

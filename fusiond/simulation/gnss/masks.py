@@ -1,4 +1,4 @@
-r"""What stands between a receiver and the sky: open country, a street between houses, a tunnel.
+r"""Sky masks: open country, a street between houses, a tunnel.
 
 Houses of height H along both sides of a street of width W hide, at azimuth A, what is lower than
 
@@ -41,7 +41,7 @@ class Mask:
     multipath: float = 2.0
 
     def holds(self, t_s: float) -> bool:
-        """Whether the vehicle is inside at an instant."""
+        """True if the vehicle is inside at an instant."""
         return self.start_s <= t_s < self.start_s + self.length_s
 
 
@@ -72,7 +72,7 @@ def parse_mask(text: str) -> Mask:
 
 @dataclass(slots=True)
 class View:
-    """Which satellites are seen along the way. Asked in the order of time."""
+    """Visible satellites along the way. Asked in the order of time."""
 
     elevation_deg: float = 10.0
     masks: Sequence[Mask] = ()
@@ -86,7 +86,7 @@ class View:
     def visible(
         self, t_s: float, azimuth: Array, elevation: Array, heading_rad: float
     ) -> tuple[Booleans, float]:
-        """Which of the satellites (n,) are seen, angles in rad, and the multipath's factor."""
+        """Mask of visible satellites (n,), angles in rad, and the multipath's factor."""
         up: Booleans = elevation >= math.radians(self.elevation_deg)
         k = self.mask(t_s)
         if k is None:

@@ -1,4 +1,4 @@
-r"""What a GNSS receiver on a true trajectory observes: pseudorange, range rate, carrier, C/N0.
+r"""Simulated raw observations of a receiver: pseudorange, range rate, carrier, C/N0.
 
     t    = t_r - b / c                               the receiver's clock shows t_r
     rho  = |Rz(we tau) p(t - tau) - r(t)|,  tau = rho / c
@@ -75,7 +75,7 @@ GPS_ALPHA = (1.4e-8, 1.5e-8, -6.0e-8, -1.2e-7)
 GPS_BETA = (1.05e5, 9.8e4, -6.5e4, -3.3e5)
 BEIDOU_ALPHA = (2.4e-8, 4.5e-8, -3.0e-7, 4.2e-7)
 BEIDOU_BETA = (1.25e5, -3.3e4, 1.3e5, 1.3e5)
-"""What is broadcast: models of the same sky that miss by a third or so at noon."""
+"""Broadcast models of the same sky that miss by a third or so at noon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +201,7 @@ class GnssRaw:
         return len(self.t_s)
 
     def broadcast(self, t_s: float, satellites: set[tuple[System, int]]) -> list[Ephemeris]:
-        """What satellites (system, PRN) send at `t_s`, as their messages carry it."""
+        """Messages of satellites (system, PRN) at `t_s`, as their messages carry it."""
         week, tow_s = self.gps_time(t_s)
         return [
             quantised(ephemeris(slot, week, tow_s, self._epoch_s))

@@ -64,7 +64,7 @@ class GnssRawStream:
         return data
 
     def repeat(self) -> None:
-        """What was sent was lost: all messages in view are due at once again, if they ever were."""
+        """Forget what was sent: all messages in view are due at once again, if they ever were."""
         self._warm = self._is_warm
 
     def _locks_ms(self, k: int, signals: tuple[RawSignal, ...]) -> list[int]:
@@ -75,7 +75,7 @@ class GnssRawStream:
         return [round((now - self._locked_s[name]) * 1e3) for name in names]
 
     def _starts(self, epoch: RawGnssEpoch) -> bool:
-        """Whether all messages are due at once; true one time at most."""
+        """True if all messages are due at once; true one time at most."""
         if not self._warm or not epoch.signals:
             return False
         self._warm = False
@@ -99,7 +99,7 @@ class GnssRawStream:
         return b"".join(out)
 
     def _second_over(self, before: float, now: float) -> bool:
-        """Whether a full second lies between: subframes of all systems end at such ones."""
+        """True if a full second lies between: subframes of all systems end at such ones."""
         second = self.receiver.start[1]
         return (now + second) // 1.0 > (before + second) // 1.0
 

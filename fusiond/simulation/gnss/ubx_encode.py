@@ -31,7 +31,7 @@ SIGNAL_ID: dict[tuple[System, str], tuple[int, int]] = {
     ("C", "6I"): (4, 10),
 }
 _MAX_LOCK_MS = 64_500
-"""Where u-blox receivers stop counting."""
+"""Limit of u-blox counters."""
 
 
 def frame(message_class: int, message_id: int, payload: bytes) -> bytes:

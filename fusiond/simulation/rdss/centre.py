@@ -1,4 +1,4 @@
-r"""What the RDSS centre makes of a request: the fix, its error and its delay, or nothing.
+r"""Simulated RDSS centre: the fix, its error and its delay, or nothing.
 
 The error is that of eq. 4 of paper 000 at the place (`fusiond.aiding.rdss_geometry`): slant ranges
 that are too long by d rho and a height that is too great by dH give
@@ -153,25 +153,25 @@ class RdssCentre:
         return np.linalg.cholesky(beside_height) @ self._unit + by.height * height_error_m
 
     def dropped(self) -> bool:
-        """Whether this request is lost on the way."""
+        """True if this request is lost on the way."""
         return bool(self._rng.random() < self._options.drop_probability)
 
     def mute(self) -> bool:
-        """Whether the terminal says nothing to this one."""
+        """True if the terminal says nothing to this one."""
         p = self._options.mute_probability
         return p > 0.0 and bool(self._rng.random() < p)
 
     def refused(self) -> Literal["no_beam", "other_host"] | None:
-        """Whether and why this request is refused by chance."""
+        """True if and why this request is refused by chance."""
         p = self._options.refuse_probability
         if p == 0.0 or self._rng.random() >= p:
             return None
         return "no_beam" if self._rng.random() < 0.5 else "other_host"
 
     def other_burst_s(self, t_s: float) -> float:
-        """When the other host's burst left: what is left to wait is whole seconds."""
+        """Instant of the other host's burst: what is left to wait is whole seconds."""
         return t_s - float(self._rng.integers(0, self._options.service_frequency_s))
 
     def foreign(self) -> bool:
-        """Whether somebody else's fix comes along with this one."""
+        """True if somebody else's fix comes along with this one."""
         return bool(self._rng.random() < self._options.foreign_probability)

@@ -105,7 +105,7 @@ class RdssTerminal:
 
     @property
     def next_s(self) -> float:
-        """When the terminal will next have something to say; infinity for never."""
+        """Next instant of the terminal; infinity for never."""
         replies = self._queue[0][0] if self._queue else math.inf
         return min([replies, *(due for due, _, _ in self._periodic.values())])
 
@@ -232,7 +232,7 @@ class RdssTerminal:
         return _EPOCH + timedelta(milliseconds=10 * hundredths)
 
     def _refusal(self, t_s: float) -> tuple[Outcome, float | None] | None:
-        """Why nothing can be sent now, in the order in which a terminal looks."""
+        """Reason why nothing can be sent, in the order in which a terminal looks."""
         binary = self.options.family == "4.0"
         if self.silent:
             return (Outcome.SILENCE_OR_LIFTED if binary else Outcome.SILENCE), None

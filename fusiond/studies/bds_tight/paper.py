@@ -93,7 +93,7 @@ BEFORE = {
     "tilt": "ins_alone",
     "heading": "ins_alone",
 }
-"""What stands for "before filtering" of each quantity."""
+"""Labels of "before filtering" of each quantity."""
 COLUMNS = {
     "position m": "position",
     "height m": "height",

@@ -96,8 +96,8 @@ density of the random walk that the daemon assumes by default (a temperature-com
 so that for less than 300 s the filter's clock is the simulated one. All else is the simulator's
 default."""
 ORBIT_ERRORS_M = (SIGNAL_IN_SPACE_M["C"], 0.5, 0.0)
-"""What the study is made with, and two smaller ones that show what makes NEES: the simulator's
-default and none."""
+"""Cases of the study, and two smaller ones that show what makes NEES: the simulator's default and
+none."""
 MOST_PDOP = 25.0
 """A fix of a worse geometry is none: an output mask as receivers have, chosen for this study."""
 ROWS = ("tight_ekf", "tight_ukf", "tight_scaled", "loose", "loose_white", "receiver", "coasting")
@@ -129,7 +129,7 @@ class CaseRun:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """How a filter row is fed."""
+    """Input of a filter row."""
 
     make: Callable[[Model, float], KalmanEstimator]
     aiding: RawAiding | GnssAiding
@@ -152,7 +152,7 @@ def epochs() -> Array:
 
 
 def in_stretch(t_s: Array) -> NDArray[np.bool_]:
-    """Which instants lie in the stretch: from its start to before its end, as masks hold."""
+    """Mask of instants in the stretch: from its start to before its end, as masks hold."""
     return (t_s >= STRETCH_S[0]) & (t_s < STRETCH_S[1])
 
 
@@ -169,7 +169,7 @@ def _true_states() -> tuple[Array, Array]:
 def observe(
     case: str, seed: int, number: int, orbit_error_m: float = ORBIT_ERRORS_M[0]
 ) -> tuple[GnssRaw, list[RawGnssEpoch]]:
-    """What the receiver observes in a run of a case; the errors are the same in every case."""
+    """Observations of a run of a case; the errors are the same in every case."""
     rng = np.random.default_rng([seed, number, 1])
     satellites, (first_s, last_s) = CASES[case], STRETCH_S
     masks = () if satellites is None else (canyon(satellites, first_s, last_s - first_s),)
@@ -203,8 +203,8 @@ class Receiver:
 
 
 def broadcast(simulated: GnssRaw) -> list[Ephemeris | Klobuchar]:
-    """What a receiver that has been on for a while knows: every ephemeris and the ionosphere. They
-    hold for longer than a run."""
+    """Stored messages of a receiver that has been on for a while: every ephemeris and the
+    ionosphere. They hold for longer than a run."""
     everything = {(slot.system, slot.prn) for slot in slots(simulated.options.systems)}
     return [*simulated.broadcast(0.0, everything), *simulated.ionosphere]
 

@@ -57,7 +57,7 @@ def _fixes(r: Recording, begin_s: float, end_s: float) -> list[Received]:
 
 
 def sparing(alter: Alter, source: str) -> Alter:
-    """What alters a recording, but for what that source says."""
+    """Change to a recording, except to that source."""
 
     def altered(r: Recording, begin_s: float, length_s: float) -> Recording:
         turns = list(dict.fromkeys(item.measurement.source for item in r.received))

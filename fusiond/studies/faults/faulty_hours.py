@@ -54,7 +54,7 @@ APART_S = (180.0, 480.0)
 LASTS_S = (20.0, 60.0)
 """Least and most of those that last to the end of the matrix's drive."""
 SETTLED_S = 60.0
-"""What is told so long after a fault's end is of the fault."""
+"""Time after a fault's end within which events count as its own."""
 JUDGED_S = 100.0
 """A hundred fixes of one a second."""
 RECEIVERS = (GNSS, SECOND)
@@ -91,7 +91,8 @@ def faults_of(kind: Kind) -> tuple[str, ...]:
 
 
 def happenings(kind: Kind, seed: int, duration_s: float) -> list[Happening]:
-    """What happens; the last so long before the end as two are apart at least."""
+    """Faults of an hour, without the last; the last so long before the end as two are apart at
+    least."""
     rng = np.random.default_rng([seed, 3])
     names, found = faults_of(kind), []
     begin_s = 0.0

@@ -107,7 +107,7 @@ class Kind:
     drive: Drive
 
     def config(self) -> Config:
-        """What the navigator gets."""
+        """Input of the navigator."""
         settings = VEHICLE.model_dump(exclude_unset=True)
         settings["imu"]["rate_hz"] = RATE_HZ
         if self.drive.second:

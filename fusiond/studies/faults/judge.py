@@ -1,4 +1,4 @@
-r"""What a run with a fault is worth: error against stated sigma, second by second.
+r"""Score of a run with a fault: error against stated sigma, second by second.
 
     ratio = max over axes of |error| / sigma
 
@@ -47,13 +47,13 @@ class Sample:
 
     @property
     def beyond(self) -> bool:
-        """Whether the mode vouches for an error that sigma does not."""
+        """True if the mode vouches for an error that sigma does not."""
         return self.mode == NAVIGATING and any(not r <= MOST_SIGMA for r in self.ratios)
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What the navigator told an operator."""
+    """Events for the operator."""
 
     t_s: float
     code: str

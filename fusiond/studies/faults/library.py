@@ -33,7 +33,7 @@ Configure = Callable[[Config], Config]
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """When faults of IMU and wheels and those of fixes begin, and the outage (start, end), in s."""
+    """Start of faults, of IMU and wheels and of fixes, and the outage (start, end), in s."""
 
     imu_s: float
     fix_s: float
@@ -71,7 +71,7 @@ class Fault:
     vehicle's, where a recording's is compared."""
 
     def begins_s(self, phase: PhaseName) -> float:
-        """When it begins, s of the drive."""
+        """Start, s of the drive."""
         if self.begin_s is not None:
             return self.begin_s
         return PHASES[phase].imu_s if self.of_imu else PHASES[phase].fix_s

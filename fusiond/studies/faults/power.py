@@ -1,4 +1,4 @@
-"""How well faults are detected, by kind and size.
+"""Power of fault detection, by kind and size.
 
 The town drive of the matrix; the fault lasts a minute, in which there are a straight, a bend of 180
 deg and a stop, and begins with another second of the straight in each run. Noticed is what the

@@ -1,4 +1,5 @@
-"""What a run published at 10 Hz, beside the truth: errors and stated sigmas of every instant.
+"""Published solution of a run at 10 Hz, beside the truth: errors and stated sigmas of every
+instant.
 
 Nothing is read but solutions, as outputs have them: whatever says inside the navigator how sure it
 is, this is what it is worth. Modes that publish are all in which there is a solution, `coasting`
@@ -57,13 +58,13 @@ class Published:
 
     @property
     def there(self) -> Bools:
-        """Where there is a solution."""
+        """Mask of epochs with a solution."""
         found: Bools = (self.modes != "") & ~np.isin(self.modes, SILENT)
         return found
 
     @property
     def navigating(self) -> Bools:
-        """Where the mode is `navigating`."""
+        """Mask of epochs in mode `navigating`."""
         found: Bools = self.modes == NAVIGATING
         return found
 
@@ -80,7 +81,7 @@ class Published:
 
     @property
     def beyond(self) -> Bools:
-        """Where an error lies beyond five sigma, whatever the mode."""
+        """Mask of errors beyond five sigma, whatever the mode."""
         return self.beyond_in(JUDGED)
 
     def beyond_in(self, axes: tuple[int, ...]) -> Bools:
@@ -100,7 +101,7 @@ class Published:
 
 
 def published(config: Config, recording: Recording, truth: Truth) -> Published:
-    """What the navigator publishes of a recording, against the truth."""
+    """Published solution of a recording, against the truth."""
     ticks = np.arange(1.0, math.floor(truth.duration_s * TICKS_PER_S + 1e-6) + 0.5)
     return against(config, recording, truth.at(ticks * STEP_S))
 

@@ -68,8 +68,8 @@ class RecordedRow:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a recording lies (a folder of tables or a CAN log), its configuration, and the smoothed
-    solution of it."""
+    """Location of a recording (a folder of tables or a CAN log), its configuration, and the
+    smoothed solution of it."""
 
     config: Path
     recording: Path
@@ -182,7 +182,7 @@ def _run(place: Place, part: _Part, fault: Fault, begin_s: float) -> Course:
 
 
 def _cut(r: Recording, from_s: float, length_s: float) -> Recording:
-    """What came in a part of it, by a clock that begins there."""
+    """Part of a recording, by a clock that begins there."""
     begin, end = round(from_s * 1e9), round((from_s + length_s) * 1e9)
     kept = r.without((r.imu_seen <= begin) | (r.imu_seen > end))
     received = [

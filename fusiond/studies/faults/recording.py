@@ -1,4 +1,4 @@
-"""What the sensors of a drive said, and when it came: what a fault alters."""
+"""Sensor data of a drive, and when it came: what a fault alters."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BEND_S = 90.0
 """Start of the bend of 180 deg in `town`, which lasts 15 s at 20 m/s."""
 RDSS_EVERY_S = 11.0
 GNSS, SECOND = "gnss", "second"
-"""What the configuration calls the receivers."""
+"""Names of the receivers in the configuration."""
 """One second more than the service frequency of a 10 s card."""
 WHEEL_EVERY_S = 0.1
 WHEEL_SD_M_S = 0.1
@@ -61,7 +61,7 @@ class Recording:
     spare: Recording | None = None
 
     def window(self, begin_s: float, length_s: float) -> NDArray[np.bool_]:
-        """Which samples (n,) arrive in the window."""
+        """Mask of samples (n,) that arrive in the window."""
         begin, end = round(begin_s * 1e9), round((begin_s + length_s) * 1e9)
         return (self.imu_seen >= begin) & (self.imu_seen < end)
 
@@ -93,7 +93,7 @@ class Recording:
 
 
 Alter = Callable[[Recording, float, float], Recording]
-"""What a fault does to a recording, from an instant (s) on, for so long (s)."""
+"""Fault of a recording, from an instant (s) on, for so long (s)."""
 
 TOWN_LEGS = (
     Leg(8, speed_m_s=14.0),
@@ -168,8 +168,8 @@ class Drive:
 
 
 def _spare(car: Scenario, truth: Truth, rng: np.random.Generator) -> Array:
-    """What the spare of a car says (n, 6): errors of its own, as large, and it sits askew by what
-    the configuration allows."""
+    """Samples of a car's spare (n, 6): errors of its own, as large, and misaligned by what the
+    configuration allows."""
     spare = car.imu.spare
     assert spare is not None
     askew = np.add(spare.mounting_deg, rng.normal(0.0, spare.mounting_sd_deg, 3))

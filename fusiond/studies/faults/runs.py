@@ -122,7 +122,7 @@ def _unharmed(drive: Drive, phase: PhaseName, seed: int) -> Course:
 
 
 def course_of(fault: Fault, phase: PhaseName, seed: int) -> Course:
-    """What came of a fault in a phase."""
+    """Result of a fault in a phase."""
     vehicle = with_wheels(VEHICLE) if fault.drive.wheels else VEHICLE
     if fault.drive.spare:
         vehicle = with_spare(vehicle)
@@ -210,7 +210,7 @@ class _Units:
             self._said.sort(key=lambda sample: sample.t_seen_ns)
 
     def give(self, navigator: Navigator, now_ns: int) -> None:
-        """What has come until now."""
+        """Results so far."""
         if self._choice is None:
             r, given = self._recording, self._given
             self._given = end = int(np.searchsorted(r.imu_seen, now_ns, side="right"))

@@ -49,7 +49,7 @@ LEVER_SD_M = 1.0
 """As `fusiond.configuration.aiding.UNKNOWN_LEVER_SD_M` of a lever arm that is not given."""
 AXLE_M = (-1.0, 0.0, 0.5)
 TYPICAL = 1.0 / 3.0
-"""What a typical unit has of its class's biases, scales and angles, which are limits of data
+"""Share of its class's biases in a typical unit, scales and angles, which are limits of data
 sheets; its noise is the class's."""
 
 
@@ -106,7 +106,7 @@ class Vehicle:
     told: Told = "all"
 
     def config(self) -> Config:
-        """What the navigator gets."""
+        """Input of the navigator."""
         gnss: dict[str, Any] = {"lever_arm_m": ANTENNA_M} if self.lever_given else {}
         slip = {"enabled": self.told != "all", "lever_arm_m": AXLE_M}
         if self.told != "class":
@@ -167,7 +167,7 @@ def scene(vehicle: Vehicle, share: Share, number: int, duration_s: float) -> Sce
 
 
 def drawing(share: Share, number: int, *what: int) -> np.random.Generator:
-    """What one thing of a drive is drawn from."""
+    """Random generator of one part of a drive."""
     key = (SHARES.index(share), number, *what)
     return np.random.default_rng(np.random.SeedSequence(ENTROPY, spawn_key=key))
 

@@ -1,4 +1,4 @@
-"""How long a vehicle is without service for a fault of a minute, and behind an outage.
+"""Loss of service by a fault of a minute, and behind an outage.
 
 A drawn drive of `DURATION_S`, the MEMS unit of `config/vehicle.toml`, one receiver of one fix a
 second, no slip, noise told.
@@ -61,7 +61,7 @@ STAYS_S = 5.0
 OUTAGES_S = {150.0: 10.0, 300.0: 30.0, 450.0: 60.0}
 """Length of an outage by its begin."""
 QUIET_S = 90.0
-"""What follows an outage is looked at for so long, and no longer."""
+"""Time after an outage that is studied, and no longer."""
 OUTAGE_DURATION_S = 600.0
 IMU, VELOCITY, POSITION, NONE = "IMU", "velocity", "position, latency, freeze", "nothing wrong"
 
@@ -217,7 +217,7 @@ def settled(run: Published, steady: Published, after: Bools) -> dict[str, float 
 
 
 def _outages(job: Job, share: Share) -> dict[str, Any]:
-    """What follows each outage, from the first fix that comes on."""
+    """Result of each outage, from the first fix that comes on."""
     receiver = AFTER_OUTAGES[job.receiver]
     on, steady = _steady(receiver, job.number, share, OUTAGE_DURATION_S)
     recording = on.recording

@@ -1,4 +1,4 @@
-"""What `service` found, as Markdown: sums by group, a line a fault, and what follows outages."""
+"""Tables of `service`, as Markdown: sums by group, a line a fault, and what follows outages."""
 
 from __future__ import annotations
 

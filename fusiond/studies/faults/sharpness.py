@@ -1,4 +1,4 @@
-r"""Whether sigma is as large as the error while nothing is wrong, cell by cell.
+r"""Sharpness of sigma in fault-free runs, cell by cell.
 
     NEES a degree = mean of (e / sigma)^2 over instants, axes and drives        1 where it is right
     sigma over RMS = sqrt(mean sigma^2 / mean e^2)                              the same
@@ -117,7 +117,7 @@ def described(vehicle: Vehicle) -> dict[str, Any]:
 
 
 def phases_of(run: Published, recording: Recording) -> dict[str, Bools]:
-    """Which instants are of which phase; no instant is of two."""
+    """Mask of instants by phase; no instant is of two."""
     t_s, left = run.t_s, run.there.copy()
     found: dict[str, Bools] = {}
 

@@ -1,5 +1,5 @@
-"""What `sharpness` found, as Markdown: how many cells are right, sums by what they share, and a
-line a cell and phase; and what `real` did, a line a drive."""
+"""Tables of `sharpness`, as Markdown: how many cells are right, sums by what they share, and a line
+a cell and phase; and what `real` did, a line a drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the fault studies found as Markdown, and into which page it goes."""
+"""Tables of the fault studies as Markdown, and into which page it goes."""
 
 from __future__ import annotations
 

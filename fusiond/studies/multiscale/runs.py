@@ -97,7 +97,7 @@ GROUPS = {"attitude": slice(0, 3), "velocity": slice(3, 5), "position": slice(5,
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is simulated: `accel_bias_mg` is one sigma of a constant that the model lacks."""
+    """Case of the simulation: `accel_bias_mg` is one sigma of a constant that the model lacks."""
 
     name: str
     accel_bias_mg: float = NONE

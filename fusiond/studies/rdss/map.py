@@ -199,7 +199,7 @@ def _readings(geometry: RdssGeometry, lat_deg: float, lon_deg: float) -> dict[st
 def path_lengths(
     lat: Array, lon: Array, height: Array, longitudes_deg: tuple[float, float]
 ) -> Array:
-    """What the centre measures, (n, 2) m: out through satellite 1, back through 1 and through 2.
+    """Measurements of the centre, (n, 2) m: out through satellite 1, back through 1 and through 2.
 
     All four legs centre-satellite-terminal-satellite-centre. Place (n,) rad, rad, m.
     """

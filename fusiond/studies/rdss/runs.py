@@ -47,8 +47,8 @@ from fusiond.studies.navigation_error import metres, nav_error, true_nav, with_e
 Array = NDArray[np.float64]
 
 YANTAI_DEG_M = (37.5, 121.4, 40.0)
-"""Where the authors of paper 000 worked. There eq. 4 with their 8, 13 and 10 m gives 22 m north and
-19 m east: 29 m in all, their "30 m"."""
+"""Position of the experiments of paper 000. There eq. 4 with their 8, 13 and 10 m gives 22 m north
+and 19 m east: 29 m in all, their "30 m"."""
 CLASS_M = 20
 GRID_S = 1.5
 """Instants at which the live solution is compared: the paper's step."""
@@ -98,7 +98,7 @@ RDSS_ALONE = "rdss_alone"
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is simulated. Fixes are asked for at `first_s` + k `spacing_s` and arrive `delay_s`
+    """Case of the simulation. Fixes are asked for at `first_s` + k `spacing_s` and arrive `delay_s`
     later; none inside `away_s` (start, end). Errors count inside `counted_s` (start, end)."""
 
     name: str
@@ -173,7 +173,7 @@ def fix_covariance() -> Array:
 
 
 def imu_samples(case: Case, rng: np.random.Generator) -> tuple[Array, Array]:
-    """What the IMU says (n, 6) and the biases it has (n, 6): rate x y z, force x y z."""
+    """IMU samples (n, 6) and their biases (n, 6): rate x y z, force x y z."""
     truth = _truth(case)
     imu = imu_output(case.imu, truth.gyro, truth.accel, rng)
     return np.hstack([imu.gyro, imu.accel]), np.hstack([imu.gyro_bias, imu.accel_bias])

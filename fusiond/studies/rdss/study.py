@@ -63,7 +63,7 @@ PAPER = {
 def run_cases(
     name: str, cases: Sequence[Case], count: int, seed: int, progress: Progress | None
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What the result begins with, and `figures` of each case over `count` runs."""
+    """Head of the result, and `figures` of each case over `count` runs."""
     if count < 2:
         raise ValueError("runs must be at least 2")
     step = step_counter(progress, count * len(cases))

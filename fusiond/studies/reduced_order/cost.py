@@ -1,4 +1,4 @@
-r"""What a step costs in studies `reduced-order` and `ins-gnss-sar`, as CPU time.
+r"""Cost of a step in studies `reduced-order` and `ins-gnss-sar`, as CPU time.
 
 `step`: the filter's own recursion, as paper 002 times it: the covariance propagated once, then the
 epoch's ranges, rates (of four satellites or of all in view) and two angles gated, folded in and fed
@@ -119,7 +119,7 @@ def _recursion(of: Model, all_in_view: bool = False) -> Callable[[], float]:
 
 
 def level_step(nav: Array) -> Array:
-    """What a strapdown step (28,) leaves in level flight at a constant velocity, nearly."""
+    """Strapdown step (28,) in level flight at a constant velocity, nearly."""
     state = State(nav, np.zeros(0), np.zeros(0), flight.model("ins17"))
     step = np.zeros(STEP_SIZE)
     step[2] = step[8] = -9.8

@@ -140,7 +140,7 @@ def initial_sd(of: Model) -> Array:
 
 
 class Scene(NamedTuple):
-    """What can be measured at an instant: n satellites (n, 3), ECEF, their places `at` (n,) in the
+    """Measurement at an instant: n satellites (n, 3), ECEF, their places `at` (n,) in the
     constellation, and a point for the radar.
 
     Geometry of one instant: truth and filter leave the flight time of the signal out alike.
@@ -245,7 +245,7 @@ def rows(of: Aids, state: State) -> Innovation:
 
 
 def measured(scene: Scene, true: State, noise: Array) -> Aids:
-    """What is measured in the `true` state, its parameters among it; `noise` (rows,) in sigmas."""
+    """Measurement in the `true` state, its parameters among it; `noise` (rows,) in sigmas."""
     z, _, r = rows(aids(scene, np.zeros(scene.rows)), true)  # of measured zeros: what is predicted
     return aids(scene, z + np.sqrt(r) * noise)
 

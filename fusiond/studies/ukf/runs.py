@@ -99,8 +99,8 @@ in plain errors, and with what turns with the heading, as the daemon's `kalman` 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What is measured, how often, and one sigma of the start: horizontal position and height (m),
-    velocity (m/s), tilt and heading (deg)."""
+    """Measurements of a case, their rate, and one sigma of the start: horizontal position and
+    height (m), velocity (m/s), tilt and heading (deg)."""
 
     name: str
     clock: bool
