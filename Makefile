@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 RUNTIME := $(VENV)/.installed-runtime
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # All extras but docs and fuzz, which `make docs` and `make fuzz` install.
-TOOLS := batch cluster compass dashboard demo foxglove mf4 raw report rinex ros dev
+TOOLS := batch cluster compass dashboard demo foxglove mf4 raw rinex ros studies dev
 COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
 	--no-emit-trusted-host --no-emit-options

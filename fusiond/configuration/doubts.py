@@ -17,6 +17,7 @@ from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
+from fusiond.files.extras import install
 
 LONGEST_M: dict[VehicleClass, float] = {
     "road": 20.0,
@@ -139,7 +140,7 @@ def _compass(config: Config) -> Iterator[str]:
     for name, section in config.aiding.items():
         if isinstance(section, CompassAiding) and section.declination_deg is None:
             yield (
-                f"aiding.{name}: no magnetic model is installed: pip install fusiond[compass], or "
+                f"aiding.{name}: no magnetic model is installed: {install('compass')}, or "
                 "give declination_deg"
             )
 
