@@ -49,25 +49,22 @@ def build(package: Path, python: str = sys.executable) -> list[Path]:
     target = package / "navigation" / "prebuilt"
     shutil.rmtree(target, ignore_errors=True)
     written = []
-    for level in LEVELS[platform.machine()]:
-        with tempfile.TemporaryDirectory(prefix="fusiond-kernels-") as folder:
-            environment = {
-                **os.environ,
-                "NUMBA_CACHE_DIR": folder,
-                "NUMBA_CPU_NAME": level,
-                "NUMBA_CPU_FEATURES": "",
-            }
+    with tempfile.TemporaryDirectory(prefix="fusiond-kernels-") as work:
+        made = {}
+        for level in LEVELS[platform.machine()]:
+            settings = {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": ""}
             done = subprocess.run(
                 (python, "-c", COMPILE),
                 cwd=package.parent,  # the package there is the one that is imported
-                env=environment,
+                env={**os.environ, **settings, "NUMBA_CACHE_DIR": f"{work}/{level}"},
                 stdout=subprocess.PIPE,
                 text=True,
                 check=True,
             )
-            made = Path(done.stdout.strip())
-            written.append(target / made.name / level)
-            shutil.copytree(made, written[-1])
+            made[level] = Path(done.stdout.strip())
+        for level, folder in made.items():  # once all are there: a level would find the other's
+            written.append(target / folder.name / level)
+            shutil.copytree(folder, written[-1])
     return written
 
 
