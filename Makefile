@@ -21,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load attack man deb docs lock clean \
-	collected dashboard-check kernels systemd test-packages
+	collected dashboard-check kernels prebuilt systemd test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -66,6 +66,9 @@ lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(YIELDING) $(BIN)/mypy
 	$(YIELDING) $(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python tools/house.py --check
+
+prebuilt: $(RUNTIME) ## kernels for levels of processors, into the checkout, for a wheel that compiles nothing
+	$(BIN)/python -m tools.prebuilt $(ARGS)
 
 # The collector would look through what the compiler keeps again and again, a tenth of its time.
 kernels: $(RUNTIME)

@@ -43,9 +43,10 @@ print(FOLDER)
 """
 
 
-def build(package: Path, python: str = sys.executable) -> list[Path]:
+def build(package: Path, python: Path | str = sys.executable) -> list[Path]:
     """Compile the kernels of the package `fusiond` at `package` with its interpreter; the folders
     that were written."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     target = package / "navigation" / "prebuilt"
     shutil.rmtree(target, ignore_errors=True)
     written = []
@@ -56,7 +57,7 @@ def build(package: Path, python: str = sys.executable) -> list[Path]:
             done = subprocess.run(
                 (python, "-c", COMPILE),
                 cwd=package.parent,  # the package there is the one that is imported
-                env={**os.environ, **settings, "NUMBA_CACHE_DIR": f"{work}/{level}"},
+                env={**environment, **settings, "NUMBA_CACHE_DIR": f"{work}/{level}"},
                 stdout=subprocess.PIPE,
                 text=True,
                 check=True,
