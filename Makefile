@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 RUNTIME := $(VENV)/.installed-runtime
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 # All extras but docs and fuzz, which `make docs` and `make fuzz` install.
-TOOLS := batch cluster compass dashboard demo foxglove mf4 raw report rinex ros dev
+TOOLS := batch cluster compass dashboard demo foxglove mf4 raw rinex ros studies dev
 COMPILE := CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/pip-compile --quiet --strip-extras --allow-unsafe \
 	--generate-hashes --all-build-deps --no-emit-index-url --no-emit-find-links \
 	--no-emit-trusted-host --no-emit-options
@@ -21,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test lint unit fuzz hil format picture bench faults wires pairs soak load attack man deb docs lock clean \
-	collected dashboard-check kernels systemd test-packages
+	collected dashboard-check kernels prebuilt systemd test-packages
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -67,6 +67,9 @@ lint: $(STAMP) ## ruff, mypy, who may import whom and the picture of it
 	$(YIELDING) $(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/python tools/house.py --check
 	$(BIN)/python -m tools.reader --check
+
+prebuilt: $(RUNTIME) ## kernels for levels of processors, into the checkout, for a wheel that compiles nothing
+	$(BIN)/python -m tools.prebuilt $(ARGS)
 
 # The collector would look through what the compiler keeps again and again, a tenth of its time.
 kernels: $(RUNTIME)

@@ -18,7 +18,7 @@ import sys
 from email.utils import formatdate
 from pathlib import Path
 
-from tools import licences, man_pages
+from tools import licences, man_pages, prebuilt
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 HOME = "opt/fusiond"
@@ -189,8 +189,11 @@ def environment(tree: Tree, python: str, requirements: Path, work: Path) -> None
     run(*pip, "wheel", *options, source)
     run(*install, "--no-deps", next(wheels.glob("*.whl")))
     shutil.rmtree(venv / "include", ignore_errors=True)
+    packages = next(venv.glob("lib/python*/site-packages"))
+    # Before the environment is made lighter: compiling takes what a vehicle then does without.
+    prebuilt.build(packages / "fusiond", venv / "bin/python")
     lighten(venv)
-    if found := licences.faults(licences.packages(next(venv.glob("lib/python*/site-packages")))):
+    if found := licences.faults(licences.packages(packages)):
         sys.exit("\n".join(found))
     _settle(venv, str(tree.root))
     stage = ("-s", tree.root, "-p", "/")

@@ -13,7 +13,7 @@ from fusiond.commands.shared import EXIT_IO, config_errors, parse_mqtt, spinner
 if TYPE_CHECKING:
     from drivers.can.bus import Interface
     from fusiond.configuration.draft import Draft, DraftSource, Vector
-    from fusiond.doctor.finding import Device
+    from fusiond.doctor.finding import Device, Unheard
 
 config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
 _NAMES = {
@@ -86,28 +86,34 @@ def init(
     if ask_terminal is None:
         question = "Ask silent serial ports whether an RDSS terminal is there (sends bytes)?"
         ask_terminal = asks and typer.confirm(question, default=False)
-    devices = _look(port, can, ask_terminal)
+    devices, unheard = _look(port, can, ask_terminal)
     for device in devices:
         typer.echo(f"found: {device.text}")
+    for silent in unheard if port is not None else ():
+        typer.echo(f"found nothing: {silent.text}")
     if not devices:
         heard = ", ".join([*(port or ()), *(can or ())]) or "serial ports and CAN buses"
         typer.echo(f"No supported device found on: {heard}")
     imu = next((d for d in devices if d.driver == "can_imu"), None)
     has_antenna = any(d.driver != "can_imu" for d in devices)
-    arm = _vector(
-        answer(antenna, "GNSS antenna from the IMU, m forward,right,down", "0,0,0")
-        if has_antenna or antenna is not None
-        else "0,0,0"
-    )
+    where = ""
+    if has_antenna or antenna is not None:
+        question = "GNSS antenna from the IMU, m forward,right,down (empty: later)"
+        where = answer(antenna, question, "")
+    arms = {} if not where else dict.fromkeys(("gnss", "rdss"), _vector(where))
+    measured, known = _measured_axes(imu)
+    if axes is None and imu is not None:
+        typer.echo(f"axes: {known}")
     kind = _choice(answer(vehicle_class, "Vehicle class", "road"), VehicleClass)
     rear = answer(axle, "Rear axle from the IMU, m forward,right,down (empty: later)", "")
     draft = Draft(
         vehicle=answer(vehicle, "Name of the vehicle", "vehicle"),
         vehicle_class=kind,
         sensor_class=_choice(answer(sensor_class, "Class of the IMU", "mems"), SensorClass),
-        axes=_axes(answer(axes, "IMU axes forward,right,down", "+x,+y,+z")),
+        axes=_axes(answer(axes, "IMU axes forward,right,down", ",".join(measured))),
+        axes_known=known if axes is None else "",
         rate_hz=100.0 if imu is None or imu.rate_hz is None else imu.rate_hz,
-        lever_arms_m={"gnss": arm, "rdss": arm},
+        lever_arms_m=arms,
         axle_m=_vector(rear) if rear else None,
         broker=parse_mqtt(answer(broker, "MQTT broker", "localhost:1883")),
         sources=_sources(devices),
@@ -115,11 +121,29 @@ def init(
     _write(draft, out)
 
 
-def _look(ports: list[str] | None, buses: list[str] | None, ask_terminal: bool) -> list[Device]:
+def _measured_axes(imu: Device | None) -> tuple[tuple[str, str, str], str]:
+    """Axes with down as gravity shows it, and what is known of them in words. Forward is assumed to
+    be the first axis that is level: no motion has been seen."""
+    if imu is None or imu.down is None:
+        level = "the unit moved or stands askew" if imu is not None else "no unit was heard"
+        return ("+x", "+y", "+z"), f"Not measured ({level}): `fusiond doctor` at rest says down."
+    sign, down = imu.down
+    forward, right = (axis for axis in "xyz" if axis != down)
+    even = down != "y"  # x, y, z in turn are right-handed; x, z, y are not
+    turned = "+" if (sign == "+") == even else "-"
+    return (f"+{forward}", f"{turned}{right}", imu.down), (
+        f"Down is {imu.down}, by gravity. That +{forward} points forward is assumed: look at the "
+        "unit's mark."
+    )
+
+
+def _look(
+    ports: list[str] | None, buses: list[str] | None, ask_terminal: bool
+) -> tuple[list[Device], list[Unheard]]:
     import asyncio  # noqa: PLC0415
 
     from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
-    from fusiond.doctor.finding import on_bus, on_port  # noqa: PLC0415
+    from fusiond.doctor.finding import Device, Unheard, on_bus, on_port  # noqa: PLC0415
 
     channels = [_bus(text) for text in (can_interfaces() if buses is None else buses)]
 
@@ -127,15 +151,14 @@ def _look(ports: list[str] | None, buses: list[str] | None, ask_terminal: bool) 
     lines = similar_ports() if ports is None else ports
     unique = {Path(line).resolve(): line for line in reversed(lines)}
 
-    async def look() -> list[Device]:
+    async def look() -> tuple[list[Device], list[Unheard]]:
         found = await asyncio.gather(
             *(on_port(line, ask_terminal=ask_terminal) for line in unique.values())
         )
         on_buses = await asyncio.gather(*(on_bus(*channel) for channel in channels))
-        return [
-            *(device for devices in on_buses for device in devices),
-            *(device for device in found if device is not None),
-        ]
+        heard = [device for devices in on_buses for device in devices]
+        heard += [one for one in found if isinstance(one, Device)]
+        return heard, [one for one in found if isinstance(one, Unheard)]
 
     with spinner("listening to ports and buses"):
         return asyncio.run(look())

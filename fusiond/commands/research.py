@@ -64,9 +64,7 @@ def study(
         typer.Option(metavar="F.parquet", help="A row a run; those that are there are not made."),
     ] = None,
     json_path: JsonPath = None,
-    plot: Annotated[
-        Path | None, typer.Option(metavar="F.png", help="Draw the result (needs matplotlib).")
-    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="F.png", help="Draw the result.")] = None,
 ) -> None:
     """Repeat a paper's experiment, or one that a default stands on."""
     if name not in STUDIES:
@@ -76,8 +74,11 @@ def study(
     from importlib import import_module  # noqa: PLC0415
     from importlib.util import find_spec  # noqa: PLC0415
 
-    if plot is not None and find_spec("matplotlib") is None:
-        typer.echo("fusiond: --plot needs matplotlib: pip install fusiond[report]", err=True)
+    missing = [name for name in ("scipy", "pywt", "matplotlib") if find_spec(name) is None]
+    if missing:
+        from fusiond.files.extras import install  # noqa: PLC0415
+
+        typer.echo(f"fusiond: studies need {', '.join(missing)}: {install('studies')}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE)
     with compiling():
         module = import_module(STUDIES[name])

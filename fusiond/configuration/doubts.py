@@ -13,10 +13,11 @@ from itertools import combinations
 from math import hypot
 from pathlib import Path
 
-from fusiond.configuration.aiding import CompassAiding
+from fusiond.configuration.aiding import CompassAiding, GnssAiding, RawAiding, RdssAiding
 from fusiond.configuration.model_fit import model_doubts
 from fusiond.configuration.plausibility import VehicleClass
 from fusiond.configuration.schema import Config
+from fusiond.files.extras import install
 
 LONGEST_M: dict[VehicleClass, float] = {
     "road": 20.0,
@@ -26,6 +27,11 @@ LONGEST_M: dict[VehicleClass, float] = {
 }
 """Longest rigid body of a class, which no lever arm leaves: an articulated bus (18.75 m, directive
 96/53/EC), a railway coach (27.5 m, UIC 567), a container ship (400 m), the An-225 (84 m)."""
+
+DEEPEST_M = 0.5
+"""Of an antenna below an IMU on wheels: one in a box on the roof, an antenna on the bonnet, which
+is half a metre lower on a car."""
+_ANTENNAS = (GnssAiding, RawAiding, RdssAiding)
 
 GIVES: dict[str, tuple[str, ...]] = {
     "bestpos": ("gnss", "heading"),
@@ -142,7 +148,7 @@ def _compass(config: Config) -> Iterator[str]:
     for name, section in config.aiding.items():
         if isinstance(section, CompassAiding) and section.declination_deg is None:
             yield (
-                f"aiding.{name}: no magnetic model is installed: pip install fusiond[compass], or "
+                f"aiding.{name}: no magnetic model is installed: {install('compass')}, or "
                 "give declination_deg"
             )
 
@@ -157,6 +163,15 @@ def _lever_arms(config: Config) -> Iterator[str]:
             yield (
                 f"{where}.lever_arm_m = {list(arm)}: {length_m:g} m from the IMU, on a vehicle of "
                 f"class {config.vehicle_class!r}? It is in metres: forward, right, down"
+            )
+    if config.vehicle_class not in ("road", "rail"):
+        return
+    for name, section in config.aiding.items():
+        if isinstance(section, _ANTENNAS) and section.lever_arm_m[2] > DEEPEST_M:
+            yield (
+                f"aiding.{name}.lever_arm_m = {list(section.lever_arm_m)}: the antenna would be "
+                f"{section.lever_arm_m[2]:g} m below the IMU. The third number counts downwards: "
+                "negative for an antenna above it"
             )
 
 

@@ -34,6 +34,8 @@ class Draft:
     vehicle_class: VehicleClass = "road"
     sensor_class: SensorClass = "mems"
     axes: Axes = ("+x", "+y", "+z")
+    axes_known: str = ""
+    """In words, how it is known which axis points where."""
     rate_hz: float = 100.0
     lever_arms_m: Mapping[str, Vector] = field(default_factory=dict)
     axle_m: Vector | None = None
@@ -72,7 +74,9 @@ def _lines(d: Draft) -> Iterator[str]:
     yield f"vehicle_class = {_value(d.vehicle_class)}"
     yield ""
     yield "[imu]"
-    yield "# Sensor axes along forward, right, down. doctor says at rest whether down is right."
+    yield "# Sensor axes along forward, right, down."
+    if d.axes_known:
+        yield f"# {d.axes_known}"
     yield f"axes = {_value(d.axes)}"
     yield f"rate_hz = {_value(d.rate_hz)}"
     yield "# consumer, mems or tactical; the figures of its data sheet are better:"
@@ -120,13 +124,19 @@ def _source(d: Draft, source: DraftSource) -> Iterator[str]:
         yield "# Noise of one reading; what the vehicle's iron makes of it: docs/compass.md."
         yield "sd_deg = 1.0"
         return
+    if source.driver == "gnss":
+        yield "# Satellite by satellite: fewer than four help, too. Of what else the line has,"
+        yield '# driver = "nmea" and kind = "gnss" take the receiver\'s own fixes.'
     arm = d.lever_arms_m.get(kind if kind == "rdss" else "gnss")
     yield "# From the IMU to the antenna: forward, right, down. Measure it to a few centimetres."
-    if kind == "gnss" and arm is None:
+    if arm is not None:
+        yield f"lever_arm_m = {_value(arm)}"
+        return
+    if kind == "gnss":
         yield "# Without it the filter looks for it, and says how poorly it is known."
-        yield "# lever_arm_m = [0.0, 0.0, -1.0]"
     else:
-        yield f"lever_arm_m = {_value(arm or (0.0, 0.0, 0.0))}"
+        yield "# Without it the antenna is taken to be at the IMU."
+    yield "# lever_arm_m = [0.0, 0.0, -1.0]"
 
 
 def _value(value: Any) -> str:

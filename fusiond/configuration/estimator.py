@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    field_validator,
+    model_validator,
+)
 
 from fusiond.configuration.aiding import Probability, Section
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
+from fusiond.files.extras import install
+
+
+def _has_wavelets() -> None:
+    if find_spec("pywt") is None:
+        raise ValueError(f"the filter multiscale needs PyWavelets: {install('studies')}")
 
 
 def _orthonormal(wavelet: str) -> str:
+    _has_wavelets()
     wavelet_matrix(wavelet, 1)  # ValueError, with those that would do
     return wavelet
 
@@ -89,3 +104,10 @@ class Estimator(Section):
     """The section of that name below."""
     multiscale: Multiscale = Field(default_factory=Multiscale.unsaid)
     unscented: Unscented = Field(default_factory=Unscented.unsaid)
+
+    @field_validator("filter")
+    @classmethod
+    def _installed(cls, name: str) -> str:
+        if name == "multiscale":
+            _has_wavelets()
+        return name

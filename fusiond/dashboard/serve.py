@@ -14,8 +14,8 @@ from typing import Any
 
 from fusiond.dashboard.broker import Access, Broker
 from fusiond.dashboard.hub import Hub
+from fusiond.files.extras import install
 
-INSTALL = "the dashboard's packages are not installed: pip install 'fusiond[dashboard]'"
 PMTILES = b"PMTiles\x03"
 """Header of a file of version 3."""
 SEND_BUFFER = 128 * 1024
@@ -86,7 +86,7 @@ def _run(
     if serving.base_map is not None:
         check_map(serving.base_map)
     if importlib.util.find_spec("uvicorn") is None or importlib.util.find_spec("starlette") is None:
-        raise DashboardError(INSTALL)
+        raise DashboardError(f"the dashboard's packages are not installed: {install('dashboard')}")
     door = listening(serving)
     port = door.getsockname()[1]
     host = f"[{serving.host}]" if ":" in serving.host else serving.host

@@ -17,7 +17,8 @@ import subprocess
 import sys
 from types import TracebackType
 
-INSTALL = "the demo's MQTT broker is not installed: pip install 'fusiond[demo]' (package amqtt)"
+from fusiond.files.extras import install
+
 _ATTEMPTS = 5
 """A port that was free may be taken before the broker has it; not five times in a row."""
 _END_S = 5.0
@@ -32,7 +33,7 @@ class DemoBroker:
 
     def __init__(self) -> None:
         if importlib.util.find_spec("amqtt") is None:
-            raise DemoError(INSTALL)
+            raise DemoError(f"the demo's MQTT broker is not installed: {install('demo')}")
         self._process = subprocess.Popen(
             [sys.executable, "-m", "fusiond.demo.broker"],
             stdin=subprocess.PIPE,

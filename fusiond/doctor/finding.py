@@ -14,6 +14,8 @@ from collections.abc import AsyncIterator, Awaitable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from drivers.base import monotonic_ns
 from drivers.bestpos.decoder import POSITIONS as LOGGED_POSITIONS
 from drivers.bestpos.framing import LogSplitter
@@ -21,12 +23,14 @@ from drivers.can.bus import CanBus, CanFrame, Interface
 from drivers.can.decoder import CanDecoder
 from drivers.can.gnss import CanGnssDriver
 from drivers.can.imu import CanImuDriver
+from drivers.measurements import ImuSample
 from drivers.nmea.compass import FORMATTERS
 from drivers.nmea.framing import Frame, Sentence, StreamSplitter, is_rdss_sentence
 from drivers.rdss.driver import RdssDriver, RdssOptions
 from drivers.sbf.framing import BlockSplitter
 from drivers.serial_line import SerialLine
 from fusiond.doctor.known_devices import KNOWN_DEVICES
+from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 
 BAUDS = (115_200, 9_600, 38_400, 460_800, 921_600, 230_400, 57_600, 19_200, 4_800)
 """In the order of how often receivers are found at them."""
@@ -36,8 +40,15 @@ SOUND_ITEMS = 3
 """Checksums that are right: one of eight bits is so by chance once in 256 lines of nonsense."""
 TERMINAL_S = 25.0
 """Two families at three baud rates, 3 s each, and a reply."""
+EPOCH_S = 1.2
+"""After a line has been understood: what a receiver sends once a second has come by then."""
 BUS_S = 3.0
 LEAST_SAMPLES = 5
+MOST_TILT_DEG = 30.0
+"""Between one axis down (0) and two as much as each other (45): a slope of 20 % is 11 deg, and a
+unit is mounted parallel to a vehicle's axes or is not."""
+GRAVITY_TOLERANCE = 0.1
+"""Of gravity: a consumer unit's bias and scale are 0.1 g at most, a unit's mistake is a factor."""
 RATES_HZ = (1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 80, 100, 125, 160, 200, 250, 400, 500, 800, 1000)
 RATE_TOLERANCE = 0.08
 """Devices offer steps of a quarter and more; what is counted in 3 s is off by a frame or two."""
@@ -72,6 +83,15 @@ class Device:
     rate_hz: float | None = None
     aiding: str | None = None
     """The kind of `[aiding]`, of a driver that may give several."""
+    down: str | None = None
+    """The sensor axis of an IMU that points down, where gravity showed it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unheard:
+    """A port at which nothing was found, and why, in words."""
+
+    text: str
 
 
 @dataclass(slots=True)
@@ -113,8 +133,8 @@ def _kind(item: Sentence | Frame) -> str:
     return "raw" if number in _MSM else "rtcm"
 
 
-async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) -> Device | None:
-    """The device on a serial port, None where nobody says anything that is understood.
+async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) -> Device | Unheard:
+    """The device on a serial port, or that nobody says anything there that is understood.
 
     `ask_terminal` lets an RDSS terminal be asked for its card: bytes go out on this port.
     """
@@ -123,13 +143,25 @@ async def on_port(port: str, *, ask_terminal: bool, listen_s: float = LISTEN_S) 
         line = SerialLine(port, baud)
         async with _running(line.run(heard.take)):
             await _until(lambda heard=heard: heard.known, listen_s)
+            if heard.sound:
+                await _until(lambda heard=heard: "raw" in heard.kinds, EPOCH_S)
         if heard.sound:
             return _receiver(port, baud, heard.kinds)
         if not line.counters["opened"]:
-            return None
+            return Unheard(f"{port}: cannot be opened: {line.detail}")
         if not line.counters["bytes_in"]:
             break  # silent at one rate is silent at all
-    return await _terminal(port) if ask_terminal else None
+    else:
+        rates = f"{len(BAUDS)} baud rates"
+        return Unheard(
+            f"{port}: bytes come, and none of {rates} makes sense of them: look at the "
+            "wiring, and whether another program reads it"
+        )
+    found = await _terminal(port) if ask_terminal else None
+    return found or Unheard(
+        f"{port}: silent: is the device powered and its output on?"
+        + ("" if ask_terminal else " An RDSS terminal is silent until it is asked: --ask-terminal")
+    )
 
 
 def _receiver(port: str, baud: int, kinds: Counter[str]) -> Device:
@@ -177,12 +209,16 @@ async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) ->
         options = kind.Options(**known.options, interface=interface, channel=channel)
         decoders.append((number, kind.Decoder(known.title, options)))
     samples: dict[int, list[int]] = {number: [] for number, _ in decoders}
+    forces: dict[int, list[tuple[float, ...]]] = {number: [] for number, _ in decoders}
 
     def take(frame: CanFrame) -> None:
         if frame.remote or frame.error:
             return
         for number, decoder in decoders:
-            samples[number] += [m.t_seen_ns for m in decoder.feed(frame)]
+            for measured in decoder.feed(frame):
+                samples[number].append(measured.t_seen_ns)
+                if isinstance(measured, ImuSample):
+                    forces[number].append(measured.accel_m_s2)
 
     bus = CanBus(interface, channel)
     async with _running(bus.run(take, lambda up, why: None, lambda state: None)):
@@ -194,17 +230,39 @@ async def on_bus(interface: Interface, channel: str, listen_s: float = BUS_S) ->
         refused = sum(decoder.counters[name] for name in ("wrong_length", "out_of_range"))
         if count >= LEAST_SAMPLES and refused < count and count > found.get(driver, (0, 0))[0]:
             found[driver] = count, number
-    return [_on_bus(interface, channel, n, samples[n]) for _, n in found.values()]
+    return [_on_bus(interface, channel, n, samples[n], forces[n]) for _, n in found.values()]
 
 
-def _on_bus(interface: Interface, channel: str, number: int, seen_ns: list[int]) -> Device:
+def down_axis(forces: list[tuple[float, ...]]) -> str | None:
+    """The sensor axis that points down, by specific forces (n, 3) in m/s^2 at rest; None where none
+    of them is gravity's alone: the unit moves, or stands more than `MOST_TILT_DEG` askew."""
+    if not forces:
+        return None
+    mean, sd = np.mean(forces, axis=0), np.std(forces, axis=0)
+    size = float(np.linalg.norm(mean))
+    up = int(np.argmax(np.abs(mean)))
+    tolerance = GRAVITY_TOLERANCE * STANDARD_GRAVITY_M_S2
+    if abs(size - STANDARD_GRAVITY_M_S2) > tolerance or float(sd.max()) > tolerance:
+        return None
+    if abs(float(mean[up])) < size * np.cos(np.radians(MOST_TILT_DEG)):
+        return None
+    return ("-" if mean[up] > 0.0 else "+") + "xyz"[up]
+
+
+def _on_bus(
+    interface: Interface,
+    channel: str,
+    number: int,
+    seen_ns: list[int],
+    forces: list[tuple[float, ...]],
+) -> Device:
     known = KNOWN_DEVICES[number]
     rate_hz = round_rate((len(seen_ns) - 1) / max(1e-9, (seen_ns[-1] - seen_ns[0]) * 1e-9))
     bus = {"channel": channel} if interface == "socketcan" else {}
     if interface != "socketcan":
         bus = {"interface": interface, "channel": channel}
     text = f"{interface} {channel}: frames of {known.title}, {rate_hz:g} Hz"
-    return Device(known.driver, {**bus, **known.options}, text, rate_hz)
+    return Device(known.driver, {**bus, **known.options}, text, rate_hz, down=down_axis(forces))
 
 
 def round_rate(rate_hz: float) -> float:

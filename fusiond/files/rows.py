@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.files.csv_tables import MissingPackageError, TableError
+from fusiond.files.extras import install
 
 Row = dict[str, Any]
 COMPRESSION = "zstd"
@@ -102,5 +103,5 @@ def _arrow() -> tuple[Any, Any]:
         import pyarrow  # noqa: PLC0415  (extra `[batch]`)
         from pyarrow import parquet  # noqa: PLC0415
     except ImportError as error:
-        raise MissingPackageError("rows need pyarrow: pip install fusiond[batch]") from error
+        raise MissingPackageError(f"rows need pyarrow: {install('batch')}") from error
     return pyarrow, parquet

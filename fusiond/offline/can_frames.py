@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 from drivers.can.python_can import can, with_mf4
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError
+from fusiond.files.extras import install
 from fusiond.offline.can_blf import DAY_S, Containers
 from fusiond.offline.can_text import (
     HEADER_ENDS,
@@ -223,7 +224,7 @@ def _mf4(
     log: _Log, lost: Refusals, stack: contextlib.ExitStack, told: Callable[[str, str], None]
 ) -> Iterator[can.Message]:
     if importlib.util.find_spec("asammdf") is None:
-        raise MissingPackageError("MF4 logs need the package asammdf: pip install 'fusiond[mf4]'")
+        raise MissingPackageError(f"MF4 logs need the package asammdf: {install('mf4')}")
     with_mf4()
     log.path.open("rb").close()
     failure = ""

@@ -31,6 +31,7 @@ from drivers.ubx.decoder import UbxDecoder
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
+from fusiond.files.extras import install
 from fusiond.files.tables import ImuTable
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.aid_files import SECONDS_OF_WEEK, Arrival
@@ -142,7 +143,7 @@ def rinex_text(path: Path, data: bytes) -> str | None:
     except ImportError as error:
         raise MissingPackageError(
             f"{path}: RINEX packed by Hatanaka's or another way needs the package hatanaka: "
-            "pip install 'fusiond[rinex]'"
+            f"{install('rinex')}"
         ) from error
     try:
         return str(hatanaka.decompress(data).decode("ascii", "replace"))

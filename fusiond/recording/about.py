@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Iterable
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from drivers.base import PermanentDriverError
@@ -36,10 +37,19 @@ def about_run(config: Config, run: str, epoch_ns: int, sources: Iterable[str]) -
         "processor": processor(),
         "python": platform.python_version(),
         "boot_id": _read(BOOT_ID).strip(),
-        **{package: version(package) for package in _PACKAGES},
+        **_versions(),
     }
     text = json.dumps(config.model_dump(mode="json"), indent=1)
     return About(metadata, (Attachment(CONFIG, "application/json", text.encode()), *_dbcs(config)))
+
+
+def _versions() -> dict[str, str]:
+    """Of the packages that figures depend on, as far as they are there."""
+    found = {}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def processor() -> str:

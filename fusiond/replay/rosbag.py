@@ -20,6 +20,7 @@ from fusiond.clock.answers import Instant
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.files.csv_tables import MissingPackageError
+from fusiond.files.extras import install
 from fusiond.recording.channels import LOCATION
 from fusiond.recording.reader import Log
 from fusiond.replay.tables import arrivals
@@ -31,7 +32,7 @@ def write_rosbag(recording: Log, config: Config, folder: Path) -> dict[str, int]
     """A bag in `folder`, which must not exist; messages by topic. Raises `MissingPackageError`,
     OSError."""
     if importlib.util.find_spec("rosbags") is None:
-        raise MissingPackageError("rosbag2 needs the package rosbags: pip install 'fusiond[ros]'")
+        raise MissingPackageError(f"rosbag2 needs the package rosbags: {install('ros')}")
     from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an extra
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 

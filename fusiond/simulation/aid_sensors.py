@@ -126,13 +126,9 @@ class StarTracker:
         self.t_s = np.arange(1, n + 1) / o.rate_hz
         self.t_arrival_s = self.t_s + o.latency_s
         self.misalignment = _misalignment(o, n, rng)
-        # Loaded where there is such a sensor on board: it takes a third of a second.
-        from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
-        body = dcm_from_rpy(truth.at(self.t_s).rpy)
-        turned = Rotation.from_matrix(body) * Rotation.from_rotvec(self.misalignment)
+        turned = dcm_from_rpy(truth.at(self.t_s).rpy) @ _turns(self.misalignment)
         self.sd_rad = np.array(o.sd_arcsec) * ARCSEC
-        self.rpy = turned.as_euler("ZYX")[:, ::-1] + rng.standard_normal((n, 3)) * self.sd_rad
+        self.rpy = _rpy(turned) + rng.standard_normal((n, 3)) * self.sd_rad
 
     @property
     def rows(self) -> Array:
@@ -162,20 +158,16 @@ class SarRadar:
         places = np.array([o.targets_deg_m[name] for name in names]).reshape(-1, 3)
         points = _earth_fixed(np.radians(places[:, 0]), np.radians(places[:, 1]), places[:, 2])
         here = _earth_fixed(*states.position.T)
-        from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
         # north-east-down axes as columns in Earth-fixed axes, then body, then the sensor's own
-        ned = Rotation.from_euler(
-            "ZY", np.column_stack((states.position[:, 1], -states.position[:, 0] - math.pi / 2.0))
-        )
-        body = ned * Rotation.from_matrix(dcm_from_rpy(states.rpy))
-        to_sensor = (body * Rotation.from_rotvec(misalignment)).inv()
+        lat, lon, _ = states.position.T
+        ned = dcm_from_rpy(np.column_stack((np.zeros(n), -lat - math.pi / 2.0, lon)))
+        from_sensor = ned @ dcm_from_rpy(states.rpy) @ _turns(misalignment)
         distance = np.linalg.norm(points[None, :, :] - here[:, None, :], axis=2)
         chosen = np.full(n, -1)
         best = np.full(n, np.inf)
         angles = np.zeros((n, 2))
         for index, point in enumerate(points):
-            x, y, z = to_sensor.apply(point - here).T
+            x, y, z = np.einsum("nji,nj->in", from_sensor, point - here)
             elevation = np.arctan2(-z, np.hypot(x, y))
             far = distance[:, index]
             seen = (far >= o.range_m[0]) & (far <= o.range_m[1]) & (far < best)
@@ -203,6 +195,25 @@ class SarRadar:
         """Epoch `k` by the slots of `CanBearingDecoder`; the names of points must be numbers."""
         azimuth, elevation = (float(a) for a in self.angles[k])
         return [azimuth, elevation, *self.sd_rad.tolist(), float(self.target[k]), 1.0]
+
+
+def _turns(vectors: Array) -> Array:
+    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    none = np.zeros_like(x)
+    cross = np.array([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
+    # sin(a)/a and (1 - cos(a))/a^2; numpy's sinc is of pi times its argument
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross), dtype=np.float64)
+
+
+def _rpy(dcm: Array) -> Array:
+    """Roll, pitch, yaw (n, 3) of body to navigation matrices (n, 3, 3)."""
+    roll = np.arctan2(dcm[:, 2, 1], dcm[:, 2, 2])
+    pitch = np.arctan2(-dcm[:, 2, 0], np.hypot(dcm[:, 2, 1], dcm[:, 2, 2]))
+    return np.column_stack((roll, pitch, np.arctan2(dcm[:, 1, 0], dcm[:, 0, 0])))
 
 
 def _wrapped(angles: Array) -> Array:

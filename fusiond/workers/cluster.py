@@ -37,7 +37,7 @@ class Cluster:
         try:
             from distributed import Client  # noqa: PLC0415  (extra `[cluster]`)
         except ImportError as error:
-            raise ClusterError("--cluster needs Dask: pip install fusiond[cluster]") from error
+            raise ClusterError("--cluster needs Dask, which is not installed") from error
         try:
             self._client: Any = Client(address, timeout=connect_s, set_as_default=False)
         except (OSError, ValueError) as error:

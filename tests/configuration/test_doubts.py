@@ -57,6 +57,10 @@ def test_examples_leave_no_doubt(path: Path) -> None:
             "aiding.gnss.lever_arm_m = [0.0, 100.0, 0.0]: 100 m from the IMU",
         ),
         (
+            f"{SOUND}[aiding.gnss]\nlever_arm_m = [0.5, 0.0, 1.5]\n",
+            "aiding.gnss.lever_arm_m = [0.5, 0.0, 1.5]: the antenna would be 1.5 m below the IMU",
+        ),
+        (
             f"{SOUND}[constraints.non_holonomic]\nlever_arm_m = [-25.0, 0.0, 0.0]\n",
             "constraints.non_holonomic.lever_arm_m",
         ),

@@ -103,7 +103,7 @@ def test_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serve.importlib.util, "find_spec", lambda name: None)
     result = CliRunner().invoke(app, ["dashboard"])
     assert result.exit_code == 69
-    assert "pip install 'fusiond[dashboard]'" in result.output
+    assert "pip install 'starlette>=1.0'" in result.output
 
 
 def test_what_is_no_recording_exits_65(tmp_path: Path) -> None:

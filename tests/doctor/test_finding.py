@@ -9,15 +9,19 @@ import tomllib
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from drivers.can.dbc import SHIPPED
 from drivers.can.imu import CanImuOptions
 from fusiond.commands.app import app
+from fusiond.commands.configure import _measured_axes
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.load import load_config
-from fusiond.doctor.finding import on_bus, on_port, round_rate
+from fusiond.configuration.settings import sensor_to_body
+from fusiond.doctor.finding import Device as Found
+from fusiond.doctor.finding import Unheard, down_axis, on_bus, on_port, round_rate
 from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
@@ -31,6 +35,7 @@ from tests.patience import PATIENCE_S, until
 from tests.places import REPOSITORY
 from tests.pty_device import Device
 
+CONFIG_IMU = load_config(REPOSITORY / "config" / "vehicle.toml").imu
 RAWX = rawx(measurement())
 HDM, HDT = (f"{made(text)}\r\n".encode() for text in ("HCHDM,101.5,M", "HEHDT,97.2,T"))
 
@@ -71,6 +76,40 @@ async def test_what_is_plugged_in_becomes_a_file_that_check_passes(tmp_path: Pat
     assert "--force overwrites it" in again.stderr
 
 
+async def test_what_is_not_answered_is_measured_or_left_open_by_name(tmp_path: Path) -> None:
+    bus = str(tmp_path)
+    car = SimulatedVehicle(
+        SCENARIOS["static"],
+        duration_s=60.0,
+        can_imu=SIM_IMU.model_copy(update={"channel": bus}),
+        gnss_link=tmp_path / "gnss",
+    )
+    out = tmp_path / "car.toml"
+    running = asyncio.create_task(car.run())
+    arguments = ["config", "init", str(out), "--yes", "--port", str(tmp_path / "gnss")]
+    arguments += ["--can", f"virtual:{bus}"]
+    await until((tmp_path / "gnss").exists)
+    done = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert done.exit_code == 0, done.output
+    config = load_config(out)
+    assert config.imu.axes == ("+x", "-y", "-z")
+    assert "axes: Down is -z, by gravity. That +x points forward is assumed" in done.stdout
+    assert "That +x points forward is assumed" in out.read_text()
+    # Not given, so that the filter looks for it.
+    assert "lever_arm_m" not in config.aiding["gnss"].model_fields_set
+    assert "\n# lever_arm_m = " in out.read_text()
+
+
+@pytest.mark.parametrize("down", ["+x", "-x", "+y", "-y", "+z", "-z"])
+def test_axes_with_down_measured_are_right_handed(down: str) -> None:
+    axes, _ = _measured_axes(Found("can_imu", {}, "", down=down))
+    assert axes[2] == down
+    section = CONFIG_IMU.model_copy(update={"axes": axes})
+    assert np.linalg.det(sensor_to_body(section)) == pytest.approx(1.0)
+
+
 def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> None:
     out = tmp_path / "vehicle.toml"
     gone = str(tmp_path / "ttyUSB0")
@@ -78,6 +117,7 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert "No supported device found on: " in done.stdout
+    assert f"found nothing: {gone}: cannot be opened" in done.stdout
     assert "! sources: none; `run` needs an IMU" in done.stdout
     assert "# [sources.imu]" in out.read_text()
     uncommented = out.read_text().replace("# [sources.imu]", "[sources.imu]")
@@ -93,12 +133,13 @@ def test_nothing_plugged_in_gives_a_file_that_check_passes(tmp_path: Path) -> No
         (RAWX * 3, "gnss", "raw observations"),
         (b"$GNVTG,,T,,M,0.0,N,0.0,K,A*3D\r\n" * 4 + RAWX, "gnss", "NMEA sentences, raw"),
         (HDT * 3 + gga(1), "nmea", "NMEA sentences"),  # a receiver of two antennas
+        (gga(1) * 9 + RAWX, "gnss", "NMEA sentences, raw"),  # fixes and raw data on one line
         (pvt() * 3, "ubx", "UBX navigation messages"),
         (pvt() * 3 + gga(1), "nmea", "NMEA sentences, UBX navigation messages"),
         (bestpos() * 3, "bestpos", "logs of the BESTPOS family"),
         (sbf_pvt() * 3, "sbf", "SBF blocks"),
-        (b"$BDICI,0242286,,,,,,60*00\r\n", None, ""),
-        (bytes(range(256)) * 4, None, ""),
+        (b"$BDICI,0242286,,,,,,60*00\r\n", None, "none of 9 baud rates makes sense of them"),
+        (bytes(range(256)) * 4, None, "none of 9 baud rates makes sense of them"),
     ],
 )
 async def test_what_speaks_on_a_port(
@@ -118,8 +159,41 @@ async def test_what_speaks_on_a_port(
     found = await on_port(str(tmp_path / "port"), ask_terminal=False, listen_s=listen_s)
     sending.cancel()
     device.unplug()
-    assert (found.driver if found else None) == driver
-    assert found is None or said in found.text
+    assert (None if isinstance(found, Unheard) else found.driver) == driver
+    assert said in found.text
+
+
+async def test_a_silent_port_is_told_with_what_may_be_wrong(tmp_path: Path) -> None:
+    device = Device(tmp_path / "port")
+    device.plug()
+    port = str(tmp_path / "port")
+    quiet = await on_port(port, ask_terminal=False, listen_s=0.1)
+    device.unplug()
+    assert isinstance(quiet, Unheard)
+    for words in (f"{port}: silent", "powered", "--ask-terminal"):
+        assert words in quiet.text
+    gone = await on_port(str(tmp_path / "none"), ask_terminal=False, listen_s=0.1)
+    assert isinstance(gone, Unheard)
+    assert "cannot be opened" in gone.text
+
+
+@pytest.mark.parametrize(
+    ("force", "down"),
+    [
+        ((0.0, 0.0, 9.81), "-z"),
+        ((0.2, -9.8, 0.3), "+y"),
+        ((9.7, 1.0, -1.0), "-x"),
+        ((7.0, 7.0, 0.0), None),
+        ((0.0, 0.0, 1.0), None),  # in g, not in m/s^2
+    ],
+)
+def test_gravity_tells_which_axis_points_down(
+    force: tuple[float, float, float], down: str | None
+) -> None:
+    assert down_axis([force] * 20) == down
+    shaken = [(force[0], force[1], force[2] + 4.0 * (-1) ** k) for k in range(20)]
+    assert down_axis(shaken) is None
+    assert down_axis([]) is None
 
 
 async def test_compasses_become_sections_that_check_passes(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def test_any_damage_ends_in_frames_a_count_or_a_sentence(name: str, tmp_path: Pa
 
 @pytest.mark.skipif(
     importlib.util.find_spec("asammdf") is None,
-    reason="the package asammdf is not installed: pip install 'fusiond[mf4]'",
+    reason="the package asammdf is not installed",
 )
 @pytest.mark.parametrize("content", [b"hello", b"MDF     4.10    " + bytes(range(256)) * 9])
 def test_what_is_no_mf4(content: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -115,7 +115,7 @@ def test_blf_that_is_zipped(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(
     importlib.util.find_spec("asammdf") is None,
-    reason="the package asammdf is not installed: pip install 'fusiond[mf4]'",
+    reason="the package asammdf is not installed",
 )
 def test_mf4(tmp_path: Path) -> None:
     with_mf4()

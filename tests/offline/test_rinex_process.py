@@ -115,7 +115,7 @@ def test_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "hatanaka", None)
     code, output = run(tmp_path, imu, OBSERVATIONS)
     assert code == 69
-    assert "pip install 'fusiond[rinex]'" in output
+    assert "pip install 'hatanaka>=2.8'" in output
 
 
 def test_b1c_of_a_rinex_file_without_cnav_says_so(tmp_path: Path) -> None:

@@ -34,8 +34,10 @@ def wavelet_matrix(name: str, scales: int) -> Array:
 
     ValueError for a name that is unknown or not an orthonormal wavelet's. Read-only.
     """
-    import pywt  # noqa: PLC0415 - for whoever filters by scales
-
+    try:
+        import pywt  # noqa: PLC0415 - for whoever filters by scales
+    except ImportError as error:
+        raise ValueError("the filter multiscale needs PyWavelets") from error
     if not 1 <= scales <= MOST_SCALES:
         raise ValueError(f"scales = {scales}: 1 to {MOST_SCALES}")
     if name not in pywt.wavelist(kind="discrete"):

@@ -1,0 +1,26 @@
+"""How the packages of an extra are installed into the Python that runs: no index has fusiond
+itself, so the packages are named."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from importlib.metadata import PackageNotFoundError, requires
+from importlib.util import find_spec
+
+
+def install(extra: str) -> str:
+    """The command that installs `extra`, as fusiond's metadata states it. A Debian package has no
+    pip of its own: the system's does it."""
+    try:
+        stated = requires("fusiond") or []
+    except PackageNotFoundError:  # run from a folder, without an installation
+        stated = []
+    names = [
+        line.partition(";")[0].strip()
+        for line in stated
+        if f'extra == "{extra}"' in line.replace("'", '"')
+    ]
+    python = shlex.quote(sys.executable)
+    pip = f"python3 -m pip --python {python}" if find_spec("pip") is None else f"{python} -m pip"
+    return f"{pip} install {' '.join(map(shlex.quote, names))}"
