@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,6 +25,7 @@ from fusiond.commands.shared import (
 
 if TYPE_CHECKING:
     from drivers.raw.messages import System
+    from fusiond.offline.calibrate import Pass
     from fusiond.offline.outages import Outage
 
 AID_KINDS = (
@@ -117,8 +119,21 @@ def process(
         raise typer.Exit(EXIT_DATA)
 
 
+def _recording(logs: list[Path]) -> Pass:
+    """A pass through the daemon's recording."""
+    from fusiond.recording.reader import Log  # noqa: PLC0415
+    from fusiond.replay.watched import watched  # noqa: PLC0415
+
+    # Its events are those of the drive, which has been: the report shows them.
+    logging.getLogger("fusiond").addHandler(logging.NullHandler())
+    return lambda config, look: watched(Log(logs), config, look)
+
+
 def calibrate(
     config: ConfigPath,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(metavar="LOG.mcap", help="The daemon's recording.")
+    ] = None,
     imu: ImuFile = None,
     can: CanLog = None,
     aid: AidFiles = None,
@@ -127,21 +142,28 @@ def calibrate(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML."""
+    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML: of files, or
+    of the daemon's own recording."""
     aids = [_aid_argument(text) for text in aid or []]
-    if (imu is None) == (can is None):
-        raise typer.BadParameter("--imu or --can: the samples come of one of the two")
+    if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and aids):
+        raise typer.BadParameter(
+            "LOG.mcap, --imu or --can: the drive is a recording, or its samples come of one of the "
+            "two and its --aid of files"
+        )
     loaded = load(config)
+    from fusiond.commands.recordings import log_errors  # noqa: PLC0415
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     with compiling():
         from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
+        from fusiond.offline.calibrate import files  # noqa: PLC0415
 
+        navigate = _recording(logs) if logs else files(imu, aids, can)
         raw_receivers(loaded.aiding)  # what they compile comes with the rest
     try:
-        with config_errors(), data_errors(), progress_bar("calibrating") as bar:
-            found = run_calibrate(loaded, imu, aids, can, bar or (lambda done, total: None))
+        with config_errors(), data_errors(), log_errors(), progress_bar("calibrating") as bar:
+            found = run_calibrate(loaded, navigate, bar or (lambda done, total: None))
     except MissingPackageError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
