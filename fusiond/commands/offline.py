@@ -179,7 +179,14 @@ def calibrate(
 
 def simulate(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="static, drive, flight.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files.")],
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the files.")] = None,
+    live: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Drive in real time instead: devices for `fusiond run DIR/vehicle.toml`.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random streams.")] = 0,
     duration: Annotated[
         float | None, typer.Option(min=1.0, help="Seconds; the scenario's own by default.")
@@ -192,7 +199,15 @@ def simulate(
         typer.Option(metavar="KIND:START:LENGTH", help="canyon, canyon2 to canyon4, tunnel; s."),
     ] = None,
 ) -> None:
-    """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle."""
+    """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle; or be its
+    devices, for a daemon of its own."""
+    if live is not None:
+        if out is not None or gnss_raw is not None or gnss_mask or scenario != "drive":
+            raise typer.BadParameter("--live: the scenario drive, without --out and --gnss-...")
+        _live(live, duration, seed)
+        return
+    if out is None:
+        raise typer.BadParameter("--out or --live: where to write, or be devices for a daemon")
     with compiling():
         from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
         from fusiond.simulation.gnss.masks import parse_mask  # noqa: PLC0415
@@ -208,6 +223,20 @@ def simulate(
         written = run_simulate(masked, out, seed, duration, gnss_raw=gnss_raw)
     for name, path in written.files.items():
         typer.echo(f"{path}: {written.rows[name]} rows")
+
+
+def _live(folder: Path, duration_s: float | None, seed: int) -> None:
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+
+    with compiling():
+        from fusiond.simulation.live import live as run_live  # noqa: PLC0415
+    try:
+        with data_errors():
+            sent = run_live(folder, duration_s, seed, typer.echo)
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    typer.echo(", ".join(f"{count} {name}" for name, count in sorted(sent.items())))
 
 
 def compare(
