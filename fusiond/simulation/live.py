@@ -15,6 +15,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from drivers.can.bus import Interface
@@ -41,13 +42,11 @@ def bus_here() -> tuple[Interface, str]:
         state = Path(f"/sys/class/net/{VCAN}/operstate").read_text(encoding="ascii").strip()
         if state in ("up", "unknown"):  # a virtual interface that is up has no carrier to know
             return "socketcan", VCAN
-    try:
-        import msgpack  # noqa: F401, PLC0415 - python-can's multicast packs with it
-    except ImportError as error:
+    if find_spec("msgpack") is None:  # python-can's multicast packs with it
         raise MissingPackageError(
             f"{VCAN} is not up (ip link add {VCAN} type vcan; ip link set {VCAN} up), and the bus "
             f"over UDP needs msgpack: {install('demo')}"
-        ) from error
+        )
     return "udp_multicast", MULTICAST
 
 

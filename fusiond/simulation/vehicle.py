@@ -23,7 +23,7 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -124,7 +124,7 @@ class SimulatedVehicle:
             if self._bus is None:
                 interface, channel = self._can
                 # Datagrams of a bus over UDP stay on this computer.
-                here = {"hop_limit": 0} if interface == "udp_multicast" else {}
+                here: dict[str, Any] = {"hop_limit": 0} if interface == "udp_multicast" else {}
                 self._bus = can.Bus(interface=interface, channel=channel, **here)
         elif device in self.aids:
             self.aids[device].plug()

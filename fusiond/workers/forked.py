@@ -147,11 +147,11 @@ class _Jobs:
 
 def _work(jobs: Sequence[Job], share: int, connection: socket.socket) -> None:
     """A child: does the jobs that it is given until it holds too much."""
-    libc = ctypes.CDLL(None)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: None)  # glibc's
     while number := connection.recv(4):
         jobs[int.from_bytes(number, "big")]()
         gc.collect()  # a compiler leaves circles, and its allocator keeps what it freed
-        libc.malloc_trim(0)
+        trim(0)
         connection.send(_LAST if _own_bytes() > share else _DONE)
 
 

@@ -76,7 +76,7 @@ def test_its_configuration_leaves_no_doubt(tmp_path: Path) -> None:
 def test_a_bus_over_udp_that_is_not_to_be_had_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "VCAN", "none0")
     assert live.bus_here()[0] == "udp_multicast"
-    monkeypatch.setitem(sys.modules, "msgpack", None)
+    monkeypatch.setattr(live, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=r"none0 is not up .* install .*msgpack"):
         live.bus_here()
 
