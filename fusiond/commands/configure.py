@@ -127,7 +127,7 @@ def _measured_axes(imu: Device | None) -> tuple[tuple[str, str, str], str]:
     if imu is None or imu.down is None:
         level = "the unit moved or stands askew" if imu is not None else "no unit was heard"
         return ("+x", "+y", "+z"), f"Not measured ({level}): `fusiond doctor` at rest says down."
-    sign, down = imu.down
+    sign, down = imu.down[0], imu.down[1]
     forward, right = (axis for axis in "xyz" if axis != down)
     even = down != "y"  # x, y, z in turn are right-handed; x, z, y are not
     turned = "+" if (sign == "+") == even else "-"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,6 +25,7 @@ from fusiond.commands.shared import (
 
 if TYPE_CHECKING:
     from drivers.raw.messages import System
+    from fusiond.offline.calibrate import Pass
     from fusiond.offline.outages import Outage
 
 AID_KINDS = (
@@ -117,8 +119,21 @@ def process(
         raise typer.Exit(EXIT_DATA)
 
 
+def _recording(logs: list[Path]) -> Pass:
+    """A pass through the daemon's recording."""
+    from fusiond.recording.reader import Log  # noqa: PLC0415
+    from fusiond.replay.watched import watched  # noqa: PLC0415
+
+    # Its events are those of the drive, which has been: the report shows them.
+    logging.getLogger("fusiond").addHandler(logging.NullHandler())
+    return lambda config, look: watched(Log(logs), config, look)
+
+
 def calibrate(
     config: ConfigPath,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(metavar="LOG.mcap", help="The daemon's recording.")
+    ] = None,
     imu: ImuFile = None,
     can: CanLog = None,
     aid: AidFiles = None,
@@ -127,21 +142,25 @@ def calibrate(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML."""
+    """Find mounting, lever arms, offsets and scales from one recorded drive, as TOML: of files, or
+    of the daemon's own recording."""
     aids = [_aid_argument(text) for text in aid or []]
-    if (imu is None) == (can is None):
-        raise typer.BadParameter("Give --imu or --can")
+    if [bool(logs), imu is not None, can is not None].count(True) != 1 or (logs and aids):
+        raise typer.BadParameter("Give LOG.mcap alone, or --imu or --can")
     loaded = load(config)
+    from fusiond.commands.recordings import log_errors  # noqa: PLC0415
     from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
 
     with compiling():
         from fusiond.navigator.intake.kind import raw_receivers  # noqa: PLC0415
         from fusiond.offline.calibrate import calibrate as run_calibrate  # noqa: PLC0415
+        from fusiond.offline.calibrate import files  # noqa: PLC0415
 
+        navigate = _recording(logs) if logs else files(imu, aids, can)
         raw_receivers(loaded.aiding)  # what they compile comes with the rest
     try:
-        with config_errors(), data_errors(), progress_bar("calibrating") as bar:
-            found = run_calibrate(loaded, imu, aids, can, bar or (lambda done, total: None))
+        with config_errors(), data_errors(), log_errors(), progress_bar("calibrating") as bar:
+            found = run_calibrate(loaded, navigate, bar or (lambda done, total: None))
     except MissingPackageError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error
@@ -157,7 +176,14 @@ def calibrate(
 
 def simulate(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="static, drive, flight.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files.")],
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the files.")] = None,
+    live: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Drive in real time instead: devices for `fusiond run DIR/vehicle.toml`.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random streams.")] = 0,
     duration: Annotated[
         float | None, typer.Option(min=1.0, help="Seconds; the scenario's own by default.")
@@ -170,7 +196,15 @@ def simulate(
         typer.Option(metavar="KIND:START:LENGTH", help="canyon, canyon2 to canyon4, tunnel; s."),
     ] = None,
 ) -> None:
-    """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle."""
+    """Write imu.csv, gnss.csv, rdss.csv, barometer.csv, truth.csv of a simulated vehicle; or be its
+    devices, for a daemon of its own."""
+    if live is not None:
+        if out is not None or gnss_raw is not None or gnss_mask or scenario != "drive":
+            raise typer.BadParameter("--live: the scenario drive, without --out and --gnss-...")
+        _live(live, duration, seed)
+        return
+    if out is None:
+        raise typer.BadParameter("--out or --live: where to write, or be devices for a daemon")
     with compiling():
         from fusiond.simulation.files import simulate as run_simulate  # noqa: PLC0415
         from fusiond.simulation.gnss.masks import parse_mask  # noqa: PLC0415
@@ -186,6 +220,20 @@ def simulate(
         written = run_simulate(masked, out, seed, duration, gnss_raw=gnss_raw)
     for name, path in written.files.items():
         typer.echo(f"{path}: {written.rows[name]} rows")
+
+
+def _live(folder: Path, duration_s: float | None, seed: int) -> None:
+    from fusiond.files.csv_tables import MissingPackageError  # noqa: PLC0415
+
+    with compiling():
+        from fusiond.simulation.live import live as run_live  # noqa: PLC0415
+    try:
+        with data_errors():
+            sent = run_live(folder, duration_s, seed, typer.echo)
+    except MissingPackageError as error:
+        typer.echo(f"fusiond: {error}", err=True)
+        raise typer.Exit(EXIT_UNAVAILABLE) from error
+    typer.echo(", ".join(f"{count} {name}" for name, count in sorted(sent.items())))
 
 
 def compare(

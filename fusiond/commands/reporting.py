@@ -13,7 +13,6 @@ from fusiond.commands.shared import spinner
 
 
 def report(
-    out: Annotated[Path, typer.Option(metavar="F.html", help="Where the page is written.")],
     run: Annotated[
         list[Path] | None,
         typer.Argument(metavar="LOG...|SOLUTION.csv", help="All files of a log, or a solution."),
@@ -30,10 +29,17 @@ def report(
         list[Path] | None,
         typer.Option(metavar="LOG|SOLUTION.csv", help="A second run; repeat for a log's files."),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="F.html", help="The page; here, by the first file's name, if none."),
+    ] = None,
 ) -> None:
     """Write what happened on a drive, or on many, as one HTML file, which needs no network."""
     if (batch is None) == (not run) or (batch is not None and (truth or beside)):
         raise typer.BadParameter("a log or a solution, or --batch with rows and nothing else")
+    if out is None:
+        first = batch or (run or [])[0]
+        out = Path(first.with_suffix(".html").name)
     if batch is None:
         _of_drive(run or [], out, truth, beside or [])
     else:

@@ -25,7 +25,8 @@ def page(answer: dict[str, Any]) -> list[str]:
         *_vehicle(status),
         *(_process(health) if health is not None else ()),
     ]
-    lines += [f"{name:<12}{text}" for name, text in facts]
+    width = max([11, *(len(name) for name, _ in facts)])
+    lines += [f"{name:<{width}} {text}" for name, text in facts]
     if health is not None:
         lines += ["", *_sources(health["sources"], answer.get("consistency"))]
     events = answer.get("events", {}).get("events", [])

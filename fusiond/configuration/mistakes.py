@@ -78,8 +78,8 @@ def _wrong(model: type[BaseModel], data: Any, detail: ErrorDetails, at: Location
     """The line's end for one error of pydantic."""
     value = detail["input"]
     if detail["type"] == "extra_forbidden":
-        section = _annotation(model, data, at[:-1])
-        known = section.model_fields if _is_model(section) else ()
+        arms = _arms(_annotation(model, data, at[:-1]))  # a section, or none
+        known = {key for arm in arms if _is_model(arm) for key in arm.model_fields}
         shown = "" if _SECRET.search(str(at[-1])) else _equals(value)
         return f"{shown}: no such key; {did_you_mean(at[-1], known)}"
     if detail["type"] == "union_tag_not_found":

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import ctypes
 import signal
+import socket
 import subprocess
 import sys
 from types import TracebackType
 
 from fusiond.demo.broker import DemoError
 
+PORT = 8088
+"""Of the page, unless it is taken: the address can be kept open from one demo to the next."""
 _END_S = 5.0
 _PR_SET_PDEATHSIG = 1
 
@@ -19,6 +22,16 @@ def _end_with_the_demo() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
+def _free(port: int) -> bool:
+    with socket.socket() as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
 class DemoPage:
     """A dashboard process, as a context; `address` is where a browser finds it.
 
@@ -26,7 +39,8 @@ class DemoPage:
     """
 
     def __init__(self, broker_port: int) -> None:
-        command = [sys.executable, "-m", "fusiond", "dashboard", "--port", "0"]
+        port = PORT if _free(PORT) else 0
+        command = [sys.executable, "-m", "fusiond", "dashboard", "--port", str(port)]
         self._process = subprocess.Popen(
             [*command, "--mqtt", f"127.0.0.1:{broker_port}"],
             stdin=subprocess.DEVNULL,

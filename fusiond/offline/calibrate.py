@@ -52,6 +52,9 @@ from fusiond.offline.calibrated import ROLL, calibrated, configured, fragment
 from fusiond.offline.process import process
 
 Array = NDArray[np.float64]
+Pass = Callable[[Config, Callable[[Navigator], None]], dict[str, Any]]
+"""One run through the recorded drive with a configuration; the navigator is shown as it advances.
+Returns what `process` says."""
 
 PASSES = 2
 # The solution is looked at this often (ns): a bend or a stop takes seconds.
@@ -119,19 +122,22 @@ class Calibration:
         }
 
 
+def files(imu_path: Path | None, aids: list[tuple[str, Path]], can_log: Path | None = None) -> Pass:
+    """A pass through files. Raises what `process` raises."""
+    return lambda config, look: process(config, imu_path, aids, can_log=can_log, watch=look)
+
+
 def calibrate(
     config: Config,
-    imu_path: Path | None,
-    aids: list[tuple[str, Path]],
-    can_log: Path | None = None,
+    navigate: Pass,
     on_pass: Callable[[int, int], None] = lambda done, total: None,
 ) -> Calibration:
-    """Find the calibration that the files show. Raises what `process` raises."""
+    """Find the calibration that a drive shows. Raises what `navigate` raises."""
     now = config
     values: dict[str, Parameter] = {}
     for done in range(PASSES):
         drive = _Drive(rolled=ROLL in values and _seen(values[ROLL]))
-        result = process(now, imu_path, aids, can_log=can_log, watch=drive.look)
+        result = navigate(now, drive.look)
         values = drive.parameters()
         before, now = now, calibrated(now, values)
         on_pass(done + 1, PASSES)

@@ -75,7 +75,8 @@ class Replay:
     come out: it does not for another configuration, nor from the middle of a drive.
 
     `on_event`, `on_outcome` and `on_arrival` (of each measurement, with its instant) hear what the
-    daemon's parts say. Without `navigate` the filter does not run, and there are no ticks.
+    daemon's parts say. Without `navigate` the filter does not run, and there are no ticks. `afresh`
+    leaves aside what the daemon had loaded.
     """
 
     def __init__(
@@ -87,8 +88,9 @@ class Replay:
         on_outcome: Callable[[Entry], None] | None = None,
         navigate: bool = True,
         on_arrival: Arrival | None = None,
+        afresh: bool = False,
     ) -> None:
-        self._navigate, self._on_arrival = navigate, on_arrival
+        self._navigate, self._on_arrival, self._afresh = navigate, on_arrival, afresh
         self._log = recording
         self._config = config
         self._same = same
@@ -122,7 +124,9 @@ class Replay:
         from_start = bool(start.get("from_start"))
         system_clock = start.get("system_clock") or _system_clock(record, self._log)
         loaded, after_ns = Loaded(), 0
-        if from_start:
+        if self._afresh:
+            self.began = "an alignment, as was asked"
+        elif from_start:
             loaded = LOADED.validate_json(
                 json.dumps({name: start.get(name) for name in ("saved", "warm", "calibration")})
             )
@@ -146,7 +150,7 @@ class Replay:
         for name, inputs in doors.items():
             inputs.heard = self._listener(name)
         self._doors = [doors.get(name) for name in self._sources]
-        self.exact = self._same and from_start and self._log.first_part
+        self.exact = self._same and from_start and self._log.first_part and not self._afresh
         self._finish()
         return after_ns
 

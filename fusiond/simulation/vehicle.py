@@ -23,7 +23,7 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -123,7 +123,9 @@ class SimulatedVehicle:
         if device == "imu":
             if self._bus is None:
                 interface, channel = self._can
-                self._bus = can.Bus(interface=interface, channel=channel)
+                # Datagrams of a bus over UDP stay on this computer.
+                here: dict[str, Any] = {"hop_limit": 0} if interface == "udp_multicast" else {}
+                self._bus = can.Bus(interface=interface, channel=channel, **here)
         elif device in self.aids:
             self.aids[device].plug()
         elif device in self.lines:

@@ -141,6 +141,10 @@ def test_one_mistake(tmp_path: Path, text: str, line: str) -> None:
             "estimater = 1: no such key; did you mean 'estimator'? allowed: aiding, ",
         ),
         ("[imu]\nrate_hs = 1", "imu.rate_hs = 1: no such key; did you mean 'rate_hz'? allowed: "),
+        (
+            "[outputs.gpsd]\nrate = 1",
+            "outputs.gpsd.rate = 1: no such key; did you mean 'rate_hz'? allowed: ",
+        ),
         ("[aiding.gnss]\nfoo = 1", "aiding.gnss.foo = 1: no such key; allowed: bias_corr"),
         (
             '[sources.rx]\ndriver = "nmea"\nport = "a"\nbauds = 1',

@@ -25,7 +25,7 @@ from fusiond.configuration.settings import sensor_to_body
 from fusiond.files.tables import read_gnss, read_solution, read_truth
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import dcm_from_rpy, rpy_from_dcm
-from fusiond.offline.calibrate import calibrate
+from fusiond.offline.calibrate import calibrate, files
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
@@ -98,7 +98,7 @@ def test_a_drive_tells_how_its_sensor_is_mounted(
 ) -> None:
     imu = tmp_path / "imu.csv"
     turn = turned(imu, rpy_deg)
-    found = calibrate(Config.model_validate(KNOWN), imu, [("gnss", GNSS)])
+    found = calibrate(Config.model_validate(KNOWN), files(imu, [("gnss", GNSS)]))
     toml = tomllib.loads(found.toml)
     calibrated = merged(KNOWN, toml)
 
@@ -149,7 +149,7 @@ def test_times_scale_and_axle_of_a_simulated_drive_are_found(tmp_path: Path) -> 
         "constraints": {"non_holonomic": {"enabled": True, "lever_arm_m": [0.0, 0.0, 0.5]}},
     }
     aids = [("gnss", tmp_path / "gnss.csv"), ("wheel", tmp_path / "wheel.csv")]
-    found = calibrate(Config.model_validate(settings), tmp_path / "imu.csv", aids)
+    found = calibrate(Config.model_validate(settings), files(tmp_path / "imu.csv", aids))
     imu, wheel = found.config.imu, found.config.aiding["wheel"]
     assert isinstance(wheel, WheelAiding)
     assert imu.time_offset_s == pytest.approx(-GNSS_LATE_S, abs=0.04)

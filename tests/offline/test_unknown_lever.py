@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fusiond.configuration.schema import Config
 from fusiond.files.tables import read_solution, read_truth
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.offline.calibrate import calibrate
+from fusiond.offline.calibrate import calibrate, files
 from fusiond.offline.process import process
 from fusiond.simulation.files import simulate
 from fusiond.simulation.scenarios import SCENARIOS
@@ -75,7 +75,7 @@ def test_position_and_velocity_are_those_of_the_imu_and_say_how_well(drive: Any)
 def test_a_drive_tells_where_the_antenna_is(drive: Any) -> None:
     folder, lever = drive
     settings = Config.model_validate(CAR)
-    found = calibrate(settings, folder / "imu.csv", [("gnss", folder / "gnss.csv")])
+    found = calibrate(settings, files(folder / "imu.csv", [("gnss", folder / "gnss.csv")]))
     section = tomllib.loads(found.toml)["aiding"]["gnss"]
     arm, sd = np.array(section["lever_arm_m"]), section["lever_arm_sd_m"]
     assert np.abs(arm - lever)[:2].max() < 0.2

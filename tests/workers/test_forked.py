@@ -139,3 +139,24 @@ def test_children_step_back_to_normal_priority(
     with Forked([told]) as work:
         assert list(work) == [1]
     assert (tmp_path / "set").read_text() == repr((os.PRIO_PROCESS, 0, 0))
+
+
+def test_one_child_works_where_memory_is_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forked, "MEMORY", tmp_path / "meminfo")
+    for told in ("MemTotal: 512000 kB\nMemAvailable: 400000 kB\n", None):
+        (tmp_path / "meminfo").unlink(missing_ok=True)
+        if told is not None:
+            (tmp_path / "meminfo").write_text(told)
+        folder = tmp_path / str(told is None)
+        folder.mkdir()
+        with Forked([partial(_slow, folder, k) for k in range(8)]) as work:
+            assert list(work)[-1] == 8
+        processors = min(forked.MOST_CHILDREN, len(os.sched_getaffinity(0)))
+        assert len(set(_pids(folder, 8))) == (1 if told else processors)
+
+
+def _slow(folder: Path, job: int) -> None:
+    _noted(folder, job)
+    time.sleep(0.02)

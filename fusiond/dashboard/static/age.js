@@ -40,7 +40,12 @@ export const SILENT_S = 3;
 // `socket` open or not, `silent` s since a frame, `link` of the hub, `online` and `status` as heard.
 export function linkFault({ socket, silent, link, vehicle, online, status, now }) {
   if (!socket || silent > SILENT_S)
-    return { kind: "page", since: silent, text: "no word from the dashboard" };
+    return {
+      kind: "page",
+      since: silent,
+      // The demo takes its page with it.
+      text: vehicle === "demo" ? "the demo has ended" : "no word from the dashboard",
+    };
   if (link.state === "lost")
     return {
       kind: "broker",

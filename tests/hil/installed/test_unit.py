@@ -157,7 +157,7 @@ async def _reload(pid: int) -> None:
     await _told("daemon: reloaded: changed: mqtt.nav_rate_hz")
     CONFIG.write_text(good.replace("nav_rate_hz = 10.0", 'nav_rate_hz = "fast"'))
     asked = ["systemctl", "reload", UNIT]
-    refused = await asyncio.to_thread(subprocess.run, asked, check=False)
+    refused = await asyncio.to_thread(subprocess.run, asked, check=False, capture_output=True)
     assert refused.returncode != 0
     await _told("daemon: reload_refused: ")
     CONFIG.write_text(good)

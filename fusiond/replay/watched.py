@@ -1,0 +1,38 @@
+"""A recording through a navigator that somebody watches: `fusiond calibrate LOG.mcap`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from fusiond.configuration.schema import Config
+from fusiond.live.scheduler import SECOND_NS, Every
+from fusiond.navigation.solution import Mode
+from fusiond.navigator.navigator import Navigator
+from fusiond.recording.reader import Log
+from fusiond.replay.replay import Replay
+
+
+def watched(recording: Log, config: Config, look: Callable[[Navigator], None]) -> dict[str, Any]:
+    """Run; what was navigated, in the words of `process`.
+
+    The navigator starts anew: what an earlier drive had found of mounting and offsets would count
+    twice. `look` has it once a second, which is less than it keeps. Raises `LogError`.
+    """
+    replay = Replay(recording, config, same=False, afresh=True)
+    rows, why = 0, "the log has no tick of a daemon"
+    second = Every(SECOND_NS)
+    for tick in replay.ticks():
+        assert replay.chain is not None
+        navigated = tick.solution.mode in (Mode.NAVIGATING, Mode.COASTING)
+        rows, why = rows + navigated, tick.solution.reason
+        if second.due(tick.solution.t_ns):
+            look(replay.chain.navigator)
+    if replay.chain is not None:
+        look(replay.chain.navigator)
+    return {
+        "solution_rows": rows,
+        "why": why,
+        "driver_faults": replay.comparison.faults,
+        "problems": recording.problems,
+    }
