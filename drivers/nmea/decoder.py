@@ -110,6 +110,10 @@ class NmeaDecoder:
         """The epoch before."""
         self._closed_by = ""
         """Closing event: `last` sentence, `silence`, or what came then."""
+        self._raw_before = b""
+        """The sentence before."""
+        self._doubling = False
+        """True if that was said twice."""
         self._without_gga = 0
         """Epochs with RMC or GLL in a row that had neither GGA nor GNS."""
 
@@ -190,6 +194,9 @@ class NmeaDecoder:
 
     def _group(self, sentence: Sentence, t_seen_ns: int, found: list[Measurement]) -> None:
         formatter, time_ns = sentence.formatter, time_of_day_ns(sentence)
+        if self._doubled(sentence, time_ns):
+            self.counters["repeated_sentence"] += 1
+            return
         epoch = self._epoch
         if formatter == "GLL" and time_ns is not None and self._told_already(time_ns, sentence):
             self.counters["unused_sentence"] += 1
@@ -230,6 +237,22 @@ class NmeaDecoder:
             self._decoding.last_sentence is None and self._cycle.whole(epoch.cycle)
         ):
             self._close(found, learn=False, by="last")
+
+    def _doubled(self, sentence: Sentence, time_ns: int | None) -> bool:
+        """True if the line says each sentence twice, or each burst: two ports of a receiver in one
+        log. The third time it is a receiver that repeats itself."""
+        raw, before = sentence.raw, self._raw_before
+        self._raw_before = raw
+        epoch = self._epoch
+        if epoch is None and self._closed_by == "last" and raw == before:
+            epoch = self._closed
+        if epoch is None or raw not in epoch.raws or epoch.time_of_day_ns is None:
+            self._doubling = False
+        else:
+            self._doubling = time_ns is not None or self._doubling or raw == before
+            if self._doubling:
+                epoch.raws.discard(raw)
+        return self._doubling
 
     def _of_epoch(self, epoch: Epoch, time_ns: int, sentence: Sentence) -> bool:
         """True if a sentence with a time is of an epoch, by that alone."""

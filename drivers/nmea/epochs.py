@@ -92,6 +92,8 @@ class Epoch:
     """Formatters in the order they came."""
     addresses: set[str] = field(default_factory=set)
     """The same with their talkers."""
+    raws: set[bytes] = field(default_factory=set)
+    """The sentences themselves, which may be said twice."""
     day: date | None = None
     t_day_seen_ns: int = 0
     rmc_valid: bool | None = None
@@ -138,6 +140,7 @@ class Epoch:
             self.t_day_seen_ns = t_seen_ns
         self.cycle.append(formatter)
         self.addresses.add(sentence.address)
+        self.raws.add(sentence.raw)
 
     def position(self) -> tuple[float, float, int] | None:
         """Latitude, longitude (deg) and quality, where the epoch has them."""

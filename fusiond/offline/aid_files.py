@@ -37,6 +37,7 @@ from fusiond.configuration.aiding import (
 )
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
+from fusiond.files.log_bytes import log_bytes
 from fusiond.files.tables import (
     ImuTable,
     read_attitude,
@@ -265,19 +266,20 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
     to say it again.
     """
     from drivers.raw.decoder import RawDecoder  # noqa: PLC0415
-    from fusiond.offline.receiver_logs import content, read_rinex, rinex_text  # noqa: PLC0415
+    from fusiond.offline.receiver_logs import read_rinex, rinex_text  # noqa: PLC0415
 
-    data = content(path)
-    text = rinex_text(path, data)
+    log = log_bytes(path)
+    text = rinex_text(path, log.data)
     if text is not None:
-        return read_rinex(path, text, imu, source)
+        rows, refused = read_rinex(path, text, imu, source)
+        return rows, [*log.notes, *refused]
     decoder = RawDecoder(source, earliest=EARLIEST_DATE)
     of_week = bool(len(imu.t_s)) and float(imu.t_s[-1]) < SECONDS_OF_WEEK
     if not of_week and len(imu.t_s):
         decoder.note_utc(_ns(float(imu.t_s[0])))  # weeks of ten bits are those of the IMU's time
     epochs: list[Arrival] = []
     broadcast: list[RawEvent] = []
-    for event in [*decoder.feed(data, 0), *decoder.flush()]:
+    for event in [*decoder.feed(log.data, 0), *decoder.flush()]:
         if not isinstance(event, RawGnssEpoch):
             broadcast.append(event)
             continue
@@ -289,7 +291,7 @@ def _read_raw(path: Path, imu: ImuTable, source: str) -> _Read:
         raise TableError(f"{path}: no epoch of raw observations (UBX-RXM-RAWX, RTCM 3 MSM, RINEX)")
     refused = [r for r in counted(decoder.counters) if r.reason.endswith(_REFUSALS)]
     first_ns = min(epoch.t_arrival_ns for epoch in epochs)
-    return [*(Arrival(first_ns, event) for event in broadcast), *epochs], refused
+    return [*(Arrival(first_ns, event) for event in broadcast), *epochs], [*log.notes, *refused]
 
 
 READERS: dict[str, Callable[[Path, ImuTable, str], _Read]] = {

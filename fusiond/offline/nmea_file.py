@@ -36,6 +36,7 @@ from fusiond.configuration.aiding import CompassAiding
 from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import Rejection, TableError, counted
+from fusiond.files.log_bytes import log_bytes
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.week_rollover import rollover_of
 
@@ -95,7 +96,8 @@ def read_nmea(
     Raises `TableError` for a file without a single measurement, with the reason.
     """
     decoder = NmeaDecoder(by.source, by.decoding)
-    lines = path.read_bytes().splitlines(keepends=True)
+    log = log_bytes(path)
+    lines = log.data.splitlines(keepends=True)
     receiver: list[Any] = _fed(decoder, enumerate(lines))
     receiver += decoder.flush()
     refused = Counter(decoder.counters)
@@ -132,7 +134,7 @@ def read_nmea(
     in_order = sorted(found, key=lambda each: each[0])
     heard = [_heard(utc_ns + add_ns, m, of_week) for utc_ns, m in in_order]
     notes = [Rejection(0, *note, 0) for note in (*decoder.cautions.items(), *said)]
-    return heard, [*notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
+    return heard, [*log.notes, *notes, *(r for r in counted(refused) if _is_refusal(r.reason))]
 
 
 def _fed(decoder: NmeaDecoder | CompassDecoder, lines: Iterable[tuple[int, bytes]]) -> list[Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gzip
 import importlib
-import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,6 +30,7 @@ from fusiond.configuration.load import driver_entry_points
 from fusiond.configuration.schema import Config
 from fusiond.files.csv_tables import MissingPackageError, Rejection, TableError, counted
 from fusiond.files.extras import install
+from fusiond.files.log_bytes import log_bytes
 from fusiond.files.tables import ImuTable
 from fusiond.navigation.gps_time import utc_ns_to_gps_week_seconds
 from fusiond.offline.aid_files import SECONDS_OF_WEEK, Arrival
@@ -71,17 +70,6 @@ _COMPRESSED = (b"\x1f\x9d", b"PK", b"BZ")
 """Packings of RINEX files but gzip: compress, zip, bzip2."""
 
 
-def content(path: Path) -> bytes:
-    """A file's bytes, unpacked where it is a gzip file, whatever it is called. TableError."""
-    data = path.read_bytes()
-    if data[:2] != b"\x1f\x8b":
-        return data
-    try:
-        return gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise TableError(f"{path}: no gzip file that can be unpacked ({error})") from error
-
-
 def decoding_of(source: str, config: Config) -> SolutionDecoding:
     """The options of the configured receiver, as of the daemon's; a log may be of any date."""
     points = driver_entry_points()
@@ -100,7 +88,8 @@ def read_solutions(
     """Fixes and headings as a receiver's own protocol states them. The bytes hold UTC, so the IMU's
     `t_s` must be GPS second of week or POSIX seconds. TableError where there is no fix."""
     decoder = _DECODERS[kind](source, decoding)
-    found = [*decoder.feed(content(path), 0), *decoder.flush()]
+    log = log_bytes(path)
+    found = [*decoder.feed(log.data, 0), *decoder.flush()]
     of_week = is_of_week(imu)
     rows = []
     undated = 0
@@ -119,7 +108,7 @@ def read_solutions(
         why = REFUSALS.get(decoder.refusal)
         raise TableError(f"{path}: no fix: {why}" if why else f"{path}: no {_NAMES[kind]}")
     refused = {name: n for name, n in decoder.counters.items() if name not in _USED}
-    return rows, counted({**refused, "undated": undated})
+    return rows, [*log.notes, *counted({**refused, "undated": undated})]
 
 
 def is_of_week(imu: ImuTable) -> bool:

@@ -10,9 +10,7 @@ every quarter of `keepalive_s`, and has half of it to be confirmed.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import socket
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 
@@ -27,13 +25,13 @@ from fusiond.outputs.commands import MAX_PAYLOAD_BYTES, Handler
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.messages.events import MOST_KEPT, events_message
 from fusiond.outputs.messages.reply import ReplyMessage
+from fusiond.outputs.mqtt_endings import FAREWELL_S, abandon, end, hang_up, honour_cancellation
+from fusiond.outputs.mqtt_version import MqttVersion
 from fusiond.outputs.reconnecting import Reconnecting
 from fusiond.outputs.topics import EVENTS, REPLY, STATUS, Topic, base_topic
 
 _PATIENCE_S = 1.0
 """An unconfirmed message this old stops the QoS 0 flow: what is sent now would be lost unseen."""
-_FAREWELL_S = 2.0
-"""Longest a shutdown waits for the broker."""
 _INCOMING = 16
 """Commands that may wait; aiomqtt discards more."""
 _OVERDUE = "timed out"
@@ -103,6 +101,7 @@ class MqttPublisher:
         self.on_confirmed: Callable[[BaseModel], None] = lambda message: None
         """Hears each queued message that the broker has taken."""
         self._reconnecting = Reconnecting()
+        self._version = MqttVersion(MAX_PAYLOAD_BYTES + packet_limit.LONGEST_TOPIC)
         self._quiet = incoming.quiet()
         self.status = DriverStatus()
 
@@ -160,7 +159,9 @@ class MqttPublisher:
             client = self._client()
             try:
                 async with client:
-                    _honour_cancellation()
+                    honour_cancellation()
+                    self._version.connected()
+                    client.timeout = self._confirm_s
                     since_s = loop.time()
                     self.counters["mqtt_reconnects"] += connected_before
                     connected_before = True
@@ -172,14 +173,16 @@ class MqttPublisher:
                 self.status = DriverStatus("absent", reason)
                 self._look_for_a_rival(loop.time() - since_s, _OVERDUE not in reason)
             except aiomqtt.MqttError as error:
+                if self._version.failed(error):
+                    continue
                 self._reconnecting.failed()
                 why = broker_access.advice(error, self._options.host, self._options.port)
                 if self.status.state != "absent":
                     self._on_event("mqtt_absent", why)
                 self.status = DriverStatus("absent", why)
             finally:
-                _hang_up(client)
-            _honour_cancellation()
+                hang_up(client)
+            honour_cancellation()
             await asyncio.sleep(self._reconnecting.wait_s())
 
     def _look_for_a_rival(self, lasted_s: float, by_broker: bool) -> None:
@@ -195,7 +198,7 @@ class MqttPublisher:
 
     def _client(self) -> aiomqtt.Client:
         options = self._options
-        client = aiomqtt.Client(
+        client = self._version.client(
             options.host,
             options.port,
             username=options.username,
@@ -225,14 +228,14 @@ class MqttPublisher:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError:
-            await _end(tasks)
+            await end(tasks)
             try:
-                await asyncio.wait_for(self._say_farewell(client), _FAREWELL_S)
+                await asyncio.wait_for(self._say_farewell(client), FAREWELL_S)
             except (aiomqtt.MqttError, TimeoutError):
-                await _abandon(client)
+                await abandon(client)
             raise
-        errors = await _end(tasks)
-        await _abandon(client)
+        errors = await end(tasks)
+        await abandon(client)
         for error in errors:
             if not isinstance(error, aiomqtt.MqttError):
                 raise error
@@ -250,7 +253,7 @@ class MqttPublisher:
     ) -> None:
         await client.publish(address, payload, qos=qos, retain=retain)
         self.counters["mqtt_published"] += 1
-        _honour_cancellation()
+        honour_cancellation()
 
     async def _send_latest(self, client: aiomqtt.Client) -> None:
         while True:
@@ -323,11 +326,11 @@ class MqttPublisher:
         coming = incoming.Incoming(client, self.counters, self._quiet)
         while True:
             for address in addresses:
-                await client.subscribe(address, 1)
-                _honour_cancellation()
+                await self._version.subscribe(client, address)
+                honour_cancellation()
             quiet_s = await coming.flood()
             await client.unsubscribe(addresses)
-            _honour_cancellation()
+            honour_cancellation()
             most = f"{incoming.MESSAGES.per_s:.0f} a second"
             text = f"commands and the like, more than {most}: not listening for {quiet_s:.0f} s"
             self._on_event("mqtt_flooded", text)
@@ -365,43 +368,3 @@ class MqttPublisher:
 
 def _encoded(message: BaseModel) -> bytes:
     return message.model_dump_json().encode()
-
-
-async def _end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
-    """Cancel the tasks, wait for them; the errors they ended with."""
-    for task in tasks:
-        task.cancel()
-    results = await asyncio.gather(*tasks, return_exceptions=True)
-    return [r for r in results if isinstance(r, Exception)]
-
-
-def _honour_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` of Python 3.11, inside aiomqtt, swallows
-    when it comes together with the result (python/cpython issue 86296)."""
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError
-
-
-def _hang_up(client: aiomqtt.Client) -> None:
-    """Shut the socket without DISCONNECT: the broker then publishes the will.
-
-    aiomqtt offers only the graceful way, which a frozen broker never confirms; its reader sees
-    the end of file and closes the connection's remains. `_client` is paho's public client.
-    """
-    sock = client._client.socket()
-    if isinstance(sock, socket.socket):
-        with contextlib.suppress(OSError):
-            sock.shutdown(socket.SHUT_RDWR)
-
-
-async def _abandon(client: aiomqtt.Client) -> None:
-    """Hang up and wait until aiomqtt has noticed, so that leaving its context is immediate."""
-
-    async def ended() -> None:
-        async for _ in client.messages:
-            pass
-
-    _hang_up(client)
-    with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
-        await asyncio.wait_for(ended(), _FAREWELL_S)

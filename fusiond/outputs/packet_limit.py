@@ -1,7 +1,7 @@
 """Packets of a broker that are longer than anything of ours: read to their end, and not kept.
 
-MQTT lets a message have 256 MB. A client of MQTT 5 may tell its broker what it takes at most; ours
-is one of MQTT 3.1.1, for the brokers that speak no other. So the length is looked at here, before
+MQTT lets a message have 256 MB. A client of MQTT 5 tells its broker what it takes at most
+(`outputs.mqtt_version`); a broker of 3.1.1 is told nothing. So the length is looked at here, before
 anything is decoded: of a packet that is too long the first bytes are kept, enough for its topic and
 for whoever takes it to see that it is too long; the rest is read from the socket and forgotten. The
 connection goes on: to close it would meet the same retained message again, and again.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 from datetime import UTC, datetime
 from pathlib import Path
@@ -50,6 +51,17 @@ def read(tmp_path: Path, lines: list[bytes], toml: str = "") -> tuple[Recorded, 
 
 def of(arrivals: list[Arrival], kind: type) -> list[Any]:
     return [row.measurement for row in arrivals if isinstance(row.measurement, kind)]
+
+
+@pytest.mark.parametrize("packed", ["gz", "cut", "utf-16"])
+def test_a_file_that_is_packed(packed: str, tmp_path: Path) -> None:
+    plain = b"".join(gga(k) + rmc(k) for k in range(SECONDS))
+    data = plain.decode().encode("utf-16") if packed == "utf-16" else gzip.compress(plain)
+    found, arrivals = read(tmp_path, [data[:-60] if packed == "cut" else data])
+    fixes = len(of(arrivals, PositionFix))
+    assert fixes == SECONDS if packed != "cut" else 0 < fixes < SECONDS
+    notes = [str(each) for each in found.files["nmea"].rejected if each.reason == "file_cut"]
+    assert len(notes) == (packed == "cut")
 
 
 @pytest.mark.parametrize("told", ["GNTHS,30.00,A", "GNHDT,30.00,T"])

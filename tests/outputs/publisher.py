@@ -13,13 +13,14 @@ from fusiond.outputs.messages.nav import NavMessage
 from fusiond.outputs.mqtt import MqttPublisher
 from tests.broker import Broker, Listener
 from tests.outputs.messages_examples import EXAMPLES
+from tests.outputs.old_broker import OldBroker
 from tests.patience import PATIENCE_S
 
 UTC_NS = 1_795_217_587_123_456_789
 BASE = "fusiond/truck"
 
 
-def options(broker: Broker, **more: Any) -> Mqtt:
+def options(broker: Broker | OldBroker, **more: Any) -> Mqtt:
     return Mqtt(host="127.0.0.1", port=broker.port, **{"keepalive_s": 2, **more})
 
 

@@ -19,6 +19,7 @@ from fusiond.outputs.command_intake import BURST, REMEMBERED, CommandIntake
 from fusiond.outputs.commands import Command, CommandRefusedError, SetPosition
 from fusiond.outputs.topics import EVENT, NAV
 from tests.broker import Broker, Listener, listening
+from tests.outputs.old_broker import old_broker
 from tests.outputs.publisher import BASE, UTC_NS, event, heard, nav, options, running
 
 
@@ -239,11 +240,11 @@ def test_a_retained_command_is_refused_by_its_mark_whatever_it_says() -> None:
 
 
 async def test_a_retained_command_is_carried_out_once_over_reconnections(tmp_path: Path) -> None:
-    """The broker delivers it unmarked to who is there, and marked to who comes later."""
+    """A broker of 3.1.1 delivers it unmarked to who is there, and marked to who comes later."""
     taken: list[Command] = []
     with Broker(tmp_path) as broker:
-        enabled = options(broker, commands=("reset_filter",))
-        async with listening(broker) as (listener, client):
+        async with listening(broker) as (listener, client), old_broker(broker) as old:
+            enabled = options(old, commands=("reset_filter",))
             async with running(enabled, on_command=handler(taken)):
                 await listener.until(heard("online"))
                 await asyncio.sleep(0.2)  # to subscribe
@@ -275,8 +276,11 @@ async def test_a_message_of_megabytes_is_not_held_and_the_connection_goes_on(
     taken: list[Command] = []
     size = 20_000_000
     with Broker(tmp_path) as broker:
-        enabled = options(broker, commands=("reset_filter",), keepalive_s=60)
-        async with listening(broker, f"{BASE}/reply") as (listener, client):
+        async with (
+            listening(broker, f"{BASE}/reply") as (listener, client),
+            old_broker(broker) as old,
+        ):
+            enabled = options(old, commands=("reset_filter",), keepalive_s=60)
             async with running(enabled, on_command=handler(taken)) as it:
                 await it.until(lambda r: r.publisher.counters["mqtt_published"])
                 tracemalloc.start()

@@ -112,6 +112,20 @@ def test_repeated_sentences_of_one_epoch() -> None:
     assert one.counters["repeated_sentence"] == 1
 
 
+@pytest.mark.parametrize("burst", [(GGA, VTG, RMC), (RMC, GGA), (VTG, GGA, RMC), (RMC, VTG, GGA)])
+@pytest.mark.parametrize("doubled", ["each", "burst"])
+def test_a_line_that_says_everything_twice(burst: tuple[bytes, ...], doubled: str) -> None:
+    """Two ports of one receiver in one log: each epoch once, with all that it has."""
+    epochs = [
+        [*epoch, *epoch] if doubled == "burst" else [s for s in epoch for _ in range(2)]
+        for epoch in seconds(10, 8, *burst)
+    ]
+    one = decoder()
+    found = one.feed(b"".join(wire(*epoch) for epoch in epochs), 1) + one.flush()
+    assert [fix.v_ned_m_s is not None for fix in fixes(found)] == [True] * 8
+    assert one.counters["late_sentence"] <= len(burst), "until the cycle is learned"
+
+
 def test_repeated_and_backward_epochs() -> None:
     one = decoder(last_sentence="RMC")
     for time in ("021430.00", "021430.00", "021429.00", "021431.00", "021430.50", "021432.00"):

@@ -1,0 +1,60 @@
+"""The bytes of a receiver's log, whatever was done to its file on the way.
+
+Unpacked where it is a gzip file, whatever it is called, as far as that goes: the last block of one
+whose writer lost its power is cut. Text that a shell of Windows has redirected (`>` of PowerShell)
+is UTF-16, with a mark at its start (RFC 2781, 3.2).
+"""
+
+from __future__ import annotations
+
+import codecs
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+from fusiond.files.csv_tables import Rejection
+
+_GZIP = b"\x1f\x8b"
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_ANY_HEADER = 16 + zlib.MAX_WBITS
+"""Of `zlib.decompressobj`: gzip's."""
+
+
+class LogBytes(NamedTuple):
+    """`cut` says where the file ends before its end, "" where it does not."""
+
+    data: bytes
+    cut: str = ""
+
+    @property
+    def notes(self) -> list[Rejection]:
+        """The same, for who reads a report."""
+        return [Rejection(0, "file_cut", f"{self.cut}: read is what comes before", 0)] * bool(
+            self.cut
+        )
+
+
+def log_bytes(path: Path) -> LogBytes:
+    """What `path` holds. Raises `OSError`."""
+    data = path.read_bytes()
+    found = _unpacked(data) if data.startswith(_GZIP) else LogBytes(data)
+    if found.data.startswith(_UTF_16):
+        text = found.data.decode("utf-16", "replace")
+        return found._replace(data=text.encode("latin-1", "replace"))
+    return found
+
+
+def _unpacked(data: bytes) -> LogBytes:
+    """All members, one after another; zeros behind the last are padding."""
+    parts: list[bytes] = []
+    while data.startswith(_GZIP):
+        member = zlib.decompressobj(_ANY_HEADER)
+        try:
+            parts.append(member.decompress(data))
+        except zlib.error as error:
+            return LogBytes(b"".join(parts), f"the gzip file is damaged ({error})")
+        if not member.eof:
+            return LogBytes(b"".join(parts), "the gzip file ends before its end")
+        data = member.unused_data.lstrip(b"\0")
+    cut = "something follows the gzip file that is none" if data else ""
+    return LogBytes(b"".join(parts), cut)

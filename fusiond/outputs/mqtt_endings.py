@@ -1,0 +1,55 @@
+"""How a connection to a broker ends where aiomqtt has no answer: a cancellation that is swallowed,
+a broker that is frozen, an attempt that is given up."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+
+import aiomqtt
+
+FAREWELL_S = 2.0
+"""Longest a shutdown waits for the broker."""
+
+
+async def end(tasks: list[asyncio.Task[None]]) -> list[Exception]:
+    """Cancel the tasks, wait for them; the errors they ended with."""
+    for task in tasks:
+        task.cancel()
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    return [r for r in results if isinstance(r, Exception)]
+
+
+def honour_cancellation() -> None:
+    """Raise the cancellation that `asyncio.wait_for` of Python 3.11, inside aiomqtt, swallows
+    when it comes together with the result (python/cpython issue 86296)."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
+def hang_up(client: aiomqtt.Client) -> None:
+    """Shut the socket without DISCONNECT: the broker then publishes the will.
+
+    aiomqtt offers only the graceful way, which a frozen broker never confirms; its reader sees
+    the end of file and closes the connection's remains. `_client` is paho's public client.
+    """
+    if client._connected.cancelled():  # aiomqtt would ask the attempt how it ended
+        client._client.on_disconnect = None
+    sock = client._client.socket()
+    if isinstance(sock, socket.socket):
+        with contextlib.suppress(OSError):
+            sock.shutdown(socket.SHUT_RDWR)
+
+
+async def abandon(client: aiomqtt.Client) -> None:
+    """Hang up and wait until aiomqtt has noticed, so that leaving its context is immediate."""
+
+    async def ended() -> None:
+        async for _ in client.messages:
+            pass
+
+    hang_up(client)
+    with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+        await asyncio.wait_for(ended(), FAREWELL_S)

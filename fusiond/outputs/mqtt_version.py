@@ -1,0 +1,73 @@
+"""Which version of MQTT to speak with a broker: 5, or 3.1.1 where it does not know that.
+
+A client of version 5 says how long a packet it takes at most (Maximum Packet Size, MQTT 5,
+3.1.2.11.4): what is longer stays with the broker. It also hears of a command whether it was meant
+to be kept (Retain As Published, 3.8.3.1). A broker of 3.1.1 alone refuses the version (CONNACK 1;
+MQTT 3.1.1, 3.1.2-2), hangs up, or says nothing, since it reads the properties as something else:
+so no answer counts as a refusal, too. What a broker has answered to is kept for the process.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import aiomqtt
+from aiomqtt import ProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+ANSWER_S = 1.0
+"""For the answer to CONNECT of version 5, on a connection that stands: over a satellite a round
+trip takes 0.6 s. A broker that is slower gets all its time with 3.1.1."""
+_UNSUPPORTED = 132
+"""Of the reason codes: Unsupported Protocol Version, to which paho translates 3.1.1's 1 as well."""
+
+_UNANSWERED = "Operation timed out"
+"""aiomqtt's words, also for who hangs up before an answer."""
+
+
+class MqttVersion:
+    """Of one broker, for a client that takes packets of at most `most_bytes`."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.is_5 = True
+        self._most_bytes = most_bytes
+        self._other_tried = False
+
+    def client(self, host: str, port: int, *, timeout: float, **options: Any) -> aiomqtt.Client:
+        """A client of this version, yet to connect; `timeout` (s) is for answers once it has."""
+        if not self.is_5:
+            return aiomqtt.Client(host, port, timeout=timeout, **options)
+        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        properties.MaximumPacketSize = self._most_bytes
+        return aiomqtt.Client(
+            host,
+            port,
+            protocol=ProtocolVersion.V5,
+            properties=properties,
+            timeout=min(timeout, ANSWER_S),
+            **options,
+        )
+
+    def connected(self) -> None:
+        """The broker speaks it."""
+        self._other_tried = False
+
+    def failed(self, error: aiomqtt.MqttError) -> bool:
+        """Take the other version, where this one may be why; whether to try that at once."""
+        code = error.rc if isinstance(error, aiomqtt.MqttCodeError) else None
+        refused = getattr(code, "value", code) == _UNSUPPORTED
+        if not (refused or str(error) == _UNANSWERED):
+            return False
+        self.is_5 = not self.is_5
+        self._other_tried = not self._other_tried
+        return self._other_tried
+
+    async def subscribe(self, client: aiomqtt.Client, address: str) -> None:
+        """With QoS 1. Raises `MqttError`."""
+        if self.is_5:
+            options = SubscribeOptions(qos=1, retainAsPublished=True)
+            await client.subscribe(address, options=options)
+        else:
+            await client.subscribe(address, 1)
