@@ -61,15 +61,21 @@ def demo(
     dashboard: Annotated[
         bool, typer.Option("--dashboard", help="Also serve the page of `fusiond dashboard`.")
     ] = False,
+    paper: Annotated[
+        str | None, typer.Option(metavar="NUMBER", help="A paper's model and devices: 000 to 004.")
+    ] = None,
 ) -> None:
     """Run the real daemon on a simulated vehicle; the last line is a JSON summary."""
     from fusiond.demo.broker import DemoError  # noqa: PLC0415
 
     with compiling():
         from fusiond.demo.demo import demo as run_demo  # noqa: PLC0415
+        from fusiond.demo.papers import PAPERS  # noqa: PLC0415
 
+    if paper is not None and paper not in PAPERS:
+        raise typer.BadParameter(f"--paper {paper}: there are {', '.join(PAPERS)}")
     try:
-        summary = run_demo(duration, headless or not draws(sys.stdout), record, dashboard)
+        summary = run_demo(duration, headless or not draws(sys.stdout), record, dashboard, paper)
     except DemoError as error:
         typer.echo(f"fusiond: {error}", err=True)
         raise typer.Exit(EXIT_UNAVAILABLE) from error

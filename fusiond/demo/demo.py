@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain, cycle
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,26 +28,23 @@ from drivers.shipped import shipped
 from fusiond.configuration.load import load_config
 from fusiond.configuration.position_reports import PositionReports
 from fusiond.configuration.recording import Recording
-from fusiond.configuration.schema import Config, Source
 from fusiond.demo.broker import DemoBroker
 from fusiond.demo.page import DemoPage
+from fusiond.demo.papers import paper_play, town
+from fusiond.demo.play import Play, Pulled
 from fusiond.demo.story import story
 from fusiond.demo.view import HeadlessView, Live, LiveView
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.simulation.can.imu import SIM_IMU
 from fusiond.simulation.rdss.network import ConvoyVehicle
-from fusiond.simulation.scenarios import SCENARIOS, Scenario
-from fusiond.simulation.trajectories import Leg, follow
-from fusiond.simulation.trajectories import Path as Motion
+from fusiond.simulation.scenarios import SCENARIOS
 from fusiond.simulation.vehicle import SimulatedVehicle
 
 Array = NDArray[np.float64]
 
 CONFIG = shipped("vehicle.toml")
 VEHICLE = "demo"
-REST_S = 8.0
 OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S = 18.0, 12.0, 60.0
 SERVICE_FREQUENCY_S = 5
 """Of the simulated RDSS card: several fixes in an outage (a civil card has 60 s)."""
@@ -56,25 +52,18 @@ REPORTS_S = 30.0
 """Position reports to the other vehicle of the convoy: one of the card's turns in six."""
 _SCORE_NS = 100_000_000
 """Spacing of the solutions that the summary compares with the truth."""
-_TOWN = (
-    Leg(9, speed_m_s=14.0),
-    Leg(3),
-    Leg(6, turn_deg=60.0),
-    Leg(6, speed_m_s=9.0),
-    Leg(6, turn_deg=-90.0),
-    Leg(8, speed_m_s=18.0),
-    Leg(8, turn_deg=30.0, climb_deg=2.0),
-    Leg(6, climb_deg=0.0),
-    Leg(8, speed_m_s=0.0),
-    Leg(5),
-)
 
 
 def demo(
-    duration_s: float, headless: bool, record: Path | None = None, dashboard: bool = False
+    duration_s: float,
+    headless: bool,
+    record: Path | None = None,
+    dashboard: bool = False,
+    paper: str | None = None,
 ) -> dict[str, Any]:
     """Run for `duration_s`, or until Ctrl-C; the summary. Recorded into the folder `record`; with
-    `dashboard` there is a page to open, whose address the view says.
+    `dashboard` there is a page to open, whose address the view says. `paper`: of
+    `fusiond.demo.papers`, whose number, filter and model the summary then begins with.
 
     `horizontal_rms_m` and `yaw_rms_deg` compare each tenth of a second of navigation with the
     truth; `nees` is the mean horizontal normalised estimation error squared, e^T P^-1 e with the
@@ -89,39 +78,26 @@ def demo(
         DemoPage(broker.port) if dashboard else contextlib.nullcontext() as page,
         _log_kept_out(headless),
     ):
+        play = demo_play() if paper is None else paper_play(paper)
         live = Live(duration_s, broker.port, VEHICLE, page.address if page else None)
+        live.aligning = play.aligning
         view = HeadlessView(sys.stderr) if headless else LiveView()
         if headless:
             seen = f", page {page.address}" if page else ""
             print(f"broker 127.0.0.1:{broker.port}, vehicle {VEHICLE}{seen}", file=sys.stderr)
-        return asyncio.run(_Run(live, view, Path(folder), record).run())
+        return asyncio.run(_Run(play, live, view, Path(folder), record).run())
 
 
-def drive(duration_s: float) -> Motion:
-    """A short rest, then town streets over and over."""
-    return follow(chain([Leg(REST_S)], cycle(_TOWN)), duration_s, course_deg=40.0, bank_ratio=-0.08)
-
-
-def demo_config(port: int, gnss_link: Path, rdss_link: Path) -> Config:
-    """The shipped car, its devices and broker replaced by the demo's."""
-    config = load_config(CONFIG)
-    sources = {
-        "imu": Source(driver="can_imu", **SIM_IMU.model_dump()),
-        "gnss": Source.model_validate({"driver": "nmea", "port": str(gnss_link)}),
-        "rdss": Source.model_validate({"driver": "rdss", "port": str(rdss_link)}),
-    }
-    mqtt = config.mqtt.model_copy(update={"host": "127.0.0.1", "port": port})
+def demo_play() -> Play:
+    """The shipped car in town streets, its receiver unplugged for a while of every minute."""
     reports = PositionReports(card=ConvoyVehicle.CARD, interval_s=REPORTS_S)
-    return config.model_copy(
-        update={"vehicle": VEHICLE, "sources": sources, "mqtt": mqtt, "position_reports": reports}
+    config = load_config(CONFIG).model_copy(
+        update={"vehicle": VEHICLE, "position_reports": reports}
     )
-
-
-def demo_scenario(config: Config) -> Scenario:
-    """The demo's drive with the sensors of `config`."""
-    scenario = replace(SCENARIOS["drive"].fitted(config), path=drive)
+    scenario = replace(SCENARIOS["drive"].fitted(config), path=town)
     rdss = replace(scenario.rdss, service_frequency_s=SERVICE_FREQUENCY_S, convoy=True)
-    return replace(scenario, rdss=rdss)
+    pulled = Pulled("gnss", OUTAGE_START_S, OUTAGE_S, OUTAGE_EVERY_S)
+    return Play(config, replace(scenario, rdss=rdss), ("imu", "gnss", "rdss"), pulled)
 
 
 class View(Protocol):
@@ -132,20 +108,17 @@ class View(Protocol):
 
 
 class _Run:
-    def __init__(self, live: Live, view: View, folder: Path, record: Path | None) -> None:
+    def __init__(
+        self, play: Play, live: Live, view: View, folder: Path, record: Path | None
+    ) -> None:
+        self._play = play
         self._duration_s = duration_s = live.duration_s
         self._port = live.port
-        links = folder / "gnss", folder / "rdss"
-        config = demo_config(live.port, *links)
+        config = play.served(live.port, folder)
         if record is not None:
             recording = Recording(directory=record.absolute())
             config = config.model_copy(update={"recording": recording})
-        self._vehicle = SimulatedVehicle(
-            demo_scenario(config),
-            duration_s=duration_s + 10.0,
-            gnss_link=links[0],
-            rdss_link=links[1],
-        )
+        self._vehicle = play.vehicle(duration_s + 10.0, folder)
         self._score = Score()
         self._without_gnss: list[tuple[float, float]] = []
         self._daemon = Daemon(config, on_solution=self._on_solution)
@@ -187,7 +160,7 @@ class _Run:
         return self._summary(duration_s)
 
     def _on_solution(self, solution: Solution) -> None:
-        self._score.take(solution, self._daemon.navigator.estimator.covariance)
+        self._score.take(solution, self._daemon.navigator.serving.covariance)
 
     async def _subscribe(self) -> None:
         """Listen as a dashboard does."""
@@ -212,8 +185,9 @@ class _Run:
             np.array([nav["t_ms"] * 1e-3 - self._vehicle.utc_start_ns * 1e-9])
         )
         position = np.radians([[nav["lat_deg"], nav["lon_deg"], 0.0]])
-        position[:, 2] = nav["height_m"]
-        rpy = np.radians([nav["roll_deg"], nav["pitch_deg"], nav["yaw_deg"]]) - truth.rpy[0]
+        position[:, 2] = math.nan if nav["height_m"] is None else nav["height_m"]
+        told = [nav["roll_deg"], nav["pitch_deg"], nav["yaw_deg"]]
+        rpy = np.radians([math.nan if x is None else x for x in told]) - truth.rpy[0]
         velocity = np.array([nav["v_n_m_s"], nav["v_e_m_s"], nav["v_d_m_s"]]) - truth.v_ned[0]
         self._live.errors = [
             *ned_error(position, truth.position)[0],
@@ -222,19 +196,21 @@ class _Run:
         ]
 
     async def _outages(self) -> None:
-        """Pull the receiver's plug, and put it back."""
+        """Pull a device's plug, and put it back."""
         loop = asyncio.get_running_loop()
         started = loop.time()
-        for number in range(math.ceil(self._duration_s / OUTAGE_EVERY_S)):
-            start = started + number * OUTAGE_EVERY_S + OUTAGE_START_S
-            await asyncio.sleep(start - loop.time())
-            self._vehicle.unplug("gnss")
+        pulled = self._play.pulled
+        for start_s, end_s in pulled.times(self._duration_s) if pulled else ():
+            assert pulled is not None
+            await asyncio.sleep(started + start_s - loop.time())
+            self._vehicle.unplug(pulled.device)
             pulled_s = time.monotonic()
-            self._live.outage_until = time.monotonic() + OUTAGE_S
-            await asyncio.sleep(start + OUTAGE_S - loop.time())
-            self._vehicle.plug("gnss")
-            self._live.outage_until = None
-            self._without_gnss.append((pulled_s, time.monotonic()))
+            self._live.outage = pulled.device, pulled_s + end_s - start_s
+            await asyncio.sleep(started + end_s - loop.time())
+            self._vehicle.plug(pulled.device)
+            self._live.outage = None
+            if pulled.device == "gnss":
+                self._without_gnss.append((pulled_s, time.monotonic()))
         await asyncio.Event().wait()
 
     def _summary(self, duration_s: float) -> dict[str, Any]:
@@ -243,6 +219,7 @@ class _Run:
         scheduler = daemon.scheduler.status()
         health = daemon.sources.health(daemon.clock.now_ns())
         return {
+            **self._play.paper,
             "duration_s": round(duration_s, 3),
             "ticks": scheduler.ticks,
             "overruns": scheduler.overruns,
@@ -298,12 +275,15 @@ class Score:
         t_s = np.array([r[0] - vehicle.start_ns for r in self._rows]) * 1e-9
         truth = vehicle.truth.at(t_s)
         north, east = ned_error(rows[:, :3], truth.position)[:, :2].T
-        yaw = wrapped(rows[:, 3] - truth.rpy[:, 2])
+        known = ~np.isnan(rows[:, 3])
+        yaw = wrapped(rows[known, 3] - truth.rpy[known, 2])
         a, b, c = rows[:, 4:].T
         nees = (c * north**2 - 2.0 * b * north * east + a * east**2) / (a * c - b * b)
         return {
             "horizontal_rms_m": round(float(np.sqrt(np.mean(north**2 + east**2))), 4),
-            "yaw_rms_deg": round(float(np.degrees(np.sqrt(np.mean(yaw**2)))), 4),
+            "yaw_rms_deg": round(float(np.degrees(np.sqrt(np.mean(yaw**2)))), 4)
+            if len(yaw)
+            else None,
             "nees": round(float(np.mean(nees)), 4),
         }
 

@@ -68,7 +68,10 @@ class Live:
         self.events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
         self.errors: list[float] = []
         """True errors: m north, east, down; m/s; degrees roll, pitch, yaw."""
-        self.outage_until: float | None = None
+        self.outage: tuple[str, float] | None = None
+        """The device whose plug is pulled, and until when (monotonic, s)."""
+        self.aligning = ""
+        """What is shown while there is no solution yet."""
         self.received = 0
         self._arrivals: deque[float] = deque(maxlen=4096)
 
@@ -103,13 +106,14 @@ class Live:
     @property
     def scene(self) -> str:
         """Name of the scene on the road."""
-        if self.outage_until is not None:
-            left = max(0.0, self.outage_until - time.monotonic())
-            return f"GNSS unplugged for {left:.0f} s more: RDSS and INS carry on"
+        if self.outage is not None:
+            device, until = self.outage
+            left = max(0.0, until - time.monotonic())
+            return f"{device} unplugged for {left:.0f} s more: the others carry on"
         speed = abs(self.nav.get("v_n_m_s") or 0.0) + abs(self.nav.get("v_e_m_s") or 0.0)
         if self.mode in ("waiting", "aligning"):
-            return "the car stands, then drives off: heading comes of the first motion"
-        return "GNSS and RDSS" if speed > 0.5 else "GNSS and RDSS, standing"
+            return self.aligning
+        return "all devices" if speed > 0.5 else "all devices, standing"
 
 
 class HeadlessView:
@@ -202,7 +206,7 @@ class Screen:
         text = Text(no_wrap=True, overflow="ellipsis")
         text.append("fusiond demo", style="bold")
         text.append(f"  {min(live.elapsed_s, live.duration_s):5.1f} / {live.duration_s:g} s  ")
-        text.append(live.scene, style="yellow" if live.outage_until is not None else "dim")
+        text.append(live.scene, style="yellow" if live.outage is not None else "dim")
         return text
 
     def _mode(self) -> Text:

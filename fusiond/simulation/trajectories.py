@@ -274,10 +274,10 @@ def drive(duration_s: float, rest_s: float = 60.0) -> Path:
     )
 
 
-def flight(duration_s: float) -> Path:
+def flight(duration_s: float, rest_s: float = 150.0) -> Path:
     """An aircraft: 150 s at rest, take-off, climb to about 10 km, cruise at 300 m/s with turns."""
     climb_out = (
-        Leg(150),  # time to gyrocompass
+        Leg(rest_s),  # time to gyrocompass
         Leg(40, speed_m_s=80.0),
         Leg(15, climb_deg=10.0),
         Leg(60, speed_m_s=160.0),
@@ -295,7 +295,9 @@ def flight(duration_s: float) -> Path:
     )
 
 
-def level_flight(duration_s: float) -> Path:
+def level_flight(duration_s: float, rest_s: float = 30.0) -> Path:
     """A micro air vehicle, as paper 001 begins: level, due east; at rest for half a minute, then at
     12 m/s."""
-    return follow([Leg(30), Leg(10, speed_m_s=12.0), Leg(duration_s)], duration_s, course_deg=90.0)
+    return follow(
+        [Leg(rest_s), Leg(10, speed_m_s=12.0), Leg(duration_s)], duration_s, course_deg=90.0
+    )

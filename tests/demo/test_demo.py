@@ -21,18 +21,16 @@ from rich.console import Console
 from fusiond.demo import broker as demo_broker
 from fusiond.demo.demo import (
     OUTAGE_START_S,
-    REST_S,
     Score,
-    demo_config,
-    demo_scenario,
+    demo_play,
     ned_error,
     wrapped,
 )
+from fusiond.demo.papers import REST_S
 from fusiond.demo.story import story
 from fusiond.demo.view import _MADE_INSIDE, Live, Screen, line
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.replay.run import Wish, replay
-from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.patience import PATIENCE_S
 
 KEYS = [
@@ -128,8 +126,7 @@ def test_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_car_rests_moves_and_has_the_configured_sensors(tmp_path: Path) -> None:
-    config = demo_config(1883, tmp_path / "gnss", tmp_path / "rdss")
-    scenario = demo_scenario(config)
+    config, scenario = demo_play().served(1883, tmp_path), demo_play().scenario
     assert scenario.imu == config.imu
     truth = scenario.truth(30.0)
     speed = np.linalg.norm(truth.at(np.array([REST_S - 0.5, OUTAGE_START_S])).v_ned, axis=1)
@@ -139,8 +136,7 @@ def test_car_rests_moves_and_has_the_configured_sensors(tmp_path: Path) -> None:
 
 def test_score_against_the_truth(tmp_path: Path) -> None:
     """Solutions 3 m north and 4 m east of the truth; P with a correlation of 0.5."""
-    config = demo_config(1883, tmp_path / "gnss", tmp_path / "rdss")
-    vehicle = SimulatedVehicle(demo_scenario(config), duration_s=20.0)
+    vehicle = demo_play().vehicle(20.0, tmp_path)
     covariance = np.zeros((21, 21))
     covariance[6:8, 6:8] = [[4.0, 3.0], [3.0, 9.0]]
     score = Score()

@@ -13,7 +13,7 @@ from drivers.measurements import ArrivalStamp, ImuSample
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.schema import Config, Imu, SpareImu
 from fusiond.configuration.settings import DEG, sensor_to_body
-from fusiond.demo.demo import demo_config
+from fusiond.demo.demo import demo_play
 from fusiond.navigation.solution import Mode
 from fusiond.navigator.imu_choice import ImuChoice
 from fusiond.replay.run import Wish, replay
@@ -34,7 +34,7 @@ FORCE_BIAS_M_S2 = np.array([0.05, 0.03, -0.04])
 
 def two_units(folder: Path) -> Config:
     """The demo's vehicle with a second unit on a bus of its own, turned by a quarter."""
-    config = demo_config(1, folder / "gnss", folder / "rdss")
+    config = demo_play().served(1, folder)
     first = config.sources["imu"]
     second = first.model_copy(update={"channel": "other"})
     return config.model_copy(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.configuration.schema import Config
-from fusiond.demo.demo import demo_config, demo_scenario
+from fusiond.demo.demo import demo_play
 from fusiond.simulation.vehicle import SimulatedVehicle
 from tests.clock.host_time import MS, Host
 from tests.recording.rig import Rig
@@ -22,8 +22,10 @@ class Drive(Rig):
     def __init__(
         self, folder: Path, duration_s: float, config: Config | None = None, **options: Any
     ) -> None:
-        config = config or demo_config(1, folder / "gnss", folder / "rdss")
-        self.vehicle = SimulatedVehicle(demo_scenario(config), seed=3, duration_s=duration_s)
+        play = demo_play()
+        config = config or play.served(1, folder)
+        scenario = play.scenario.fitted(config)
+        self.vehicle = SimulatedVehicle(scenario, seed=3, duration_s=duration_s)
         host = Host()
         self._start_ns = self.vehicle.start_ns = host.mono + 500 * MS
         utc_ns = host.utc(self._start_ns)
