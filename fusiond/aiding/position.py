@@ -7,11 +7,12 @@ r"""Position of an antenna: a GNSS fix, with or without height.
 
 l is the lever arm from the IMU to the antenna, b an error that successive fixes share (orbits,
 ionosphere), s what part of it there is in this one, c one that lasts for seconds, of w metres, down
-as many more as the fix's own sigma is larger there (fusiond.aiding.wander), tau how much later than
-its stamp the fix is valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the acceleration,
-smoothed (fusiond.aiding.felt); where the model has states for them they are estimated, true minus
-estimated in dl, db, dtau. A timing error of sigma s_t that is not shared moves the antenna by
-v s_t, which adds (v_i s_t)^2 to the variance of each axis.
+as many more as the fix's own sigma is larger there (fusiond.aiding.fix_errors), tau how much later
+than its stamp the fix is valid, v_a the antenna's velocity (fusiond.aiding.antenna), a the
+acceleration, smoothed (fusiond.aiding.felt); where the model has states for them they are
+estimated, true minus estimated in dl, db, dtau. A timing error of sigma s_t that is not shared
+moves the antenna by v s_t, which adds (v_i s_t)^2 to the variance of each axis. An error that lasts
+for seconds and has no state is noise.
 
 An offset in time multiplies v_a. What a linear filter leaves out of the product of the two errors,
 and of dtau's square, is noise to it, where P is the filter's own:
@@ -161,6 +162,9 @@ def position_rows(
             w = wander_m if i < 2 else 2.0 * wander_m * sd2 / (sd0 + sd1)
             z[i] += w * xi[wander[i]]
             h[i, wander[i]] = -w
+        elif wander_m > 0.0:  # the model has no state for it
+            w = wander_m if i < 2 else 2.0 * wander_m * sd2 / (sd0 + sd1)
+            r[i] += w * w
     for slot in time:
         late_s = xi[slot]
         v, of_v, columns = np.empty(m), np.zeros((m, n)), np.empty(n, dtype=np.int64)

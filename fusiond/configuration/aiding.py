@@ -81,10 +81,11 @@ class GnssAiding(Aiding):
     it is as measured. Without it 1 m for the only receiver, if its `lever_arm_m` is not given, else
     0."""
     bias_sd_m: NonNegativeFloat = 1.0
-    """Error that fixes without carrier phase share for minutes (orbits, ionosphere), one sigma
-    north and east: data sheets state 1.5 to 2 m for half of all fixes, noise included. Fixes by
-    carrier phase share half of the variance that they state. 0: none is estimated, nor one that
-    lasts for seconds, and sigma shrinks as if errors were white."""
+    """Error that fixes share for minutes (orbits, ionosphere), one sigma north and east, beside
+    what they state; fixes by carrier phase have half of what they state. Unless it is given, what
+    the receiver shows by its velocities counts; 1 m is of one without any: data sheets state 1.5 to
+    2 m for half of all fixes, noise included. 0: none is estimated, nor one that lasts for seconds,
+    and sigma shrinks as if errors were white."""
     bias_down_sd_m: PositiveFloat = 3.0
     """The same downwards, where most of the ionosphere goes."""
     bias_correlation_s: PositiveFloat = 1800.0

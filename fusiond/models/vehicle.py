@@ -75,7 +75,7 @@ def clock_skew(name: str) -> Block:
 
 def fix_wander(name: str, lasts_s: float) -> Block:
     """An error that fixes share for a while, of sigma one: an aid says how many metres it counts
-    (fusiond.aiding.wander)."""
+    (fusiond.aiding.fix_errors)."""
     return Block(name, "1", ("n", "e", "d"), (-1,) * 3, initial=1.0, steady=1.0, tau_s=lasts_s)
 
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 from drivers.measurements import PositionFix, Vector3
 from drivers.plausible import SIGMA_M
 from fusiond.aiding.base import Aid
+from fusiond.aiding.fix_errors import LASTS_S, Fix, FixErrors, Shares
 from fusiond.aiding.position import PositionAid
 from fusiond.aiding.velocity import SUFFIX, VelocityAid
-from fusiond.aiding.wander import LASTS_S, Fix, Wander
 from fusiond.configuration.aiding import GnssAiding, RawAiding, lever_sd_m
 from fusiond.models.blocks import Block, position_bias
 from fusiond.models.vehicle import (
@@ -74,6 +74,8 @@ class _Receiver(NamedTuple):
     wander: str
     holds: bool
     """True if the model has states for what its fixes share: its section is configured."""
+    told: bool
+    """True if the section says what fixes share, beside what they state."""
 
 
 def _receiver(source: str, sections: Sections) -> _Receiver:
@@ -83,7 +85,8 @@ def _receiver(source: str, sections: Sections) -> _Receiver:
     time, velocity_time, lever = names
     bias, wander = _fix_bias(source, o, sections), _wander(source, o, sections)
     holds = bool(bias) and any(section is o for section in sections.aiding.values())
-    return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds)
+    told = "bias_sd_m" in o.model_fields_set
+    return _Receiver(o, raw, source + SUFFIX, time, velocity_time, lever, bias, wander, holds, told)
 
 
 def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
@@ -113,16 +116,21 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         math.hypot(max(d * scale, least_d), rounding[2]),
     )
     sd_time_s = math.hypot(when.sd_time_s, o.time_sd_s)
+    motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
     by_phase = _by_phase(m, sections)
     share = _phase_share(sd, o) if by_phase else (1.0, 1.0, 1.0)
+    wander, wander_m = "" if by_phase else receiver.wander, 0.0
+    shares = _shares(m, when, motion, by_phase, o, sections, sd) if receiver.wander else None
+    if shares is not None:
+        wander_m = math.sqrt(shares.wanders) * _level(sd)
+        if receiver.holds and not receiver.told:
+            share = _lasting(sd, shares, o)
     height = m.height_m
     if receiver.holds:
         if m.geoid_sd_m:
             share = _with_geoid(share, m.geoid_sd_m, o)
     elif m.geoid_sd_m > sd[2]:
         height = None  # nothing holds what fixes share: sigma would shrink with their number
-    motion = None if m.v_ned_m_s is None else _velocity(m, m.v_ned_m_s, o)
-    wander = "" if by_phase else receiver.wander
     position = PositionAid(
         source,
         when.t_ns,
@@ -138,7 +146,7 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
         receiver.lever,
         share,
         wander,
-        _wandering(m, when, motion, o, sections, sd) if wander else 0.0,
+        wander_m if wander else 0.0,
     )
     if motion is None or not o.use_velocity:
         return [position]
@@ -221,24 +229,41 @@ def _wander(source: str, section: GnssAiding, sections: Sections) -> str:
     return sections.own(FIX_WANDER, source, section) if section.bias_sd_m else ""
 
 
-def _wandering(
+def _level(sd: Vector3) -> float:
+    """One sigma (m) of a horizontal axis."""
+    return math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2))
+
+
+def _shares(
     m: PositionFix,
     when: Instants,
     motion: Motion | None,
+    by_phase: bool,
     o: GnssAiding,
     sections: Sections,
     sd: Vector3,
-) -> float:
-    """Size (m) of that error, as this receiver's fixes and velocities have shown."""
-    known = sections.wander.get(m.source)
+) -> Shares | None:
+    """How a fix's variance is divided, as this receiver's fixes and velocities have shown, those by
+    code and those by phase each; None of one that states no velocity with it."""
+    known = sections.fix_errors.get((m.source, by_phase))
     if known is None:
         offset_sd_s = math.sqrt(2.0) * o.time_offset_sd_s  # that of two instants
-        known = sections.wander[m.source] = Wander(offset_sd_s)
-    if motion is not None:
-        (north, east, *_), sds = motion
-        sd_v = math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
-        known.take(Fix(when.t_ns, m.lat_rad, m.lon_rad, (north, east), sd_v))
-    return known.sd_m(math.sqrt(0.5 * (sd[0] ** 2 + sd[1] ** 2)))
+        known = sections.fix_errors[m.source, by_phase] = FixErrors(offset_sd_s, not by_phase)
+    if motion is None:
+        return None
+    (north, east, *_), sds = motion
+    variance, sd_v = _level(sd) ** 2, math.sqrt(0.5 * (sds[0] ** 2 + sds[1] ** 2))
+    known.take(Fix(when.t_ns, m.lat_rad, m.lon_rad, variance, (north, east), sd_v))
+    return known.shares(when.t_ns)
+
+
+def _lasting(sd: Vector3, shares: Shares, o: GnssAiding) -> Vector3:
+    """How much of the error that fixes share there is in one of that sigma; what is seen of the
+    horizontal is taken to be so of the height. Its own error counts as stated all the same: how a
+    receiver that smooths its fixes follows a turn is in no share."""
+    north, east, down = sd
+    level, vertical = (math.sqrt(shares.lasts) / s for s in (o.bias_sd_m, o.bias_down_sd_m))
+    return level * north, level * east, vertical * down
 
 
 def blocks(source: str, section: GnssAiding, sections: Sections) -> list[Block]:

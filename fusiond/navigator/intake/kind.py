@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from drivers.immutable import immutable
 from fusiond.aiding.base import Aid
-from fusiond.aiding.wander import Wander
+from fusiond.aiding.fix_errors import FixErrors
 from fusiond.configuration.aiding import Aiding, AnyAiding, RawAiding
 from fusiond.models.blocks import Block
 
@@ -47,8 +47,8 @@ class Sections:
         """Latitude and longitude (rad) of the last fix."""
         self.by_code: set[tuple[str, int]] = set()
         """Receivers and the qualities under which they have stated a sigma of code."""
-        self.wander: dict[str, Wander] = {}
-        """Of each receiver whose fixes share an error."""
+        self.fix_errors: dict[tuple[str, bool], FixErrors] = {}
+        """Of each receiver whose fixes share an error, by code or by phase."""
         self.utc_ns: int | None = None
         """The last instant that a fix's stamp said with its date (POSIX)."""
         self.any_robust = any(section.robust for section in aiding.values())
