@@ -17,7 +17,7 @@ from drivers.can.imu import CanImuOptions
 from fusiond.commands.app import app
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.load import load_config
-from fusiond.doctor.finding import on_bus, on_port, round_rate
+from fusiond.doctor.discovery import on_bus, on_port, round_rate
 from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS
