@@ -3,8 +3,8 @@ r"""Heading from positions alone: a vehicle that drives, and fixes without veloc
 A bank of headings (fusiond.navigator.alignment.heading_bank) starts where the vehicle is last known
 to have stood, level, at rest and with the gyro's bias seen; or, of a vehicle that has been driving
 all the time, at its first fix, with a road's slope and a road's speed. All that is measured from
-then on is weighed at its own instant: the bank runs `LATE_NS` behind the samples, so that what comes
-late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
+then on is weighed at its own instant: the bank runs `LATE_NS` behind the samples, so that what
+comes late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
 heading:
 
     sd_yaw ~ sqrt(2) sd_fix / way,   6 deg after 280 m with fixes of 20 m
