@@ -34,11 +34,9 @@ import argparse
 import asyncio
 import contextlib
 import json
-import multiprocessing
 import os
 import random
 import re
-import subprocess
 import sys
 import tempfile
 import time
@@ -52,30 +50,30 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.attackers import ATTACKS, Ports
-from benchmarks.daemon_load import CONFIG, RECORDING, resident_mb, simulate
+from benchmarks.daemon_bench import (
+    SETTLE_S,
+    DaemonBench,
+    compile_kernels,
+    daemon_bench,
+    descriptors,
+    resident_mb,
+)
 from benchmarks.probes import gap_ms, probing
 from fusiond.recording.reader import Log
-from tests.broker import Broker, free_port, listening
+from tests.broker import listening
 from tests.hil.heard import Heard
-from tests.hil.processes import SIM_IMU, DaemonProcess
-from tests.live.rig import bus_here, network_of_its_own
+from tests.hil.processes import DaemonProcess
+from tests.live.rig import network_of_its_own
 
-SETTLE_S = 5.0
 NAV = "fusiond/load/nav"
-OUTPUTS = """
-[outputs.gpsd]
-port = {gpsd}
-rate_hz = 10.0
-[outputs.nmea]
-port = {nmea}
-rate_hz = 10.0
-[outputs.prometheus]
-port = {prometheus}
-[outputs.foxglove]
-port = {foxglove}
+MORE = """
 [outputs.home_assistant]
 [outputs.owntracks]
 """
+BETWEEN_S = 15.0
+"""Of a row, beside its attack and its rest: probes that start, and two rounds of `health`."""
+KILL_S = 30.0
+"""A start of the daemon, some seconds under way, and its recording read."""
 COLUMNS = (
     ("attack", "attack", 18), ("ticks", "ticks", 6), ("overruns", "overruns", 9),
     ("nav_ms", "nav_ms", 8), ("sent_ms", "sent_ms", 8), ("tick_ms", "tick_ms", 8),
@@ -127,14 +125,10 @@ async def _scrape(port: int, watch: Watch) -> None:
         await asyncio.sleep(1.0)
 
 
-def _descriptors(pid: int) -> int:
-    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
-
-
 async def _sample(pid: int, watch: Watch) -> None:
     while True:
         watch.memory_mb.append(resident_mb(pid))
-        watch.descriptors.append(_descriptors(pid))
+        watch.descriptors.append(descriptors(pid))
         await asyncio.sleep(0.1)
 
 
@@ -184,12 +178,12 @@ async def _attack(name: str, seconds: float, ports: Ports) -> dict[str, Any]:
 
 
 async def _row(
-    name: str, daemon: DaemonProcess, heard: Heard, broker: int, ports: Ports, args: Any
+    name: str, daemon: DaemonProcess, heard: Heard, ports: Ports, args: Any
 ) -> dict[str, Any]:
-    async with probing(broker, NAV) as probed, _watching(daemon.pid, ports) as watch:
+    async with probing(ports.mqtt, NAV) as probed, _watching(daemon.pid, ports) as watch:
         before = await heard.until("health")
         log_at = len(daemon.log)
-        memory_mb, descriptors = watch.memory_mb[-1], watch.descriptors[-1]
+        memory_mb, before_fds = watch.memory_mb[-1], watch.descriptors[-1]
         came = await _attack(name, args.seconds, ports)
         after = await heard.until("health")
         log = daemon.log[log_at:]
@@ -207,7 +201,7 @@ async def _row(
         "before_mb": round(memory_mb, 1),
         "most_mb": round(max(watch.memory_mb), 1),
         "after_mb": round(resident_mb(daemon.pid), 1),
-        "fds": f"{descriptors}/{max(watch.descriptors)}/{_descriptors(daemon.pid)}",
+        "fds": f"{before_fds}/{max(watch.descriptors)}/{descriptors(daemon.pid)}",
         "log_lines_a_minute": round(most * 60.0 / max(60.0, args.seconds)),
         "log_causes": causes,
         "cpu_percent": after["cpu_percent"],
@@ -222,15 +216,17 @@ async def _row(
 async def measure(folder: Path, args: Any) -> list[dict[str, Any]]:
     """Run the attacks; their rows, told as they come."""
     rows: list[dict[str, Any]] = []
-    async with _bench(folder) as (config, broker, ports), DaemonProcess(config) as daemon:
+    names = args.only or ("peace", *ATTACKS)
+    lasts_s = 120.0 + len(names) * (args.seconds + args.rest + BETWEEN_S)
+    async with _bench(folder, lasts_s) as (bench, ports), DaemonProcess(bench.config) as daemon:
         await daemon.start()
         await daemon.ready()
-        async with listening(broker, "fusiond/load/+") as (listener, _):
+        async with listening(bench.broker, "fusiond/load/+") as (listener, _):
             heard = Heard(listener, "load")
             await heard.until("nav", lambda m: m["mode"] == "navigating")
             await asyncio.sleep(SETTLE_S)
-            for name in args.only or ("peace", *ATTACKS):
-                row = await _row(name, daemon, heard, broker.port, ports, args)
+            for name in names:
+                row = await _row(name, daemon, heard, ports, args)
                 if not rows:
                     print("".join(title.rjust(width) for title, _, width in COLUMNS))
                 print("".join(str(row[key]).rjust(width) for _, key, width in COLUMNS))
@@ -244,14 +240,14 @@ async def kill(folder: Path, args: Any) -> list[dict[str, Any]]:
     """Kill the daemon (SIGKILL) so many times while three attacks go on; a row a kill: how much of
     what its broker's client had heard is not in the recording, and what is wrong with that."""
     dice, rows = random.Random(1), []
-    async with _bench(folder) as (config, broker, ports):
+    async with _bench(folder, 120.0 + args.kill * KILL_S) as (bench, ports):
         attacks = [
             asyncio.create_task(_attack(name, 3600.0, ports))
             for name in ("poll_8_unread", "deaf_1100", "subscribe_138000")
         ]
         for number in range(args.kill):
-            async with probing(broker.port, NAV) as probed:
-                async with DaemonProcess(config) as daemon:
+            async with probing(ports.mqtt, NAV) as probed:
+                async with DaemonProcess(bench.config) as daemon:
                     await daemon.start()
                     await daemon.ready()
                     await asyncio.sleep(dice.uniform(1.0, 3.0))
@@ -273,32 +269,14 @@ def _newest(folder: Path) -> Path:
 
 
 @asynccontextmanager
-async def _bench(folder: Path) -> AsyncIterator[tuple[Path, Broker, Ports]]:
-    """A vehicle under way and a broker; the configuration of a daemon for them."""
-    bus = bus_here(0)
-    # Else Mosquitto waits for the client's delayed acknowledgement, 40 ms.
-    broker = Broker(folder, "allow_anonymous true", "set_tcp_nodelay true")
-    ports = Ports(*(free_port() for _ in Ports._fields[:-1]), mqtt=broker.port)
-    config = folder / "load.toml"
-    config.write_text(
-        CONFIG.format(
-            imu=SIM_IMU.format(interface=bus["interface"], channel=bus["channel"]),
-            imu_hz=200.0, tick_hz=100.0, nav_hz=100.0, folder=folder, port=broker.port,
-            filter="kalman", kind="raw",
-        )
-        + 'commands = ["request_fix"]\n'
-        + RECORDING.format(folder=folder)
-        + OUTPUTS.format(**ports._asdict())
-    )  # fmt: skip
-    vehicle = multiprocessing.get_context("spawn").Process(
-        target=simulate, args=(str(folder), bus["interface"], bus["channel"], True), daemon=True
-    )
-    try:
-        with broker:
-            vehicle.start()
-            yield config, broker, ports
-    finally:
-        vehicle.kill()
+async def _bench(folder: Path, duration_s: float) -> AsyncIterator[tuple[DaemonBench, Ports]]:
+    """A vehicle under way for so long and a broker; the configuration of a daemon for them."""
+    commands = ("request_fix",)
+    async with daemon_bench(
+        folder, duration_s, nav_hz=100.0, raw=True, commands=commands, more=MORE
+    ) as bench:
+        bench.vehicle.start()
+        yield bench, Ports(**bench.ports, mqtt=bench.broker.port)
 
 
 def main() -> None:
@@ -315,7 +293,7 @@ def main() -> None:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
         os.setpriority(os.PRIO_PROCESS, 0, -10)
     network_of_its_own()
-    subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
+    compile_kernels()
     with tempfile.TemporaryDirectory(prefix="fusiond-attack-") as folder:
         rows = asyncio.run((kill if args.kill else measure)(Path(folder), args))
     if args.json is not None:

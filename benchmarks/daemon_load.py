@@ -27,16 +27,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import multiprocessing
-import os
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,108 +40,21 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fusiond.simulation.can.imu import SIM_IMU as SIM_IMU_OPTIONS
-from fusiond.simulation.scenarios import SCENARIOS
-from fusiond.simulation.trajectories import drive
-from fusiond.simulation.vehicle import SimulatedVehicle
-from tests.broker import Broker, free_port, listening
+from benchmarks.daemon_bench import (
+    SETTLE_S,
+    compile_kernels,
+    cpu_s,
+    daemon_bench,
+    resident_mb,
+    running_s,
+)
+from tests.broker import Broker, listening
 from tests.hil.heard import Heard
-from tests.hil.processes import SIM_IMU, DaemonProcess
-from tests.live.rig import bus_here, network_of_its_own
+from tests.hil.processes import DaemonProcess
+from tests.live.rig import network_of_its_own
 
-IMU_HZ, TICK_HZ, GNSS_HZ, NAV_HZ = 200.0, 100.0, 10.0, 20.0
-SETTLE_S = 5.0
-REST_S = 5.0
-CONFIG = """
-vehicle = "load"
-[imu]
-axes = ["+x", "-y", "-z"]
-rate_hz = {imu_hz}
-{imu}
-[sources.gnss]
-driver = "gnss"
-port = "{folder}/gnss"
-[aiding.gnss]
-kind = "{kind}"
-lever_arm_m = [0.0, 0.0, -1.0]
-[sources.rdss]
-driver = "rdss"
-port = "{folder}/rdss"
-baud = 115200
-[aiding.rdss]
-lever_arm_m = [0.0, 0.0, -1.0]
-[constraints.non_holonomic]
-enabled = true
-lever_arm_m = [-1.0, 0.0, 0.5]
-[estimator]
-filter = "{filter}"
-[clock]
-utc = "system"
-[scheduler]
-rate_hz = {tick_hz}
-[mqtt]
-host = "127.0.0.1"
-port = {port}
-nav_rate_hz = {nav_hz}
-"""
-OUTPUTS = """
-[outputs.gpsd]
-port = {gpsd}
-rate_hz = 10.0
-[outputs.nmea]
-port = {nmea}
-rate_hz = 10.0
-[outputs.foxglove]
-port = {foxglove}
-rate_hz = 10.0
-[outputs.prometheus]
-port = {prometheus}
-"""
-RECORDING = """
-[recording]
-directory = "{folder}/logs"
-"""
-COMMANDS = """commands = ["start_recording", "stop_recording"]
-"""
+NAV_HZ = 20.0
 TURN_S, SKIPPED_S = 10.0, 1.0
-
-
-def simulate(
-    folder: str, interface: str, channel: str, raw: bool, duration_s: float = 600.0
-) -> None:
-    scenario = SCENARIOS["drive"]
-    vehicle = SimulatedVehicle(
-        replace(
-            scenario,
-            path=partial(drive, rest_s=REST_S),
-            imu=scenario.imu.model_copy(update={"rate_hz": IMU_HZ}),
-            gnss=replace(scenario.gnss, rate_hz=GNSS_HZ),
-            gnss_raw=replace(scenario.gnss_raw, rate_hz=GNSS_HZ),
-        ),
-        duration_s=duration_s,
-        can_imu=SIM_IMU_OPTIONS.model_copy(update={"interface": interface, "channel": channel}),
-        gnss_link=Path(folder, "gnss"),
-        rdss_link=Path(folder, "rdss"),
-        gnss_raw="ubx" if raw else None,
-    )
-    asyncio.run(vehicle.run())
-
-
-def _cpu_s(pid: int) -> float:
-    """User and system time of all threads (proc(5): utime, stime)."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _running_s(pid: int) -> float:
-    """On a processor, all threads (proc(5): schedstat, ns) that have not ended."""
-    tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
-    return sum(int(task.read_text().split()[0]) for task in tasks) * 1e-9
-
-
-def resident_mb(pid: int) -> float:
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def _recorded_mb(folder: Path) -> float:
@@ -162,9 +70,9 @@ async def _in_turns(pid: int, port: int, seconds: float) -> list[float]:
                 name = "stop_recording" if turn % 2 else "start_recording"
                 await client.publish(f"fusiond/load/cmd/{name}", json.dumps({"id": str(turn)}), 1)
             await asyncio.sleep(SKIPPED_S)
-            start_s, used_s = time.monotonic(), _running_s(pid)
+            start_s, used_s = time.monotonic(), running_s(pid)
             await asyncio.sleep(TURN_S - SKIPPED_S)
-            shares.append(100.0 * (_running_s(pid) - used_s) / (time.monotonic() - start_s))
+            shares.append(100.0 * (running_s(pid) - used_s) / (time.monotonic() - start_s))
     return shares
 
 
@@ -195,7 +103,7 @@ async def _ages_ms(broker: Broker) -> AsyncIterator[list[float]]:
 
 
 @asynccontextmanager
-async def _clients(count: int, *ports: int) -> AsyncIterator[dict[str, Any]]:
+async def _clients(count: int, broker: int, ports: dict[str, int]) -> AsyncIterator[dict[str, Any]]:
     """That many of each kind, in a process of their own; what they heard is there afterwards."""
     heard: dict[str, Any] = {}
     if not count:
@@ -203,7 +111,8 @@ async def _clients(count: int, *ports: int) -> AsyncIterator[dict[str, Any]]:
         return
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, str(Path(__file__).with_name("clients.py"))),
-        *map(str, (count, *ports)),
+        *(str(count), str(broker)),
+        *(str(ports[name]) for name in ("gpsd", "nmea", "foxglove", "prometheus")),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
     )
@@ -218,60 +127,47 @@ async def measure(
     folder: Path, seconds: float, name: str, raw: bool, record: bool, clients: int
 ) -> dict[str, object]:
     """Run both processes for `seconds` after alignment; the figures."""
-    bus = bus_here(0)
-    interface, channel = bus["interface"], bus["channel"]
-    broker = Broker(folder)
-    served_at = {n: free_port() for n in ("gpsd", "nmea", "foxglove", "prometheus")}
-    config = folder / "load.toml"
-    config.write_text(
-        CONFIG.format(
-            imu=SIM_IMU.format(interface=interface, channel=channel),
-            imu_hz=IMU_HZ,
-            tick_hz=TICK_HZ,
+    async with (
+        daemon_bench(
+            folder,
+            seconds + 300.0,
             nav_hz=NAV_HZ,
-            folder=folder,
-            port=broker.port,
-            filter=name,
-            kind="raw" if raw else "gnss",
-        )
-        + (COMMANDS + RECORDING.format(folder=folder) if record else "")
-        + (OUTPUTS.format(**served_at) if clients else "")
-    )
-    vehicle = multiprocessing.get_context("spawn").Process(
-        target=simulate, args=(str(folder), interface, channel, raw, seconds + 300.0), daemon=True
-    )
-    try:
-        with broker:
-            async with DaemonProcess(config) as daemon:
-                start_s = time.monotonic()
-                await daemon.start()
-                while ": mode_" not in daemon.log:  # noqa: ASYNC110 - the first tick logs its mode
-                    await asyncio.sleep(0.01)
-                first_tick_s = time.monotonic() - start_s
-                vehicle.start()
-                async with listening(broker) as (listener, _):
-                    heard = Heard(listener, "load")
-                    await heard.until("nav", lambda m: m["mode"] == "navigating")
-                    await asyncio.sleep(SETTLE_S)
-                    async with (
-                        _clients(clients, broker.port, *served_at.values()) as served,
-                        _ages_ms(broker) as ages_ms,
-                    ):
-                        since, before = heard.count, await heard.until("health")
-                        start_s, cpu_s = time.monotonic(), _cpu_s(daemon.pid)
-                        first_mb = resident_mb(daemon.pid)
-                        shares: list[float] = []
-                        if record:
-                            shares = await _in_turns(daemon.pid, broker.port, seconds)
-                        else:
-                            await asyncio.sleep(seconds)
-                        elapsed_s, used_s = time.monotonic() - start_s, _cpu_s(daemon.pid) - cpu_s
-                        memory_mb = resident_mb(daemon.pid)
-                        after = await heard.until("health")
-                        nav = len(heard.all("nav", since))
-                await daemon.terminate()
-    finally:
-        vehicle.kill()
+            raw=raw,
+            name=name,
+            commands=("start_recording", "stop_recording") if record else (),
+            servers=bool(clients),
+            recording=record,
+        ) as bench,
+        DaemonProcess(bench.config) as daemon,
+    ):
+        broker = bench.broker
+        start_s = time.monotonic()
+        await daemon.start()
+        while ": mode_" not in daemon.log:  # noqa: ASYNC110 - the first tick logs its mode
+            await asyncio.sleep(0.01)
+        first_tick_s = time.monotonic() - start_s
+        bench.vehicle.start()
+        async with listening(broker) as (listener, _):
+            heard = Heard(listener, "load")
+            await heard.until("nav", lambda m: m["mode"] == "navigating")
+            await asyncio.sleep(SETTLE_S)
+            async with (
+                _clients(clients, broker.port, bench.ports) as served,
+                _ages_ms(broker) as ages_ms,
+            ):
+                since, before = heard.count, await heard.until("health")
+                start_s, used_s = time.monotonic(), cpu_s(daemon.pid)
+                first_mb = resident_mb(daemon.pid)
+                shares: list[float] = []
+                if record:
+                    shares = await _in_turns(daemon.pid, broker.port, seconds)
+                else:
+                    await asyncio.sleep(seconds)
+                elapsed_s, used_s = time.monotonic() - start_s, cpu_s(daemon.pid) - used_s
+                memory_mb = resident_mb(daemon.pid)
+                after = await heard.until("health")
+                nav = len(heard.all("nav", since))
+        await daemon.terminate()
     return {
         "filter": name,
         "raw": raw,
@@ -283,7 +179,7 @@ async def measure(
         "resident_before_mb": round(first_mb, 1),
         "first_tick_s": round(first_tick_s, 2),
         "seconds": round(elapsed_s, 1),
-        "interface": interface,
+        "interface": bench.interface,
         "imu_received": after["sources"]["imu"]["received"] - before["sources"]["imu"]["received"],
         "gnss_fused": after["sources"]["gnss"]["fused"] - before["sources"]["gnss"]["fused"],
         "nav_messages": nav,
@@ -306,7 +202,7 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=0)
     args = parser.parse_args()
     network_of_its_own()
-    subprocess.run([sys.executable, "-c", "import fusiond.live.daemon"], check=True)  # compiles
+    compile_kernels()
     with tempfile.TemporaryDirectory(prefix="fusiond-load-") as folder:
         wish = args.seconds, args.filter, args.raw, args.record, args.clients
         figures = asyncio.run(measure(Path(folder), *wish))

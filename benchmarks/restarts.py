@@ -139,7 +139,9 @@ class Process:
 def restarted(old: Process, data: Received, row: int, gap_s: float) -> tuple[Array, Array]:
     """First errors, and the greatest of the time after, of a process that follows `old`."""
     navigator, clock = old.navigator, old.clock
-    state = warm_state(navigator.estimator, navigator.imu, "GNSS course", "", "boot", 0)
+    state = warm_state(
+        navigator.estimator, navigator.imu, "GNSS course", "", "boot", 0, confirmed=True
+    )
     new = Process(data, row + round(gap_s * RATE_HZ))
     new.navigator.warm = WarmStart(state, new.navigator.model)
     new.clock.resume(clock.known())

@@ -8,7 +8,6 @@ left to the first command that needs them.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 
@@ -24,18 +23,13 @@ MODULES = (
 )
 
 
-class _ImportedError(Exception):
-    """All is imported: what `gathered` would compile now is left alone."""
-
-
 def main() -> None:
     """Import it."""
-    with suppress(_ImportedError), gathered(lambda done, total: None):
+    with gathered():
         for name in MODULES:
             import_module(name)
         for driver in entry_points(group="fusiond.drivers"):
             driver.load()
-        raise _ImportedError
 
 
 if __name__ == "__main__":

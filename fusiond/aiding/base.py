@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from operator import attrgetter
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,21 +58,14 @@ class State(NamedTuple):
     """View of the filter for a measurement: navigation state (10,), parameters (n,), last step
     (28,), model, and the filter's own P (n, n), None where the state is not a filter's (a sigma
     point, the truth). `lent` is what a filter lends aids to write their innovations to, by the
-    number of rows."""
+    number of rows: it holds until the next innovation is asked for."""
 
     nav: Array
     xi: Array
     step: Array
     model: Model
     covariance: Array | None = None
-    lent: tuple[Innovation, ...] = ()
-
-    def rows(self, count: int) -> Innovation:
-        """To write an innovation of so many rows to, of any content. What is lent holds until the
-        next innovation is asked for."""
-        if self.lent and count <= LENT_ROWS:
-            return self.lent[count]
-        return Innovation.unwritten(count, self.model.size)
+    lent: Mapping[int, Innovation] = MappingProxyType({})
 
     @property
     def dcm(self) -> Array:
@@ -125,6 +120,12 @@ class Aid:
     no_slip: ClassVar[bool] = False
     """It holds while the vehicle moves the way it faces: refused for long, it slides, or the
     attitude or the IMU's mounting is wrong."""
+    shown: ClassVar[attrgetter[Any] | None] = None
+    """Value that a frozen sensor repeats to the bit; else the first of its `offers` says it."""
+    waits: ClassVar[bool] = False
+    """Its `feedback` is not always at once."""
+    placed: ClassVar[bool] = False
+    """Its corrections depend on the place: it is folded in as it is `at` the filter's."""
     late: ClassVar[bool] = False
     """It comes seldom and long after its instant, as what must be asked for does."""
 
@@ -159,6 +160,12 @@ class Aid:
         """The aid as it is for a vehicle in the navigation state (10,), which is the filter's at
         the aid's instant: itself, unless its corrections depend on the place."""
         return self
+
+    def unturned(self) -> Aid | None:
+        """The aid for a vehicle of which nobody knows which way it faces, the state being that of
+        one that faces north and is level: of a lever arm only its upward part is known, and the
+        rest is noise. None where the measurement says nothing without an attitude."""
+        return None
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`, or the name of why there is none."""
@@ -210,6 +217,11 @@ class Linearised(Protocol):
     def no_slip(self) -> bool: ...
     def innovation(self, state: State) -> Innovation | NotApplicable:
         """The innovation at `state`."""
+
+
+def level_arm_m(lever: Vector3) -> float:
+    """One sigma (m) of each horizontal axis of a lever arm that may point anywhere."""
+    return math.hypot(lever[0], lever[1]) / math.sqrt(2.0)
 
 
 def rate_columns(h: Array, rows: slice, model: Model, per_rate: Array) -> None:

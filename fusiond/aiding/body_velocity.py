@@ -29,7 +29,8 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import ClassVar
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,7 +293,8 @@ class NonHolonomicAid(Aid):
             return NotApplicable("too_slow")
         model, slots = state.model, _slots(state.model, SIDE_DRIFT)
         at = state.nav, state.step, state.xi, model.column_of, model.hold_height
-        rows = state.rows(1 if model.hold_height else 2)  # right, down
+        m = 1 if model.hold_height else 2  # right, down
+        rows = state.lent.get(m) or Innovation.unwritten(m, model.size)
         no_slip_rows(*at, *self.lever, slots, self.sd_m_s, self.sd_down_m_s, *rows)
         return rows
 
@@ -309,6 +311,7 @@ class WheelSpeedAid(Aid):
     """
 
     rolls: ClassVar[bool] = True
+    shown: ClassVar[attrgetter[Any] | None] = attrgetter("speed_m_s")
 
     speed_m_s: float
     sd_m_s: float
@@ -323,11 +326,11 @@ class WheelSpeedAid(Aid):
     drifts: tuple[float, float] = STEADY
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, xi, step, model, p, _ = state
+        nav, xi, step, model, p, lent = state
         slots = _slots(model, self.drift, self.scale, self.latency)
         speed = self.speed_m_s
         at = nav, step, xi, model.column_of, model.hold_height, *self.lever, slots
-        rows = state.rows(1)
+        rows = lent.get(1) or Innovation.unwritten(1, model.size)
         if not self.signed:
             z, h, _ = rows
             direction = direction_of(*at, _UNKNOWN if p is None else p, z, h)

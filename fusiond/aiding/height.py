@@ -39,6 +39,9 @@ class HeightAid(Aid):
     def shares(self) -> tuple[str, ...]:
         return self.of
 
+    def unturned(self) -> HeightAid:
+        return self
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
         if state.model.hold_height:
             return NotApplicable("height_held")
@@ -63,6 +66,9 @@ class BarometerAid(Aid):
     offset: str
     scale: str
     airflow: str
+
+    def unturned(self) -> BarometerAid:
+        return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         model, nav = state.model, state.nav

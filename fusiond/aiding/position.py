@@ -36,14 +36,16 @@ section 10.3.2 (second-order terms).
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from dataclasses import replace
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.immutable import immutable
 from fusiond.aiding.antenna import Matrix, antenna_velocity
-from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3, level_arm_m
 from fusiond.aiding.felt import add_of_force
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.compiled import compiled
@@ -207,6 +209,7 @@ class PositionAid(Aid):
     """
 
     locates: ClassVar[bool] = True
+    shown: ClassVar[attrgetter[Any] | None] = attrgetter("lat_rad", "lon_rad")
 
     lat_rad: float
     lon_rad: float
@@ -225,10 +228,16 @@ class PositionAid(Aid):
     def shares(self) -> tuple[str, ...]:
         return self.bias
 
+    def unturned(self) -> PositionAid:
+        (north, east, down), arm = self.sd, level_arm_m(self.lever)
+        sd = math.hypot(north, arm), math.hypot(east, arm), down
+        return replace(self, sd=sd, lever=(0.0, 0.0, self.lever[2]), rest="")
+
     def innovation(self, state: State) -> Innovation | NotApplicable:
-        nav, xi, step, model, p, _ = state
+        nav, xi, step, model, p, lent = state
         height, at = self.height_m, model.indices
-        rows = state.rows(2 if height is None or model.hold_height else 3)
+        m = 2 if height is None or model.hold_height else 3
+        rows = lent.get(m) or Innovation.unwritten(m, model.size)
         slots = model.column_of, at[self.bias], at[self.time], at[self.rest], at[self.wander]
         fix = self.lat_rad, self.lon_rad, 0.0 if height is None else height
         where = *self.lever, *self.sd, self.sd_time_s, *self.bias_share, self.wander_m

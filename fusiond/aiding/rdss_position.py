@@ -24,12 +24,22 @@ Source: paper 000, eq. 2 to 4.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from dataclasses import replace
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 
 from drivers.immutable import immutable
-from fusiond.aiding.base import Aid, Feedback, Innovation, NotApplicable, State, Vector3
+from fusiond.aiding.base import (
+    Aid,
+    Feedback,
+    Innovation,
+    NotApplicable,
+    State,
+    Vector3,
+    level_arm_m,
+)
 from fusiond.aiding.offers import PositionOffer
 from fusiond.navigation.earth import meridian_radius, transverse_radius
 from fusiond.navigation.rotation import skew
@@ -47,7 +57,9 @@ class RdssPositionAid(Aid):
     """
 
     locates: ClassVar[bool] = True
+    shown: ClassVar[attrgetter[Any] | None] = attrgetter("lat_rad", "lon_rad")
     late: ClassVar[bool] = True
+    waits: ClassVar[bool] = True
 
     lat_rad: float
     lon_rad: float
@@ -64,6 +76,11 @@ class RdssPositionAid(Aid):
     @property
     def feedback(self) -> Feedback:
         return "hold" if self.holds else "at_once"
+
+    def unturned(self) -> RdssPositionAid:
+        (nn, ne, ee), arm = self.covariance, level_arm_m(self.lever)
+        wider = nn + arm * arm, ne, ee + arm * arm
+        return replace(self, covariance=wider, lever=(0.0, 0.0, self.lever[2]))
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         nav = state.nav
@@ -103,9 +120,14 @@ class RdssPositionAid(Aid):
 class FeedBackAid(Aid):
     """The instant at which an estimate that was held is fed back."""
 
+    waits: ClassVar[bool] = True
+
     @property
     def feedback(self) -> Feedback:
         return "release"
+
+    def unturned(self) -> FeedBackAid:
+        return self
 
     def innovation(self, state: State) -> Innovation | NotApplicable:
         return NotApplicable("fed_back")

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TextIO
 
 from fusiond.commands.shared import draws, loaded
+from fusiond.workers.forked import Forked
 
 # A line of a log every so often, where a terminal's is written anew at each kernel.
 LINE_EVERY_S = 5.0
@@ -24,9 +25,26 @@ def compiling() -> Iterator[None]:
     collector of garbage leaves alone what has been loaded by its end."""
     from fusiond.navigation.compiled import gathered  # noqa: PLC0415 - numba
 
-    with gathered(Progress(sys.stderr)):
+    with gathered() as missing:
         yield
-        loaded()  # and then compile what is missing
+        loaded()
+    if missing:
+        compile_aside(missing, Progress(sys.stderr))
+
+
+def compile_aside(missing: Sequence[Callable[[], None]], progress: Progress) -> None:
+    """Compile kernels in processes that end, and link them in this one. What cannot be kept on disk
+    is compiled here."""
+    from fusiond.navigation.compiled import load_compiler  # noqa: PLC0415 - numba
+
+    progress(0, len(missing))
+    with Forked(missing, load_compiler) as compiling:
+        for done in compiling:
+            progress(done, compiling.total)
+    for load in missing:
+        load()
+    if compiling.done < compiling.total:
+        progress(compiling.total, compiling.total)
 
 
 class Progress:

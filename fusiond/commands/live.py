@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from fusiond.commands.shared import (
     load,
     plain,
 )
+from fusiond.commands.shared import loaded as code_is_there
 
 if TYPE_CHECKING:
     from fusiond.configuration.schema import Config
@@ -31,12 +33,17 @@ RecordPath = Annotated[
 def run(config: ConfigPath, record: RecordPath = None) -> None:
     """Run the daemon."""
     loaded = recorded(load(config), record)
-    from fusiond.configuration.load import load_config  # noqa: PLC0415
+    from fusiond.configuration.load import ConfigError, load_config  # noqa: PLC0415
+    from fusiond.navigation.compiled import gathered  # noqa: PLC0415
 
-    with compiling():
+    with gathered() as missing:
         from fusiond.live.daemon import run as run_daemon  # noqa: PLC0415
+        from fusiond.navigator.navigator import Navigator  # noqa: PLC0415
 
-    run_daemon(loaded, config, lambda: recorded(load_config(config), record))
+        with suppress(ConfigError):  # the daemon's own will say so
+            Navigator(loaded)
+    code_is_there()
+    run_daemon(loaded, config, lambda: recorded(load_config(config), record), missing)
 
 
 def recorded(config: Config, folder: Path | None) -> Config:

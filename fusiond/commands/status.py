@@ -49,8 +49,10 @@ class Heard:
 
     @property
     def complete(self) -> bool:
-        """True if there is nothing more to wait for."""
-        return self.online == "offline" or (self.live and all(t in self.topics for t in _ASKED))
+        """True if there is nothing more to wait for; nothing is before the first tick."""
+        compiling = self.topics.get("status", {}).get("ticks") == 0
+        asked = ("status",) if compiling else _ASKED
+        return self.online == "offline" or (self.live and all(t in self.topics for t in asked))
 
 
 class UnansweredError(Exception):

@@ -69,7 +69,10 @@ def _imu(config: Config) -> Iterator[str]:
     imus = [name for name, source in config.sources.items() if source.driver == "can_imu"]
     foreign = [s.driver for s in config.sources.values() if s.driver not in GIVES]
     if not imus and not foreign:
-        yield "sources: none is an IMU, and nothing is navigated without: add one (can_imu)"
+        yield (
+            "sources: none is an IMU: position and velocity by fixes and a constant velocity, "
+            "sigma that grows by metres in seconds without a fix, no attitude: add one (can_imu)"
+        )
     spare = config.imu.spare
     if spare is not None and (spare.source not in imus or len(imus) < 2) and not foreign:
         yield (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
+from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
 
 from fusiond.configuration.aiding import Probability, Section
 from fusiond.estimators.multiscale.wavelet import MOST_SCALES, wavelet_matrix
@@ -32,6 +32,9 @@ class Federated(Section):
     mode: Literal["no_reset", "fusion_reset", "zero_reset", "rescale"] = "no_reset"
     """Reset of the local filters after a fusion; only `no_reset` keeps a fault in its own
     filter."""
+    fusion: Literal["uncorrelated", "correlated"] = "uncorrelated"
+    """Fusion of the estimates: by sharing factors, as if they were uncorrelated, or by
+    the covariances between them (paper 004), which only `no_reset` can."""
     sharing: Literal["fixed", "adaptive"] = "fixed"
     """True if the sharing factors stay or follow the local covariances."""
     shares: dict[str, PositiveFloat] = Field(default_factory=dict)
@@ -48,6 +51,16 @@ class Federated(Section):
     """Innovations judged together."""
     readmit_after: PositiveInt = 20
     """Innovations in a row that must fit the master before a source is taken back."""
+
+    @model_validator(mode="after")
+    def _correlated_share_nothing_out(self) -> Federated:
+        if self.fusion == "uncorrelated":
+            return self
+        if self.mode != "no_reset":
+            raise ValueError("fusion 'correlated' needs mode 'no_reset': a reset leaves nothing")
+        if self.sharing != "fixed" or self.shares:
+            raise ValueError("fusion 'correlated' has no sharing factors")
+        return self
 
 
 class Unscented(Section):

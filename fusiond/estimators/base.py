@@ -13,6 +13,7 @@ Source: Groves, 2nd ed., sections 3.2.6 and 14.1; Bar-Shalom, Li, Kirubarajan (2
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -29,7 +30,7 @@ from fusiond.estimators.propagation import (
     RECORD,
     propagate_for,
 )
-from fusiond.estimators.reading import Published, sigmas, speed_sigma, widen
+from fusiond.estimators.reading import WIDER, Published, sigmas, speed_sigma, widen
 from fusiond.estimators.robust import reweighted
 from fusiond.estimators.screening import KEPT, Codes, jumped, screened_update
 from fusiond.estimators.sensors import sensor_estimates
@@ -38,12 +39,15 @@ from fusiond.models.blocks import CLOCK_OFFSET
 from fusiond.models.model import Model
 from fusiond.navigation.chi_square import quantile
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigation.strapdown import step_before
+from fusiond.navigation.strapdown import STEP_RESTS_S, VE, VN, step_before
 
 Array = NDArray[np.float64]
 
 
 AS_STATED = np.ones(3)
+MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
+"""A vehicle moves whose speed is beyond both."""
+_NO_WIDER = np.zeros(WIDER)
 
 
 class _Thresholds(dict[tuple[float, int], float]):
@@ -175,8 +179,9 @@ class Estimator(Protocol):
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
 
-    def speed_sigma(self) -> float:
-        """One sigma (m/s) of the horizontal velocity."""
+    def surely_moves(self, published: bool) -> bool:
+        """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
+        `published`, or P's alone."""
 
     def snapshot(self) -> Snapshot:
         """A copy of everything."""
@@ -212,12 +217,13 @@ class ErrorStateFilter:
         self._covs: Array = m.covs
         self._cov: Array = self._covs[0]
         self._covariance: Array = self._cov[: model.size, : model.size]
-        lent = tuple(Innovation.unwritten(rows, model.size) for rows in range(LENT_ROWS + 1))
+        lent = {rows: Innovation.unwritten(rows, model.size) for rows in range(LENT_ROWS + 1)}
         self._view = State(self.nav, self.xi, self.step, model, self._covariance, lent)
         self._dxs: Array = m.dxs
         self._dx: Array = self._dxs[0]
         m.published[:] = self.published
-        self.hypotheses = Hypotheses(m.bank, faults, model) if faults.groups else None
+        own = m.bank, faults, model, m.xi, m.step, m.wider
+        self.hypotheses = Hypotheses(*own) if faults.groups else None
         self._holding = False
         self._carrying = False
         self.turned = 0.0
@@ -270,6 +276,8 @@ class ErrorStateFilter:
     ) -> None:
         """Propagate to `target_ns`, or to the last sample that the buffer holds before it; in
         `passing`, if nothing is to be folded in there."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         options = self._options
         if passing:
             options |= PASSING
@@ -297,14 +305,26 @@ class ErrorStateFilter:
 
     def sigmas(self) -> Array:
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         out = np.empty(9)
         sigmas(self._covs[0], self.nav, self.step, *self.published, out)
         widen(self.wider, out)
         return out
 
-    def speed_sigma(self) -> float:
-        """One sigma (m/s) of the horizontal velocity."""
-        return speed_sigma(self._cov, self.nav, self.step, *self.published, self.wider)
+    def surely_moves(self, published: bool) -> bool:
+        """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
+        `published`, or P's alone."""
+        nav, wider = self.nav, _NO_WIDER
+        speed = math.hypot(nav.item(VN), nav.item(VE))
+        if self.step.item(STEP_RESTS_S) > 0.0 or speed <= MOVES_M_S:
+            return False
+        if published:
+            wider = self.wider
+            if self.hypotheses is not None:
+                self.hypotheses.conclude()
+        sd = speed_sigma(self._cov, nav, self.step, *self.published, wider)
+        return speed > MOVES_SIGMAS * sd
 
     def _feed_back(self, dx: Array) -> None:
         """Take the error estimate (n,) out of the navigation state, add its parameters to `xi`."""
@@ -379,6 +399,8 @@ class ErrorStateFilter:
 
     def snapshot(self) -> Snapshot:
         """A copy of everything."""
+        if self.hypotheses is not None:
+            self.hypotheses.conclude()
         m = self._memory
         held = m.held.copy() if m.head[AHEAD] else None
         extra = self._own_snapshot()

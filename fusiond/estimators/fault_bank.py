@@ -80,14 +80,18 @@ KIND_INTS = 9
 # whether its size is known to be of that prior (1 or 0).
 PRIOR, LOG_RATE, LAG, MEAN, BOUNDED = 0, 3, 4, 5, 6
 KIND_NUMBERS = 7
+LOG_PRIOR = 7
+"""Behind them in a table: logs of the prior sigmas (3)."""
 
 # The bank's array: head, ring of the path, groups, a transition, sensitivities V (n, columns). The
 # head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
-# aid lies, 1 if it is not the identity, and the probability of any fault as it was judged last.
+# aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
+# one was likely then, and the epoch (s) of rows that are taken in and not judged, or infinity.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
-ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, HEAD = 10, 11, 12, 13, 14, 15, 16
+ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED = range(10, 18)
+HEAD = 24
 RING, POINT, RING_S = 64, 7, 0.1
 GROUPS = HEAD + RING * POINT
 LANES = 8
@@ -116,8 +120,8 @@ LASTS_S = 1.0
 
 class FaultTable(NamedTuple):
     """Kinds of faults as the kernels read them, those of three numbers first: `ints` (k, 9) and
-    `numbers` (k, 7), `lanes` with the constants of their groups, and the devices whose numbers they
-    name."""
+    `numbers` (k, 10), `lanes` with the constants of their groups, and the devices whose numbers
+    they name."""
 
     ints: Indices
     numbers: Array
@@ -136,8 +140,8 @@ class FaultTable(NamedTuple):
 
 
 def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:
-    """The table of these kinds; ValueError where one has another number than three or one, a mean
-    of three, or those of three do not come first."""
+    """The table of these kinds, `numbers` (k, 7); ValueError where one has another number than
+    three or one, a mean of three, or those of three do not come first."""
     sizes = ints[:, SIZE]
     if not np.isin(sizes, (1, 3)).all() or (np.diff(sizes) > 0).any():
         raise ValueError("kinds have three numbers or one, those of three first")
@@ -157,7 +161,9 @@ def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> Faul
         lanes[row, MEAN_AT + lane] = numbers[kind, MEAN]
         odds = numbers[kind, LOG_RATE] + math.log(PERIODS_S[level])
         lanes[row, ODDS_AT + lane] = odds - np.log(prior).sum()
-    return FaultTable(ints, numbers, lanes.ravel(), devices)
+    logs = [[math.log(sd) for sd in row] for row in numbers[:, PRIOR : PRIOR + 3].tolist()]
+    known = np.hstack((numbers, np.array(logs).reshape(-1, 3)))
+    return FaultTable(ints, known, lanes.ravel(), devices)
 
 
 NO_FAULTS = fault_table(
@@ -187,6 +193,7 @@ def begin_bank(bank: Array, table: FaultTable, n: int, width: int) -> None:
         bank[SENSITIVITIES] = bank.size - n * columns_of(table)
         bank[PHI] = bank[SENSITIVITIES] - width * width
         bank[ALL], bank[THREES], bank[LENGTH] = table.groups, table.threes, LANES
+        bank[UNJUDGED] = np.inf
 
 
 @compiled("i8(f8[::1], i8)", forceinline=True)

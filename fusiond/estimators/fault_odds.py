@@ -56,6 +56,7 @@ from fusiond.estimators.fault_bank import (
     LENGTH,
     LIKELY,
     LOG_ODDS,
+    LOG_PRIOR,
     MEAN,
     MEAN_AT,
     N_AT,
@@ -68,9 +69,11 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SENSITIVITIES,
     SIGNATURE,
+    SUSPECTS,
     THREES,
     UNEXPLAINED,
     UNEXPLAINED_SIGMAS,
+    UNJUDGED,
     WEIGHT,
     column_of,
     group_at,
@@ -191,9 +194,12 @@ def _gains(bank: Array, lanes: Array) -> None:
             bank[j + unsigned(UNEXPLAINED)] = left
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1])")
-def _odds(bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int, m: Array) -> None:
-    """Write the log odds of a group; m (12,) is work space."""
+@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[:, ::1])")
+def _odds(
+    bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int, m: Array, counts: Array
+) -> None:
+    """Write the log odds of a group; m (12,) is work space, `counts` (restarts, 2) the number of
+    rows of those before it, most often that of all kinds, and its log."""
     threes, at, kind = int(bank[THREES]), group_at(bank, number), number // RESTARTS
     size = 3.0 if number < threes else 1.0
     a, bank[at + WEIGHT] = bank[at + WEIGHT], 0.0
@@ -204,9 +210,12 @@ def _odds(bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int,
     rate = lanes[place // LANES * CONSTANTS + place % LANES + ODDS_AT] + bank[at + COUNTS_BY]
     by_size = 0.5 * math.log(a)
     if numbers[kind, BOUNDED] == 0.0:
-        by_rows = 0.5 * size * math.log(bank[at + N_AT])
+        known = counts[number % RESTARTS]
+        if known[0] != bank[at + N_AT]:
+            known[0], known[1] = bank[at + N_AT], math.log(bank[at + N_AT])
+        by_rows = 0.5 * size * known[1]
         for c in range(int(size)):
-            by_rows -= math.log(numbers[kind, PRIOR + c])
+            by_rows -= numbers[kind, LOG_PRIOR + c]
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)
     else:
         gained = bank[at + LOG_ODDS] - by_size
@@ -258,11 +267,11 @@ def judge(
     less: what fits as well is not told apart by rates alone. Compared are those of one onset; else
     the source's may have lost something.
     """
-    groups, m = int(bank[ALL]), np.empty(12)
+    groups, m, counts = int(bank[ALL]), np.empty(12), np.zeros((RESTARTS, 2))
     _gains(bank, lanes)
     largest = 0.0
     for number in range(groups):
-        _odds(bank, ints, numbers, lanes, number, m)
+        _odds(bank, ints, numbers, lanes, number, m, counts)
         at = group_at(bank, number)
         if bank[at + UNEXPLAINED] <= 0.0:
             largest = max(largest, bank[at + LOG_ODDS])
@@ -278,6 +287,7 @@ def judge(
     found[BEST], bank[ANY_FAULT] = -1.0, 1.0 - nothing / total
     found[BEST_ODDS] = found[EXPLAINS] = -np.inf
     found[AHEAD] = np.inf
+    bank[SUSPECTS], bank[UNJUDGED] = 0.0, np.inf
     for number in range(groups):
         at = group_at(bank, number)
         bank[at + WEIGHT] /= total
@@ -289,6 +299,8 @@ def judge(
             bank[at + LIKELY] = np.inf
         elif not bank[at + LIKELY] <= epoch_s:
             bank[at + LIKELY] = epoch_s
+        if bank[at + LIKELY] < np.inf:
+            bank[SUSPECTS] = 1.0
         lasted = epoch_s - bank[at + LIKELY] > LASTS_S - 1e-3
         if lasted and odds > found[BEST_ODDS]:
             found[BEST], found[BEST_ODDS] = number, odds

@@ -37,8 +37,10 @@ from fusiond.estimators.fault_bank import (
     SLOTS,
     SLOTS_OF,
     STATES,
+    SUSPECTS,
     THREES,
     TURNED,
+    UNJUDGED,
     WEIGHT,
     column_of,
     group_at,
@@ -145,7 +147,7 @@ def begin_all(
 ) -> None:
     """Begin all hypotheses anew; what the path was remains."""
     begin_transition(bank, n, width)
-    bank[ANY_FAULT] = 0.0
+    bank[ANY_FAULT], bank[SUSPECTS], bank[UNJUDGED] = 0.0, 0.0, np.inf
     followed = np.zeros(n + 1)
     for kind in range(ints.shape[0]):
         for restart in range(RESTARTS):

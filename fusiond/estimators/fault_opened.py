@@ -196,7 +196,7 @@ def widen_by_faults(
 
 
 @compiled(
-    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, b1, b1, f8[::1], f8[::1], f8[:, ::1],"
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8, b1, b1, f8[::1], f8[::1], f8[:, ::1],"
     " f8[::1], f8[::1], f8[::1])"
 )
 def judge_and_widen(
@@ -205,7 +205,7 @@ def judge_and_widen(
     numbers: Array,
     lanes: Array,
     n: int,
-    t_ns: int,
+    epoch_s: float,
     measured: bool,
     used: bool,
     xi: Array,
@@ -222,7 +222,7 @@ def judge_and_widen(
     squares is chance.
     """
     if measured and used:
-        judge(bank, ints, numbers, lanes, t_ns * 1e-9, found)
+        judge(bank, ints, numbers, lanes, epoch_s, found)
         if identified(found):
             return
     elif not measured and not bank[ANY_FAULT] > COUNTS:

@@ -13,11 +13,12 @@ from fusiond.estimators.fault_bank import (
     RESTARTS,
     SIGNATURE,
     SIZE,
+    UNJUDGED,
     WEIGHT,
     column_of,
     group_at,
 )
-from fusiond.estimators.fault_odds import solve
+from fusiond.estimators.fault_odds import judge, solve
 from fusiond.estimators.fault_onsets import restart_due
 from fusiond.estimators.fault_rows import account, sensitivity_rows
 from fusiond.estimators.update import feed_back, fold_in, whiten
@@ -70,7 +71,7 @@ def nis_if_sensors_fail(
 
 @compiled(
     "f8(f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8, f8[::1],"
-    "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1])"
+    "f8[:, ::1], f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, i8, i8, f8[::1], f8[::1])"
 )
 def fold_and_account(
     nav: Array,
@@ -87,21 +88,26 @@ def fold_and_account(
     bank: Array,
     ints: Indices,
     numbers: Array,
+    lanes: Array,
     t_ns: int,
     measures: int,
     device: int,
     work: Array,
+    found: Array,
 ) -> float:
     """As `fusiond.estimators.update.fuse` without holding, with the bank beside it; `measures` and
     `device` as of `sensitivity_rows`.
 
     A row that fails is evidence all the same: a fault of the inertial unit that fails every gate
-    would never be found else. Where such a fault, as likely as it is, explains it, it is folded in.
+    would never be found else. Where such a fault, as likely as it is, explains it, it is folded in;
+    what of the same instant has not been judged is judged before, to `found` (5,).
     """
     n = dx.shape[0]
     nis = whiten(cov, z, h, r, y, g)
     if not nis < np.inf:
         return nis
+    if nis > threshold and bank[UNJUDGED] < np.inf:
+        judge(bank, ints, numbers, lanes, bank[UNJUDGED], found)
     restart_due(bank, ints, numbers, n, t_ns, nav, step)
     columns = sensitivity_rows(bank, ints, numbers, n, t_ns, measures, device, nav, h, r, g, work)
     judged = nis

@@ -3,6 +3,7 @@ and fusiond.estimators.fault_odds on its part of the filter's memory."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,9 @@ from fusiond.estimators.fault_bank import (
     ROLLS,
     SENSITIVITIES,
     SIZE,
+    SUSPECTS,
     UNEXPLAINED,
+    UNJUDGED,
     WAITS,
     WEIGHT,
     FaultTable,
@@ -56,10 +59,18 @@ class Estimated(NamedTuple):
 
 
 class Hypotheses:
-    """A bank of `table` in `bank`, beside a filter of `model`."""
+    """A bank of `table` in `bank`, beside a filter of `model` with its parameters `xi` (n,), its
+    last `step` (28,) and the variances `wider` (9,) that what it publishes has beyond P's.
 
-    def __init__(self, bank: Array, table: FaultTable, model: Model) -> None:
+    Rows of one instant are judged once, together, unless something depends on it before the filter
+    goes on: one fails its gate, or a hypothesis has been likely, and may be identified.
+    """
+
+    def __init__(
+        self, bank: Array, table: FaultTable, model: Model, xi: Array, step: Array, wider: Array
+    ) -> None:
         self.bank, self.table = bank, table
+        self._xi, self._step, self._wider = xi, step, wider
         self.n, self.width = model.size, model.width
         self.found = np.full(FOUND, -np.inf)
         """Result of the last `judge`, as of fusiond.estimators.fault_odds."""
@@ -74,16 +85,16 @@ class Hypotheses:
         self.sensitivities = bank[int(bank[SENSITIVITIES]) :].reshape(self.n, -1)
         """V (n, columns)."""
         self._nine = np.zeros((9, 9))
-        self._of_source: dict[str, tuple[int, int]] = {}
+        self.of_source: dict[str, tuple[int, int]] = {}
 
     def of(self, aid: Linearised) -> tuple[int, int]:
         """Kinds of a measurement's rows, as of fusiond.estimators.fault_bank, and the number of its
         device; -1 where no kind is of it."""
-        known = self._of_source.get(aid.source)
+        known = self.of_source.get(aid.source)
         if known is None:
             devices = self.table.devices
             device = devices.index(aid.device) if aid.device in devices else -1
-            known = self._of_source[aid.source] = _measures(aid, device >= 0), device
+            known = self.of_source[aid.source] = _measures(aid, device >= 0), device
         return known
 
     @property
@@ -113,16 +124,26 @@ class Hypotheses:
         judge(self.bank, *table[:3], t_ns * 1e-9, self.found)
         return self.found
 
-    def take(
-        self, t_ns: int, measured: bool, used: bool, xi: Array, step: Array, wider: Array
-    ) -> Array:
+    def take(self, t_ns: int, measured: bool, used: bool, fused: bool) -> Array | None:
         """After rows of an aid: what is `found` of all if they were `measured` and `used`, and,
-        unless one is identified, what the weighed hypotheses leave open of what is published,
-        `wider` (9,)."""
-        table, n, found = self.table, self.n, self.found
+        unless one is identified, what the weighed hypotheses leave open of what is published goes
+        to `wider`. None where all that can wait, of rows that were `fused`, until `conclude`."""
+        if fused and measured and used and self.bank.item(SUSPECTS) == 0.0:
+            self.bank[UNJUDGED] = t_ns * 1e-9
+            return None
+        return self._take(t_ns * 1e-9, measured, used)
+
+    def conclude(self) -> None:
+        """Judge what waits for it."""
+        epoch_s = self.bank.item(UNJUDGED)
+        if epoch_s < math.inf:
+            self._take(epoch_s, measured=True, used=True)
+
+    def _take(self, epoch_s: float, measured: bool, used: bool) -> Array:
+        table, found = self.table, self.found
         judge_and_widen(
-            *(self.bank, table.ints, table.numbers, table.lanes, n, t_ns, measured, used),
-            *(xi, step, self._mounting, self.work, wider, found),
+            *(self.bank, table.ints, table.numbers, table.lanes, self.n, epoch_s, measured, used),
+            *(self._xi, self._step, self._mounting, self.work, self._wider, found),
         )
         return found
 
@@ -133,11 +154,13 @@ class Hypotheses:
     def opened(self) -> Array:
         """Covariance that the weighed hypotheses add to attitude, velocity, position (9, 9);
         written anew by the next call."""
+        self.conclude()
         mixture(self.bank, self.table.numbers, self.n, self._nine)
         return self._nine
 
     def opened_of_all(self) -> Array:
         """The same of all states (n, n)."""
+        self.conclude()
         out = np.zeros((self.n, self.n))
         mixture(self.bank, self.table.numbers, self.n, out)
         return out

@@ -284,6 +284,7 @@ class InvariantFilter(TiltAxesFilter):
             return
         if self._bent:
             self._bent = False
+            bank.conclude()
             bank.begin(self.t_ns, self.nav, self.step)
         kept = np.array(found.rows) == KEPT if found.rows else np.ones(len(rows.z), dtype=np.bool_)
         if kept.any():

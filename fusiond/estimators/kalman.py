@@ -58,9 +58,9 @@ class KalmanEstimator(ErrorStateFilter):
         if bank is None or degrees > LENT_ROWS:
             nis = fuse(nav, xi, cov, dx, z, h, r, threshold, self._holding, y, g)
         else:
-            of, table = bank.of(aid), bank.table
+            of, table = bank.of_source.get(aid.source) or bank.of(aid), bank.table
             if not self._holding:
-                now = bank.bank, *table[:2], aid.t_ns, *of, bank.work
+                now = bank.bank, *table[:3], aid.t_ns, *of, bank.work, bank.found
                 nis = fold_and_account(nav, xi, self.step, cov, dx, z, h, r, threshold, y, g, *now)
             else:
                 nis = fuse(nav, xi, cov, dx, z, h, r, threshold, True, y, g)

@@ -68,13 +68,25 @@ def whiten(cov: Array, z: Array, h: Array, r: Array, y: Array, g: Array) -> floa
 @compiled("void(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])")
 def fold_in(cov: Array, dx: Array, y: Array, g: Array) -> None:
     """Update `dx` (n,) and `cov` (w, w), in place, by what `whiten` left."""
-    m, width = g.shape
-    for i in range(dx.shape[0]):
-        for a in range(m):
-            c = g[a, i]
-            dx[i] += c * y[a]
-            for j in range(width):
-                cov[i, j] -= c * g[a, j]
+    m = g.shape[0]
+    at = 0
+    while at < m:
+        g_0 = g[at]
+        if at + 3 <= m:  # three rows in one pass, one after the other
+            g_1, g_2 = g[at + 1], g[at + 2]
+            for i in range(dx.shape[0]):
+                c_0, c_1, c_2, row = g_0[i], g_1[i], g_2[i], cov[i]
+                dx[i] = dx[i] + c_0 * y[at] + c_1 * y[at + 1] + c_2 * y[at + 2]
+                for j in range(row.shape[0]):
+                    row[j] = row[j] - c_0 * g_0[j] - c_1 * g_1[j] - c_2 * g_2[j]
+            at += 3
+        else:
+            for i in range(dx.shape[0]):
+                c_0, row = g_0[i], cov[i]
+                dx[i] += c_0 * y[at]
+                for j in range(row.shape[0]):
+                    row[j] -= c_0 * g_0[j]
+            at += 1
 
 
 @compiled("void(f8[::1], f8[:, ::1], f8[::1], f8[::1])", forceinline=True)

@@ -45,7 +45,7 @@ from fusiond.integrity.catalogue import Kind
 from fusiond.integrity.finding import Finding, Lasting
 from fusiond.integrity.service import DISAGREES, REPEATS, STILL, Series, value_of
 from fusiond.navigation.earth import meridian_radius, transverse_radius
-from fusiond.navigation.strapdown import HEIGHT, LAT, LON, STEP_RESTS_S, VE, VN
+from fusiond.navigation.strapdown import HEIGHT, LAT, LON
 
 Array = NDArray[np.float64]
 
@@ -53,8 +53,6 @@ PLACE_ROW = 6
 """First row of the position in the error state."""
 ALIKE = 7.0
 """Hypotheses of the class that are less likely by more than this count nothing."""
-MOVES_SIGMAS, MOVES_M_S = 5.0, 0.5
-"""A vehicle moves whose speed is beyond both."""
 FITS_NS, FITS_AGAINST_NS = 5_000_000_000, 60_000_000_000
 """Five fixes of a receiver that sends each second; a minute is what a vehicle's MEMS unit keeps to
 within a hundred metres."""
@@ -154,15 +152,25 @@ class Diagnosis:
     def comes(self, aid: Aid, estimator: Estimator) -> Series:
         """The series of an aid, before it is folded in; one that repeats itself leaves service,
         with all of its device."""
-        one = self.own(aid)
+        one, shown = self._series.get(aid.source), aid.shown
+        if one is None or aid.source in self._shared:
+            one = self.own(aid)
         one.hear(aid.t_ns)
-        if aid.constraint or (value := value_of(aid.offers())) is None:
+        if aid.constraint:
+            if estimator.hypotheses is not None:  # it is no evidence of what waits to be judged
+                estimator.hypotheses.conclude()
             return one
-        # A position that differs repeats nothing, whether it moves or not.
-        moving = (value == one.value or not one.locates) and _moves(estimator)
+        value = value_of(aid.offers()) if shown is None else shown(aid)
+        if value is None:
+            return one
+        # A position that differs repeats nothing, whether it moves or not. How often others do in
+        # motion is counted by the filter's own sigma.
+        same = value == one.value
+        moving = (same or not one.locates) and estimator.surely_moves(published=same)
         if one.repeats_itself(value, moving) and not one.out:
             self._exclude(aid.t_ns, REPEATS, lambda s: s.device == aid.device)
-        return self._series[aid.source]
+            one = self._series[aid.source]
+        return one
 
     def judge(
         self, aid: Aid, one: Series, outcome: Outcome, estimator: Estimator
@@ -173,8 +181,8 @@ class Diagnosis:
         if one.out or one.device in self._agreement:
             self._agrees(aid, one)
         if bank is not None:
-            found = bank.take(t_ns, measured, used, e.xi, e.step, e.wider)
-            if measured and used:
+            found = bank.take(t_ns, measured, used, outcome.name == "fused")
+            if found is not None and measured and used:
                 if identified(found):
                     correction = self._decide(t_ns, bank, found)
                 explained = found.item(EXPLAINS) > DECIDED - APART
@@ -329,14 +337,3 @@ def _somewhere_else(aid: Aid, estimator: Estimator) -> Correction:
             for row, apart in enumerate((north, east, down)):
                 spread[PLACE_ROW + row, PLACE_ROW + row] = apart * apart
     return Correction(np.zeros(len(spread)), spread)
-
-
-def _moves(estimator: Estimator) -> bool:
-    """True if the vehicle surely moves, by the filter's own speed and its sigma."""
-    if estimator.step.item(STEP_RESTS_S) > 0.0:
-        return False
-    nav = estimator.nav
-    speed = math.hypot(nav.item(VN), nav.item(VE))
-    if speed <= MOVES_M_S:
-        return False
-    return speed > MOVES_SIGMAS * estimator.speed_sigma()

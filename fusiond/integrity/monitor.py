@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -201,21 +200,20 @@ class ConsistencyMonitor:
         row = white if self.options.whitened else nu
         with np.errstate(over="ignore"):
             nis, energy = float(white @ white), float(row @ row)
-        self._take(row[None], np.array([nis]), np.array([energy]))
+        self.take(row[None], np.array([nis]), np.array([energy]))
 
-    def add_whitened(self, rows: Array, nis: Sequence[float]) -> list[tuple[int, Verdict]]:
-        """Take L^-1 nu (n, m) of successive epochs whose squares are known already: `add` without
-        its checks. After which of them the verdict turned, and to what."""
-        sizes = np.array(nis)
-        return self._take(rows, sizes, sizes)
-
-    def _take(self, rows: Array, nis: Array, energy: Array) -> list[tuple[int, Verdict]]:
-        """Epochs (n, m), their NIS and energy (n,)."""
+    def take(
+        self, rows: Array, nis: Array, energy: Array | None = None
+    ) -> list[tuple[int, Verdict]]:
+        """Take innovations (n, m) of successive epochs, of which NIS and energy (n,), the same
+        where they are whitened, are known already: `add` without its checks. After which of them
+        the verdict turned, and to what."""
+        energy = nis if energy is None else energy
         finite = np.isfinite(nis + energy)
         if not finite.all():
             places = np.flatnonzero(finite).tolist()
             self.rejected["not_finite"] += len(rows) - len(places)
-            turned = self._take(rows[finite], nis[finite], energy[finite]) if places else []
+            turned = self.take(rows[finite], nis[finite], energy[finite]) if places else []
             return [(places[i], to) for i, to in turned]
         if rows.shape[1] != self._m:
             self.restarts += self._m > 0

@@ -29,7 +29,8 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +74,8 @@ class Series:
     locates: bool
     moves: bool
     state: Service = Service.NOMINAL
+    out: bool = False
+    """True if it is looked at, and not fused."""
     since_ns: int = 0
     heard_ns: int = 0
     reason: str = ""
@@ -84,7 +87,7 @@ class Series:
     """Until when (ns) it is on probation: for as long as it was out."""
     over: float = 0.0
     """Log likelihood that the fault for which it is out is over, against that it lasts."""
-    value: tuple[float, ...] | None = None
+    value: object = None
     repeats: int = 0
     unchanged: bool = False
     """True if the last value was that before it, to the bit."""
@@ -99,12 +102,9 @@ class Series:
 
     def copied(self) -> Series:
         """A copy for a checkpoint."""
-        return replace(self, noise=self.noise.copy())
-
-    @property
-    def out(self) -> bool:
-        """True if it is looked at, and not fused."""
-        return self.state is Service.OUT
+        other = Series(*_EACH(self))
+        other.noise = self.noise.copy()
+        return other
 
     def hear(self, t_ns: int) -> None:
         """One has come."""
@@ -117,6 +117,7 @@ class Series:
     def exclude(self, t_ns: int, reason: str) -> None:
         """It leaves service."""
         self.state, self.since_ns, self.reason, self.out_ns = Service.OUT, t_ns, reason, t_ns
+        self.out = True
         forget_lately(self.noise)
         self.failed = self.passed = 0
 
@@ -163,10 +164,10 @@ class Series:
     def readmit(self, t_ns: int) -> None:
         """It is back in service."""
         self.proven_ns = 2 * t_ns - self.out_ns
-        self.state, self.since_ns = Service.PROBATION, t_ns
+        self.state, self.out, self.since_ns = Service.PROBATION, False, t_ns
         self.failed = self.passed = 0
 
-    def repeats_itself(self, value: tuple[float, ...], moving: bool) -> bool:
+    def repeats_itself(self, value: object, moving: bool) -> bool:
         """True if a new value makes so many alike to the bit, of a vehicle that is `moving`, that
         it is no measurement. What stands may repeat."""
         self.unchanged = value == self.value
@@ -180,6 +181,9 @@ class Series:
         elif moving:
             self.repeating += (1.0 - self.repeating) / REPEATS_KEPT
         return same and self.repeats >= math.log(CHANCE) / math.log(chance)
+
+
+_EACH = attrgetter(*(each.name for each in fields(Series)))
 
 
 def value_of(offers: Sequence[Offer]) -> tuple[float, ...] | None:

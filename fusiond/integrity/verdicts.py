@@ -59,32 +59,38 @@ class Verdicts:
         if aid.constraint or not outcome.whitened:
             return
         if not aid.screened:
-            self._hear(aid.source, aid, outcome.whitened, outcome.nis)
+            series = self._series.get(aid.source) or self._begin(aid.source, aid)
+            self._heard += 1
+            whitened = outcome.whitened
+            series.waiting.append((len(whitened), self._heard, whitened, outcome.nis))
             return
         kept = np.array(outcome.rows) == KEPT
         for name, row in aid.series(outcome.whitened, kept).items():
-            self._hear(f"{aid.source}_{name}", aid, row, float(row @ row))
+            source = f"{aid.source}_{name}"
+            series = self._series.get(source) or self._begin(source, aid)
+            self._heard += 1
+            series.waiting.append((len(row), self._heard, row, float(row @ row)))
 
-    def _hear(self, source: str, aid: Aid, row: Sequence[float] | Array, nis: float) -> None:
-        series = self._series.get(source)
-        if series is None:
-            window = max(FEWEST, self._window // 2) if aid.late else self._window
-            shared = self._model.slots_of_all(aid.shares).size > 0
-            options = ConsistencyOptions(window, self._alpha, gate=aid.gate, shared=shared)
-            series = self._series[source] = _Series(ConsistencyMonitor(options))
-        self._heard += 1
-        series.waiting.append((len(row), self._heard, row, nis))
+    def _begin(self, source: str, aid: Aid) -> _Series:
+        window = max(FEWEST, self._window // 2) if aid.late else self._window
+        shared = self._model.slots_of_all(aid.shares).size > 0
+        options = ConsistencyOptions(window, self._alpha, gate=aid.gate, shared=shared)
+        series = self._series[source] = _Series(ConsistencyMonitor(options))
+        return series
 
     def tell(self) -> None:
         """Judge what has come since the last time, and say which verdicts have turned, in the order
         in which they did."""
         turned: list[tuple[int, str, Verdict]] = []
         for source, series in self._series.items():
-            waiting, series.waiting = series.waiting, []
+            waiting = series.waiting
+            if not waiting:
+                continue
+            series.waiting = []
             for _, alike in groupby(waiting, key=itemgetter(0)):
                 _, numbers, rows, nis = zip(*alike, strict=True)
                 whitened = np.fromiter(chain.from_iterable(rows), np.float64)
-                judged = series.monitor.add_whitened(whitened.reshape(len(rows), -1), nis)
+                judged = series.monitor.take(whitened.reshape(len(rows), -1), np.array(nis))
                 for row, verdict in judged:
                     turned.append((numbers[row], source, verdict))
         for _, source, verdict in sorted(turned):

@@ -75,7 +75,7 @@ class Chain:
         arrived = self.sources.take_imu(t_ns)
         if arrived is not None:
             self.navigator.add_imu(*arrived)
-        self.navigator.advance()
+        self.navigator.tick(t_ns)
         solution = self.navigator.solution(t_ns)
         before, self.solution = self.solution, solution
         self.changed = before is None or before.mode is not solution.mode

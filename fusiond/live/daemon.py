@@ -10,7 +10,8 @@ import asyncio
 import logging
 import signal
 import sys
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +22,7 @@ from fusiond.configuration.load import EXIT_CONFIG, ConfigError, config_digest
 from fusiond.configuration.schema import Config
 from fusiond.live.calibration_keeper import CalibrationKeeper
 from fusiond.live.chain import Chain
-from fusiond.live.events import Events
+from fusiond.live.front import Front
 from fusiond.live.journal import handler
 from fusiond.live.loaded import LOADED, Loaded
 from fusiond.live.message_keeper import MessageKeeper
@@ -29,16 +30,13 @@ from fusiond.live.process_usage import release_compiler_pages
 from fusiond.live.publishing import Publishing
 from fusiond.live.reload import difference
 from fusiond.live.scheduler import SECOND_NS, Every, Scheduler
-from fusiond.live.service_manager import ServiceManager
-from fusiond.live.serving import Serving
 from fusiond.live.state_keeper import StateKeeper
 from fusiond.live.supervision import supervise
 from fusiond.live.warm_keeper import KEPT_STATE, WarmKeeper
-from fusiond.navigation.compiled import load_kernels
+from fusiond.navigation.compiled import load_compiler, load_kernels
 from fusiond.navigation.solution import Solution
 from fusiond.navigator.timeline import Entry
 from fusiond.outputs.base import Output
-from fusiond.outputs.catalogue import make_outputs
 from fusiond.outputs.commands import (
     NAMES,
     Command,
@@ -48,32 +46,34 @@ from fusiond.outputs.commands import (
     StartRecording,
     StopRecording,
 )
-from fusiond.outputs.guests import Guests
 from fusiond.outputs.messages.event import EventMessage
 from fusiond.outputs.mqtt import MqttPublisher
 from fusiond.outputs.topics import EVENT
 from fusiond.recording.digest import state_digest
 from fusiond.recording.recorder import Recorder, RecordingRefusedError
+from fusiond.workers.forked import Forked
 
 log = logging.getLogger("fusiond")
 
-# Readiness is told when every device sends, or after this long with what there is: an absent
-# receiver must not keep the vehicle's other services waiting.
-READY_AFTER_S = 10.0
+SWITCH_S = 0.0005
+"""Time that a tick waits for a thread that computes, as the log's does ten times a second: 5 ms by
+CPython's default, by which one tick of a hundred began 7 ms late."""
 
 
 class Daemon:
-    """One vehicle. `on_solution` hears every tick's solution (the demo, tests)."""
+    """One vehicle. `on_solution` hears every tick's solution (the demo, tests); `front` is there
+    already where it had to wait for kernels."""
 
     def __init__(
         self,
         config: Config,
         clock: Clock | None = None,
         on_solution: Callable[[Solution], None] | None = None,
+        front: Front | None = None,
     ) -> None:
         self.config = config
-        self.clock = clock or Clock(config.clock)
-        self._events = Events(self.clock)
+        self._front = front = front or Front(config, clock or Clock(config.clock))
+        self.clock, self._events = front.clock, front.events
         navigator_event = partial(self._events.report, "navigator")
         self._state = StateKeeper(config, self.clock, navigator_event)
         self._warm = WarmKeeper(config, self.clock, navigator_event)
@@ -93,16 +93,16 @@ class Daemon:
             self._warm.offer(self.navigator)
         messages = self._messages.load(self._chain.messaging)
         self._loaded = Loaded(saved, self._warm.loaded, self.navigator.calibration, messages)
-        self.service = ServiceManager()
+        self.service = front.service
         self.scheduler = Scheduler(
             config.scheduler.rate_hz,
             self._tick,
             now=self.clock.now_ns,
             on_time=self.service.feed_watchdog,
         )
-        self._serving = Serving(self._events.report)
-        self._guests = Guests()
-        self.outputs = self._make_outputs(config, {})
+        self._serving = front.serving
+        front.on_command = self._carry_out
+        self.outputs = self._completed(front.outputs)
         self._publishing = Publishing(
             config,
             self._chain,
@@ -111,8 +111,6 @@ class Daemon:
             lambda: self.recorder.recording,
         )
         self._on_solution = on_solution
-        self._started_ns = self.clock.now_ns()
-        self._ready = False
         self._second = Every(SECOND_NS)
 
     @property
@@ -120,21 +118,14 @@ class Daemon:
         """Of the last tick."""
         return self._chain.solution
 
-    def _make_outputs(self, config: Config, kept: Mapping[str, Output]) -> dict[str, Output]:
-        made = make_outputs(
-            config,
-            on_event=self._events.report,
-            on_command=self._carry_out,
-            clock=self.clock,
-            guests=self._guests,
-            kept=kept,
-        )
-        mqtt = made.get("mqtt")
+    def _completed(self, outputs: dict[str, Output]) -> dict[str, Output]:
+        """With what the navigator's parts have to do with them."""
+        mqtt = outputs.get("mqtt")
         if isinstance(mqtt, MqttPublisher):
             mqtt.on_confirmed = self._chain.messaging.told
-        if config.recording.directory is not None:
-            made["recording"] = self.recorder
-        return made
+        if self.config.recording.directory is not None:
+            return {**outputs, "recording": self.recorder}
+        return outputs
 
     def _tell_outputs(self, message: EventMessage) -> None:
         for output in self.outputs.values():
@@ -161,15 +152,16 @@ class Daemon:
             text = "; ".join(str(error).splitlines())
             self._events.report("daemon", "reload_refused", text)
         finally:
-            if self._ready:
+            if self._front.ready:
                 self.service.ready()
 
     async def _reload(self, read: Config) -> None:
         found = difference(self.config, read)
         kept = {n: o for n, o in self.outputs.items() if n not in found.outputs}
-        made = self._make_outputs(found.config, kept)
+        made = self._front.make_outputs(found.config, kept)
         # Nothing is refused from here on.
         self.config = found.config
+        made = self._completed(made)
         await self._serving.stop(found.outputs)
         self.outputs = made
         self._publishing.serve(found.config, made)
@@ -229,7 +221,7 @@ class Daemon:
         if self.outputs:
             self._publishing.tick(t_ns, solution)
         if self._second.due(t_ns) or self._chain.changed:
-            self._each_second(t_ns, solution)
+            self._each_second(solution)
         self._state.keep(t_ns, solution, confirmed=not self.navigator.unconfirmed)
         self._warm.keep(t_ns, solution, self.navigator)
         self._calibration.keep(t_ns, self.navigator)
@@ -266,14 +258,9 @@ class Daemon:
         missing = await self._messages.kept(messaging.revision, messaging)
         return f"{text}; {missing}" if missing else text
 
-    def _each_second(self, t_ns: int, solution: Solution) -> None:
+    def _each_second(self, solution: Solution) -> None:
         """Tell the service manager how it stands."""
-        text = f"{solution.mode}: {solution.reason}"
-        if self._ready:
-            self.service.status(text)
-        elif self.sources.all_running or (t_ns - self._started_ns) * 1e-9 > READY_AFTER_S:
-            self._ready = True
-            self.service.ready(text)
+        self._front.tell(f"{solution.mode}: {solution.reason}", self.sources.all_running)
 
 
 async def _cancel(*tasks: asyncio.Task[Any]) -> None:
@@ -282,30 +269,47 @@ async def _cancel(*tasks: asyncio.Task[Any]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def run(config: Config, config_path: Path, read: Callable[[], Config]) -> None:
+def run(
+    config: Config,
+    config_path: Path,
+    read: Callable[[], Config],
+    missing: Sequence[Callable[[], None]] = (),
+) -> None:
     """Run until SIGTERM or SIGINT; SIGHUP takes what can be taken of the configuration that `read`
-    gives then. Exits 78 if the configuration leaves nothing to run."""
+    gives then. The `missing` kernels are compiled first. Exits 78 if the configuration leaves
+    nothing to run."""
     logging.basicConfig(level=logging.INFO, handlers=[handler()])
     logging.getLogger("can").setLevel(logging.WARNING)  # a line for every attempt to open
     log.setLevel(config.log_level.upper())
     log.info("configuration %s", config_path)
+    sys.setswitchinterval(SWITCH_S)
 
-    async def main() -> None:
+    async def main(compiling: Forked | None) -> None:
         stop, again = asyncio.Event(), asyncio.Event()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, stop.set)
         loop.add_signal_handler(signal.SIGHUP, again.set)
-        if not config.sources:
-            raise ConfigError("sources: there is none: add [sources.imu] with a driver")
-        daemon = Daemon(config)
+        front = Front(config, Clock(config.clock))
+        if compiling is not None:
+            await front.wait_for(compiling, stop)
+            if stop.is_set():
+                await front.close()
+                return
+            for load in missing:  # links them; compiles here what could not be kept on disk
+                load()
+        daemon = Daemon(config, front=front)
         release_compiler_pages()
         reloading = asyncio.create_task(daemon.reload_when(again, read), name="reload")
         await daemon.run(stop)
         await _cancel(reloading)
 
     try:
-        asyncio.run(main())
+        if not config.sources:
+            raise ConfigError("sources: there is none: add [sources.imu] with a driver")
+        # The children are forked while nothing else runs in this process.
+        with Forked(missing, load_compiler) if missing else nullcontext() as compiling:
+            asyncio.run(main(compiling))
     except ConfigError as error:
         log.error("%s: %s", config_path, error)
         sys.exit(EXIT_CONFIG)

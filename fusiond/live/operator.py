@@ -58,6 +58,7 @@ class Operator:
                 return self._messaging.send(command, t_ns)
             case ResetFilter():
                 self._navigator.reset("reset by an operator")
+                self._navigator.without_imu.stop()
                 return "aligning anew"
             case SetGates():
                 self._navigator.set_gates(command.gates)

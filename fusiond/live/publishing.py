@@ -186,7 +186,7 @@ def _health(output: Output) -> OutputHealth:
 def _totals(navigator: Navigator) -> tuple[int, int]:
     """Measurements fused and rejected, of all sources since the start."""
     fused = rejected = 0
-    for outcomes in navigator.timeline.counters.outcomes.values():
+    for outcomes in navigator.outcomes().values():
         fused += outcomes["fused"]
         rejected += outcomes.total() - outcomes["fused"]
     for refused in navigator.refused.values():

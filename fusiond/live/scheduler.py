@@ -10,11 +10,11 @@ follow keep the phase of t_0. asyncio sleeps in whole milliseconds of epoll, so 
 from __future__ import annotations
 
 import asyncio
-import gc
 import time
 from collections.abc import Awaitable, Callable
 from math import ceil, log10
 
+from fusiond.live.collector import Collector
 from fusiond.outputs.messages.health import SchedulerStatus
 
 SECOND_NS = 1_000_000_000
@@ -22,11 +22,6 @@ SECOND_NS = 1_000_000_000
 _FIRST_BIN_NS = 10_000
 _BINS_PER_DECADE = 10
 _BINS = 6 * _BINS_PER_DECADE + 1
-_SLACK_MARGIN_NS = 500_000
-_FORCE_AFTER_NS = 10 * SECOND_NS
-"""Cycles hold memory: if no slack was long enough for this time, collect all the same."""
-_GC_THRESHOLDS = (700, 10, 10)
-"""CPython's own thresholds of its three generations (gc.get_threshold)."""
 
 
 class Every:
@@ -85,51 +80,6 @@ class LatenessHistogram:
         )
 
 
-class _Collector:
-    """Runs the cyclic garbage collector in the slack after a tick instead of anywhere."""
-
-    def __init__(self, now: Callable[[], int]) -> None:
-        self._now = now
-        self._cost_ns = [0, 0, 0]
-        self._due_ns: list[int | None] = [None, None, None]
-        self._was_enabled = gc.isenabled()
-        self.collections = 0
-        self.forced = 0
-        self.max_ns = 0
-
-    def start(self) -> None:
-        """Move the objects of the start-up out of the collector's sight."""
-        gc.collect()
-        gc.freeze()
-        gc.disable()
-
-    def stop(self) -> None:
-        gc.unfreeze()
-        if self._was_enabled:
-            gc.enable()
-
-    def use_slack(self, slack_ns: int) -> None:
-        """Collect the oldest generation that is due, if twice its last cost fits the slack."""
-        start = self._now()
-        counts = gc.get_count()
-        for generation in (2, 1, 0):
-            if counts[generation] <= _GC_THRESHOLDS[generation]:
-                continue
-            due_ns = self._due_ns[generation]
-            if due_ns is None:
-                due_ns = self._due_ns[generation] = start
-            fits = 2 * self._cost_ns[generation] + _SLACK_MARGIN_NS < slack_ns
-            if fits or start - due_ns > _FORCE_AFTER_NS:
-                gc.collect(generation)
-                cost_ns = self._now() - start
-                self._cost_ns[generation] = cost_ns
-                self._due_ns[: generation + 1] = [None] * (generation + 1)
-                self.max_ns = max(self.max_ns, cost_ns)
-                self.collections += 1
-                self.forced += not fits
-                return
-
-
 class Scheduler:
     """Calls `tick(deadline_ns)` at `rate_hz` until cancelled.
 
@@ -152,7 +102,7 @@ class Scheduler:
         self._now = now
         self._sleep = sleep
         self._on_time = on_time
-        self._collector = _Collector(now)
+        self._collector = Collector(now)
         self.lateness = LatenessHistogram()
         self.ticks = 0
         self.overruns = 0

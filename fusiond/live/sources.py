@@ -210,7 +210,7 @@ class Sources:
         """`health` by source; what the filter makes by itself (`zero_velocity`) has its own
         line."""
         navigator = self._navigator
-        outcomes = navigator.timeline.counters.outcomes
+        outcomes = navigator.outcomes()
         diagnosed = self._diagnosed(now_ns)
         health: dict[str, SourceHealth] = {}
         for name in dict.fromkeys((*self.all, *outcomes, *navigator.refused)):

@@ -100,6 +100,8 @@ class StateKeeper:
         if utc_ns is None or not _speed_m_s(solution) <= SAVE_MAX_SPEED_M_S:
             return None
         s = solution
+        if math.isnan(s.rpy_rad[2]):  # without an inertial unit there is none to keep
+            return None
         try:
             return SavedState(
                 utc_ns * 1e-9,

@@ -126,6 +126,8 @@ class WarmKeeper:
         usable = solution.mode in (Mode.NAVIGATING, Mode.COASTING)
         if navigator.started is None or navigator.on_trial or not usable:
             return None
+        if navigator.without_imu.active:
+            return None
         if published_of_spare(navigator.estimator, navigator.config.imu):
             return None
         try:

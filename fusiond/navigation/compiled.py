@@ -2,9 +2,9 @@
 
 With an explicit signature numba compiles when the module is imported and never again: no
 compilation can happen inside the navigation loop. A kernel that is in the cache already is linked
-when it is first called; `load_kernels` does that for all at once, before a loop that keeps time.
-Where somebody waits for the imports, `gathered` keeps what is to be compiled until it is known how
-many there are, and tells how far it is.
+when it is first called, or when one that is being compiled calls it; `load_kernels` does that for
+all at once, before a loop that keeps time. Where somebody waits for the imports, `gathered` lists
+what is to be compiled: for other processes, that end and give their memory back.
 `error_model="numpy"` drops the zero-division checks that would keep loops from being vectorised;
 `fastmath` stays off because it would let results depend on the order that the compiler picks.
 References are counted where a kernel makes arrays and nowhere else (`_nrt`): a count is atomic, a
@@ -18,7 +18,8 @@ What is in the cache was compiled by several processes and is linked in one, by 
 a symbol of module, qualified name, argument types and a number that counts the functions compiled
 in the process: two closures of one name, compiled in two processes, may get the same symbol, and
 one of them then runs in place of the other. So every kernel has a name of its own (a variant of a
-closure says which), and the count starts somewhere else in each process, for numba's own closures.
+closure says which), and the count starts somewhere else in each process, forked ones too, for
+numba's own closures.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.types import Array
 from numba.np.numpy_support import FROM_DTYPE, map_layout
 
-from fusiond.navigation.kernel_cache import KernelCache, kept_in
+from fusiond.navigation.kernel_cache import KernelCache, kept_in, shipped_in
 
 # numba's functions have no types.
 _array: Any = Array
@@ -76,13 +77,20 @@ def _cache_folder() -> Path:
 
 
 FOLDER = _cache_folder()
-_names: dict[str, int] = {}  # in the order of definition: what a kernel calls comes before it
+_names: set[str] = set()
 _in_cache = kept_in(FOLDER)
-_waiting: dict[int, Callable[[], None]] = {}
+_shipped = shipped_in(Path(__file__).with_name("prebuilt") / FOLDER.name)
+_waiting: dict[str, Callable[[], None]] = {}
 _gathered: list[Callable[[], None]] | None = None
 
-# 2^48 starts: no two processes that filled a cache count through the same numbers.
-setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48)))  # noqa: B010
+
+def _count_from_anywhere() -> None:
+    """2^48 starts: no two processes that filled a cache count through the same numbers."""
+    setattr(FunctionIdentity, "_unique_ids", itertools.count(secrets.randbits(48)))  # noqa: B010
+
+
+_count_from_anywhere()
+os.register_at_fork(after_in_child=_count_from_anywhere)
 
 
 def compiled(
@@ -103,17 +111,16 @@ def compiled(
         name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
         if name in _names:
             raise ValueError(f"two kernels of the name {name}: give each a variant of its own")
-        place = _names[name] = len(_names)
+        _names.add(name)
         options.update(error_model="numpy", _nrt=allocates)
         setattr(function, "__signature__", inspect.signature(function))  # noqa: B010 - asked twice
         kernel = numba.njit(**options)(function)
         kernel.typeof_pyval = partial(_type_of, kernel)
-        missing = partial(load_kernels, place)
-        kernel._cache = cache = KernelCache(FOLDER, name, signature, kernel.targetctx, missing)
-        if cache.file_name in _in_cache:
-            _load_when_called(kernel, signature, place)
+        kernel._cache = cache = KernelCache(FOLDER, _shipped, name, signature, kernel.targetctx)
+        if cache.shipped is not None or cache.file_name in _in_cache:
+            _load_when_called(kernel, name, signature)
         elif _gathered is not None:
-            _gathered.append(_load_when_called(kernel, signature, place))
+            _gathered.append(_load_when_called(kernel, name, signature))
         else:
             kernel.compile(signature)
             kernel.disable_compile()
@@ -124,49 +131,44 @@ def compiled(
 
 
 @contextmanager
-def gathered(progress: Callable[[int, int], None]) -> Iterator[None]:
-    """Compile what is imported inside at its end, kernel after kernel; where the cache has all of
-    it nothing happens, and `progress` is not called.
-
-    `progress` hears how many of how many are compiled, before each and at the end.
-    """
+def gathered() -> Iterator[list[Callable[[], None]]]:
+    """List what is imported inside and lies in no cache, instead of compiling it: each item
+    compiles one kernel, with those that it calls, and leaves it in the cache. A kernel that is
+    called is compiled all the same."""
     global _gathered  # noqa: PLW0603 - imports have no other way to be told
     missing: list[Callable[[], None]] = []
     outer, _gathered = _gathered, missing
     try:
-        yield
+        yield missing
     finally:
         _gathered = outer
-    for done, load in enumerate(missing):
-        progress(done, len(missing))
-        load()
-    if missing:
-        progress(len(missing), len(missing))
 
 
-def load_kernels(before: int | None = None) -> None:
+def load_compiler() -> None:
+    """Load what compiling needs, before processes are forked that compile: numba's tables of
+    implementations and its runtime come with the first function."""
+    numba.njit("f8(f8)")(lambda x: x)
+
+
+def load_kernels() -> None:
     """Link every kernel that has been imported and not been called yet, before a loop that keeps
-    time.
-
-    Those defined `before` one that is about to be compiled: it finds a kernel that it calls by the
-    signature which that has once it is linked.
-    """
+    time."""
     with global_compiler_lock:
-        for place, load in sorted(_waiting.items()):
-            if before is None or place < before:
-                load()
+        for load in [*_waiting.values()]:
+            load()
 
 
-def _load_when_called(kernel: Any, signature: str, place: int) -> Callable[[], None]:
+def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], None]:
     """Link the kernel when it is first called, or compile it where the cache has none; returns what
     does so at once. A dispatcher that knows no signature yet asks `_compile_for_args` for the one
-    of a call."""
+    of a call, and `get_call_template` is asked by the compiler for that of a kernel which calls:
+    it would compile one for the very types that it has there."""
 
     def load() -> None:
         with global_compiler_lock:
-            if _waiting.pop(place, None) is not None:
-                del kernel._compile_for_args
-                found = kernel._cache.linked(kernel.targetctx)
+            if _waiting.pop(name, None) is not None:
+                del kernel._compile_for_args, kernel.get_call_template
+                found = kernel._cache.load_overload(signature, kernel.targetctx)
                 if found is None:
                     kernel.compile(signature)
                 else:
@@ -180,13 +182,17 @@ def _load_when_called(kernel: Any, signature: str, place: int) -> Callable[[], N
         load()
         return kernel  # it is what is called next, with the arguments' types looked at
 
-    kernel._compile_for_args = first_call
-    _waiting[place] = load
+    def called_by_another(*types: Any) -> Any:
+        load()
+        return kernel.get_call_template(*types)
+
+    kernel._compile_for_args, kernel.get_call_template = first_call, called_by_another
+    _waiting[name] = load
     return load
 
 
 def _type_of(kernel: Any, value: Any) -> Any:
-    """What numba's dispatcher says of an argument's type, which it asks for once a kind of array:
+    """Type of an argument for numba's dispatcher, which it asks for once a kind of array:
     to be sure that it is no masked one it would import them, as long as linking twenty kernels."""
     kind = FROM_DTYPE.get(value.dtype) if type(value) is np.ndarray else None
     if kind is None:

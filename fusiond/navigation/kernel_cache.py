@@ -10,6 +10,9 @@ Files are written under a name of their own and renamed, so that processes that 
 or die while they write leave whole files; a later start removes what a dead one left. Where nothing
 can be written, kernels are compiled at each start.
 
+A package may bring kernels that were compiled where it was built, for a level of processors: they
+are checked and linked as those of the cache are, and never removed. What the cache has goes first.
+
 A start that finds all kernels compiles nothing, and so does without what numba needs to compile:
 its tables of implementations (a fifth of the processor time of a start) and the bitcode of the
 kernels, which others inline (another seventh). Both come when a kernel is missing. A kernel that is
@@ -24,6 +27,7 @@ import contextlib
 import hashlib
 import os
 import pickle
+import platform
 import secrets
 import shutil
 import sys
@@ -32,9 +36,9 @@ import zlib
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from llvmlite.binding import ObjectFileRef, add_symbol, parse_bitcode
+from llvmlite.binding import ObjectFileRef, add_symbol, get_host_cpu_features, parse_bitcode
 from numba.core.caching import NullCache
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompileResult
@@ -52,24 +56,65 @@ _parse_bitcode: Any = parse_bitcode
 _add_symbol: Any = add_symbol
 _Environment: Any = Environment
 _known_environment: Any = lookup_environment
+_host_features: Any = get_host_cpu_features
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
+
+
+# What an x86-64 processor of a level has (x86-64 psABI, 3.1.1), by LLVM's names; that of aarch64's
+# base, Armv8.0-A, every one has. The first that is shipped and fits is taken.
+LEVELS: dict[str, dict[str, tuple[str, ...]]] = {
+    "x86_64": {
+        "x86-64-v3": ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"),
+        "x86-64-v2": ("cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"),
+    },
+    "aarch64": {"generic": ()},
+}
+
+
+class Shipped(NamedTuple):
+    """Kernels that came with the package, for processors of one level."""
+
+    folder: Path
+    level: str
+    names: frozenset[str]
+
+
+def shipped_in(folder: Path) -> Shipped | None:
+    """The kernels in a folder of `folder` that this processor runs, None where there are none.
+
+    The folders are named after LLVM's names of processors; a kernel in them was compiled for that
+    one with no feature besides (`tools.prebuilt`).
+    """
+    try:
+        levels = set(os.listdir(folder))
+    except OSError:
+        return None
+    has = {name for name, there in _host_features().items() if there}
+    for level, needs in LEVELS.get(platform.machine(), {}).items():
+        # Level 3 has what level 2 has.
+        if level in levels and has.issuperset(needs):
+            return Shipped(folder / level, level, frozenset(os.listdir(folder / level)))
+    return None
 
 
 class KernelCache(NullCache):
     """Interface to numba's dispatcher for its one signature; `name` is the kernel's alone.
 
-    `on_missing` is called before the kernel is compiled, since there is nothing sound.
+    `shipped` is the file of the package's own that has it, None where none has.
     """
 
     def __init__(
-        self, folder: Path, name: str, signature: str, target: Any, on_missing: Callable[[], None]
+        self, folder: Path, shipped: Shipped | None, name: str, signature: str, target: Any
     ) -> None:
-        # Native code differs by signature, system, processor and its features.
-        made_for = repr((signature, _processor(target.codegen()))).encode()
-        self.file_name = f"{name}-{hashlib.sha256(made_for).hexdigest()[:16]}.kernel"
+        triple, *processor = _processor(target.codegen())
+        self.file_name = _file_name(name, signature, triple, *processor)
         self._folder = folder
-        self._on_missing = on_missing
+        self.shipped: Path | None = None
+        if shipped is not None:
+            file_name = _file_name(name, signature, triple, shipped.level, "")
+            if file_name in shipped.names:
+                self.shipped = shipped.folder / file_name
 
     @property
     def cache_path(self) -> str:
@@ -77,31 +122,14 @@ class KernelCache(NullCache):
         return str(self._folder)
 
     def load_overload(self, _signature: object, target: Any) -> Any:
-        """Compiled code for this processor, or None where there is nothing sound."""
-        found = self.linked(target)
-        if found is None:
-            self._on_missing()
-        return found
-
-    def linked(self, target: Any) -> Any:
-        """The same, and nobody is told."""
+        """Code compiled for this processor, else shipped for its level; None where
+        there is nothing sound."""
         _name_runtime()
         path = self._folder / self.file_name
-        try:
-            data = memoryview(path.read_bytes())
-        except FileNotFoundError:
-            return None
-        except IsADirectoryError:
-            _discard(path, "a folder")
-            return None
-        except OSError as error:
-            _tell(f"{path} cannot be read ({error})")
-            return None
-        kept = data[_DIGEST_SIZE:]
-        if hashlib.sha256(kept).digest() != data[:_DIGEST_SIZE]:
-            _discard(path, "its checksum is wrong")
-            return None
-        return _linked(target, *pickle.loads(kept))
+        kept = _sound(path, _discard)
+        if kept is None and self.shipped is not None:
+            kept = _sound(self.shipped, _leave)
+        return None if kept is None else _linked(target, *pickle.loads(kept))
 
     def save_overload(self, _signature: object, data: Any) -> None:
         """Write what was compiled; where that fails it is compiled again at the next start."""
@@ -119,6 +147,31 @@ class KernelCache(NullCache):
         except OSError:
             with contextlib.suppress(OSError):
                 written.unlink()
+
+
+def _file_name(name: str, signature: str, *processor: str) -> str:
+    """Native code differs by signature, system, processor and its features."""
+    made_for = repr((signature, processor)).encode()
+    return f"{name}-{hashlib.sha256(made_for).hexdigest()[:16]}.kernel"
+
+
+def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | None:
+    """Contents of a file, if its digest is right."""
+    try:
+        data = memoryview(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except IsADirectoryError:
+        damaged(path, "a folder")
+        return None
+    except OSError as error:
+        _tell(f"{path} cannot be read ({error})")
+        return None
+    kept = data[_DIGEST_SIZE:]
+    if hashlib.sha256(kept).digest() != data[:_DIGEST_SIZE]:
+        damaged(path, "its checksum is wrong")
+        return None
+    return kept
 
 
 @cache
@@ -248,6 +301,10 @@ def kept_in(folder: Path) -> set[str]:
                 (folder / name).unlink()
                 names.remove(name)
     return names
+
+
+def _leave(path: Path, reason: str) -> None:
+    _tell(f"{path} is damaged ({reason}): install the package again")
 
 
 def _discard(path: Path, reason: str) -> None:

@@ -15,6 +15,7 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import DEG, imu_noise, sensor_to_body
 from fusiond.estimators.base import Estimator
 from fusiond.estimators.invariant import InvariantFilter
+from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.estimators.separation import SeparatedEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
 from fusiond.integrity.verdicts import Verdicts
@@ -94,7 +95,8 @@ def estimator_of(config: Config, model: Model, kinds: Sequence[Kind] = ()) -> Es
             u = config.estimator.unscented
             return UnscentedEstimator(model, config.imu.gap_s, u.spread, u.propagation)
         case "federated":
-            return _federated(config, model)
+            names = config.estimator.federated.sources or tuple(config.aiding)
+            return _federated(config, model, names, config.imu.gap_s)
 
 
 def imu_buffer_of(config: Config) -> ImuBuffer:
@@ -120,10 +122,24 @@ def verdicts_of(config: Config, model: Model, on_event: Callable[[str, str], Non
     )
 
 
+def estimator_without_imu(config: Config, model: Model, gap_s: float) -> Estimator:
+    """The estimator of a vehicle without an inertial unit: `federated` with a local filter for each
+    receiver where the configuration says so, else the Kalman filter."""
+    if config.estimator.filter == "federated":
+        names = config.estimator.federated.sources or tuple(config.aiding)
+        heard = tuple(name for name in names if name in config.positioning)
+        return _federated(config, model, heard or names, gap_s)
+    return KalmanEstimator(model, gap_s)
+
+
 def federated(
     model: Model, gap_s: float, names: tuple[str, ...], options: FederatedOptions
 ) -> FederatedFilter:
     """The federated filter of a mode."""
+    if options.fusion == "correlated":
+        from fusiond.estimators.federated.correlated import CorrelatedFilter  # noqa: PLC0415
+
+        return CorrelatedFilter(model, gap_s, names, options)
     from fusiond.estimators.federated.reset import ResetFilter  # noqa: PLC0415
     from fusiond.estimators.federated.standing import StandingFilter  # noqa: PLC0415
 
@@ -131,13 +147,15 @@ def federated(
     return (ResetFilter if resets else StandingFilter)(model, gap_s, names, options)
 
 
-def _federated(config: Config, model: Model) -> FederatedFilter:
+def _federated(
+    config: Config, model: Model, names: tuple[str, ...], gap_s: float
+) -> FederatedFilter:
     from fusiond.estimators.federated.options import FederatedOptions  # noqa: PLC0415
 
     o = config.estimator.federated
-    names = o.sources or tuple(config.aiding)
     options = FederatedOptions(
         mode=o.mode,
+        fusion=o.fusion,
         shares=tuple(o.shares[name] for name in names) if o.shares else (),
         adaptive=o.sharing == "adaptive",
         master_share=o.master_share,
@@ -147,4 +165,4 @@ def _federated(config: Config, model: Model) -> FederatedFilter:
         window=o.window,
         readmit_after=o.readmit_after,
     )
-    return federated(model, config.imu.gap_s, names, options)
+    return federated(model, gap_s, names, options)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusiond.aiding.velocity import CORNER_RAD_S
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_range
 from fusiond.navigation.distributions import median
@@ -27,13 +28,11 @@ from fusiond.navigator.reasons import reason
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-# A yaw error whose sine is wrong by 3 %, so that an error state still means what it says; and how
-# fast a vehicle ordinarily turns at a street corner, a quarter turn in six to eight seconds. The
-# mean of a drive, by which sigma grows, is half of that: a gap of 3 s in a bend left errors of 7.7
-# sigma. That makes 2.2 s.
+# A yaw error whose sine is wrong by 3 %, so that an error state still means what it says, at the
+# rate of a street corner. The mean of a drive, by which sigma grows, is half of that: a gap of 3 s
+# in a bend left errors of 7.7 sigma. That makes 2.2 s.
 BEARABLE_YAW_RAD = math.radians(25.0)
-CORNER_RATE_RAD_S = 0.2
-BEARABLE_GAP_S = BEARABLE_YAW_RAD / CORNER_RATE_RAD_S
+BEARABLE_GAP_S = BEARABLE_YAW_RAD / CORNER_RAD_S
 # Good samples that end a trouble: twice what it takes to see that an axis is dead.
 SOUND_NS = 2_000_000_000
 

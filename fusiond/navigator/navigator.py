@@ -51,6 +51,7 @@ from fusiond.navigator.service_events import ServiceEvents
 from fusiond.navigator.state_file import RefusedStateError
 from fusiond.navigator.status import Begun, NavigationStatus
 from fusiond.navigator.timeline import JUDGED, Entry, Timeline
+from fusiond.navigator.without_imu import WithoutImu, counted_together
 
 if TYPE_CHECKING:
     from fusiond.navigator.saved_calibration import SavedCalibration
@@ -85,7 +86,8 @@ class Navigator:
         self._intake = Intake(config.aiding, config.plausibility, self._event)
         self.raw = self._intake.receivers
         of_vehicle = vehicle_blocks(config.constraints.non_holonomic)
-        self.model = model_of(config, *of_vehicle, *self._intake.extra_blocks())
+        of_aids = self._intake.extra_blocks()
+        self.model = model_of(config, *of_vehicle, *of_aids)
         self.imu = imu_buffer_of(config)
         self._door = ImuDoor(imu, e.buffer_s, self._event)
         self._units = RateUnits(self._noise.rate_bias_initial, self._event)
@@ -106,6 +108,9 @@ class Navigator:
         self._protection = ProtectionWatch(config, self.estimator, self._event)
         self.refused: dict[str, Counter[str]] = {}
         self.last_fused_ns: dict[str, int] = {}
+        self.without_imu = WithoutImu(
+            config, of_aids, self._event, self.last_fused_ns, self._on_outcome
+        )
         self._last_position_ns = 0
         self.started: Start | None = None
         self._start_check: StartCheck | None = None
@@ -194,6 +199,7 @@ class Navigator:
             return self._refuse(m.source, "failed")
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
+        self.without_imu.hear(aids, seen_ns)
         aids = self._latency.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
@@ -223,6 +229,12 @@ class Navigator:
         return "aligning" if entry.outcome is None else entry.outcome.name
 
     # ------------------------------------------------------------------ running
+
+    def tick(self, t_ns: int) -> None:
+        """It is `t_ns`: navigate by what there is where no inertial unit says anything, then
+        `advance`."""
+        self.without_imu.tick(t_ns, self.imu, self.started is not None)
+        self.advance()
 
     def advance(self, record: bool = False) -> None:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
@@ -332,6 +344,8 @@ class Navigator:
         that very instant, by the aids valid until then; before what is kept of it (`buffer_s`, and
         the start) nothing is known. The mode is always that of now.
         """
+        if self.without_imu.active:
+            return self.without_imu.solution(t_ns, self.mode(t_ns)[1], self._protection.unknown())
         if self.started is None or t_ns >= self.estimator.t_ns:
             return self._present(t_ns)
         if t_ns < self.timeline.oldest_ns:
@@ -353,6 +367,15 @@ class Navigator:
         if self.started is not None:
             begun = Begun(self.started.how, self.unconfirmed, self._last_position_ns)
         return self._status.of(t_ns, begun, self._aligner.reason)
+
+    @property
+    def serving(self) -> Estimator:
+        """The estimator of which the solution is."""
+        return self.without_imu.estimator or self.estimator
+
+    def outcomes(self) -> dict[str, Counter[str]]:
+        """Outcomes of measurements, by source, with an inertial unit or without."""
+        return counted_together(self.timeline.counters.outcomes, self.without_imu.counted())
 
     # ------------------------------------------------------------------ inside
 

@@ -84,6 +84,7 @@ class RawEpochAid(Aid):
 
     screened: ClassVar[bool] = True
     locates: ClassVar[bool] = True
+    placed: ClassVar[bool] = True
 
     receiver: RawGnss
     epoch: RawGnssEpoch

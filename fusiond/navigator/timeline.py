@@ -139,10 +139,11 @@ class Timeline:
         # Of one instant, velocities come first: after an outage a false position passes its gate by
         # the outage's sigma and takes the velocity along, and then the honest velocity would fail.
         first = " " if aid.moves and not aid.locates else ""
-        feedback = aid.feedback
+        feedback: Feedback = aid.feedback if aid.waits else "at_once"
         key = (aid.t_ns, "" if feedback == "release" else first + aid.source, serial)
         entry = Entry(key, aid, feedback)
-        if self._checkpoints and not self._precedes(self._checkpoints[0], key):
+        oldest = self._checkpoints[0] if self._checkpoints else None
+        if oldest and key[0] <= oldest.snapshot.t_ns and not self._precedes(oldest, key):
             self._count(entry, Outcome("too_old"))
             return entry
         last = len(self._keys)
@@ -164,19 +165,23 @@ class Timeline:
 
     def run(self, record: bool = False) -> None:
         """Apply every aid whose instant the IMU has reached, and propagate to its last sample."""
-        latest = self.imu.latest_ns
+        latest, imu, kept = self.imu.latest_ns, self.imu, self._checkpoints
         estimator, entries = self.estimator, self._entries
         for entry in entries[self._next :]:
             if (t_ns := entry.key[0]) > latest:
                 break
             if t_ns > estimator.t_ns or estimator.passing:
-                estimator.propagate(self.imu, t_ns, record)
-                self._checkpoint()
+                estimator.propagate(imu, t_ns, record)
+                if estimator.t_ns - kept[-1].snapshot.t_ns >= self._checkpoint_ns:
+                    self._checkpoint()
             self._count(entry, self._apply(entry))
             self._next += 1
-        estimator.propagate(self.imu, latest, record, passing=True)
-        self._checkpoint()
-        self._forget(latest - self._keep_ns)
+        estimator.propagate(imu, latest, record, passing=True)
+        if estimator.t_ns - kept[-1].snapshot.t_ns >= self._checkpoint_ns:
+            self._checkpoint()
+        horizon = latest - self._keep_ns
+        if len(kept) > 1 and kept[1].snapshot.t_ns <= horizon:
+            self._forget(horizon)
 
     @contextmanager
     def past(self, t_ns: int) -> Iterator[None]:
@@ -221,7 +226,9 @@ class Timeline:
                 estimator.release()
             elif entry.feedback == "hold":
                 estimator.hold()
-            aid = entry.aid.at(estimator.nav)
+            aid = entry.aid
+            if aid.placed:
+                aid = aid.at(estimator.nav)
             entry.raw = raw_innovation(aid, estimator) if self.keeps_raw else None
             if self._isolates:
                 return estimator.update(aid)
@@ -230,7 +237,7 @@ class Timeline:
                 outcome = estimator.look(aid, diagnosis.lasting(aid, one, estimator))
             else:
                 outcome = estimator.update(aid, one.noise)
-            if aid.rests_s:
+            if aid.constraint and aid.rests_s:
                 estimator.step[STEP_RESTS_S] = aid.rests_s * (outcome.name == "fused")
             if outcome.name in JUDGED:
                 correction = diagnosis.judge(aid, one, outcome, estimator)
@@ -252,12 +259,10 @@ class Timeline:
             self._on_outcome(entry)
 
     def _checkpoint(self) -> None:
-        last = self._checkpoints[-1]
-        if self.estimator.t_ns - last.snapshot.t_ns >= self._checkpoint_ns:
-            last_key = self._keys[self._next - 1] if self._next else last.last_key
-            self._checkpoints.append(
-                _Checkpoint(self.estimator.snapshot(), last_key, self.diagnosis.snapshot())
-            )
+        last_key = self._keys[self._next - 1] if self._next else self._checkpoints[-1].last_key
+        self._checkpoints.append(
+            _Checkpoint(self.estimator.snapshot(), last_key, self.diagnosis.snapshot())
+        )
 
     def _rewind(self, key: Key) -> None:
         """Back to the last checkpoint that `key` could still follow."""

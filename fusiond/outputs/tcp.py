@@ -154,7 +154,10 @@ class Client:
         self._guests.left(self)
         self._socket.close()
         self._out.clear()
+        session, self.session, self.on_room = self.session, None, None  # no circle is left
         self._server.ended(self)
+        if session is not None:
+            session.end()
 
     def owes(self, now_ns: int) -> bool:
         """True if a request, or the room for an answer that ends the connection, is overdue."""
@@ -316,8 +319,6 @@ class TcpServer:
         """A connection is closed."""
         del self.clients[client]
         self.port.serves(len(self.clients))
-        if client.session is not None:
-            client.session.end()
 
     # ------------------------------------------------------------------ who comes
 

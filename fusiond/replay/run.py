@@ -165,7 +165,7 @@ class _Run:
             first = {"tick": c.first.tick, "t_utc": t_utc, "what": c.first.what}
         duration_s = (self._last_ns - (self._first_ns or self._last_ns)) * 1e-9
         chain = self.replay.chain
-        outcomes = {} if chain is None else chain.navigator.timeline.counters.outcomes
+        outcomes = {} if chain is None else chain.navigator.outcomes()
         return {
             "vehicle": about.metadata["vehicle"],
             "recorded_by": about.metadata["version"],

@@ -16,6 +16,7 @@ import pytest
 
 from drivers.can.imu import CanImuOptions
 from fusiond.configuration.load import load_config
+from fusiond.configuration.schema import Config
 from fusiond.live.daemon import Daemon
 from fusiond.navigation.solution import Mode, Solution
 from fusiond.outputs.messages.health import SourceHealth
@@ -68,14 +69,18 @@ class Bench:
         self.seen: list[Solution] = []
         self._log = log
 
-    def daemon(self, *sections: str) -> Daemon:
-        """A daemon for the configuration of `BASE` and `sections`."""
+    def configuration(self, *sections: str) -> Config:
+        """The configuration of `BASE` and `sections`, in a file as well."""
         path = self.folder / "test.toml"
         text = BASE.format(imu=imu_section(self.imu)) + "\n".join(sections)
         for port in ("gnss", "rdss"):
             text = text.replace(f'port = "{port}"', f'port = "{self.folder / port}"')
         path.write_text(text)
-        self.made = Daemon(load_config(path), on_solution=self.seen.append)
+        return load_config(path)
+
+    def daemon(self, *sections: str) -> Daemon:
+        """A daemon for that configuration."""
+        self.made = Daemon(self.configuration(*sections), on_solution=self.seen.append)
         return self.made
 
     def vehicle(self, scenario: Any = REST, **links: Path) -> SimulatedVehicle:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import itertools
+from collections import deque
 from collections.abc import Callable
 from unittest.mock import patch
 
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fusiond.live.collector import Collector
 from fusiond.live.scheduler import LatenessHistogram, Scheduler
 
 MS = 1_000_000
@@ -172,6 +174,45 @@ async def test_garbage_is_collected_between_ticks() -> None:
     assert status.gc_collections > 10
     assert status.gc_forced == 0
     assert alive < 5000  # of 40000 made
+
+
+async def test_what_a_collection_looks_through_stays_little_where_as_much_goes_as_comes() -> None:
+    """A full queue: CPython's count of what is new stands still, and what is young would grow."""
+    simulation, queue = Simulation(2.0), deque[list[object]](maxlen=2000)
+    young: list[int] = []
+
+    def tick(_: int) -> None:
+        young.append(len(gc.get_objects(0)))
+        for _ in range(20):
+            queue.append([[]])
+
+    await run(simulation, 100.0, tick)
+    assert len(queue) == 2000
+    assert max(young[100:]) < 1000, "some ticks' worth, of 4000 that came while it was full"
+
+
+@pytest.mark.parametrize(("cost_ms", "seconds"), [(1, (10.0,)), (12, (3.3, 6.7)), (40, (1.0, 2.0))])
+def test_the_oldest_generation_is_looked_through_by_its_cost(
+    cost_ms: int, seconds: tuple[float, ...]
+) -> None:
+    """Full of garbage it is dear, and is emptied more often; never later than twice as long."""
+    now_ns, old = 0, list[int]()
+
+    def collect(generation: int) -> None:
+        nonlocal now_ns
+        if generation == 2:
+            old.append(now_ns)
+            now_ns += cost_ms * MS
+
+    collector = Collector(lambda: now_ns)
+    with patch.object(gc, "collect", collect):
+        for _ in range(10_000):
+            now_ns += 10 * MS
+            collector.use_slack(8 * MS)
+    between_s = [(b - a) / S for a, b in itertools.pairwise(old)][1:]
+    assert min(seconds) - 0.1 <= min(between_s)
+    assert max(between_s) <= max(seconds) + 0.2
+    assert collector.max_ns == cost_ms * MS
 
 
 async def test_collection_is_forced_when_there_is_never_slack() -> None:

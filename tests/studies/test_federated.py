@@ -18,7 +18,7 @@ from fusiond.studies.federated import study as federated
 def result() -> dict[str, Any]:
     seen: list[tuple[int, int]] = []
     found = federated.run(2, seed=1, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(k, 12) for k in range(1, 13)]
+    assert seen == [(k, 16) for k in range(1, 17)]
     return found
 
 
@@ -54,6 +54,24 @@ def test_active_and_passive_receiver_fuse_to_better_than_either() -> None:
     assert e["federated_rms_m"] < e["active_alone_rms_m"] < e["rdss_fixes_rms_m"]
     assert e["federated_rms_m"] < e["gnss_fixes_rms_m"]
     assert e["federated_rms_m"] == pytest.approx(e["centralised_rms_m"], rel=0.1)
+
+
+def test_two_receivers_without_an_inertial_unit() -> None:
+    """Experiments 3 and 4 live. What the estimates share is the vehicle's motion, and of two active
+    terminals an error: taken for uncorrelated, with nothing shared out, they state too little."""
+    for name, live in result()["without_imu"].items():
+        e = live["estimates"]
+        for label in ("federated", "federated, correlated"):
+            assert e[label]["rms_m"] == pytest.approx(e["one filter"]["rms_m"], rel=0.1)
+            for source, rms in live["fixes_rms_m"].items():
+                assert e[label]["rms_m"] < rms
+                assert e[label]["sigma_m"] < e[f"{source} alone"]["sigma_m"], (name, source)
+            assert e["as if uncorrelated"]["sigma_m"] < 0.95 * e[label]["sigma_m"]
+            assert e["as if uncorrelated"]["nees_mean"] > 1.2 * e[label]["nees_mean"]
+        # One of a bound and one of what is shared: alike where the sources are.
+        assert e["federated, correlated"]["sigma_m"] == pytest.approx(
+            e["federated"]["sigma_m"], rel=0.1
+        )
 
 
 def test_experiments_of_the_paper() -> None:

@@ -7,12 +7,15 @@ from typing import Literal
 from drivers.immutable import immutable
 
 Mode = Literal["no_reset", "fusion_reset", "zero_reset", "rescale"]
+Fusion = Literal["uncorrelated", "correlated"]
 
 
 @immutable()
 class FederatedOptions:
     """Options for sharing, reset and isolation of a federated filter.
 
+    `fusion`: by bounds that make estimates as good as uncorrelated, or by what they share
+    (fusiond.estimators.federated.correlated), which is for `no_reset` and has no `shares`.
     `shares`: relative factors by local filter, equal where there is none. `master_share` is the
     part of process noise and initial information of the master's own estimate in `rescale`,
     `retained` what an updated local filter keeps there.
@@ -27,6 +30,7 @@ class FederatedOptions:
     false_alarm: float = 1e-6
     window: int = 10
     readmit_after: int = 20
+    fusion: Fusion = "uncorrelated"
 
 
 def local_of(source: str, names: tuple[str, ...]) -> int | None:

@@ -133,8 +133,11 @@ class Viewer:
                 elif isinstance(event, Frame):
                     self._heard(event)
             self._pass_on()
+            if self._client.closed:
+                return
 
     def end(self) -> None:
+        self._socket.parser.close()  # it holds the protocol, which holds it
         self._waiting.clear()
         self.channels.clear()
 

@@ -55,7 +55,7 @@ AIDING: dict[str, AnyAiding] = {
 
 
 @lru_cache(maxsize=1)
-def _active_root() -> Array:
+def active_root() -> Array:
     """Cholesky factor (2, 2) of what the intake says of an RDSS fix here."""
     o = RdssAiding()
     lat, lon, height = ORIGIN_DEG_M
@@ -74,7 +74,7 @@ def arrivals(rng: np.random.Generator) -> tuple[list[Measurement], dict[str, Arr
         t_s = np.arange(every_s, DURATION_S - 2.0, every_s)
         error = rng.standard_normal((len(t_s), 3))
         if source == ACTIVE:
-            error[:, :2] = error[:, :2] @ _active_root().T
+            error[:, :2] = error[:, :2] @ active_root().T
             error[:, 2] *= HEIGHT_SD_M
         else:
             error *= PASSIVE_SD_M

@@ -1,6 +1,8 @@
 r"""Study `federated`: the four experiments of paper 004, and faults in one of three local filters.
 
-Experiments: `fusiond.studies.federated.papers` (1 to 3), `fusiond.studies.federated.platform` (4).
+Experiments: `fusiond.studies.federated.papers` (1 to 3), `fusiond.studies.federated.platform` (4,
+with an inertial unit), `fusiond.studies.federated.without_imu` (3 and 4 live, as the paper has
+them).
 Faults and honesty: `fusiond.studies.federated.runs`. A fault lasts 100 s; errors count from its
 start to the end of the run, 70 s after its end, so that the return counts too. `detected_after_s`
 is the median over the runs; a run in which it is not detected counts as later than any.
@@ -20,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusiond.estimators.federated.options import FederatedOptions
-from fusiond.studies.federated import papers, platform
+from fusiond.studies.federated import papers, platform, without_imu
 from fusiond.studies.federated.runs import (
     DRIFT_M_S,
     DURATION_S,
@@ -66,7 +68,7 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
     count = runs or DEFAULT_RUNS
     if count < 2:
         raise ValueError("runs must be at least 2")
-    step = step_counter(progress, count * (len(FAULTS) + 3))
+    step = step_counter(progress, count * (len(FAULTS) + 5))
     honest = {
         name: _honesty(monte_carlo((*FILTERS, Filter(_GATE_ONLY)), "", sd_m, count, seed, step))
         for name, sd_m in (("equal", EQUAL_M), ("unequal", UNEQUAL_M))
@@ -87,6 +89,12 @@ def run(runs: int | None = None, seed: int = 0, progress: Progress | None = None
             "4_active_and_passive": platform.platform(
                 on_processes(partial(platform.simulate, seed), count, step)
             ),
+        },
+        "without_imu": {
+            name: without_imu.result(
+                on_processes(partial(without_imu.simulate, name, seed), count, step)
+            )
+            for name in without_imu.EXPERIMENTS
         },
         "sources_sd_m": {"equal": list(EQUAL_M), "unequal": list(UNEQUAL_M)},
         "fault": {
@@ -226,6 +234,15 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
             ],
         ),
     ]
+    for name, live in result["without_imu"].items():
+        low, high = live["nees_interval"]
+        rows = [[f"{s} fixes", f"{rms:.2f}", "", ""] for s, rms in live["fixes_rms_m"].items()]
+        for label, f in live["estimates"].items():
+            values = (f[key] for key in ("rms_m", "sigma_m", "nees_mean"))
+            rows.append([label, *(f"{value:.2f}" for value in values)])
+        title = f"{name.replace('_', ' ')}, live, without an inertial unit; NEES of 4 within"
+        header = ["", "horizontal RMS m", "sigma m", "NEES (4)"]
+        found.append((f"{title} [{low:.2f}, {high:.2f}]", header, rows))
     for name, honest in result["honesty"].items():
         low, high = honest["nees_interval"]
         found.append(
@@ -262,18 +279,21 @@ def tables(result: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Experiments 1 and 2 as the paper's figures, and the courses of the faults, to `path`."""
+    """Experiments 1 to 4 as the paper's figures, and the courses of the faults, to `path`."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (extra `[report]`)
 
-    figure = Figure(figsize=(9.0, 13.0), layout="constrained")
-    axes = figure.subplots(5, 1)
+    figure = Figure(figsize=(9.0, 19.0), layout="constrained")
+    axes = figure.subplots(7, 1)
+    for panel, (key, live) in zip(axes[5:], result["without_imu"].items(), strict=True):
+        _ways(panel, live["series"])
+        panel.set_title(f"experiment {key.replace('_', ' ')}, no inertial unit", loc="left")
     for panel, key in zip(axes[:2], ("1_random_truth", "2_constant_truth"), strict=True):
         for name, values in result["experiments"][key]["series"].items():
             panel.plot(values, linewidth=0.6 if name == "measured" else 1.6, label=name)
         panel.set_title(f"experiment {key.replace('_', ' ')}", loc="left")
         panel.set_xlabel("step")
         panel.set_ylabel("m")
-    for panel, fault in zip(axes[2:], FAULTS, strict=True):
+    for panel, fault in zip(axes[2:5], FAULTS, strict=True):
         for name, values in result["series"]["horizontal_rms_m"][fault].items():
             panel.plot(result["series"]["t_s"], values, label=name.replace("_", " "))
         panel.axvspan(result["fault"]["start_s"], result["fault"]["end_s"], alpha=0.1)
@@ -286,3 +306,18 @@ def plot(result: dict[str, Any], path: Path) -> None:
         panel.grid(alpha=0.3)
         panel.legend(fontsize="small", ncols=5, loc="upper left")
     figure.savefig(path, dpi=120)
+
+
+def _ways(panel: Any, series: dict[str, Any]) -> None:
+    """Figures 3 and 4: the true way, each receiver's fixes, and what was made of them."""
+    for name, fixes in series["fixes"].items():
+        north, east = zip(*fixes, strict=True)
+        panel.plot(east, north, ".", markersize=2.5, label=f"{name} fixes")
+    fused = "federated, correlated"
+    north, east = zip(*series["ways"][fused], strict=True)
+    panel.plot(east, north, linewidth=1.6, label=fused)
+    north, east = zip(*series["truth"], strict=True)
+    panel.plot(east, north, "k", linewidth=0.8, label="truth")
+    panel.set_xlabel("east, m")
+    panel.set_ylabel("north, m")
+    panel.set_aspect("equal", adjustable="datalim")

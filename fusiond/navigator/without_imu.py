@@ -1,0 +1,256 @@
+r"""Navigation without an inertial unit: position and velocity by fixes and a constant velocity.
+
+While the unit is absent, or has been silent for longer than navigation can bridge
+(`fusiond.navigator.imu_door`), the same timeline, filters and aids run on samples that a vehicle
+would feel which is level, faces north and goes on as it goes:
+
+    w = w_ie + w_en(v^),   f = (2 w_ie + w_en(v^)) x v^ - g
+
+so that velocity changes by the model's noise and by what is measured alone. Attitude is not known
+and not published; aids that say nothing without it are left out, a lever arm counts by its upward
+part (`Aid.unturned`). With `[estimator] filter = "federated"` the receivers have a local filter
+each, as in experiments 3 and 4 of paper 004; every other filter is here the Kalman filter.
+
+The first fix makes a start that knows next to nothing, and is then an aid like any other. When the
+inertial unit has aligned, its navigation takes over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusiond.aiding.base import Aid
+from fusiond.aiding.offers import PositionOffer
+from fusiond.configuration.schema import Config
+from fusiond.estimators.base import Estimator
+from fusiond.models.blocks import Block
+from fusiond.models.constant_velocity import constant_velocity
+from fusiond.navigation.earth import EARTH_RATE_RAD_S, gravity, meridian_radius, transverse_radius
+from fusiond.navigation.imu_buffer import ImuBuffer
+from fusiond.navigation.solution import Bound, Mode, Solution
+from fusiond.navigation.strapdown import HEIGHT, LAT, Q0, VD, VE, VN
+from fusiond.navigator.alignment.start import UNKNOWN_HEIGHT_SD_M
+from fusiond.navigator.filters import estimator_without_imu
+from fusiond.navigator.imu_door import BEARABLE_GAP_S
+from fusiond.navigator.readout import solution_of
+from fusiond.navigator.timeline import Entry, Timeline
+
+Array = NDArray[np.float64]
+
+# Spacing of the samples (ns): velocity is linear in between, whatever it is; the tick's rate of a
+# slow computer.
+STEP_NS = 100_000_000
+# No two of them are so far apart (s).
+GAP_S = 1.0
+# One sigma (m) of the first position before its fix has been told: no receiver errs by so much.
+START_SD_M = 1000.0
+# Aids that are remembered for a start: a minute of two receivers once a second.
+MOST_REMEMBERED = 128
+
+
+class WithoutImu:
+    """Takes over where there is no inertial unit. `on_event(code, text)` hears of both changes,
+    `on_outcome` of each aid; `last_fused_ns` by source is kept."""
+
+    def __init__(
+        self,
+        config: Config,
+        blocks: Sequence[Block],
+        on_event: Callable[[str, str], None],
+        last_fused_ns: dict[str, int],
+        on_outcome: Callable[[Entry], None] | None,
+    ) -> None:
+        self._config, self._blocks = config, blocks
+        self._event, self._on_outcome = on_event, on_outcome
+        self._last_fused_ns = last_fused_ns
+        self.estimator: Estimator | None = None
+        """Published solution, while this navigates."""
+        self._ended: dict[str, Counter[str]] = {}
+        self._recent: deque[Aid] = deque(maxlen=MOST_REMEMBERED)
+        self._first_ns: int | None = None
+        self._silent_ns = 0
+        self._located_ns = 0
+        self._max_speed_m_s = config.plausibility.max_speed_m_s
+
+    @property
+    def active(self) -> bool:
+        """True if it navigates."""
+        return self.estimator is not None
+
+    def hear(self, aids: Sequence[Aid], seen_ns: int) -> None:
+        """Aids have come at `seen_ns`."""
+        self._recent.extend(aids)
+        if self._first_ns is None and aids:
+            self._first_ns = seen_ns or aids[0].t_ns
+        if self.estimator is not None:
+            for aid in aids:
+                self._insert(aid)
+
+    def tick(self, t_ns: int, imu: ImuBuffer, navigating: bool) -> None:
+        """It is `t_ns`: begin, go on or end. `navigating`: inertial navigation has begun."""
+        since_ns = imu.latest_ns if imu.end else self._first_ns
+        if since_ns is None:
+            return
+        self._silent_ns = t_ns - since_ns
+        silent = self._silent_ns * 1e-9 > BEARABLE_GAP_S
+        if self.estimator is None:
+            if silent:
+                self._begin(since_ns)
+        elif navigating and not silent:
+            self._event("with_imu", "the inertial unit has aligned and navigates")
+            self.stop()
+            return
+        if self.estimator is not None:
+            self._run(self.estimator, t_ns)
+
+    def stop(self) -> None:
+        """Another navigates from now on, or all is to begin anew."""
+        self._ended, self.estimator = self.counted(), None
+        self._recent.clear()
+
+    def counted(self) -> dict[str, Counter[str]]:
+        """Outcomes of measurements here, by source, since the daemon began."""
+        found = {name: Counter(counts) for name, counts in self._ended.items()}
+        if self.estimator is not None:
+            for name, counts in self._timeline.counters.outcomes.items():
+                found.setdefault(name, Counter()).update(counts)
+        return found
+
+    # ------------------------------------------------------------------ solution
+
+    def solution(self, t_ns: int, why: str, bound: Bound) -> Solution:
+        """The solution at `t_ns`; `why` there is no inertial navigation."""
+        e = self.estimator
+        assert e is not None
+        mode, reason = self._mode(t_ns, e, why)
+        s = solution_of(e, self._imu, t_ns, round(GAP_S * 1e9), mode, reason, bound)
+        north, east, down = s.sd_ned_m
+        # The position is that of the antennas, as far as nobody knows where they point.
+        arm = self._arm_m
+        return replace(
+            s,
+            rpy_rad=(math.nan,) * 3,
+            sd_ned_m=(math.hypot(north, arm), math.hypot(east, arm), down),
+            gyro_bias_rad_s=(math.nan,) * 3,
+            accel_bias_m_s2=(math.nan,) * 3,
+        )
+
+    def _mode(self, t_ns: int, e: Estimator, why: str) -> tuple[Mode, str]:
+        limits = self._config.estimator
+        sigmas = e.sigmas()
+        sd_m = math.hypot(float(sigmas[0]), float(sigmas[1]))
+        said = f"{why}; without an inertial unit: constant velocity, no attitude"
+        if not sd_m <= limits.invalid_sd_m:
+            return Mode.INVALID, f"horizontal sigma {sd_m:.0f} m; {said}"
+        unaided = (t_ns - self._located_ns) * 1e-9
+        if unaided > limits.coast_after_s:
+            return Mode.COASTING, f"no position fused for {unaided:.0f} s; {said}"
+        return Mode.NAVIGATING, said
+
+    # ------------------------------------------------------------------ inside
+
+    def _begin(self, since_ns: int) -> None:
+        """Start at the newest fix since the samples ended, if there is one."""
+        fixes = [
+            offer
+            for aid in self._recent
+            if aid.t_ns >= since_ns and aid.unturned() is not None
+            for offer in aid.offers()
+            if isinstance(offer, PositionOffer)
+        ]
+        if not fixes:
+            return
+        fix = max(fixes, key=lambda offer: offer.t_ns)
+        config = self._config
+        model = constant_velocity(config.plausibility.manoeuvre, self._blocks)
+        estimator = estimator_without_imu(config, model, GAP_S)
+        self._imu = ImuBuffer(1e9 / STEP_NS, config.estimator.buffer_s, np.eye(3), 0.0, GAP_S)
+        self._timeline = Timeline(
+            *(estimator, self._imu, config.estimator.buffer_s, config.estimator.checkpoint_s),
+            self._outcome,
+        )
+        arms = (section.lever_arm_m for section in config.aiding.values())
+        self._arm_m = max((math.hypot(x, y) for x, y, _ in arms), default=0.0) / math.sqrt(2.0)
+        nav = np.zeros(10)
+        nav[LAT], nav[LAT + 1], nav[HEIGHT] = fix.lat_rad, fix.lon_rad, fix.height_m or 0.0
+        nav[Q0] = 1.0
+        sd = model.initial.copy()
+        sd[3:6] = self._max_speed_m_s / math.sqrt(3.0)
+        sd[6:8], sd[8] = START_SD_M, UNKNOWN_HEIGHT_SD_M
+        self._imu.append(np.array([fix.t_ns], dtype=np.int64), _felt(nav))
+        estimator.initialise(fix.t_ns, 1, nav, np.zeros(model.size), np.diag(sd**2))
+        self._timeline.start()
+        self.estimator = estimator
+        for aid in self._recent:
+            if aid.t_ns >= fix.t_ns:
+                self._insert(aid)
+        self._event(
+            "without_imu",
+            "no inertial unit: position and velocity by fixes and a constant velocity, no attitude",
+        )
+
+    def _insert(self, aid: Aid) -> None:
+        level = aid.unturned()
+        if level is not None:
+            self._timeline.insert(level)
+
+    def _run(self, e: Estimator, t_ns: int) -> None:
+        """Samples until now, and all that has come."""
+        count = (t_ns - self._imu.latest_ns) // STEP_NS
+        if count > 0:
+            times = self._imu.latest_ns + STEP_NS * np.arange(1, count + 1, dtype=np.int64)
+            self._imu.append(times, np.repeat(_felt(e.nav), count, axis=0))
+        self._timeline.run()
+        if not (np.isfinite(e.nav).all() and np.isfinite(e.covariance).all()):
+            self._event("filter_not_finite", "without an inertial unit: starting anew")
+            self.stop()
+
+    def _outcome(self, entry: Entry) -> None:
+        if entry.outcome is not None and entry.outcome.name == "fused":
+            source, t_ns = entry.aid.source, entry.key[0]
+            self._last_fused_ns[source] = max(t_ns, self._last_fused_ns.get(source, -1))
+            if entry.aid.locates:
+                self._located_ns = max(self._located_ns, t_ns)
+        if self._on_outcome is not None:
+            self._on_outcome(entry)
+
+
+def counted_together(
+    inertial: Mapping[str, Counter[str]], without: Mapping[str, Counter[str]]
+) -> dict[str, Counter[str]]:
+    """Outcomes by source of both. An aid that was fused without an inertial unit, and came before
+    the alignment or where no sample reaches, is not counted as lost as well."""
+    found = {name: Counter(counts) for name, counts in inertial.items()}
+    for name, counts in without.items():
+        both = found.setdefault(name, Counter())
+        fused = counts["fused"]
+        for lost in ("no_alignment", "no_imu"):
+            spared = min(both[lost], fused)
+            both[lost], fused = both[lost] - spared, fused - spared
+        both.update(counts)
+    return found
+
+
+def _felt(nav: Array) -> Array:
+    """Rate and force (1, 6) of a vehicle in the state (10,) that keeps facing north, level, at its
+    velocity."""
+    lat, height = float(nav[LAT]), float(nav[HEIGHT])
+    north, east = float(nav[VN]), float(nav[VE])
+    earth = np.array([math.cos(lat), 0.0, -math.sin(lat)]) * EARTH_RATE_RAD_S
+    radius_n = transverse_radius(lat) + height
+    transport = np.array(
+        [
+            east / radius_n,
+            -north / (meridian_radius(lat) + height),
+            -east * math.tan(lat) / radius_n,
+        ]
+    )
+    force = np.cross(2.0 * earth + transport, nav[VN : VD + 1])
+    force[2] -= gravity(lat, height)
+    return np.hstack([earth + transport, force])[None, :]

@@ -1,0 +1,200 @@
+"""Jobs of this process done for their side effects by children that are forked, and end.
+
+A job finds everything as its caller has it, and what it takes of memory goes when its child ends.
+One child forks the others and tells how many jobs are done by a pipe, so that whoever waits may do
+so in an event loop and never forks in it. Children work side by side, each at one job; one that
+holds more than its share of memory is followed by another. A job whose child dies is given to a
+child alone, once more; what has failed then is left to the caller, who can say why.
+
+They run by normal priority, and go before the caller does where memory ends.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import NoReturn
+
+Job = Callable[[], object]
+
+# Children side by side, where there are as many processors.
+MOST_CHILDREN = 2
+# What a child may hold of its own, in bytes: two of them beside the caller keep below 350 MB.
+SHARE = 70_000_000
+_PR_SET_PDEATHSIG = 1
+_DONE, _LAST = b".", b"!"
+
+
+class Forked:
+    """`jobs` at work in other processes; iterate for the number that is done, to the end. `prepare`
+    loads what all jobs need, once."""
+
+    def __init__(
+        self, jobs: Sequence[Job], prepare: Job = lambda: None, share: int = SHARE
+    ) -> None:
+        self.total = len(jobs)
+        self.done = 0
+        self._read, write = os.pipe()
+        self._pid = _fork(lambda: _Jobs(jobs, share, write).work(prepare))
+        os.close(write)
+
+    def __enter__(self) -> Forked:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.end()
+
+    def __iter__(self) -> Iterator[int]:
+        while self.read():
+            yield self.done
+
+    def fileno(self) -> int:
+        """Descriptor that is readable when there is news."""
+        return self._read
+
+    def read(self) -> bool:
+        """Wait for news, and take it; False when all is over."""
+        news = os.read(self._read, self.total)
+        self.done += len(news)
+        return bool(news)
+
+    def end(self) -> None:
+        """The children end, in the middle of a job too."""
+        if self._pid:
+            with suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGTERM)
+            os.waitpid(self._pid, 0)
+            os.close(self._read)
+            self._pid = 0
+
+
+class _Child:
+    """One that works, and the job that it has."""
+
+    def __init__(self, jobs: Sequence[Job], share: int) -> None:
+        self.connection, theirs = socket.socketpair()
+        self.job: int | None = None
+        self._pid = _fork(lambda: _work(jobs, share, theirs))
+        theirs.close()
+
+    def fileno(self) -> int:
+        return self.connection.fileno()
+
+    def give(self, job: int) -> None:
+        self.job = job
+        with suppress(OSError):  # it died: its end is read
+            self.connection.send(job.to_bytes(4, "big"))
+
+    def end(self) -> None:
+        with suppress(OSError):  # later children have a copy of it: to close it would not do
+            self.connection.shutdown(socket.SHUT_RDWR)
+        self.connection.close()
+        os.waitpid(self._pid, 0)
+
+
+class _Jobs:
+    """The first child: hands out jobs, in their order."""
+
+    def __init__(self, jobs: Sequence[Job], share: int, told: int) -> None:
+        self._jobs, self._share, self._told = jobs, share, told
+        self._waiting = deque(range(len(jobs)))
+        self._alone: deque[int] = deque()
+
+    def work(self, prepare: Job) -> None:
+        """Have all of them done."""
+        prepare()
+        gc.freeze()  # a collection in a child would copy what they share
+        self._hand_out(self._waiting, min(MOST_CHILDREN, len(os.sched_getaffinity(0))))
+        self._hand_out(self._alone, 1)
+
+    def _hand_out(self, waiting: deque[int], most: int) -> None:
+        children: list[_Child] = []
+        while waiting or children:
+            while waiting and len(children) < most:
+                child = _Child(self._jobs, self._share)
+                child.give(waiting.popleft())
+                children.append(child)
+            ready, _, _ = select.select(children, [], [])
+            for child in ready:
+                answer = child.connection.recv(1)
+                if not answer and waiting is not self._alone and child.job is not None:
+                    self._alone.append(child.job)
+                elif answer:
+                    os.write(self._told, b".")
+                if answer == _DONE and waiting:
+                    child.give(waiting.popleft())
+                else:
+                    children.remove(child)
+                    child.end()
+
+
+def _work(jobs: Sequence[Job], share: int, connection: socket.socket) -> None:
+    """A child: does the jobs that it is given until it holds too much."""
+    while number := connection.recv(4):
+        jobs[int.from_bytes(number, "big")]()
+        connection.send(_LAST if _own_bytes() > share else _DONE)
+
+
+def _own_bytes() -> int:
+    """Memory that is this process's alone (proc(5), smaps_rollup); 0 where the kernel hides it."""
+    try:
+        lines = Path("/proc/self/smaps_rollup").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) * 1024
+
+
+def _fork(work: Callable[[], None]) -> int:
+    """A child that does `work` and ends; the pid. It ends with its parent, too."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    parent = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        _child(work, parent)
+    return pid
+
+
+def _child(work: Callable[[], None], parent: int) -> NoReturn:
+    status = 1
+    try:
+        signal.set_wakeup_fd(-1)  # signals of ours are not our parent's
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started us
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() == parent:
+            _step_back()
+            work()
+            status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(status)
+
+
+def _step_back() -> None:
+    """Normal priority and badness, where the caller's are better."""
+    with suppress(OSError):
+        if os.getpriority(os.PRIO_PROCESS, 0) < 0:
+            os.setpriority(os.PRIO_PROCESS, 0, 0)
+    badness = Path("/proc/self/oom_score_adj")
+    with suppress(OSError, ValueError):
+        if int(badness.read_text(encoding="ascii")) < 0:
+            badness.write_text("0", encoding="ascii")
