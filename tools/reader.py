@@ -6,7 +6,7 @@
 | `long_openings` | docstrings whose first sentence has more than 25 words |
 | `long_functions` | functions of more than 60 lines, docstring included |
 | `many_parameters` | functions of more than 10 parameters |
-| `shared_names` | functions and methods whose name more than 20 others have |
+| `shared_names` | functions and methods whose name more than 25 others have |
 | `private_words` | names with a word of the glossary's table "Words that go" |
 
 Usage: python -m tools.reader [--list COUNT | --names | --check | --lower]. Without an option: the
@@ -33,7 +33,7 @@ GLOSSARY = REPOSITORY / "docs" / "glossary.md"
 PACKAGES = ("fusiond", "drivers")
 
 QUESTIONS = frozenset(["what", "whether", "how", "who", "when", "where", "which", "whose", "why"])
-MOST_WORDS, MOST_LINES, MOST_PARAMETERS, MOST_ALIKE = 25, 60, 10, 20
+MOST_WORDS, MOST_LINES, MOST_PARAMETERS, MOST_ALIKE = 25, 60, 10, 25
 KINDS = (
     *("questions", "long_openings", "long_functions", "many_parameters"),
     *("shared_names", "private_words"),

@@ -121,7 +121,7 @@ class Aid:
     """It holds while the vehicle moves the way it faces: refused for long, it slides, or the
     attitude or the IMU's mounting is wrong."""
     shown: ClassVar[attrgetter[Any] | None] = None
-    """What a sensor that hangs repeats to the bit; else the first of its `offers` says it."""
+    """Value that a frozen sensor repeats to the bit; else the first of its `offers` says it."""
     waits: ClassVar[bool] = False
     """Its `feedback` is not always at once."""
     placed: ClassVar[bool] = False

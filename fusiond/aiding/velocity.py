@@ -49,7 +49,7 @@ lag makes: of a change at once it is between nothing and all. With 0.5 what step
 forces explain of drive_0708 (receiver's lag 0.13 s) is chi-square (mean l / p of 1.1 and 0.9; 5.2
 and 1.7 without it, with seven decisions in six runs; 0.7 and 0.6 with 1)."""
 CORNER_RAD_S = 0.2
-"""How fast a vehicle ordinarily turns at a street corner: a quarter turn in six to eight seconds.
+"""Usual turn rate of a vehicle at a street corner: a quarter turn in six to eight seconds.
 By so much times its lever arm an antenna goes its own way."""
 Indices = NDArray[np.int64]
 

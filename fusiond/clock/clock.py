@@ -35,7 +35,6 @@ from drivers.measurements import (
     UtcStamp,
 )
 from fusiond.clock import dates
-from fusiond.clock.answers import ClockStatus, Instant, TimeSample
 from fusiond.clock.device_clock import DeviceClock
 from fusiond.clock.host import (
     KERNEL_FUTURE_NS,
@@ -46,6 +45,7 @@ from fusiond.clock.host import (
     SystemClock,
     SystemTime,
 )
+from fusiond.clock.results import ClockStatus, Instant, TimeSample
 from fusiond.clock.time_of_day import RdssTimeOfDay, nearest
 from fusiond.clock.utc_envelope import UtcEnvelope, UtcKnown
 from fusiond.configuration.schema import ClockOptions

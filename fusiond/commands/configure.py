@@ -13,7 +13,7 @@ from fusiond.commands.shared import EXIT_IO, config_errors, parse_mqtt, spinner
 if TYPE_CHECKING:
     from drivers.can.bus import Interface
     from fusiond.configuration.draft import Draft, DraftSource, Vector
-    from fusiond.doctor.finding import Device, Unheard
+    from fusiond.doctor.discovery import Device, Unheard
 
 config = typer.Typer(no_args_is_help=True, help="Configurations: write a first one.")
 _NAMES = {
@@ -143,7 +143,7 @@ def _look(
     import asyncio  # noqa: PLC0415
 
     from fusiond.doctor.devices import can_interfaces, similar_ports  # noqa: PLC0415
-    from fusiond.doctor.finding import Device, Unheard, on_bus, on_port  # noqa: PLC0415
+    from fusiond.doctor.discovery import Device, Unheard, on_bus, on_port  # noqa: PLC0415
 
     channels = [_bus(text) for text in (can_interfaces() if buses is None else buses)]
 

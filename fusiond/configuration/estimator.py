@@ -48,7 +48,7 @@ class Federated(Section):
     """Reset of the local filters after a fusion; only `no_reset` keeps a fault in its own
     filter."""
     fusion: Literal["uncorrelated", "correlated"] = "uncorrelated"
-    """How the estimates are put together: by sharing factors, as if they were uncorrelated, or by
+    """Fusion of the estimates: by sharing factors, as if they were uncorrelated, or by
     the covariances between them (paper 004), which only `no_reset` can."""
     sharing: Literal["fixed", "adaptive"] = "fixed"
     """True if the sharing factors stay or follow the local covariances."""

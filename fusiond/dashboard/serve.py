@@ -130,12 +130,12 @@ async def serve(
     """Serve at `door` what `source` feeds into the hub, until `stop` is set or the source fails."""
     import uvicorn  # noqa: PLC0415 - an extra
 
-    from fusiond.dashboard.door import Door  # noqa: PLC0415 - the same
+    from fusiond.dashboard.connections import BoundedConnection  # noqa: PLC0415 - the same
     from fusiond.dashboard.web import application  # noqa: PLC0415 - the same
 
     config = uvicorn.Config(
         application(hub, serving.token, serving.loopback, serving.base_map),
-        http=Door,
+        http=BoundedConnection,
         ws="websockets-sansio",
         ws_per_message_deflate=False,  # a core's worth of it, for a local network
         ws_max_size=65536,

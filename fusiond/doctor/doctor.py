@@ -27,7 +27,7 @@ from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise, quiet_limits, sensor_to_body
 from fusiond.doctor.devices import device_name, open_findings
 from fusiond.doctor.findings import finding
-from fusiond.doctor.values import KEPT, Values
+from fusiond.doctor.measurement_statistics import KEPT, Values
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.outputs import broker_access
 

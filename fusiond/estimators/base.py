@@ -180,7 +180,7 @@ class Estimator(Protocol):
         """One sigma (9,): position, velocity (n, e, d), roll, pitch, yaw."""
 
     def surely_moves(self, published: bool) -> bool:
-        """Whether the vehicle moves, by the horizontal velocity and its sigma: that of what is
+        """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
         `published`, or P's alone."""
 
     def snapshot(self) -> Snapshot:
@@ -313,7 +313,7 @@ class ErrorStateFilter:
         return out
 
     def surely_moves(self, published: bool) -> bool:
-        """Whether the vehicle moves, by the horizontal velocity and its sigma: that of what is
+        """True if the vehicle moves, by the horizontal velocity and its sigma: that of what is
         `published`, or P's alone."""
         nav, wider = self.nav, _NO_WIDER
         speed = math.hypot(nav.item(VN), nav.item(VE))

@@ -75,7 +75,7 @@ class Series:
     moves: bool
     state: Service = Service.NOMINAL
     out: bool = False
-    """Whether it is looked at, and not fused."""
+    """True if it is looked at, and not fused."""
     since_ns: int = 0
     heard_ns: int = 0
     reason: str = ""

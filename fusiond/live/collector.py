@@ -35,7 +35,7 @@ class Collector:
         self.max_ns = 0
 
     def start(self) -> None:
-        """What start-up made lives for ever: move it out of the collector's sight."""
+        """Move the objects of the start-up out of the collector's sight."""
         gc.collect()
         gc.freeze()
         gc.disable()

@@ -56,7 +56,7 @@ from fusiond.workers.forked import Forked
 log = logging.getLogger("fusiond")
 
 SWITCH_S = 0.0005
-"""How long a tick waits for a thread that computes, as the log's does ten times a second: 5 ms by
+"""Time that a tick waits for a thread that computes, as the log's does ten times a second: 5 ms by
 CPython's default, by which one tick of a hundred began 7 ms late."""
 
 

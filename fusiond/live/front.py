@@ -1,4 +1,4 @@
-"""What faces outwards: events, the service manager, outputs. It is there before the navigator, and
+"""Front of the daemon: events, the service manager, outputs. It is there before the navigator, and
 answers while kernels compile."""
 
 from __future__ import annotations

@@ -192,7 +192,7 @@ def _load_when_called(kernel: Any, name: str, signature: str) -> Callable[[], No
 
 
 def _type_of(kernel: Any, value: Any) -> Any:
-    """What numba's dispatcher says of an argument's type, which it asks for once a kind of array:
+    """Type of an argument for numba's dispatcher, which it asks for once a kind of array:
     to be sure that it is no masked one it would import them, as long as linking twenty kernels."""
     kind = FROM_DTYPE.get(value.dtype) if type(value) is np.ndarray else None
     if kind is None:

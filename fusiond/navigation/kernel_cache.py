@@ -156,7 +156,7 @@ def _file_name(name: str, signature: str, *processor: str) -> str:
 
 
 def _sound(path: Path, damaged: Callable[[Path, str], None]) -> memoryview | None:
-    """What a file holds, if its digest is right."""
+    """Contents of a file, if its digest is right."""
     try:
         data = memoryview(path.read_bytes())
     except FileNotFoundError:

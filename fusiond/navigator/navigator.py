@@ -23,11 +23,11 @@ from fusiond.estimators.invariant import InvariantFilter
 from fusiond.integrity.catalogue import SENSOR, Kind
 from fusiond.models.model import Model
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigator.alignment.afterwards import Afterwards
 from fusiond.navigator.alignment.aligner import Aligner
-from fusiond.navigator.alignment.lateness import Lateness
+from fusiond.navigator.alignment.latency import LatencySearch
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import Start
+from fusiond.navigator.alignment.start_check import StartCheck
 from fusiond.navigator.calibration import CalibrationWatch
 from fusiond.navigator.constraints import ConstraintMaker, vehicle_blocks
 from fusiond.navigator.faults import SourceService
@@ -114,13 +114,15 @@ class Navigator:
         )
         self._last_position_ns = 0
         self.started: Start | None = None
-        self._afterwards: Afterwards | None = None
+        self._start_check: StartCheck | None = None
         self.warm: WarmStart | None = None
         """A start to be tried before any alignment, and its trial."""
         self.calibration: SavedCalibration | None = None
         """Calibration of an earlier drive, taken up by each alignment until it is refuted."""
         self.calibrating = CalibrationWatch(self.model, self._event, imu.misalignment_deg * DEG)
-        self._lateness = Lateness(alignment_options(config), self._noise, self.model, self._event)
+        self._latency = LatencySearch(
+            alignment_options(config), self._noise, self.model, self._event
+        )
         self._status = NavigationStatus(config, self.estimator, self.imu, self._door, self._units)
         self._aligner = self._new_aligner()
 
@@ -199,7 +201,7 @@ class Navigator:
         if isinstance(aids, str):
             return self._refuse(m.source, aids)
         self.without_imu.hear(aids, seen_ns)
-        aids = self._lateness.hear(m.source, aids)
+        aids = self._latency.hear(m.source, aids)
         if self.started is None:
             self._aligner.aids(aids)
         self._units.fix(m, t_ns, self.imu, aids)
@@ -210,7 +212,7 @@ class Navigator:
 
     def reset(self, why: str, saved: SavedState | None = None) -> None:
         """Forget the solution and align anew, with a saved state if it still holds."""
-        self._lateness.stop()
+        self._latency.stop()
         self.timeline.clear()
         self._protection.restart()
         self.started, self._saved, self.warm = None, saved, None
@@ -239,7 +241,7 @@ class Navigator:
         """Run as far as the IMU reaches. `record` keeps the solution at each sample in `imu`."""
         if self.started is None:
             start = self._warm_start() or self._aligner.attempt(self.imu)
-            if start is None or self._late() or self._aligner.waits(start, self._lateness):
+            if start is None or self._late() or self._aligner.waits(start, self._latency):
                 return
             if self.calibration is not None and not self.on_trial:
                 start = self.calibration.taken_up(start, self.model)
@@ -251,7 +253,7 @@ class Navigator:
             self.timeline.start(start.used)
             self.verdicts.reset()
             self.started = start
-            self._afterwards = Afterwards(alignment_options(self.config), start)
+            self._start_check = StartCheck(alignment_options(self.config), start)
             self._last_position_ns = max(start.t_ns, self._last_position_ns)
             self._event("aligned", reason("heading_from", how=start.how))
         self.timeline.run(record)
@@ -293,7 +295,7 @@ class Navigator:
 
     def _refuted(self) -> bool:
         """True if the start has shown to be a wrong one; alignment then begins anew."""
-        e, start = self.estimator, self._afterwards
+        e, start = self.estimator, self._start_check
         if start is None:
             return False
         doubted = any(f.kind.of == SENSOR for f in self.timeline.diagnosis.findings)
@@ -308,12 +310,12 @@ class Navigator:
     def _late(self) -> bool:
         """True if a receiver is found to be late; alignment then begins anew, by its last fixes at
         the instants at which they were true."""
-        found = self._lateness.look(self.imu)
+        found = self._latency.look(self.imu)
         if found is None:
             return False
         publish_by_own_clock(self.estimator, found.sd_s)  # it has said when the fixes were
         self.reset(found.why)
-        self._aligner.aids(self._lateness.kept())
+        self._aligner.aids(self._latency.kept())
         return True
 
     def _warm_start(self) -> Start | None:
@@ -337,7 +339,7 @@ class Navigator:
         """Condition of the heading that nothing has shown, in words; empty where it does not."""
         if self.warm is not None and self.warm.on_trial:
             return reason("not_confirmed_by_fix")
-        return self._afterwards.unconfirmed if self._afterwards else ""
+        return self._start_check.unconfirmed if self._start_check else ""
 
     def solution(self, t_ns: int) -> Solution:
         """The solution at `t_ns`, of all that has been run by `advance`.
@@ -377,7 +379,7 @@ class Navigator:
         return self.without_imu.estimator or self.estimator
 
     def outcomes(self) -> dict[str, Counter[str]]:
-        """What became of aids, by source, with an inertial unit or without."""
+        """Outcomes of measurements, by source, with an inertial unit or without."""
         return counted_together(self.timeline.counters.outcomes, self.without_imu.counted())
 
     # ------------------------------------------------------------------ inside

@@ -70,7 +70,7 @@ class WithoutImu:
         self._event, self._on_outcome = on_event, on_outcome
         self._last_fused_ns = last_fused_ns
         self.estimator: Estimator | None = None
-        """What is published, while this navigates."""
+        """Published solution, while this navigates."""
         self._ended: dict[str, Counter[str]] = {}
         self._recent: deque[Aid] = deque(maxlen=MOST_REMEMBERED)
         self._first_ns: int | None = None
@@ -80,7 +80,7 @@ class WithoutImu:
 
     @property
     def active(self) -> bool:
-        """Whether it navigates."""
+        """True if it navigates."""
         return self.estimator is not None
 
     def hear(self, aids: Sequence[Aid], seen_ns: int) -> None:
@@ -115,7 +115,7 @@ class WithoutImu:
         self._recent.clear()
 
     def counted(self) -> dict[str, Counter[str]]:
-        """What became of aids here, by source, since the daemon began."""
+        """Outcomes of measurements here, by source, since the daemon began."""
         found = {name: Counter(counts) for name, counts in self._ended.items()}
         if self.estimator is not None:
             for name, counts in self._timeline.counters.outcomes.items():

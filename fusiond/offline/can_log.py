@@ -2,9 +2,9 @@
 
 Frames go to the very drivers that the configuration names, and their stamps to the daemon's own
 `Clock`, whose host lives by the log: the recorder's stamp of a frame is the instant at which it
-came, and its clock is the system's, which may be set (fusiond.clock.recorder). Times are those of
-the log, POSIX seconds where the recorder knew the date; where its clock was set, they are those of
-the clock as it was at the end.
+came, and its clock is the system's, which may be set (fusiond.clock.recorder_clock). Times are
+those of the log, POSIX seconds where the recorder knew the date; where its clock was set, they are
+those of the clock as it was at the end.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from drivers.raw.messages import Bdgim, Ephemeris, Klobuchar, RawGnssEpoch
 from drivers.rdss.mail import FleetFix, MessageReceived, MessageStage
 from fusiond.clock import dates
 from fusiond.clock.clock import Clock
-from fusiond.clock.recorder import (
+from fusiond.clock.recorder_clock import (
     AHEAD_NS,
     ENOUGH_REPORTS,
     FOLLOWING,

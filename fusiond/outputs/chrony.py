@@ -16,7 +16,7 @@ import struct
 from collections import Counter
 
 from drivers.base import DriverStatus
-from fusiond.clock.answers import TimeSample
+from fusiond.clock.results import TimeSample
 from fusiond.configuration.outputs import Chrony
 from fusiond.outputs.base import Surroundings
 from fusiond.outputs.latest import Latest

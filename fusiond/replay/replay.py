@@ -19,8 +19,8 @@ from pydantic import ValidationError
 
 from drivers.measurements import Measurement
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.clock.answers import Instant
 from fusiond.clock.clock import Clock
+from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
 from fusiond.live.chain import Chain
 from fusiond.live.events import Events

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.measurements import ImuSample, Measurement
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.clock.answers import Instant
+from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import sensor_to_body
 from fusiond.files.csv_tables import MissingPackageError

@@ -24,7 +24,7 @@ from drivers.measurements import (
     WheelSpeed,
 )
 from drivers.raw.messages import RawGnssEpoch
-from fusiond.clock.answers import Instant
+from fusiond.clock.results import Instant
 from fusiond.configuration.schema import Config
 from fusiond.recording.reader import Log
 from fusiond.replay.replay import Replay

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
-from fusiond.report.items import Item, Plot, Section, Sentence, Series
+from fusiond.report.page_items import Item, Plot, Section, Sentence, Series
 from fusiond.report.run import Run
 
 _BINS = 80

@@ -16,8 +16,8 @@ import numpy as np
 
 from fusiond.files.csv_tables import Floats, TableError
 from fusiond.files.rows import Row, read_rows
-from fusiond.report.items import Grid, Item, Plot, Section, Sentence, Series, Table
 from fusiond.report.page import page
+from fusiond.report.page_items import Grid, Item, Plot, Section, Sentence, Series, Table
 
 GROUPED = ("study", "part", "config_digest", "version", "seed")
 MOST_GROUPS = 6

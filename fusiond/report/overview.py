@@ -10,8 +10,8 @@ import numpy as np
 from fusiond.files.tables import TrajectoryTable
 from fusiond.integrity.service import Service
 from fusiond.navigation.solution import Mode
-from fusiond.report.items import Item, Section, Sentence, Table, Track
-from fusiond.report.local import metres_from, origin_of
+from fusiond.report.local_plane import metres_from, origin_of
+from fusiond.report.page_items import Item, Section, Sentence, Table, Track
 from fusiond.report.run import Run
 
 MODES = tuple(str(mode) for mode in Mode)

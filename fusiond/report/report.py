@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from fusiond.files.tables import TrajectoryTable, read_truth
-from fusiond.report import devices, overview, states, trust
-from fusiond.report.items import Item, Section
+from fusiond.report import devices, filter_plots, overview, states
 from fusiond.report.log_run import run_from_log
 from fusiond.report.page import page
+from fusiond.report.page_items import Item, Section
 from fusiond.report.run import Problem, Run
 from fusiond.report.solution_run import run_from_solution
 
@@ -98,11 +98,11 @@ def _sections(run: Run, truth: TrajectoryTable | None) -> list[Section]:
         overview.track(run, truth),
         states.states(run),
         None if truth is None else states.errors(run, truth),
-        trust.innovations(run),
+        filter_plots.innovations(run),
         states.parameters(run),
-        trust.verdicts(run),
-        trust.delays(run),
-        trust.satellites(run),
+        filter_plots.verdicts(run),
+        filter_plots.delays(run),
+        filter_plots.satellites(run),
         devices.inertial(run),
         devices.computer(run),
     )

@@ -7,8 +7,8 @@ import numpy as np
 from fusiond.files.csv_tables import Floats
 from fusiond.files.tables import TrajectoryTable
 from fusiond.offline.compare import Errors, NothingToCompareError, errors_of, report_of
-from fusiond.report.items import Item, Plot, Section, Sentence, Series, Table
-from fusiond.report.local import metres_from, origin_of
+from fusiond.report.local_plane import metres_from, origin_of
+from fusiond.report.page_items import Item, Plot, Section, Sentence, Series, Table
 from fusiond.report.run import Estimated, Run
 
 _NED = ("north", "east", "down")

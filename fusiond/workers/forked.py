@@ -70,7 +70,7 @@ class Forked:
             yield self.done
 
     def fileno(self) -> int:
-        """What can be read when there is news."""
+        """Descriptor that is readable when there is news."""
         return self._read
 
     def read(self) -> bool:

@@ -7,7 +7,7 @@ import struct
 import zlib
 
 from drivers.can.dbc_flaws import UnreadableError, sound_part
-from fusiond.clock.recorder import FOLLOWING, RecorderClock
+from fusiond.clock.recorder_clock import FOLLOWING, RecorderClock
 from fusiond.files.csv_tables import TableError
 from fusiond.offline.can_frames import Refusals, messages
 from tests.fuzz.documents import INPUT_FILE, input_of

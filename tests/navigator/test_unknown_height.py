@@ -16,7 +16,7 @@ from fusiond.aiding.offers import PositionOffer
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
 from fusiond.navigation.solution import Mode, Solution
-from fusiond.navigator.alignment.collected import Collected
+from fusiond.navigator.alignment.evidence import AlignmentEvidence
 from fusiond.navigator.alignment.options import alignment_options
 from fusiond.navigator.alignment.start import SLOPE_SD, UNKNOWN_HEIGHT_SD_M
 from fusiond.navigator.navigator import Navigator
@@ -135,7 +135,7 @@ def test_a_saved_place_without_a_height_tells_none() -> None:
     config = Config.model_validate(PLACELESS)
     for height, sd_m in ((None, UNKNOWN_HEIGHT_SD_M), (321.0, 5.0)):
         saved = SavedState(1.0, (lat, lon, height), 5.0, 0.0, 0.1)
-        known = Collected(alignment_options(config), imu_noise(config.imu), saved, print)
+        known = AlignmentEvidence(alignment_options(config), imu_noise(config.imu), saved, print)
         place = known.place()
         assert place is not None
         assert (place.where[2], place.sd_height) == (height or 0.0, sd_m)

@@ -8,7 +8,7 @@ from typing import Any
 from drivers.rdss.mail import MessageStage
 from drivers.rdss.report import PositionReport
 from drivers.rdss.wording import worded
-from fusiond.clock.answers import ClockStatus
+from fusiond.clock.results import ClockStatus
 from fusiond.integrity.catalogue import velocity_kinds
 from fusiond.integrity.consistency import judge
 from fusiond.integrity.finding import Finding

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from fusiond.configuration.schema import Config
 from fusiond.files.tables import TrajectoryTable
-from fusiond.report.arrays import BUCKETS, thinned
 from fusiond.report.input_look import spectrum
 from fusiond.report.page import page
+from fusiond.report.plot_arrays import BUCKETS, thinned
 from fusiond.report.report import document
 from fusiond.report.run import Innovations, LogParts, Run
 from fusiond.report.settings import differing

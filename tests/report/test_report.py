@@ -17,7 +17,7 @@ from fusiond.files.solution_csv import STATUS, SolutionWriter
 from fusiond.files.tables import read_truth
 from fusiond.offline.compare import compare
 from fusiond.recording.reader import Log
-from fusiond.report.local import metres_from, origin_of
+from fusiond.report.local_plane import metres_from, origin_of
 from fusiond.report.report import report
 from fusiond.report.run import Run
 from tests.outputs.messages_examples import EXAMPLES

@@ -206,7 +206,7 @@ class CorrelatedFilter(FederatedFilter):
         return "fused"
 
     def _publish(self, members: Sequence[int], fused: Fused) -> None:
-        """What was fused becomes what is published."""
+        """Publish the fused estimate."""
         order = self._order
         estimates = self._bank_dxs[:, order][list(members)]
         self._covs[0][np.ix_(order, order)] = fused.covariance

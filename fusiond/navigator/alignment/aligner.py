@@ -16,8 +16,8 @@ from fusiond.models.model import Model
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.standstill import Window
 from fusiond.navigator.alignment.basis import Basis
-from fusiond.navigator.alignment.collected import Collected
 from fusiond.navigator.alignment.course import from_course
+from fusiond.navigator.alignment.evidence import AlignmentEvidence
 from fusiond.navigator.alignment.headings import (
     from_compass,
     from_config,
@@ -25,11 +25,11 @@ from fusiond.navigator.alignment.headings import (
     from_gyrocompass,
     from_saved,
 )
-from fusiond.navigator.alignment.lateness import Lateness
+from fusiond.navigator.alignment.latency import LatencySearch
+from fusiond.navigator.alignment.missing import Journal, why_not
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.positions import Track, from_positions
 from fusiond.navigator.alignment.start import Place, Start
-from fusiond.navigator.alignment.why import Journal, why_not
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
 
@@ -62,7 +62,7 @@ class Aligner:
     ) -> None:
         self.reason = reason("no_imu")
         self._found: Start | None = None
-        self.known = Collected(options, noise, saved, on_event)
+        self.known = AlignmentEvidence(options, noise, saved, on_event)
         self._track = Track(options, model)
         self._journal = Journal(on_event)
         self._news, self._said = True, -1
@@ -82,13 +82,13 @@ class Aligner:
             self._news = True
         self._track.hear(aids)
 
-    def waits(self, start: Start, lateness: Lateness) -> bool:
+    def waits(self, start: Start, latency: LatencySearch) -> bool:
         """True if a start that was found must wait: while it is looked whether the fixes that it is
         made of are late, and longer where one is suspected, until others come."""
-        self._found = start if lateness.looking else None
-        if lateness.suspects:
-            self.reason = lateness.suspects
-        return self._found is not None or bool(lateness.suspects)
+        self._found = start if latency.looking else None
+        if latency.suspects:
+            self.reason = latency.suspects
+        return self._found is not None or bool(latency.suspects)
 
     def attempt(self, imu: ImuBuffer) -> Start | None:
         """A start, if all is known by now; else None, and `reason` says what is missing."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.earth import EARTH_RATE_RAD_S
-from fusiond.navigator.alignment.collected import Collected, Standing
+from fusiond.navigator.alignment.evidence import AlignmentEvidence, Standing
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.saved_state import SavedState
 
@@ -28,7 +28,7 @@ class Basis(NamedTuple):
     noise: ImuNoise
     model: Model
     saved: SavedState | None
-    known: Collected
+    known: AlignmentEvidence
     track: Track
 
 

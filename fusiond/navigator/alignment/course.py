@@ -33,9 +33,9 @@ from fusiond.navigation.rotation import (
     rpy_from_dcm,
     wrap_angle,
 )
-from fusiond.navigator.alignment import motion, motion_fit
+from fusiond.navigator.alignment import motion_fit, sensed_motion
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.collected import Fix, Standing
+from fusiond.navigator.alignment.evidence import Fix, Standing
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
     BACKWARD,
@@ -127,7 +127,7 @@ def _moved_off(
     velocity: it was no rest."""
     lat, _, height = (float(v) for v in place[1])
     g = gravity(lat, height)
-    f = motion.felt(imu, np.array([standing.end_ns, velocity.t_ns]), standing.mean_rate)
+    f = sensed_motion.felt(imu, np.array([standing.end_ns, velocity.t_ns]), standing.mean_rate)
     rested = dcm_from_rpy(*level(standing.mean_force), 0.0)
     gained = rested @ f.gained[1] + [0.0, 0.0, g * f.of.t_s[1]]
     dcm = rested @ f.turned[1]
@@ -237,9 +237,9 @@ def _reversing(by: Basis, velocity: VelocityOffer) -> str:
 class Ways:
     """Measured velocities against what the IMU felt; what fits best is asked for each way."""
 
-    felt: motion.Felt
-    _past: motion.Past
-    _measured: motion.Measured
+    felt: sensed_motion.Felt
+    _past: sensed_motion.Past
+    _measured: sensed_motion.Measured
     _latest: VelocityOffer
     _options: AlignmentOptions
     _noise: ImuNoise
@@ -257,8 +257,8 @@ class Ways:
 
 
 def ways(
-    past: motion.Past,
-    m: motion.Measured,
+    past: sensed_motion.Past,
+    m: sensed_motion.Measured,
     latest: VelocityOffer,
     options: AlignmentOptions,
     noise: ImuNoise,
@@ -267,7 +267,7 @@ def ways(
 ) -> Ways:
     """Of velocities in order of time, `latest` the last; they are late by 0 to within
     `sd_late_s`."""
-    f = motion.felt(past, m.instants, motion.rate_before_motion(past, m))
+    f = sensed_motion.felt(past, m.instants, sensed_motion.rate_before_motion(past, m))
     return Ways(f, past, m, latest, options, noise, g, sd_late_s)
 
 
@@ -284,7 +284,7 @@ def _on_the_move(
         return None
     lat, _, height = (float(v) for v in place[1])
     late = _sd_late_s(by, velocity)
-    m, g = motion.measured(usable, motion.MOST_FIXES), gravity(lat, height)
+    m, g = sensed_motion.measured(usable, sensed_motion.MOST_FIXES), gravity(lat, height)
     either = ways(imu, m, usable[-1], by.options, by.noise, g, late)
     rate = either.felt.rates[-1]
     forward_fit, backward_fit = either.fit(backward=False), either.fit(backward=True)
@@ -360,7 +360,7 @@ def _build(
     """With the antenna's velocity taken to the body."""
     velocity, sd = velocity_of(offer)
     velocity = velocity - dcm @ np.cross(rate, offer.lever)
-    force = motion.samples_at(imu, offer.t_ns)[3:]
+    force = sensed_motion.samples_at(imu, offer.t_ns)[3:]
     if fitted is not None:
         force = force - fitted.biases[:3]
     acceleration = dcm @ force + [0.0, 0.0, gravity(float(place[1][0]), float(place[1][2]))]

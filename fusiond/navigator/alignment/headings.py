@@ -13,7 +13,7 @@ from fusiond.navigation.earth import EARTH_RATE_RAD_S
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.collected import CONTRADICTION_SIGMAS
+from fusiond.navigator.alignment.evidence import CONTRADICTION_SIGMAS
 from fusiond.navigator.alignment.start import (
     Levelled,
     Place,

@@ -44,7 +44,7 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import STANDARD_GRAVITY_M_S2
 from fusiond.navigation.motion_descent import BIASES, FIRST, LATE, PRIORS, SOUGHT, descend
 from fusiond.navigation.rotation import dcm_from_rpy
-from fusiond.navigator.alignment.motion import Felt, Measured, Past, stretch
+from fusiond.navigator.alignment.sensed_motion import Felt, Measured, Past, stretch
 
 Array = NDArray[np.float64]
 

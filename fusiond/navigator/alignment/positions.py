@@ -1,10 +1,10 @@
 r"""Heading from positions alone: a vehicle that drives, and fixes without velocity, late ones too.
 
-A bank of headings (fusiond.navigator.alignment.bank) starts where the vehicle is last known to
-have stood, level, at rest and with the gyro's bias seen; or, of a vehicle that has been driving all
-the time, at its first fix, with a road's slope and a road's speed. All that is measured from then
-on is weighed at its own instant: the bank runs `LATE_NS` behind the samples, so that what comes
-late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
+A bank of headings (fusiond.navigator.alignment.heading_bank) starts where the vehicle is last known
+to have stood, level, at rest and with the gyro's bias seen; or, of a vehicle that has been driving
+all the time, at its first fix, with a road's slope and a road's speed. All that is measured from
+then on is weighed at its own instant: the bank runs `LATE_NS` behind the samples, so that what
+comes late finds it there. How far the way by the IMU may be turned to lead through the fixes is the
 heading:
 
     sd_yaw ~ sqrt(2) sd_fix / way,   6 deg after 280 m with fixes of 20 m
@@ -33,9 +33,9 @@ from fusiond.navigation.alignment import level
 from fusiond.navigation.error_model import DV, PHI
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.rotation import dcm_from_rpy, skew
-from fusiond.navigator.alignment.bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
 from fusiond.navigator.alignment.basis import Basis, rest_bias
-from fusiond.navigator.alignment.collected import FIXES_NS, Standing
+from fusiond.navigator.alignment.evidence import FIXES_NS, Standing
+from fusiond.navigator.alignment.heading_bank import CELL_SD_RAD, YAWS_RAD, Cell, HeadingBank
 from fusiond.navigator.alignment.headings import REST_VELOCITY_SD
 from fusiond.navigator.alignment.motion_fit import TILT_SD_RAD
 from fusiond.navigator.alignment.options import AlignmentOptions

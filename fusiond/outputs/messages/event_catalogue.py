@@ -328,6 +328,10 @@ IMU: Mapping[str, Entry] = {
     "imu_backwards": Entry(
         "warning", "The IMU seems mounted backwards.", "Correct `axes` in [imu], then restart."
     ),
+    "without_imu": Entry(
+        "warning", "No IMU data: receivers alone are fused.", "Check power and bus of the IMU."
+    ),
+    "with_imu": Entry("info", "Inertial navigation took over again."),
     "imu_spare": Entry(
         "warning", "The spare IMU is used.", "Check the first unit; a restart returns to it."
     ),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.base import State
-from fusiond.clock.answers import ClockStatus
+from fusiond.clock.results import ClockStatus
 from fusiond.integrity.consistency import Verdict
 from fusiond.integrity.service import Service
 from fusiond.outputs.messages.base import Count, Message, Number, stamp

@@ -187,7 +187,7 @@ def fly(config: Config, fixes: list[Measurement]) -> Course:
 
 
 def as_if_uncorrelated(one: Course, other: Course) -> Course:
-    """What the formula for uncorrelated estimates makes of two filters that share the vehicle's
+    """Result of the formula for uncorrelated estimates with two filters that share the vehicle's
     motion, and nothing is shared out."""
     pairs = [
         fuse_uncorrelated(np.array(x), np.array(p))

@@ -20,8 +20,8 @@ from fusiond.commands.configure import _measured_axes
 from fusiond.configuration.doubts import doubts
 from fusiond.configuration.load import load_config
 from fusiond.configuration.settings import sensor_to_body
-from fusiond.doctor.finding import Device as Found
-from fusiond.doctor.finding import Unheard, down_axis, on_bus, on_port, round_rate
+from fusiond.doctor.discovery import Device as Found
+from fusiond.doctor.discovery import Unheard, down_axis, on_bus, on_port, round_rate
 from fusiond.doctor.known_devices import KNOWN_DEVICES
 from fusiond.simulation.can.imu import SIM_IMU, CanImu
 from fusiond.simulation.scenarios import SCENARIOS

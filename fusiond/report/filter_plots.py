@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
-from fusiond.report.items import Item, Plot, Section, Sentence, Series, Table
+from fusiond.report.page_items import Item, Plot, Section, Sentence, Series, Table
 from fusiond.report.run import Innovations, LogParts, Run
 
 _AXES = {"n": "north", "e": "east", "d": "down"}

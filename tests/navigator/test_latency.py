@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from fusiond.configuration.schema import Config
-from fusiond.navigator.alignment import lateness, motion_fit
-from fusiond.navigator.alignment.lateness import SETTLED_SD_S, Lateness
-from fusiond.navigator.alignment.leaps import Epoch
+from fusiond.navigator.alignment import latency, motion_fit
+from fusiond.navigator.alignment.latency import SETTLED_SD_S, LatencySearch
 from fusiond.navigator.alignment.options import alignment_options
+from fusiond.navigator.alignment.position_jumps import Epoch
 from fusiond.navigator.navigator import Navigator
 from fusiond.studies.faults import aid_faults, imu_faults
 from fusiond.studies.faults.judge import longest_lie_s
@@ -27,11 +27,11 @@ ALWAYS_LATE = aid_faults.late(ON_TIME, 0.0, math.inf)
 
 def looked(
     recording: Recording, until_s: tuple[float, ...], config: Config = VEHICLE
-) -> tuple[list[str], Lateness, Navigator]:
+) -> tuple[list[str], LatencySearch, Navigator]:
     """What looks at some instants have told."""
     told: list[str] = []
     navigator = Navigator(config)
-    late = Lateness(
+    late = LatencySearch(
         alignment_options(config),
         navigator._noise,
         navigator.model,
@@ -74,7 +74,7 @@ def test_a_receiver_that_cannot_have_become_late_is_not(monkeypatch: pytest.Monk
         asked.append(by_s)
         return len(epochs) > 0
 
-    monkeypatch.setattr(lateness, "unchanged", unchanged)
+    monkeypatch.setattr(latency, "unchanged", unchanged)
     told, late, _ = looked(ALWAYS_LATE, (19.0, 20.5, 22.0, 23.5, 25.0))
     assert not told
     assert not late.suspects

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 
-from fusiond.clock.recorder import ENOUGH_REPORTS, FOLLOWING, RecorderClock, set_by
+from fusiond.clock.recorder_clock import ENOUGH_REPORTS, FOLLOWING, RecorderClock, set_by
 
 S, MS = 1_000_000_000, 1_000_000
 BEGIN = 1_760_000_000 * S

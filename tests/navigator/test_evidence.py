@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
 from fusiond.configuration.schema import Config
 from fusiond.configuration.settings import imu_noise
-from fusiond.navigator.alignment.collected import Collected, Fix
+from fusiond.navigator.alignment.evidence import AlignmentEvidence, Fix
 from fusiond.navigator.alignment.options import alignment_options
 
 CONFIG = Config.model_validate({"imu": {"rate_hz": 100.0}})
@@ -20,11 +20,11 @@ METRES = np.array([6_378_137.0, 6_378_137.0])  # a radian at the equator, near e
 
 def _looked_at(
     rng: np.random.Generator, wrong: NDArray[np.float64], strayed_m: float = 0.0
-) -> tuple[Collected, bool]:
+) -> tuple[AlignmentEvidence, bool]:
     """Straight on to the north; the velocity of each fix is `wrong` (n, 2) by so much (m/s), the
     tenth position off by `strayed_m`. A look at each fix, as an alignment that waits has it; and
     what it saw at the last."""
-    known = Collected(
+    known = AlignmentEvidence(
         alignment_options(CONFIG), imu_noise(CONFIG.imu), None, lambda code, text: None
     )
     confirmed = False

@@ -26,7 +26,7 @@ STUCK_S = 20.0
 LOOK_S = 0.5
 
 
-class Door(H11Protocol):
+class BoundedConnection(H11Protocol):
     """A connection that is looked after. Idle ones between two requests are uvicorn's to close."""
 
     _since_s = _moved_s = 0.0
@@ -54,7 +54,9 @@ class Door(H11Protocol):
         return self.cycle is not None and not self.cycle.response_complete
 
     def _make_room(self) -> None:
-        waiting = [one for one in self.connections if isinstance(one, Door) and not one._asked]
+        waiting = [
+            one for one in self.connections if isinstance(one, BoundedConnection) and not one._asked
+        ]
         min(waiting, key=lambda one: one._since_s, default=self)._give_up()
 
     def _give_up(self) -> None:

@@ -17,6 +17,7 @@ from fusiond.aiding.witnesses import LEAST_SD_M_S, Witnesses
 from fusiond.models.blocks import ImuNoise
 from fusiond.navigation.earth import EARTH_RATE_RAD_S, STANDARD_GRAVITY_M_S2
 from fusiond.navigation.standstill import BIAS_SIGMAS, FEWEST_SAMPLES, Window
+from fusiond.navigator.alignment.innovation_trend import NO_TREND, Offset
 from fusiond.navigator.alignment.options import AlignmentOptions
 from fusiond.navigator.alignment.start import (
     SLOPE_SD,
@@ -25,7 +26,6 @@ from fusiond.navigator.alignment.start import (
     as_geodetic,
     velocity_of,
 )
-from fusiond.navigator.alignment.trend import NO_TREND, Offset
 from fusiond.navigator.reasons import reason
 from fusiond.navigator.saved_state import SavedState
 
@@ -83,7 +83,7 @@ class Standing:
         return self.force_sum / self.seconds
 
 
-class Collected:
+class AlignmentEvidence:
     """Windows and offers since the alignment began."""
 
     def __init__(

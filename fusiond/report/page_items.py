@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fusiond.files.csv_tables import Floats
-from fusiond.report.arrays import packed, thinned
+from fusiond.report.plot_arrays import packed, thinned
 
 Role = Literal["line", "points", "refused", "bound", "steps", "bars"]
 """Style of a series. `bound`: thin and dashed, such as two sigma around zero; `refused`: the

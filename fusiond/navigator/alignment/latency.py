@@ -19,10 +19,10 @@ where
     J(now) - J(tau*) > EVIDENCE             chi-square of one: 4.5 sigma, one in 130,000
     |tau* - now| > PRIOR_SIGMAS s_0         s_0 of the filter's own state for it
 
-in some looks that agree, by fixes of one lateness, unless the positions have followed the
-velocities all the way since it was known (fusiond.navigator.alignment.leaps). On drive_0708 and
-css_164, which have no late fixes, two of 452 looks met all but the first; the smoothing of
-receivers moves tau* by 0.1 s.
+in some looks that agree, by fixes of one delay, unless the positions have followed the
+velocities all the way since it was known (fusiond.navigator.alignment.position_jumps). On
+drive_0708 and css_164, which have no late fixes, two of 452 looks met all but the first; the
+smoothing of receivers moves tau* by 0.1 s.
 
 What was found is taken off the stamps, by the IMU's clock: an IMU cannot be early, so it is the
 fixes that are late, and not the vehicle that is ahead. From then on that clock is what solutions
@@ -51,17 +51,17 @@ from fusiond.models.blocks import ImuNoise
 from fusiond.models.model import Model
 from fusiond.navigation.earth import gravity
 from fusiond.navigation.imu_buffer import ImuBuffer
-from fusiond.navigator.alignment import motion
+from fusiond.navigator.alignment import sensed_motion
 from fusiond.navigator.alignment.course import ways
-from fusiond.navigator.alignment.leaps import (
+from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.position_jumps import (
     LOOKED_NS,
     Epoch,
     since_leap,
     unchanged,
     velocities_alone,
 )
-from fusiond.navigator.alignment.motion import MOST_FIXES
-from fusiond.navigator.alignment.options import AlignmentOptions
+from fusiond.navigator.alignment.sensed_motion import MOST_FIXES
 from fusiond.navigator.reasons import reason
 
 MOST_LATE_S = 3.0
@@ -80,9 +80,9 @@ LEAST_PRIOR_S = 0.05
 # Fixes of so long are looked at, and so many at least; kept are a minute's of a receiver of 10 Hz,
 # and handed on the last of them.
 KEPT_NS, MOST_KEPT, HANDED_ON, FEWEST = 15_000_000_000, 600, 300, 5
-# The valley is sought with `motion.MOST_FIXES`, its bottom with all of a receiver of 5 Hz.
+# The valley is sought with `sensed_motion.MOST_FIXES`, its bottom with all of a receiver of 5 Hz.
 ALL_FIXES = 5 * KEPT_NS // 1_000_000_000
-# A lateness that is known worse (s) is waited for so long (ns) to be known better: half the sigma
+# A delay that is known worse (s) is waited for so long (ns) to be known better: half the sigma
 # of the filter's own state for it, which takes over.
 SETTLED_SD_S, PATIENCE_NS = 0.05, 10_000_000_000
 # So many looks must have seen it, within so many sigmas of each other.
@@ -96,17 +96,17 @@ MOST_LOOKS = 100
 FIT_EVERY_NS = 10_000_000
 
 
-# Twice the negative log likelihood of a lateness and its degrees of freedom, a fit at a time.
+# Twice the negative log likelihood of a delay and its degrees of freedom, a fit at a time.
 Fitting = Generator[None, None, tuple[float, int]]
 
 
-class Late(NamedTuple):
+class Delay(NamedTuple):
     """Delay against the stamps (s), and one sigma."""
 
     seconds: float
     sd: float
 
-    def agrees(self, other: Late) -> bool:
+    def agrees(self, other: Delay) -> bool:
         """True if both may be the same."""
         return abs(self.seconds - other.seconds) <= AGREED * math.hypot(self.sd, other.sd)
 
@@ -139,15 +139,15 @@ class _Heard:
 @dataclass(slots=True)
 class _Receiver:
     """The last measurements of a receiver, how late they are taken to be (ns), and what speaks for
-    another lateness since when (ns)."""
+    another delay since when (ns)."""
 
     heard: deque[_Heard] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
     late_ns: int = 0
-    suspected: Late | None = None
+    suspected: Delay | None = None
     since_ns: int = 0
     seen: int = 0
 
-    def suspect(self, late: Late, t_ns: int) -> None:
+    def suspect(self, late: Delay, t_ns: int) -> None:
         """Delay by the fixes until `t_ns`; what looks agree upon counts, the best known of it."""
         before = self.suspected
         if before is None or not late.agrees(before):
@@ -157,7 +157,7 @@ class _Receiver:
         if late.sd < before.sd:
             self.suspected = late
 
-    def settled(self, t_ns: int) -> Late | None:
+    def settled(self, t_ns: int) -> Delay | None:
         """Delay, once that is known; a suspicion that has not lasted ends."""
         late = self.suspected
         if late is None:
@@ -171,7 +171,7 @@ class _Receiver:
         return None
 
 
-class Lateness:
+class LatencySearch:
     """Keeps the last fixes of each receiver as they were stamped, and how late each was found to
     be; `on_event(code, text)` hears of it."""
 
@@ -262,7 +262,7 @@ class Lateness:
         self._due_ns = t_ns + EVERY_NS
         earliest_ns = round((MOST_LATE_S + NEAR_S[0]) * 1e9)
         first_ns = max(imu.oldest_ns + earliest_ns, t_ns - KEPT_NS)
-        past = motion.span_since(imu, first_ns - earliest_ns)
+        past = sensed_motion.span_since(imu, first_ns - earliest_ns)
         # What was not felt, gravity neither, shows in a fix that falls there, and in none that
         # would be earlier.
         lost = np.flatnonzero(np.diff(past.times) > imu.hold_ns)
@@ -282,7 +282,7 @@ class Lateness:
         return None
 
     def _weigh(
-        self, receiver: _Receiver, past: motion.Past, first_ns: int, t_ns: int
+        self, receiver: _Receiver, past: sensed_motion.Past, first_ns: int, t_ns: int
     ) -> Generator[None, None, None]:
         """Weigh the delay by the fixes of a span; the best that they have said counts."""
         of_each = (epoch for heard in receiver.heard for epoch in heard.epochs())
@@ -295,8 +295,8 @@ class Lateness:
         if len(fixes) < FEWEST or place is None:
             return
         by = fixes[-1], self._options, self._noise, gravity(place.lat_rad, place.height_m or 0.0)
-        said = {most: motion.measured(fixes, most) for most in (ALL_FIXES, MOST_FIXES)}
-        # Of each lateness (ns) and share of the fixes: some are asked for twice or three times.
+        said = {most: sensed_motion.measured(fixes, most) for most in (ALL_FIXES, MOST_FIXES)}
+        # Of each delay (ns) and share of the fixes: some are asked for twice or three times.
         known: dict[tuple[int, int], tuple[float, int]] = {}
 
         def cost(late_s: float, most: int = ALL_FIXES) -> Fitting:
@@ -340,11 +340,11 @@ class Lateness:
         ):
             return
         self._due_ns = t_ns + EVERY_NS
-        receiver.suspect(Late(max(0.0, late.seconds), late.sd), t_ns)
+        receiver.suspect(Delay(max(0.0, late.seconds), late.sd), t_ns)
 
 
 def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityOffer], PositionOffer | None]:
-    """Velocities of one lateness, and a position. What repeats the one before to the bit is no
+    """Velocities of one delay, and a position. What repeats the one before to the bit is no
     measurement, but of a vehicle that stands."""
     left = since_leap(epochs)
     found = [epoch.velocity for epoch in left]
@@ -353,7 +353,9 @@ def _fixes(epochs: Sequence[Epoch]) -> tuple[list[VelocityOffer], PositionOffer 
     return list(compress(found, new)), place
 
 
-def _bottom(cost: Callable[[float], Fitting], about_s: float) -> Generator[None, None, Late | None]:
+def _bottom(
+    cost: Callable[[float], Fitting], about_s: float
+) -> Generator[None, None, Delay | None]:
     """The bottom of a valley of costs by parabolas, and the sigma that its bend means; None where
     it is none."""
     sd = math.inf
@@ -366,7 +368,7 @@ def _bottom(cost: Callable[[float], Fitting], about_s: float) -> Generator[None,
             return None
         about_s += max(-h, min(h, 0.5 * h * (before - after) / bent))
         sd = h * math.sqrt(2.0 / bent)
-    return Late(about_s, sd)
+    return Delay(about_s, sd)
 
 
 def _earlier(aid: Aid, late_ns: int) -> Aid:

@@ -27,7 +27,7 @@ DETERMINED = 0.5
 COURSE_NS = 1_000_000_000
 
 
-class Afterwards:
+class StartCheck:
     """Watches a start; `refuted` says why it was a wrong one."""
 
     def __init__(self, options: AlignmentOptions, start: Start) -> None:

@@ -8,7 +8,7 @@ from fusiond.configuration.settings import imu_noise
 from fusiond.navigation.imu_buffer import ImuBuffer
 from fusiond.navigation.motion_descent import judge_guess, least_squares, moved
 from fusiond.navigation.rotation import dcm_from_rpy
-from fusiond.navigator.alignment import motion, motion_fit
+from fusiond.navigator.alignment import motion_fit, sensed_motion
 
 RATE_HZ, SECONDS = 100.0, 12.0
 BEGIN_NS = 7_000_000_000
@@ -33,23 +33,26 @@ def instants(imu: ImuBuffer) -> np.ndarray:
     return imu.times[[50, 300, 301, 800, 1100]] + 3_000_000
 
 
-def shifted(imu: ImuBuffer, force: np.ndarray) -> motion.Span:
+def shifted(imu: ImuBuffer, force: np.ndarray) -> sensed_motion.Span:
     samples = imu.samples[: imu.end].copy()
     samples[:, 3:] -= force
-    return motion.Span(imu.times[: imu.end].copy(), samples)
+    return sensed_motion.Span(imu.times[: imu.end].copy(), samples)
 
 
 def test_slopes_by_biases_are_those_of_differences(imu: ImuBuffer) -> None:
     at, step = instants(imu), 1e-4
     bias = np.array([0.01, -0.02, 0.03])
-    f = motion.felt(imu, at, bias)
+    f = sensed_motion.felt(imu, at, bias)
     for axis in range(3):
         unit = np.eye(3)[axis] * step
-        ahead = motion.felt(shifted(imu, unit), at, bias)
-        behind = motion.felt(shifted(imu, -unit), at, bias)
+        ahead = sensed_motion.felt(shifted(imu, unit), at, bias)
+        behind = sensed_motion.felt(shifted(imu, -unit), at, bias)
         slope = (ahead.gained - behind.gained) / (2.0 * step)
         assert f.slopes[:, :, axis] == pytest.approx(slope, abs=1e-6)
-        ahead, behind = motion.felt(imu, at, bias + unit), motion.felt(imu, at, bias - unit)
+        ahead, behind = (
+            sensed_motion.felt(imu, at, bias + unit),
+            sensed_motion.felt(imu, at, bias - unit),
+        )
         slope = (ahead.gained - behind.gained) / (2.0 * step)
         # Of 600 m/s per rad/s: steps of 10 ms are of the first order.
         assert f.slopes[:, :, 3 + axis] == pytest.approx(slope, abs=0.05)
@@ -59,8 +62,8 @@ def test_slopes_by_biases_are_those_of_differences(imu: ImuBuffer) -> None:
 
 def test_rates_at_fixes_are_the_means_around_them(imu: ImuBuffer) -> None:
     at = instants(imu)
-    rates = motion.felt(imu, at, np.zeros(3)).rates
-    means = [motion.samples_at(imu, int(t_ns))[:3] for t_ns in at]
+    rates = sensed_motion.felt(imu, at, np.zeros(3)).rates
+    means = [sensed_motion.samples_at(imu, int(t_ns))[:3] for t_ns in at]
     assert rates == pytest.approx(np.array(means), abs=1e-12)
 
 
@@ -68,7 +71,7 @@ LATE_S, SD_M_S = 0.09, 0.03
 DOWN = np.array([0.0, 0.0, -9.8])
 
 
-def pulling_off() -> tuple[ImuBuffer, motion.Measured]:
+def pulling_off() -> tuple[ImuBuffer, sensed_motion.Measured]:
     """Northward from rest to 12 m/s, level, the sensors perfect; velocities that are late."""
     n = round(RATE_HZ * SECONDS)
     t = np.arange(1, n + 1) / RATE_HZ
@@ -82,7 +85,7 @@ def pulling_off() -> tuple[ImuBuffer, motion.Measured]:
     v[:, 0] = np.interp(at + LATE_S, t, np.cumsum(samples[:, 3]) / RATE_HZ)
     v += SD_M_S * np.random.default_rng(2).standard_normal(v.shape)
     sd, levers = np.full(v.shape, SD_M_S), np.zeros(v.shape)
-    return buffer, motion.Measured((BEGIN_NS + at * 1e9).astype(np.int64), v, sd, levers)
+    return buffer, sensed_motion.Measured((BEGIN_NS + at * 1e9).astype(np.int64), v, sd, levers)
 
 
 @pytest.mark.parametrize("sd_late_s", [0.0, 0.1])
@@ -90,7 +93,7 @@ def test_velocities_that_are_late_tilt_nobody_who_asks_whether_they_are(sd_late_
     """What tilt and force bias make together is known to some mm/s^2: is it right?"""
     imu, m = pulling_off()
     noise = imu_noise(Imu())
-    f = motion.felt(imu, m.instants, motion.rate_before_motion(imu, m))
+    f = sensed_motion.felt(imu, m.instants, sensed_motion.rate_before_motion(imu, m))
     found = motion_fit.fit(imu, f, m, noise, 9.8, 0.0, 0.02, sd_late_s)
     h = np.zeros((2, 10))
     h[:, :2] = 9.8 * np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -114,8 +117,8 @@ def test_what_a_guess_says_moves_by_its_slopes(imu: ImuBuffer) -> None:
     rng = np.random.default_rng(5)
     at = instants(imu)
     v, levers = rng.normal(0.0, 5.0, (len(at), 3)), np.tile((1.4, 0.2, -1.2), (len(at), 1))
-    m = motion.Measured(at, v, np.full(v.shape, 0.1), levers)
-    f = motion.felt(imu, at, np.array([0.01, -0.02, 0.03]))
+    m = sensed_motion.Measured(at, v, np.full(v.shape, 0.1), levers)
+    f = sensed_motion.felt(imu, at, np.array([0.01, -0.02, 0.03]))
     asked = motion_fit.Asked(imu_noise(Imu()), 9.8, 0.3, np.full(10, 0.1), 0.1)
     guess = motion_fit.Guess(dcm_from_rpy(0.02, -0.03, 0.4), f.biases, 0.0, v[0])
     packed = guess.packed()
@@ -150,16 +153,16 @@ def test_least_squares_are_those_of_numpy() -> None:
 def test_rate_before_motion() -> None:
     imu, m = pulling_off()
     imu.samples[:, :3] = 0.05, -0.02, 0.01
-    assert motion.rate_before_motion(imu, m) == pytest.approx([0.05, -0.02, 0.01])
+    assert sensed_motion.rate_before_motion(imu, m) == pytest.approx([0.05, -0.02, 0.01])
     moving = m._replace(velocity=m.velocity + 1.0)
-    assert not motion.rate_before_motion(imu, moving).any()
+    assert not sensed_motion.rate_before_motion(imu, moving).any()
 
 
 def test_a_span_is_felt_as_the_buffer_it_was_taken_from(imu: ImuBuffer) -> None:
     at, none = instants(imu), np.zeros(3)
-    span = motion.span_since(imu, int(at[0]))
+    span = sensed_motion.span_since(imu, int(at[0]))
     assert len(span.times) < imu.end
-    there, here = motion.felt(span, at, none), motion.felt(imu, at, none)
+    there, here = sensed_motion.felt(span, at, none), sensed_motion.felt(imu, at, none)
     assert np.array_equal(there.gained, here.gained)
     assert there.rates == pytest.approx(here.rates, abs=1e-12)
 
@@ -175,11 +178,13 @@ def test_gyros_that_nobody_calibrated_lead_no_fit_astray(seed: int) -> None:
     samples[:, :3] += spare.rate_noise * np.sqrt(RATE_HZ) * rng.standard_normal((n, 3))
     samples[:, 3:] += spare.force_noise * np.sqrt(RATE_HZ) * rng.standard_normal((n, 3))
     times = BEGIN_NS + (np.arange(1, n + 1) / RATE_HZ * 1e9).astype(np.int64)
-    past = motion.Span(times, samples)
+    past = sensed_motion.Span(times, samples)
     at = BEGIN_NS + (np.arange(0.2, 17.3, 0.9) * 1e9).astype(np.int64)
     v = np.array([6.0, 0.0, 0.0]) + 0.05 * rng.standard_normal((len(at), 3))
-    m = motion.Measured(at, v, np.full(v.shape, 0.05), np.tile((1.4, 0.2, -1.2), (len(at), 1)))
-    f = motion.felt(past, at, motion.rate_before_motion(past, m))
+    m = sensed_motion.Measured(
+        at, v, np.full(v.shape, 0.05), np.tile((1.4, 0.2, -1.2), (len(at), 1))
+    )
+    f = sensed_motion.felt(past, at, sensed_motion.rate_before_motion(past, m))
     for yaw in (0.0, np.pi):
         found = motion_fit.fit(past, f, m, spare, 9.8, yaw, np.radians(5.0), 0.1)
         assert found.converged

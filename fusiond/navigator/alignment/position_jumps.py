@@ -3,7 +3,7 @@ r"""Position jumps of a receiver against its own velocities.
     r_k = p_k - p_k-1 - (v_k + v_k-1) / 2 (t_k - t_k-1)
 
 Stamps that begin to be late by tau, or end to be, make a leap of v tau, and what the fixes before
-it say of a lateness is not true of those after it. Noise of s an axis has norms of the median
+it say of a delay is not true of those after it. Noise of s an axis has norms of the median
 s sqrt(2 ln 2), which a few leaps do not move.
 
 And where the sum of r along the track, which telescopes to two positions' noise, stays below v tau,
@@ -34,15 +34,15 @@ Array = NDArray[np.float64]
 
 # Beyond as many sigmas chance leaps once in seventy million.
 LEAP_SIGMAS = 6.0
-# A lateness that changes by less (s) is as good as the same: the least that is told of one.
+# A delay that changes by less (s) is as good as the same: the least that is told of one.
 SAME_S = 0.05
 # Over longer intervals (s) trapezoids of the velocity are no way.
 LONGEST_S = 4.0
-# Slower (m/s) a lateness may change by a second within the noise of a position.
+# Slower (m/s) a delay may change by a second within the noise of a position.
 SLOW_M_S = 3.0
 # A look goes by fixes of so long (15 s, and 10 s that it waits for a better one).
 LOOKED_NS = 30_000_000_000
-# So much change of velocity (m/s) shows a lateness: at 1 m/s^2 one of half a second is off by ten
+# So much change of velocity (m/s) shows a delay: at 1 m/s^2 one of half a second is off by ten
 # sigma of a receiver's velocity meanwhile.
 SHOWING_M_S = 5.0
 
@@ -69,7 +69,7 @@ def since_leap(epochs: Sequence[Epoch]) -> Sequence[Epoch]:
 def unchanged(epochs: Sequence[Epoch], by_s: float, doubted_ns: int = 0) -> bool:
     """True if a receiver cannot have become later by `by_s` within what a look goes by, nor have
     been so before: its positions have followed its velocities all the way, and before that these
-    had changed by as much as shows a lateness. What follows `doubted_ns`, when something did not
+    had changed by as much as shows a delay. What follows `doubted_ns`, when something did not
     fit, shows none as long: what is begun anew by late fixes agrees with them for a while."""
     steps = _steps(epochs)
     if steps is None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusiond.aiding.offers import PositionOffer, VelocityOffer
-from fusiond.navigator.alignment.leaps import (
+from fusiond.navigator.alignment.position_jumps import (
     LOOKED_NS,
     Epoch,
     since_leap,
