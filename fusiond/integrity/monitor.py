@@ -213,8 +213,8 @@ class ConsistencyMonitor:
         if not finite.all():
             places = np.flatnonzero(finite).tolist()
             self.rejected["not_finite"] += len(rows) - len(places)
-            turned = self.take(rows[finite], nis[finite], energy[finite]) if places else []
-            return [(places[i], to) for i, to in turned]
+            of_finite = self.take(rows[finite], nis[finite], energy[finite]) if places else []
+            return [(places[i], to) for i, to in of_finite]
         if rows.shape[1] != self._m:
             self.restarts += self._m > 0
             self._m = rows.shape[1]
