@@ -235,10 +235,11 @@ class ConsistencyMonitor:
                 self._limits_k = k
             limits, turned = self._limits, np.empty((end - done, 2), dtype=np.int64)
             dof, patience = k * self._m, k // 2 if k >= FEWEST else 0
+            low, high = limits.nis_limits
             turns = _slide_over(
                 *(self._rows, self._figures, self._products, self._sums, first, o.window),
                 *(rows[now], nis[now], energy[now], limits.weights, self._rho),
-                *(*limits.nis_limits, limits.portmanteau, dof, patience, self._held, turned),
+                *(low, high, limits.portmanteau, dof, patience, self._held, turned),
             )
             if k >= FEWEST:
                 self._average = float(self._sums[0]) / dof
