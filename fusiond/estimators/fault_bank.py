@@ -87,8 +87,8 @@ LOG_PRIOR = 7
 # head holds which restart each level is at (4), the instant (s), place (m) and number of entries of
 # the path, where V begins, how many groups there are and how many of them have three numbers, LANES
 # (loops whose length is read from an array become vector code), where the transition since the last
-# aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if one
-# was likely then, and the epoch (s) of rows that have been taken in and not judged, or infinity.
+# aid lies, 1 if it is not the identity, the probability of any fault as it was judged last, 1 if
+# one was likely then, and the epoch (s) of rows that were taken in and are not judged, or infinity.
 RESTARTED, PATH_S, PATH, ENTRIES, SENSITIVITIES = 0, 4, 5, 8, 9
 ALL, THREES, LENGTH, PHI, WAITS, ANY_FAULT, SUSPECTS, UNJUDGED = range(10, 18)
 HEAD = 24
@@ -120,8 +120,8 @@ LASTS_S = 1.0
 
 class FaultTable(NamedTuple):
     """Kinds of faults as the kernels read them, those of three numbers first: `ints` (k, 9) and
-    `numbers` (k, 10), `lanes` with the constants of their groups, and the devices whose numbers they
-    name."""
+    `numbers` (k, 10), `lanes` with the constants of their groups, and the devices whose numbers
+    they name."""
 
     ints: Indices
     numbers: Array
@@ -140,8 +140,8 @@ class FaultTable(NamedTuple):
 
 
 def fault_table(ints: Indices, numbers: Array, devices: tuple[str, ...]) -> FaultTable:
-    """The table of these kinds, `numbers` (k, 7); ValueError where one has another number than three or one, a mean
-    of three, or those of three do not come first."""
+    """The table of these kinds, `numbers` (k, 7); ValueError where one has another number than
+    three or one, a mean of three, or those of three do not come first."""
     sizes = ints[:, SIZE]
     if not np.isin(sizes, (1, 3)).all() or (np.diff(sizes) > 0).any():
         raise ValueError("kinds have three numbers or one, those of three first")

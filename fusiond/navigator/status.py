@@ -58,7 +58,8 @@ class NavigationStatus:
             return Mode.WAITING if begun is None else Mode.INVALID, self._door.silence(silent)
         if begun is None:
             return Mode.ALIGNING, aligning
-        sd_m = self._horizontal_sd_m()
+        sd = self._estimator.sigmas()
+        sd_m = math.hypot(sd.item(0), sd.item(1))
         if not sd_m <= self._limits.invalid_sd_m:
             return Mode.INVALID, f"horizontal sigma {sd_m:.0f} m"
         if begun.unconfirmed:
@@ -80,10 +81,7 @@ class NavigationStatus:
             return None
         if (device := diagnosis.contradicts) is not None:
             return f"positions and velocities of {device} fit each other, not the filter"
-        if not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
+        sd = e.sigmas()
+        if not math.hypot(sd.item(0), sd.item(1)) <= self._limits.invalid_sd_m:
             return "no position in service, and the solution is not valid any more"
         return None
-
-    def _horizontal_sd_m(self) -> float:
-        sd = self._estimator.sigmas()
-        return math.hypot(sd.item(0), sd.item(1))
