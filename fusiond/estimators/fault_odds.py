@@ -194,7 +194,9 @@ def _gains(bank: Array, lanes: Array) -> None:
             bank[j + unsigned(UNEXPLAINED)] = left
 
 
-@compiled("void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[:, ::1])")
+@compiled(
+    "void(f8[::1], i8[:, ::1], f8[:, ::1], f8[::1], i8, f8[::1], f8[:, ::1])", forceinline=True
+)
 def _odds(
     bank: Array, ints: Indices, numbers: Array, lanes: Array, number: int, m: Array, counts: Array
 ) -> None:
@@ -210,10 +212,10 @@ def _odds(
     rate = lanes[place // LANES * CONSTANTS + place % LANES + ODDS_AT] + bank[at + COUNTS_BY]
     by_size = 0.5 * math.log(a)
     if numbers[kind, BOUNDED] == 0.0:
-        known = counts[number % RESTARTS]
-        if known[0] != bank[at + N_AT]:
-            known[0], known[1] = bank[at + N_AT], math.log(bank[at + N_AT])
-        by_rows = 0.5 * size * known[1]
+        restart = number % RESTARTS
+        if counts[restart, 0] != bank[at + N_AT]:
+            counts[restart, 0], counts[restart, 1] = bank[at + N_AT], math.log(bank[at + N_AT])
+        by_rows = 0.5 * size * counts[restart, 1]
         for c in range(int(size)):
             by_rows -= numbers[kind, LOG_PRIOR + c]
         gained = 0.5 * bank[at + EXPLAINED] - max(by_rows, by_size)

@@ -13,6 +13,7 @@ class ServiceEvents:
 
     def __init__(self, timeline: Timeline, on_event: Callable[[str, str], None]) -> None:
         self._timeline, self._event = timeline, on_event
+        self._isolates = timeline.estimator.isolates
         self._out: dict[str, str] = {}
         """Told to be left out, and why."""
         self._found_ns: dict[tuple[str, str], int] = {}
@@ -31,9 +32,9 @@ class ServiceEvents:
             if finding.kind.corrected:
                 over = finding.kind.of == OVER
                 self._event("fault_over" if over else "sensor_fault", finding.text)
-        estimator, now = self._timeline.estimator, diagnosis.excluded
-        if estimator.isolates:
-            now = estimator.isolated | now
+        now = diagnosis.excluded
+        if self._isolates:
+            now = self._timeline.estimator.isolated | now
         for source, reason in now.items():
             if source not in self._out:
                 self._event("isolated", f"{source} is left out of the solution: {reason}")

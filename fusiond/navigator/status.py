@@ -59,7 +59,8 @@ class NavigationStatus:
             return Mode.WAITING if begun is None else Mode.INVALID, self._door.silence(silent)
         if begun is None:
             return Mode.ALIGNING, aligning
-        sd_m = self._horizontal_sd_m()
+        sd = self._estimator.sigmas()
+        sd_m = math.hypot(sd.item(0), sd.item(1))
         if not sd_m <= self._limits.invalid_sd_m:
             limit = self._limits.invalid_sd_m
             return Mode.INVALID, reason("sigma", sd=sd_m, limit=limit)
@@ -83,10 +84,7 @@ class NavigationStatus:
             return None
         if (device := diagnosis.contradicts) is not None:
             return reason("filter_disagrees", device=device)
-        if not self._horizontal_sd_m() <= self._limits.invalid_sd_m:
+        sd = e.sigmas()
+        if not math.hypot(sd.item(0), sd.item(1)) <= self._limits.invalid_sd_m:
             return reason("nothing_in_service")
         return None
-
-    def _horizontal_sd_m(self) -> float:
-        sd = self._estimator.sigmas()
-        return math.hypot(sd.item(0), sd.item(1))

@@ -20,6 +20,7 @@ from fusiond.aiding.rdss_position import FeedBackAid, RdssPositionAid
 from fusiond.aiding.velocity import VelocityAid
 from fusiond.configuration.schema import Imu
 from fusiond.configuration.settings import imu_noise
+from fusiond.estimators import hypotheses
 from fusiond.estimators.base import Outcome
 from fusiond.estimators.kalman import KalmanEstimator
 from fusiond.integrity.catalogue import Kind, kinds_of, table_of
@@ -107,6 +108,11 @@ def drive() -> Drive:
 
 @lru_cache(maxsize=1)
 def in_order() -> tuple[KalmanEstimator, list[Outcome]]:
+    """The reference, of which there is one."""
+    return applied_in_order()
+
+
+def applied_in_order() -> tuple[KalmanEstimator, list[Outcome]]:
     """The reference knows no timeline: propagate to each aid in turn, apply and judge it, go on."""
     d = drive()
     estimator = d.estimator()
@@ -219,6 +225,41 @@ def test_order_of_arrival_within_one_instant_is_not_seen() -> None:
         states.append(timeline.estimator)
     assert_same_state(states[0], states[1])
     assert_same_state(states[0], states[2])
+
+
+def test_rows_of_one_instant_are_judged_together_as_each_by_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A compass and a position of one instant, some of which fail their gate: to the bit, the bank
+    as well. The reference goes on to each aid, and has judged those before it."""
+    d, judged = drive(), count(monkeypatch)
+    reference, outcomes = applied_in_order()
+    each = judged.total()
+    judged.clear()
+    timeline = d.timeline(keep_s=60.0)
+    timeline.imu.append(d.times, d.samples)
+    entries = [timeline.insert(aid) for aid in d.aids]
+    timeline.run()
+    assert 0 < judged.total() < 0.8 * each
+    assert [entry.outcome for entry in entries] == outcomes
+    timeline.estimator.propagate(timeline.imu, timeline.imu.latest_ns)
+    assert_same_state(timeline.estimator, reference)
+    assert reference.hypotheses is not None
+    assert timeline.estimator.hypotheses is not None
+    assert timeline.estimator.hypotheses.bank.tobytes() == reference.hypotheses.bank.tobytes()
+
+
+def count(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Counts how often the hypotheses are judged, from now on."""
+    judged: Counter[str] = Counter()
+    kernel = hypotheses.judge_and_widen
+
+    def counted(*given: object) -> None:
+        judged["judge_and_widen"] += 1
+        kernel(*given)
+
+    monkeypatch.setattr(hypotheses, "judge_and_widen", counted)
+    return judged
 
 
 @pytest.mark.parametrize("chunk", [1, 33, 300])

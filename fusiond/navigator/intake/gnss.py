@@ -95,7 +95,9 @@ def aids(m: PositionFix, sections: Sections, when: Instants) -> list[Aid] | str:
     `raw_is_used`: the receiver's raw data are the aid, not its fixes.
     """
     source = m.source
-    receiver = sections.made(source, _receiver)
+    receiver: _Receiver | None = sections.made.get((source, _receiver))
+    if receiver is None:
+        receiver = sections.made[source, _receiver] = _receiver(source, sections)
     if receiver.raw:
         return "raw_is_used"
     o, stated = receiver.section, m.sd_ned_m

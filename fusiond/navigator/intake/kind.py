@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from fusiond.navigator.raw_gnss import RawGnss
 
 S = TypeVar("S", bound=Aiding)
-T = TypeVar("T")
 
 
 class Instants(NamedTuple):
@@ -55,7 +54,8 @@ class Sections:
         """Whether one wants large residuals to weigh less: by default none does."""
         self._found: dict[tuple[str, type[Aiding]], Aiding] = {}
         self._names: dict[tuple[str, type[Aiding], tuple[str, ...]], tuple[str, ...]] = {}
-        self._made: dict[tuple[str, object], Any] = {}
+        self.made: dict[tuple[str, object], Any] = {}
+        """By source and maker: what the sections alone say of it, for all that comes of it."""
 
     def set_gates(self, gates: Mapping[str, float]) -> None:
         """`gate_probability` by section, of what comes from now on."""
@@ -65,7 +65,7 @@ class Sections:
         }
         self.aiding = {**self.aiding, **changed}
         self._found.clear()
-        self._made.clear()
+        self.made.clear()
         for name in self.receivers.keys() & gates:
             self.receivers[name].gate = gates[name]
 
@@ -78,13 +78,6 @@ class Sections:
             section = next((s for s in named if isinstance(s, kind)), None) or kind()
             self._found[source, kind] = section
         return section
-
-    def made(self, source: str, make: Callable[[str, Sections], T]) -> T:
-        """Options of a source, made once for all that comes of it."""
-        found: T | None = self._made.get((source, make))
-        if found is None:
-            found = self._made[source, make] = make(source, self)
-        return found
 
     def robust(self, source: str) -> bool:
         """True if the section that a measurement of the source was made with, as `of` found it,
