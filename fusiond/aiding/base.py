@@ -53,7 +53,7 @@ class Innovation(NamedTuple):
 
 
 class State(NamedTuple):
-    """What an aid may look at: navigation state (10,), parameters (n,), last step (28,), model, and
+    """What an aid may look at: navigation state (10,), parameters (n,), last step (35,), model, and
     the filter's own P (n, n), None where the state is not a filter's (a sigma point, the truth).
     `lent` is what a filter lends aids to write their innovations to, by the number of rows."""
 

@@ -1,24 +1,28 @@
 r"""Corrected pseudoranges and rates of an epoch: which signals serve, and how good each row is.
 
-    sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2
-                     + (0.12 m)^2 + (0.2 s_I)^2 + s_sis^2 + s_d^2
-    sigma^2(rate)  = (r m)^2 + s_rx^2
-    common to all ranges: s_I n,  n ~ N(0, 1),  s_I half the modelled delay, or 5 m m without model
+    sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2 + s_sis^2 + s_d^2
+                     + what carriers leave of the ionosphere + (0.2 s_I)^2
+    sigma^2(rate)  = (r m)^2 + s_rx^2,  or of the carrier from epoch to epoch
+    common to all ranges: s_I n_1 + 0.12 m n_2 + s_2 n_3,   n ~ N(0, 1)
 
 m = 1.001 / sqrt(0.002001 + sin^2 E) grows as 1 / sin E; a multipath at the zenith and b thermal
-noise at 45 dB-Hz (m), s_rx what the receiver states, 0.12 m the troposphere left, s_sis orbit and
-clock, s_d the group delay left; r (m/s). Where a receiver states nothing, C/N0 or s_rx is left out.
+noise at 45 dB-Hz (m), s_rx what the receiver states, s_sis orbit and clock, s_d the group delay
+left; r (m/s). Where a receiver states nothing, C/N0 or s_rx is left out.
 
-The ionosphere that is left is not noise: the model is too strong or too weak for the whole sky and
-for hours. So it has a column of its own, `ionosphere_sigma_m`, to be used as one more unknown with
-unit variance (as `fusiond.gnss.single_point` does), or as a state of a filter; a fifth of it stands
-for what differs from satellite to satellite.
+s_I is what is not known of the ionosphere: half the modelled delay, or 5 m m without a model, of a
+satellite with one carrier; of one with two what `fusiond.gnss.range_kernel` leaves of it. 0.12 m is
+the troposphere left, s_2 what a receiver delays BeiDou-2 more than BeiDou-3. These are not noise:
+a model is too strong or too weak for the whole sky and for hours. So each has a column of its own,
+to be used as one more unknown with unit variance (as `fusiond.gnss.single_point` does), or as a
+state of a filter; a fifth of s_I stands for what differs from satellite to satellite.
 
-One signal of each satellite serves: the first of `PREFERRED` that is there. Nothing is combined:
-the ionosphere-free pair makes noise and multipath 2.6 to 3 times as large.
+One signal of each satellite serves as range and carrier, a second one for its slant delay
+(`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range
+is the least uncertain; without a pair the first of `PREFERRED` that is there.
 
 Refusals, by satellite: `no_ephemeris`, `stale_ephemeris`, `unhealthy`, `no_group_delay` (of none of
-its signals, or of none that is preferred), `weak_signal`, `low_elevation`.
+its signals, or of none that is preferred), `weak_signal`, `low_elevation`; of carriers, which then
+give no rate for the epoch, `lock_lost`, `cycle_slip`, and of all at once `clock_jump`.
 """
 
 from __future__ import annotations
@@ -42,9 +46,10 @@ from drivers.raw.messages import (
     RawSignal,
     System,
 )
+from fusiond.gnss import carriers as ca
 from fusiond.gnss import range_kernel as rk
 from fusiond.gnss.bdgim import TERMS, bdgim_terms
-from fusiond.gnss.group_delay import group_delay
+from fusiond.gnss.group_delay import GroupDelay, group_delay
 from fusiond.gnss.orbit import WEEK_S, Orbits
 from fusiond.gnss.store import EphemerisStore
 
@@ -57,13 +62,18 @@ PREFERRED: dict[System, tuple[str, ...]] = {
 }
 """Signals that have a broadcast group delay, best known first."""
 
-SIGNAL_IN_SPACE_M: dict[System, float] = {"G": 0.7, "E": 0.7, "C": 1.5}
-"""Orbit and clock, global RMS: Montenbruck, Steigenberger, Hauschild, GPS Solutions 19 (2015),
-321-333, for GPS and BeiDou. Galileo's 1.6 m there were its first four satellites: GPS's
-is taken."""
+SIGNAL_IN_SPACE_M: dict[System, float] = {"G": 0.6, "E": 0.3, "C": 0.6}
+"""Orbit and clock, global RMS: Montenbruck, Steigenberger, Hauschild, Advances in Space Research 61
+(2018), 3020-3038: Galileo 0.2 m, GPS 0.6, BeiDou-2 1.0, all of 2017. Galileo's group delays are in
+the 0.3 m; BeiDou-3, not whole then, is taken for GPS."""
+BEIDOU_2_IN_SPACE_M = 1.0
+LAST_BEIDOU_2_PRN = 18
+"""BDS-SIS-ICD-B1I-3.0 table 4-1: BeiDou-3 begins with 19 but for its GEO, from 59."""
 
 GPS_IONO_HZ = CARRIER_HZ["G", "1"]
 BEIDOU_IONO_HZ = CARRIER_HZ["C", "2"]
+LEAST_GAMMA = 1.1
+"""Of (f_a / f_b)^2: nearer carriers, E5a and E5b or B3I and B2I, make noise tenfold."""
 PLAN_HOLDS_S = 10.0
 """Ephemerides are chosen anew after this: it is what one may be used beyond its limit."""
 
@@ -137,9 +147,11 @@ class Rows:
     satellites; `line_of_sight` (n, 3) from receiver to satellite; `range_m` (n,) from the receiver
     that was assumed; `system` (n,) indices into `SYSTEMS`, `clock` (n,) into the systems in use;
     `measured_at` (n,) into the epoch's signals; `variance` and `rate_variance` (n,) of what is
-    independent, `ionosphere_sigma_m` (n,) of what is common, `total_variance` (n,) of both;
-    `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs of satellite and reason.
-    `values` (21, n) has all of them, as `range_kernel.range_rows` writes it.
+    independent, `common` (n, 3) what a common error of one sigma adds (ionosphere, troposphere,
+    BeiDou-2), `total_variance` (n,) of both; `carrier_rate_m_s` (n,) the mean rate over the last
+    `span_s` (n,) by the carrier, NaN and 0 where there is none; `troposphere_m` and `ionosphere_m` (n,) were taken out; `refused` pairs
+    of satellite and reason.
+    `values` (27, n) has all of them, as `range_kernel.range_rows` writes it.
     """
 
     satellites: tuple[str, ...]
@@ -162,6 +174,9 @@ class Rows:
     troposphere_m = _Of(rk.TROPOSPHERE)
     ionosphere_m = _Of(rk.IONOSPHERE)
     ionosphere_sigma_m = _Of(rk.COMMON)
+    common = _Of(slice(rk.COMMON, rk.BEIDOU_2_SIGMA + 1))
+    span_s = _Of(rk.CARRIER_SPAN)
+    carrier_rate_m_s = _Of(rk.CARRIER_RATE)
     total_variance = _Of(rk.TOTAL_VARIANCE)
 
     @property
@@ -195,6 +210,10 @@ class _Plan(NamedTuple):
     gps_s: float
     serving: list[int]
     doubles: struct.Struct
+    seconds: list[int]
+    second_doubles: struct.Struct
+    second_rows: npt.NDArray[np.intp]
+    followed: Array
     measured_at: npt.NDArray[np.intp]
     satellites: tuple[str, ...]
     signals: tuple[str, ...]
@@ -206,13 +225,27 @@ class _Plan(NamedTuple):
     refused: tuple[tuple[str, str], ...]
 
 
+class _Served(NamedTuple):
+    """Of a satellite: which signal is its range, which one measures the ionosphere beside it, and
+    its rows of the plan."""
+
+    index: int
+    second: int | None
+    ephemeris: Ephemeris
+    fixed: tuple[float, float, float, float, float]
+    followed: tuple[float, float, float, float, float, float, float]
+
+
 class Picked(NamedTuple):
-    """An epoch's signals that serve, (n, 5) as measured: all that does not need the receiver."""
+    """An epoch's signals that serve, (n, 7) as measured, what their carriers tell (n, 6), and whose
+    carriers tell nothing and why: all that does not need the receiver."""
 
     plan: _Plan
     week: int
     tow_s: float
     measured: Array
+    carriers: Array
+    slips: tuple[tuple[str, str], ...]
 
 
 class RangeModel:
@@ -223,6 +256,7 @@ class RangeModel:
         self.options = options or RangeOptions()
         self._noise = self.options.noise.array()
         self._plan: _Plan | None = None
+        self._kept = np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
 
     def rows(self, epoch: RawGnssEpoch, receiver: Array) -> Rows:
         """Rows for a receiver at about (3,) ECEF m; 100 m off moves a correction by 1 cm.
@@ -253,13 +287,34 @@ class RangeModel:
                 s.cno_db_hz,
                 s.sd_pseudorange_m,
                 s.sd_range_rate_m_s,
+                s.carrier_cycles,
+                s.lock_s,
             )
-        measured = np.empty((len(plan.serving), rk.MEASURED_COLUMNS))
-        try:
-            plan.doubles.pack_into(measured.data, 0, *values)  # half of what numpy takes
-        except struct.error:  # what a receiver does not say is None
-            measured[:] = np.array(values, float).reshape(measured.shape)
-        return Picked(plan, epoch.week, epoch.tow_s, measured)
+        measured = _packed(plan.doubles, values, ca.FIRST_COLUMNS)
+        values = []
+        for k in plan.seconds:
+            s = epoch.signals[k]
+            values += (
+                s.pseudorange_m,
+                s.cno_db_hz,
+                s.sd_pseudorange_m,
+                s.carrier_cycles,
+                s.lock_s,
+            )
+        second = np.full((len(plan.serving), ca.SECOND_COLUMNS), np.nan)
+        second[plan.second_rows] = _packed(plan.second_doubles, values, ca.SECOND_COLUMNS)
+        carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
+        refused = np.empty(len(plan.serving), np.int64)
+        jumped = ca.follow(self._kept, plan.followed, measured, second, now, carriers, refused)
+        slips: tuple[tuple[str, str], ...] = ()
+        if refused.any():
+            slips = tuple(
+                (plan.satellites[k], "lock_lost" if refused[k] == ca.LOCK_LOST else "cycle_slip")
+                for k in np.flatnonzero(refused)
+            )
+        if jumped:
+            slips += (("", "clock_jump"),)
+        return Picked(plan, epoch.week, epoch.tow_s, measured, carriers, slips)
 
     def evaluate(self, picked: Picked, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
@@ -269,6 +324,7 @@ class RangeModel:
             plan.orbits.elements,
             plan.fixed,
             picked.measured,
+            picked.carriers,
             plan.ionosphere,
             float(picked.week),
             picked.tow_s,
@@ -297,55 +353,107 @@ class RangeModel:
         for k, s in enumerate(epoch.signals):
             if s.system in self.options.systems:
                 by_satellite.setdefault((s.system, s.prn), {})[s.signal] = k
-        chosen: list[tuple[int, RawSignal, Ephemeris]] = []
-        fixed: list[tuple[float, float, float, float]] = []
+        chosen: list[_Served] = []
         refused: list[tuple[str, str]] = []
         for found in by_satellite.values():
             served = self._serve(epoch, found)
             if isinstance(served, str):
                 refused.append((epoch.signals[next(iter(found.values()))].satellite, served))
-                continue
-            index, ephemeris, row = served
-            chosen.append((index, epoch.signals[index], ephemeris))
-            fixed.append(row)
-        serving = [k for k, _, _ in chosen]
+            else:
+                chosen.append(served)
+        serving = [s.index for s in chosen]
+        signals = [epoch.signals[k] for k in serving]
+        paired = [k for k, s in enumerate(chosen) if s.second is not None]
+        seconds = [s.second for s in chosen if s.second is not None]
         return _Plan(
             keys,
             self.store.version,
             now,
             serving,
-            struct.Struct(f"{len(serving) * rk.MEASURED_COLUMNS}d"),
+            struct.Struct(f"{len(serving) * ca.FIRST_COLUMNS}d"),
+            seconds,
+            struct.Struct(f"{len(seconds) * ca.SECOND_COLUMNS}d"),
+            np.array(paired, np.intp),
+            np.array([s.followed for s in chosen], float).reshape(-1, ca.PLAN_COLUMNS),
             np.array(serving, np.intp),
-            tuple(s.satellite for _, s, _ in chosen),
-            tuple(s.signal for _, s, _ in chosen),
-            np.array([SYSTEMS.index(s.system) for _, s, _ in chosen], np.intp),
-            np.array([self.options.systems.index(s.system) for _, s, _ in chosen], np.int64),
-            Orbits.of([e for _, _, e in chosen]),
-            np.array(fixed, float).reshape(len(fixed), rk.SIGNAL_COLUMNS),
+            tuple(s.satellite for s in signals),
+            tuple(s.signal for s in signals),
+            np.array([SYSTEMS.index(s.system) for s in signals], np.intp),
+            np.array([self.options.systems.index(s.system) for s in signals], np.int64),
+            Orbits.of([s.ephemeris for s in chosen]),
+            np.array([s.fixed for s in chosen], float).reshape(-1, rk.SIGNAL_COLUMNS),
             self._ionosphere(epoch),
             tuple(refused),
         )
 
-    def _serve(
-        self, epoch: RawGnssEpoch, found: dict[str, int]
-    ) -> tuple[int, Ephemeris, tuple[float, float, float, float]] | str:
-        """Of one satellite's signals the one that serves: index, ephemeris, row of the plan."""
+    def _serve(self, epoch: RawGnssEpoch, found: dict[str, int]) -> _Served | str:
+        """Of one satellite's signals those that serve."""
         first = epoch.signals[next(iter(found.values()))]
         wanted = [found[name] for name in self.options.preferred[first.system] if name in found]
         outcome = "no_group_delay"
+        candidates: list[tuple[int, Ephemeris, GroupDelay]] = []
         for k in wanted or found.values():
             s = epoch.signals[k]
             e = self.store.select(s.system, s.prn, epoch.week, epoch.tow_s, s.signal[0])
             if isinstance(e, str):
                 outcome = e
-                continue
-            delay = group_delay(e, s.signal)
-            if delay is None:
-                continue
-            model, scale = self._ionosphere_model(s)
-            variance = self.options.signal_in_space_m[s.system] ** 2 + delay.sigma_m**2
-            return k, e, (SPEED_OF_LIGHT_M_S * delay.delay_s, model, scale, variance)
-        return outcome
+            elif (delay := group_delay(e, s.signal)) is not None:
+                candidates.append((k, e, delay))
+        if not candidates:
+            return outcome
+        best: tuple[float, int, int, Ephemeris, GroupDelay, GroupDelay] | None = None
+        for k, e, delay in candidates:
+            for j in found.values():
+                other = group_delay(e, epoch.signals[j].signal)
+                if other is None:
+                    continue
+                gamma = _gamma(epoch.signals[k], epoch.signals[j])
+                if gamma <= LEAST_GAMMA:
+                    continue
+                noise = ca.CODE_M**2
+                a, b = noise + delay.sigma_m**2, noise + other.sigma_m**2
+                variance = (gamma**2 * a + b) / (gamma - 1.0) ** 2
+                if best is None or variance < best[0]:
+                    best = variance, k, j, e, delay, other
+        if best is None:
+            k, e, delay = candidates[0]
+            return self._served(epoch, k, e, delay, None, None)
+        _, k, j, e, delay, other = best
+        return self._served(epoch, k, e, delay, j, other)
+
+    def _served(
+        self,
+        epoch: RawGnssEpoch,
+        index: int,
+        ephemeris: Ephemeris,
+        delay: GroupDelay,
+        second: int | None,
+        other: GroupDelay | None,
+    ) -> _Served:
+        s = epoch.signals[index]
+        model, scale = self._ionosphere_model(s)
+        group, in_space = SYSTEMS.index(s.system), self.options.signal_in_space_m[s.system]
+        if s.system == "C" and s.prn <= LAST_BEIDOU_2_PRN:
+            group, in_space = rk.BEIDOU_2, max(in_space, BEIDOU_2_IN_SPACE_M)
+        variance = in_space**2 + delay.sigma_m**2
+        delay_m = SPEED_OF_LIGHT_M_S * delay.delay_s
+        slot = float(64 * SYSTEMS.index(s.system) + s.prn)
+        length = SPEED_OF_LIGHT_M_S / CARRIER_HZ[s.system, s.signal[0]]
+        followed = (slot, length, 0.0, 0.0, 0.0, 0.0, 0.0)
+        if second is not None and other is not None:
+            b = epoch.signals[second]
+            gamma = _gamma(s, b)
+            followed = (
+                slot,
+                length,
+                SPEED_OF_LIGHT_M_S / CARRIER_HZ[b.system, b.signal[0]],
+                gamma,
+                SPEED_OF_LIGHT_M_S * (other.delay_s - delay.delay_s),
+                (delay.sigma_m**2 + other.sigma_m**2) / (gamma - 1.0) ** 2,
+                float(_number(s.signal, b.signal)),
+            )
+        fixed = (delay_m, model, scale, variance, float(group))
+        return _Served(index, second, ephemeris, fixed, followed)
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
         """Model and scale to the signal's frequency: the system's own, else whichever came. Of
@@ -369,3 +477,24 @@ class RangeModel:
         if self.store.bdgim is not None:
             out[2] = bdgim_terms(self.store.bdgim, epoch.week, epoch.tow_s)
         return out
+
+
+def _packed(doubles: struct.Struct, values: list[float | None], columns: int) -> Array:
+    """Values as rows; NaN for None."""
+    out = np.empty((len(values) // columns, columns))
+    try:
+        doubles.pack_into(out.data, 0, *values)  # half of what numpy takes
+    except struct.error:  # what a receiver does not say is None
+        out[:] = np.array(values, float).reshape(out.shape)
+    return out
+
+
+def _gamma(a: RawSignal, b: RawSignal) -> float:
+    """(f_a / f_b)^2."""
+    hertz = (CARRIER_HZ[s.system, s.signal[0]] for s in (a, b))
+    return float(next(hertz) / next(hertz)) ** 2
+
+
+def _number(a: str, b: str) -> int:
+    """A number, not 0, of a pair of signals."""
+    return int.from_bytes((a + b).encode("ascii"))

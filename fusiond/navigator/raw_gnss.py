@@ -20,11 +20,11 @@ from drivers.immutable import immutable
 from drivers.raw.messages import NavigationMessage, RawGnssEpoch
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State
 from fusiond.aiding.offers import Offer, PositionOffer, VelocityOffer
-from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid
+from fusiond.aiding.pseudorange import RANGE_BIAS, PseudorangeAid, nothing_left
 from fusiond.configuration.aiding import RawAiding
 from fusiond.estimators.screening import KEPT, RESIDUAL
 from fusiond.gnss.ecef import ned_axes, to_ecef, to_geodetic
-from fusiond.gnss.range_kernel import AID_ROWS, RATE_VARIANCE, TOTAL_VARIANCE
+from fusiond.gnss.range_kernel import AID_ROWS, CARRIER_VARIANCE, RATE_VARIANCE, VARIANCE
 from fusiond.gnss.ranges import Picked, RangeModel, RangeOptions, Rows
 from fusiond.gnss.selection import best_four
 from fusiond.gnss.single_point import Dops, SinglePoint, dops, single_point
@@ -68,10 +68,17 @@ class _Corrected(NamedTuple):
 
 @dataclass(slots=True)
 class _Memory:
-    """What an epoch came to last, and whether its refused satellites have been counted."""
+    """What an epoch came to last, and whether its refused satellites have been counted; what the
+    epoch before left to it, and it to the next, in the filter's last run over them."""
 
+    before: Array
+    left: Array
     corrected: _Corrected | None = None
     counted: bool = False
+
+
+def _memory() -> _Memory:
+    return _Memory(nothing_left(), nothing_left())
 
 
 @immutable(eq=False)
@@ -88,7 +95,7 @@ class RawEpochAid(Aid):
     receiver: RawGnss
     epoch: RawGnssEpoch
     picked: Picked
-    memory: _Memory = field(default_factory=_Memory)
+    memory: _Memory = field(default_factory=_memory)
 
     @property
     def shares(self) -> tuple[str, ...]:
@@ -136,6 +143,7 @@ class RawGnss:
         self._left_out: dict[str, str] = {}
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
+        self._left = nothing_left()
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
@@ -145,11 +153,13 @@ class RawGnss:
     def aid(self, epoch: RawGnssEpoch, t_ns: int) -> RawEpochAid:
         """The epoch as an aid, with the ephemerides that are known by now."""
         picked = self._model.pick(epoch)
-        return RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
+        memory = _Memory(self._left, nothing_left())
+        self._left = memory.left
+        return RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked, memory)
 
     def alone(self, aid: RawEpochAid) -> list[Offer]:
         """Position and velocity of an epoch alone, for the alignment; none without a solution."""
-        found = single_point(self._model, aid.epoch, self._guess)
+        found = single_point(self._model, aid.picked, self._guess)
         offers: list[Offer] = []
         if isinstance(found, str) or not found.consistent:
             self.refused[found if isinstance(found, str) else "inconsistent"] += 1
@@ -172,7 +182,7 @@ class RawGnss:
         scale, values = self._section.sigma_scale**2, rows.values[:AID_ROWS]
         if scale != 1.0:
             values = values.copy()
-            values[[TOTAL_VARIANCE, RATE_VARIANCE]] *= scale
+            values[[VARIANCE, RATE_VARIANCE, CARRIER_VARIANCE]] *= scale
         return rows, PseudorangeAid(
             self.source,
             aid.t_ns,
@@ -182,6 +192,8 @@ class RawGnss:
             rows.clock,
             self._section.lever_arm_m,
             aid.epoch.clock_reset,
+            aid.memory.before,
+            aid.memory.left,
             robust=aid.robust,
         )
 
@@ -211,6 +223,8 @@ class RawGnss:
             aid.memory.counted = True
             for satellite, reason in refused:
                 self.refused[f"{satellite[0]}_{reason}"] += 1
+            for satellite, reason in aid.picked.slips:
+                self.refused[f"{satellite[0]}_{reason}" if satellite else reason] += 1
 
     def sky(self) -> Sky:
         """What the last epoch came to."""
