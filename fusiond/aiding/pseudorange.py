@@ -14,7 +14,9 @@ An error that all ranges share for many minutes may be a state of the model (blo
 `RANGE_BIAS`): a displacement t of the antenna that stands for orbit errors, multipath and,
 downwards, the ionosphere that is left:
 
-    rho^ = |s - p^ - a - t^| + c_k^,    z_rho += u . dt    (dt true minus estimated)
+    rho^ = |s - p^ - a - k t^| + c_k^,    z_rho += k u . dt    (dt true minus estimated)
+
+with k = sqrt(8 / n) of n satellites: errors of many average, t is that of eight.
 
 Other errors that all ranges share are states of unit variance n (blocks of `RANGE_SHARED`: what the
 models of ionosphere and troposphere leave, BeiDou-2's offset), with what one sigma of each adds to
@@ -84,6 +86,8 @@ RANGE_BIAS = ("range_bias", "range_bias_down")
 RANGE_SHARED = ("range_ionosphere", "range_troposphere", "range_beidou_2")
 """Blocks, of one state each, of what the models leave in all ranges."""
 CARRIER_CLOCK = "carrier_clock"
+DISPLACED_BY = 8.0
+"""Satellites, of which a displacement is as large as its block says."""
 UNUSED_VARIANCE = 1e6
 """(m/s)^2, of a rate that only a carrier gives and nothing is known of the epoch before."""
 SAME_SPAN_S = 1e-3
@@ -172,6 +176,11 @@ def _rows(
         if 0 <= column_of[slot] - RATE_ERROR < 3:
             begin, end = slot, max(end, slot + 1)
 
+    there = 0
+    for i in range(clock.shape[0]):
+        there += math.isfinite(values[_RANGE, i])
+    several = math.sqrt(DISPLACED_BY / max(there, 1))
+
     range_row = 0
     for i in range(clock.shape[0]):
         # From the antenna to the satellite, north, east, down.
@@ -192,8 +201,8 @@ def _rows(
                 g[slot] = -1.0
             _hold(active, g)
             for axis in range(displacement.shape[0]):
-                g[displacement[axis]] = -g[6 + axis]
-                innovation += g[6 + axis] * xi[displacement[axis]]
+                g[displacement[axis]] = -several * g[6 + axis]
+                innovation -= g[displacement[axis]] * xi[displacement[axis]]
             r[range_row] = values[_RANGE_VARIANCE, i]
             for k in range(3):
                 one = values[_SHARED + k, i]

@@ -6,13 +6,18 @@ r"""Range and range rate equations of one epoch, for all satellites at once.
 
 Of a satellite with two carriers I is what they measure (fusiond.gnss.carriers), of variance V, up
 to an offset that its system's signals share (what the receiver delays one band more than the
-other). With I0 the model's delay and s_I its sigma, of satellite k, over those of its group
+other). With I0 the model's delay, p the part of it that is not known, of satellite k, over
+those of its group
 
-    B   = sum w_k (I_k - I0_k) / sum w_k,       w_k = 1 / (V_k + s_Ik^2)
-    I   = I0 + B + a (I_k - I0 - B),            a = s_I^2 / (s_I^2 + V);  a = 0 with one carrier
-    var = a^2 V + a 2 cov(P, I_k),              left in common: (1 - a) s_I
+    B   = sum w_k (I_k - I0_k) / sum w_k,       w_k = 1 / (V_k + p^2 I0_k^2)
+    M   = sum w_k I0_k / sum w_k
+    I   = I0 + B + a (I_k - I0 - B),            a = s^2 / (s^2 + V),  a = 0 with one carrier
+    s^2 = p^2 (I0 - M)^2 + (0.3 p I0)^2
+    var = a^2 V + a 2 cov(P, I_k),              left in common: (1 - a) p (I0 - M)
 
-A group without pairs has B = 0. So a satellite with one carrier, or a fresh one, has its delay of
+for with B known a model that is too strong or too weak errs by p (I0 - M), and by 0.3 p I0 from
+place to place in the sky. A group are the signals of one carrier of GPS, Galileo, BeiDou-3 or BeiDou-2; one without pairs has
+B = 0. So a satellite with one carrier, or a fresh one, has its delay of
 the model, at the level that the others measure.
 
 s_t, v_t satellite position and velocity at transmission, turned into the ECEF frame of the instant
@@ -92,11 +97,8 @@ _NEPERS = 0.1 * math.log(10.0)
 """A decibel of power as an exponent of e."""
 
 # What the plan says of each row.
-SIGNAL_COLUMNS = 5
-GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP = range(SIGNAL_COLUMNS)
-GROUPS = 4
-"""GPS, Galileo, BeiDou-3, BeiDou-2: receivers delay the signals of the last two otherwise."""
-BEIDOU_2 = 3
+SIGNAL_COLUMNS = 6
+GROUP_DELAY_M, IONO_MODEL, IONO_SCALE, FIXED_VARIANCE, GROUP, BEIDOU_2 = range(SIGNAL_COLUMNS)
 NO_MODEL, GPS_MODEL, BEIDOU_MODEL, BDGIM_MODEL = 0.0, 1.0, 2.0, 3.0
 # What the receiver says of each row; NaN where it does not.
 MEASURED_COLUMNS = FIRST_COLUMNS
@@ -123,7 +125,7 @@ def _take_off_ionosphere(
 ) -> None:
     """Settle each satellite's delay by model and carriers, and what is left of it."""
     n = signals.shape[0]
-    weights, offsets = np.zeros(GROUPS), np.zeros(GROUPS)
+    weights, offsets, middles = np.zeros(n), np.zeros(n), np.zeros(n)
     for k in range(n):
         if math.isnan(carriers[k, SLANT]):
             continue
@@ -131,23 +133,27 @@ def _take_off_ionosphere(
         group = int(signals[k, GROUP])
         weights[group] += w
         offsets[group] += w * (carriers[k, SLANT] - out[IONOSPHERE, k])
+        middles[group] += w * out[IONOSPHERE, k]
     for k in range(n):
-        group, sigma = int(signals[k, GROUP]), out[COMMON, k]
-        share, variance = 0.0, 0.0
+        group, sigma, delay = int(signals[k, GROUP]), out[COMMON, k], out[IONOSPHERE, k]
+        share, variance, own = 0.0, 0.0, local * sigma
         if weights[group] > 0.0:
             level = offsets[group] / weights[group]
+            if on_earth and delay > 0.0:
+                sigma *= (delay - middles[group] / weights[group]) / delay
             if not math.isnan(carriers[k, SLANT]):
                 v = carriers[k, SLANT_VARIANCE]
-                share = sigma * sigma / (sigma * sigma + v) if on_earth else 1.0
-                level += share * (carriers[k, SLANT] - out[IONOSPHERE, k] - level)
+                s = sigma * sigma + own * own
+                share = s / (s + v) if on_earth else 1.0
+                level += share * (carriers[k, SLANT] - delay - level)
                 variance = share * (share * v + carriers[k, WITH_CODE])
             out[IONOSPHERE, k] += level
         out[CORRECTED, k] -= out[IONOSPHERE, k]
         left = (1.0 - share) * sigma
         out[COMMON, k] = left
-        out[VARIANCE, k] += variance + (local * left) ** 2
+        out[VARIANCE, k] += variance + ((1.0 - share) * own) ** 2
         out[BEIDOU_2_SIGMA, k] = 0.0
-        if group == BEIDOU_2:
+        if signals[k, BEIDOU_2] > 0.0:
             out[BEIDOU_2_SIGMA, k] = BEIDOU_2_CODE_M + BEIDOU_2_PAIR_M * share
         out[TOTAL_VARIANCE, k] = (
             out[VARIANCE, k]
@@ -179,7 +185,7 @@ def range_rows(
     """Write (27, n) values for a receiver (3,) ECEF m at GPS time `week`, `tow` of its clock; how
     many satellites are lower than `least_elevation` (rad) or weaker than `least_cno` (dB Hz).
 
-    `elements` (n, 33), `signals` (n, 5), `measured` (n, 7), `carriers` (n, 6) of
+    `elements` (n, 33), `signals` (n, 6), `measured` (n, 7), `carriers` (n, 6) of
     fusiond.gnss.carriers, `ionosphere` (3, 49): GPS's and BeiDou's eight coefficients, and the
     terms of BDGIM; `noise` (8,).
     """

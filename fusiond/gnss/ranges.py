@@ -1,7 +1,7 @@
 r"""Corrected pseudoranges and rates of an epoch: which signals serve, and how good each row is.
 
     sigma^2(range) = (a m)^2 + b^2 10^((45 - C/N0) / 10) + s_rx^2 + s_sis^2 + s_d^2
-                     + what carriers leave of the ionosphere + (0.2 s_I)^2
+                     + what carriers leave of the ionosphere + (0.3 s_I)^2
     sigma^2(rate)  = (r m)^2 + s_rx^2,  or of the carrier from epoch to epoch
     common to all ranges: s_I n_1 + 0.12 m n_2 + s_2 n_3,   n ~ N(0, 1)
 
@@ -14,7 +14,10 @@ satellite with one carrier; of one with two what `fusiond.gnss.range_kernel` lea
 the troposphere left, s_2 what a receiver delays BeiDou-2 more than BeiDou-3. These are not noise:
 a model is too strong or too weak for the whole sky and for hours. So each has a column of its own,
 to be used as one more unknown with unit variance (as `fusiond.gnss.single_point` does), or as a
-state of a filter; a fifth of s_I stands for what differs from satellite to satellite.
+state of a filter; 0.3 of s_I stand for what differs from satellite to satellite.
+
+a and b are those of `RangeNoise` until the codes of satellites with two carriers have shown what
+this receiver's are (`fusiond.gnss.carriers`).
 
 One signal of each satellite serves as range and carrier, a second one for its slant delay
 (`fusiond.gnss.carriers`): of all pairs with known group delays the one whose ionosphere-free range
@@ -27,8 +30,9 @@ give no rate for the epoch, `lock_lost`, `cycle_slip`, and of all at once `clock
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
 from typing import NamedTuple
@@ -72,8 +76,11 @@ LAST_BEIDOU_2_PRN = 18
 
 GPS_IONO_HZ = CARRIER_HZ["G", "1"]
 BEIDOU_IONO_HZ = CARRIER_HZ["C", "2"]
-LEAST_GAMMA = 1.1
-"""Of (f_a / f_b)^2: nearer carriers, E5a and E5b or B3I and B2I, make noise tenfold."""
+BAND_DELAY_M = 3.0
+"""10 ns: what receivers delay one carrier more than another."""
+LEAST_GAMMA = 1.3
+"""Of (f_a / f_b)^2: nearer carriers (B3I and B2a, 1.16; E1 and E6 have 1.52) make noise tenfold, and
+of what a receiver delays one more than the other metres."""
 PLAN_HOLDS_S = 10.0
 """Ephemerides are chosen anew after this: it is what one may be used beyond its limit."""
 
@@ -96,7 +103,7 @@ class RangeNoise:
     troposphere_m: float = 0.12
     ionosphere_share: float = 0.5
     ionosphere_unmodelled_m: float = 5.0
-    ionosphere_local: float = 0.2
+    ionosphere_local: float = 0.3
     rate_m_s: float = 0.05
 
     def array(self) -> Array:
@@ -226,25 +233,28 @@ class _Plan(NamedTuple):
 
 
 class _Served(NamedTuple):
-    """Of a satellite: which signal is its range, which one measures the ionosphere beside it, and
-    its rows of the plan."""
+    """Of a satellite: which signal is its range, which one measures the ionosphere beside it, its
+    group (system, BeiDou-2, carrier), and its rows of the plan but for the group's."""
 
     index: int
     second: int | None
     ephemeris: Ephemeris
-    fixed: tuple[float, float, float, float, float]
-    followed: tuple[float, float, float, float, float, float, float]
+    group: tuple[System, bool, str]
+    fixed: tuple[float, float, float, float]
+    followed: tuple[float, float, float, float, float, float, float, float]
 
 
 class Picked(NamedTuple):
-    """An epoch's signals that serve, (n, 7) as measured, what their carriers tell (n, 6), and whose
-    carriers tell nothing and why: all that does not need the receiver."""
+    """An epoch's signals that serve, (n, 7) as measured, what their carriers tell (n, 6), what the
+    model's sigmas of codes are multiplied by, and whose carriers tell nothing and why: all that
+    does not need the receiver."""
 
     plan: _Plan
     week: int
     tow_s: float
     measured: Array
     carriers: Array
+    code_scale: float
     slips: tuple[tuple[str, str], ...]
 
 
@@ -306,6 +316,7 @@ class RangeModel:
         carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
         refused = np.empty(len(plan.serving), np.int64)
         jumped = ca.follow(self._kept, plan.followed, measured, second, now, carriers, refused)
+        scale = math.sqrt(ca.scale_squared(self._kept))
         slips: tuple[tuple[str, str], ...] = ()
         if refused.any():
             slips = tuple(
@@ -314,12 +325,14 @@ class RangeModel:
             )
         if jumped:
             slips += (("", "clock_jump"),)
-        return Picked(plan, epoch.week, epoch.tow_s, measured, carriers, slips)
+        return Picked(plan, epoch.week, epoch.tow_s, measured, carriers, scale, slips)
 
     def evaluate(self, picked: Picked, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
         plan, options = picked.plan, self.options
         out = np.empty((rk.ROW_COLUMNS, len(plan.satellites)))
+        noise = self._noise.copy()
+        noise[: rk.CODE_CNO + 1] *= picked.code_scale
         lost = rk.range_rows(
             plan.orbits.elements,
             plan.fixed,
@@ -329,7 +342,7 @@ class RangeModel:
             float(picked.week),
             picked.tow_s,
             np.ascontiguousarray(receiver, float),
-            self._noise,
+            noise,
             options.elevation_mask_rad,
             options.cno_mask_db_hz,
             out,
@@ -361,6 +374,7 @@ class RangeModel:
                 refused.append((epoch.signals[next(iter(found.values()))].satellite, served))
             else:
                 chosen.append(served)
+        groups = _grouped(chosen)
         serving = [s.index for s in chosen]
         signals = [epoch.signals[k] for k in serving]
         paired = [k for k, s in enumerate(chosen) if s.second is not None]
@@ -381,7 +395,7 @@ class RangeModel:
             np.array([SYSTEMS.index(s.system) for s in signals], np.intp),
             np.array([self.options.systems.index(s.system) for s in signals], np.int64),
             Orbits.of([s.ephemeris for s in chosen]),
-            np.array([s.fixed for s in chosen], float).reshape(-1, rk.SIGNAL_COLUMNS),
+            np.array(groups, float).reshape(-1, rk.SIGNAL_COLUMNS),
             self._ionosphere(epoch),
             tuple(refused),
         )
@@ -432,14 +446,16 @@ class RangeModel:
     ) -> _Served:
         s = epoch.signals[index]
         model, scale = self._ionosphere_model(s)
-        group, in_space = SYSTEMS.index(s.system), self.options.signal_in_space_m[s.system]
-        if s.system == "C" and s.prn <= LAST_BEIDOU_2_PRN:
-            group, in_space = rk.BEIDOU_2, max(in_space, BEIDOU_2_IN_SPACE_M)
+        in_space = self.options.signal_in_space_m[s.system]
+        beidou_2 = s.system == "C" and s.prn <= LAST_BEIDOU_2_PRN
+        if beidou_2:
+            in_space = max(in_space, BEIDOU_2_IN_SPACE_M)
         variance = in_space**2 + delay.sigma_m**2
         delay_m = SPEED_OF_LIGHT_M_S * delay.delay_s
         slot = float(64 * SYSTEMS.index(s.system) + s.prn)
         length = SPEED_OF_LIGHT_M_S / CARRIER_HZ[s.system, s.signal[0]]
-        followed = (slot, length, 0.0, 0.0, 0.0, 0.0, 0.0)
+        first = float(_number(s.signal, ""))
+        followed = (slot, length, 0.0, 0.0, 0.0, 0.0, 0.0, first)
         if second is not None and other is not None:
             b = epoch.signals[second]
             gamma = _gamma(s, b)
@@ -451,9 +467,11 @@ class RangeModel:
                 SPEED_OF_LIGHT_M_S * (other.delay_s - delay.delay_s),
                 (delay.sigma_m**2 + other.sigma_m**2) / (gamma - 1.0) ** 2,
                 float(_number(s.signal, b.signal)),
+                first,
             )
-        fixed = (delay_m, model, scale, variance, float(group))
-        return _Served(index, second, ephemeris, fixed, followed)
+        fixed = (delay_m, model, scale, variance)
+        group = s.system, beidou_2, s.signal[0]
+        return _Served(index, second, ephemeris, group, fixed, followed)
 
     def _ionosphere_model(self, signal: RawSignal) -> tuple[float, float]:
         """Model and scale to the signal's frequency: the system's own, else whichever came. Of
@@ -487,6 +505,26 @@ def _packed(doubles: struct.Struct, values: list[float | None], columns: int) ->
     except struct.error:  # what a receiver does not say is None
         out[:] = np.array(values, float).reshape(out.shape)
     return out
+
+
+def _grouped(chosen: Sequence[_Served]) -> list[tuple[float, ...]]:
+    """Rows of the plan with the numbers of their groups. What a receiver delays one carrier more
+    than another is in the clock where satellites with two carriers settle it: a satellite with
+    one, on another carrier than theirs, does not know it."""
+    numbers: dict[tuple[System, bool, str], int] = {}
+    paired: dict[tuple[System, bool], set[str]] = {}
+    for s in chosen:
+        numbers.setdefault(s.group, len(numbers))
+        if s.second is not None:
+            paired.setdefault(s.group[:2], set()).add(s.group[2])
+    rows = []
+    for s in chosen:
+        delay, model, scale, variance = s.fixed
+        settled = paired.get(s.group[:2])
+        if settled and s.group[2] not in settled:
+            variance += BAND_DELAY_M**2
+        rows.append((delay, model, scale, variance, numbers[s.group], s.group[1]))
+    return rows
 
 
 def _gamma(a: RawSignal, b: RawSignal) -> float:
