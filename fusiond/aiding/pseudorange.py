@@ -29,12 +29,12 @@ the Doppler's place. With q = s' - v~, v~ the antenna's mean velocity over dt, a
 (block `CARRIER_CLOCK`: phases walk by more than the drift's mean, the same for all satellites)
 
     rate^ = u . q - (dt / 2) (u . s'' + (|q|^2 - (u . q)^2) / rho) + d^ + m^,
-    z = -u . dv + .. - dd - dm + v
-    v~ = v - w + (m - m') / dt + (a - a') / dt
+    z = -u . dv + (y x u) . phi + (dt / 2) (C^T u) . f + .. - dd - dm + v
+    v~ = v - w + (m - m') / dt + (a - a') / dt,     y = v~ - v + (0, 0, g dt / 2)
 
 w is how much the IMU alone has changed the velocity since the start, m its integral, primes those
-at the epoch before: so feedback in between, which moves v, leaves the difference alone. Left out:
-what errors of tilt and accelerometers make of w over dt, 2 mm/s by 0.1 deg in 0.25 s.
+at the epoch before: so feedback in between, which moves v, leaves the difference alone. y is what
+of v~ - v turns with the attitude, f the force error of the accelerometers, even over dt.
 
 `turn` is the turning of the NED axes with the position, which turns v + b. s and s' are those at
 transmission, turned into the Earth's axes at reception: then the Earth's rotation needs no further
@@ -63,8 +63,8 @@ from drivers.immutable import immutable
 from fusiond.aiding.base import Aid, Innovation, NotApplicable, State, Vector3
 from fusiond.models.blocks import CLOCK_DRIFT, CLOCK_OFFSET
 from fusiond.navigation.compiled import compiled
-from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M
-from fusiond.navigation.error_model import CORE_SIZE, RATE_ERROR
+from fusiond.navigation.earth import ECCENTRICITY_SQUARED, SEMI_MAJOR_M, gravity
+from fusiond.navigation.error_model import CORE_SIZE, FORCE_ERROR, RATE_ERROR
 from fusiond.navigation.rotation import dcm_elements
 from fusiond.navigation.strapdown import (
     HEIGHT,
@@ -161,6 +161,7 @@ def _rows(
     for j in range(3):
         left[1 + j], left[4 + j] = step[STEP_CHANGED_N + j], step[STEP_MOVED_N + j]
     left[7], left[8], left[9] = a0, a1, a2
+    weight = gravity(nav[LAT], nav[HEIGHT])
     gone = left[0] - before[0] if before[0] > 0.0 else 0.0
     sl, cl = math.sin(nav[LAT]), math.cos(nav[LAT])
     so, co = math.sin(nav[LON]), math.cos(nav[LON])
@@ -220,12 +221,15 @@ def _rows(
             q0 = -sl * co * e0 - sl * so * e1 + cl * e2 - v0
             q1 = -so * e0 + co * e1 - v1
             q2 = -cl * co * e0 - cl * so * e1 - sl * e2 - v2
+            d0, d1, d2 = b0, b1, b2
             known = carrier.shape[0] == 1 and span > 0.0 and abs(gone - span) < SAME_SPAN_S
             if known:
                 k0 = left[1] - (left[4] - before[4]) / span + b0 - (a0 - before[7]) / span
                 k1 = left[2] - (left[5] - before[5]) / span + b1 - (a1 - before[8]) / span
                 k2 = left[3] - (left[6] - before[6]) / span + b2 - (a2 - before[9]) / span
                 q0, q1, q2 = q0 + k0, q1 + k1, q2 + k2
+                # What turns with the attitude of v~: b in it, less what the force has changed.
+                d0, d1, d2 = b0 - k0, b1 - k1, b2 - k2 + 0.5 * weight * span
             along = u0 * q0 + u1 * q1 + u2 * q2
             if known:
                 bend = values[_PULL, i] + (q0 * q0 + q1 * q1 + q2 * q2 - along * along) / distance
@@ -242,9 +246,9 @@ def _rows(
             k0 = (along * u0 - q0) / distance
             k1 = (along * u1 - q1) / distance
             k2 = (along * u2 - q2) / distance
-            g[0] = b1 * u2 - b2 * u1 + k1 * a2 - k2 * a1
-            g[1] = b2 * u0 - b0 * u2 + k2 * a0 - k0 * a2
-            g[2] = b0 * u1 - b1 * u0 + k0 * a1 - k1 * a0
+            g[0] = d1 * u2 - d2 * u1 + k1 * a2 - k2 * a1
+            g[1] = d2 * u0 - d0 * u2 + k2 * a0 - k0 * a2
+            g[2] = d0 * u1 - d1 * u0 + k0 * a1 - k1 * a0
             g[3], g[4], g[5] = -u0, -u1, -u2
             # The axes turn by [dr_e, -dr_n R_N / R_M, -dr_e tan(lat)] / R_N.
             p0, p1, p2 = v1 * u2 - v2 * u1, v2 * u0 - v0 * u2, v0 * u1 - v1 * u0
@@ -263,6 +267,11 @@ def _rows(
                     g[slot] = n2 * l0 - n0 * l2
                 elif axis == 2:
                     g[slot] = n0 * l1 - n1 * l0
+            if known:
+                for slot in range(CORE_SIZE, column_of.shape[0]):
+                    axis = column_of[slot] - FORCE_ERROR
+                    if 0 <= axis < 3:
+                        g[slot] = 0.5 * span * (n0 if axis == 0 else n1 if axis == 1 else n2)
             if clock[i] >= 0:
                 innovation += xi[drifts[0]]
                 g[drifts[0]] = -1.0

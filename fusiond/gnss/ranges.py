@@ -245,17 +245,30 @@ class _Served(NamedTuple):
 
 
 class Picked(NamedTuple):
-    """An epoch's signals that serve, (n, 7) as measured, what their carriers tell (n, 6), what the
-    model's sigmas of codes are multiplied by, and whose carriers tell nothing and why: all that
-    does not need the receiver."""
+    """An epoch's signals that serve, (n, 7) as measured, and the second ones (n, 5), NaN where there
+    is none."""
 
     plan: _Plan
     week: int
     tow_s: float
     measured: Array
+    second: Array
+
+
+class Followed(NamedTuple):
+    """Picked signals with what their carriers tell (n, 6) after the epochs before, what the model's
+    sigmas of codes are multiplied by, and whose carriers tell nothing and why: all that does not
+    need the receiver."""
+
+    picked: Picked
     carriers: Array
     code_scale: float
     slips: tuple[tuple[str, str], ...]
+
+
+def nothing_kept() -> Array:
+    """What is kept of carriers before the first epoch."""
+    return np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
 
 
 class RangeModel:
@@ -266,15 +279,19 @@ class RangeModel:
         self.options = options or RangeOptions()
         self._noise = self.options.noise.array()
         self._plan: _Plan | None = None
-        self._kept = np.zeros((ca.SLOTS, ca.KEPT_COLUMNS))
+        self._kept = nothing_kept()
 
     def rows(self, epoch: RawGnssEpoch, receiver: Array) -> Rows:
         """Rows for a receiver at about (3,) ECEF m; 100 m off moves a correction by 1 cm.
 
         A receiver nearer to the earth's centre than its surface is a first guess: elevations are
-        then 90 deg and the atmosphere is left out.
+        then 90 deg and the atmosphere is left out. Epochs are to come in the order of time.
         """
-        return self.evaluate(self.pick(epoch), receiver)
+        return self.evaluate(self.followed(epoch), receiver)
+
+    def followed(self, epoch: RawGnssEpoch) -> Followed:
+        """An epoch after those that were asked for before."""
+        return self.follow(self.pick(epoch), self._kept)
 
     def pick(self, epoch: RawGnssEpoch) -> Picked:
         """Choose the signals that serve."""
@@ -313,10 +330,17 @@ class RangeModel:
             )
         second = np.full((len(plan.serving), ca.SECOND_COLUMNS), np.nan)
         second[plan.second_rows] = _packed(plan.second_doubles, values, ca.SECOND_COLUMNS)
+        return Picked(plan, epoch.week, epoch.tow_s, measured, second)
+
+    def follow(self, picked: Picked, kept: Array) -> Followed:
+        """Take an epoch in to what is `kept` of the ones before, which is changed."""
+        plan = picked.plan
         carriers = np.empty((len(plan.serving), ca.OUT_COLUMNS))
         refused = np.empty(len(plan.serving), np.int64)
-        jumped = ca.follow(self._kept, plan.followed, measured, second, now, carriers, refused)
-        scale = math.sqrt(ca.scale_squared(self._kept))
+        now = picked.week * WEEK_S + picked.tow_s
+        args = plan.followed, picked.measured, picked.second, now, carriers, refused
+        jumped = ca.follow(kept, *args)
+        scale = math.sqrt(ca.scale_squared(kept))
         slips: tuple[tuple[str, str], ...] = ()
         if refused.any():
             slips = tuple(
@@ -325,19 +349,20 @@ class RangeModel:
             )
         if jumped:
             slips += (("", "clock_jump"),)
-        return Picked(plan, epoch.week, epoch.tow_s, measured, carriers, scale, slips)
+        return Followed(picked, carriers, scale, slips)
 
-    def evaluate(self, picked: Picked, receiver: Array) -> Rows:
+    def evaluate(self, followed: Followed, receiver: Array) -> Rows:
         """Rows of picked signals for a receiver at (3,) ECEF m."""
-        plan, options = picked.plan, self.options
+        picked, options = followed.picked, self.options
+        plan = picked.plan
         out = np.empty((rk.ROW_COLUMNS, len(plan.satellites)))
         noise = self._noise.copy()
-        noise[: rk.CODE_CNO + 1] *= picked.code_scale
+        noise[: rk.CODE_CNO + 1] *= followed.code_scale
         lost = rk.range_rows(
             plan.orbits.elements,
             plan.fixed,
             picked.measured,
-            picked.carriers,
+            followed.carriers,
             plan.ionosphere,
             float(picked.week),
             picked.tow_s,

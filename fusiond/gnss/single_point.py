@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from drivers.raw.messages import SYSTEMS, RawGnssEpoch
 from fusiond.gnss.ecef import ned_axes, to_geodetic
-from fusiond.gnss.ranges import Picked, RangeModel, Rows
+from fusiond.gnss.ranges import Followed, RangeModel, Rows
 from fusiond.navigation.chi_square import quantile
 
 Array = npt.NDArray[np.float64]
@@ -116,17 +116,17 @@ class _Fit(NamedTuple):
 
 
 def single_point(
-    model: RangeModel, epoch: RawGnssEpoch | Picked, guess: Array | None = None
+    model: RangeModel, epoch: RawGnssEpoch | Followed, guess: Array | None = None
 ) -> SinglePoint | str:
     """Solve one epoch; `too_few`, `geometry` or `diverged` names why there is none.
 
     `guess` (3,) ECEF m: where the receiver is about.
     """
-    picked = epoch if isinstance(epoch, Picked) else model.pick(epoch)
+    followed = epoch if isinstance(epoch, Followed) else model.followed(epoch)
     position = np.zeros(3) if guess is None else np.array(guess, float)
     out: list[str] = []
     while True:
-        fit = _fit(model, picked, position, out)
+        fit = _fit(model, followed, position, out)
         if isinstance(fit, str):
             return fit
         position, rows = fit.position, fit.rows
@@ -158,10 +158,12 @@ def single_point(
     )
 
 
-def _fit(model: RangeModel, picked: Picked, position: Array, out: list[str]) -> _Fit | str:
+def _fit(
+    model: RangeModel, followed: Followed, position: Array, out: list[str]
+) -> _Fit | str:
     """Gauss-Newton from `position`, without the satellites in `out`."""
     for _ in range(MAX_ITERATIONS):
-        rows = model.evaluate(picked, position)
+        rows = model.evaluate(followed, position)
         if out:
             rows = rows.without(out)
         h, systems = design(rows.line_of_sight, rows.system)
