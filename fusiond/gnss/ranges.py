@@ -32,9 +32,10 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
+from itertools import chain, compress
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -132,6 +133,19 @@ class RangeOptions:
     preferred: dict[System, tuple[str, ...]] = field(default_factory=lambda: PREFERRED)
     noise: RangeNoise = RangeNoise()
     signal_in_space_m: dict[System, float] = field(default_factory=lambda: SIGNAL_IN_SPACE_M)
+
+
+_FIRST = attrgetter(
+    "pseudorange_m",
+    "range_rate_m_s",
+    "cno_db_hz",
+    "sd_pseudorange_m",
+    "sd_range_rate_m_s",
+    "carrier_cycles",
+    "lock_s",
+)
+_SECOND = attrgetter("pseudorange_m", "cno_db_hz", "sd_pseudorange_m", "carrier_cycles", "lock_s")
+_KEY = attrgetter("system", "prn", "signal")
 
 
 class _Of:
@@ -295,7 +309,7 @@ class RangeModel:
 
     def pick(self, epoch: RawGnssEpoch) -> Picked:
         """Choose the signals that serve."""
-        keys = [(s.system, s.prn, s.signal) for s in epoch.signals]
+        keys = list(map(_KEY, epoch.signals))
         now = epoch.week * WEEK_S + epoch.tow_s
         plan = self._plan
         if (
@@ -305,31 +319,14 @@ class RangeModel:
             or plan.keys != keys
         ):
             self._plan = plan = self._make_plan(epoch, keys, now)
-        values: list[float | None] = []
-        for k in plan.serving:
-            s = epoch.signals[k]
-            values += (
-                s.pseudorange_m,
-                s.range_rate_m_s,
-                s.cno_db_hz,
-                s.sd_pseudorange_m,
-                s.sd_range_rate_m_s,
-                s.carrier_cycles,
-                s.lock_s,
-            )
-        measured = _packed(plan.doubles, values, ca.FIRST_COLUMNS)
-        values = []
-        for k in plan.seconds:
-            s = epoch.signals[k]
-            values += (
-                s.pseudorange_m,
-                s.cno_db_hz,
-                s.sd_pseudorange_m,
-                s.carrier_cycles,
-                s.lock_s,
-            )
+        signals = epoch.signals
+        measured = _packed(
+            plan.doubles, map(_FIRST, [signals[k] for k in plan.serving]), ca.FIRST_COLUMNS
+        )
         second = np.full((len(plan.serving), ca.SECOND_COLUMNS), np.nan)
-        second[plan.second_rows] = _packed(plan.second_doubles, values, ca.SECOND_COLUMNS)
+        second[plan.second_rows] = _packed(
+            plan.second_doubles, map(_SECOND, [signals[k] for k in plan.seconds]), ca.SECOND_COLUMNS
+        )
         return Picked(plan, epoch.week, epoch.tow_s, measured, second)
 
     def follow(self, picked: Picked, kept: Array) -> Followed:
@@ -522,8 +519,11 @@ class RangeModel:
         return out
 
 
-def _packed(doubles: struct.Struct, values: list[float | None], columns: int) -> Array:
+def _packed(
+    doubles: struct.Struct, rows: Iterable[tuple[float | None, ...]], columns: int
+) -> Array:
     """Values as rows; NaN for None."""
+    values = list(chain.from_iterable(rows))
     out = np.empty((len(values) // columns, columns))
     try:
         doubles.pack_into(out.data, 0, *values)  # half of what numpy takes

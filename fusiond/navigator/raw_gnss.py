@@ -144,7 +144,8 @@ class RawEpochAid(Aid):
 
 
 class RawGnss:
-    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`."""
+    """One receiver. `refused` counts satellites by reason, `<system>_<reason>`; `recent` are its last
+    epochs in the order of time."""
 
     def __init__(self, source: str, section: RawAiding) -> None:
         self.source = source
@@ -159,7 +160,7 @@ class RawGnss:
         self._left_out: dict[str, str] = {}
         self._judged: tuple[RawEpochAid, _Corrected, Sequence[int], Sequence[float]] | None = None
         self._counted_ns = -1
-        self._recent: list[RawEpochAid] = []
+        self.recent: list[RawEpochAid] = []
         self.refused: Counter[str] = Counter()
 
     def learn(self, message: NavigationMessage) -> None:
@@ -170,15 +171,15 @@ class RawGnss:
         """The epoch as an aid, with the ephemerides that are known by now."""
         picked = self._model.pick(epoch)
         aid = RawEpochAid(self.source, t_ns, self.gate, self, epoch, picked)
-        insort(self._recent, aid, key=_instant)
-        oldest = self._recent[-1].t_ns - REMEMBERED_NS
-        del self._recent[: bisect_left(self._recent, oldest, key=_instant)]
+        insort(self.recent, aid, key=_instant)
+        oldest = self.recent[-1].t_ns - REMEMBERED_NS
+        del self.recent[: bisect_left(self.recent, oldest, key=_instant)]
         return aid
 
     def followed(self, aid: RawEpochAid) -> Followed:
         """The epoch after all that are known by now to be before it, in whatever order they came:
         one that came late changes those behind it."""
-        recent = self._recent
+        recent = self.recent
         at = bisect_left(recent, aid.t_ns, key=_instant)
         while at < len(recent) and recent[at] is not aid and recent[at].t_ns == aid.t_ns:
             at += 1
